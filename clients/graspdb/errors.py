@@ -1,0 +1,121 @@
+"""Errors that the SDK raises: each carries the service's problem, if it answered one."""
+
+from __future__ import annotations
+
+from graspdb.wire import FieldError, Problem
+
+__all__ = [
+    "AmbiguousSelection",
+    "Conflict",
+    "Forbidden",
+    "GraspDBError",
+    "Infeasible",
+    "InvalidInput",
+    "LeaseLost",
+    "NotFound",
+    "ServiceError",
+    "TooLarge",
+    "TooManyRequests",
+    "Unauthorized",
+    "Unreachable",
+    "error_for",
+]
+
+
+class GraspDBError(Exception):
+    """Base of every error of this package."""
+
+    def __init__(self, message: str, *, problem: Problem | None = None) -> None:
+        super().__init__(message)
+        self.problem = problem
+
+    @property
+    def status(self) -> int | None:
+        """The HTTP status, or None if no answer came."""
+        return None if self.problem is None else self.problem.status
+
+    @property
+    def fields(self) -> list[FieldError]:
+        """The fields the service names, each with what is wrong with it."""
+        return [] if self.problem is None else self.problem.errors
+
+
+class Unreachable(GraspDBError):
+    """No service answered at that address."""
+
+
+class InvalidInput(GraspDBError):
+    """400, 415 or 422: the request is wrong; ``fields`` says where."""
+
+
+class Unauthorized(GraspDBError):
+    """401: no valid API key."""
+
+
+class Forbidden(GraspDBError):
+    """403: the key lacks the scope."""
+
+
+class NotFound(GraspDBError):
+    """404: no such resource."""
+
+
+class Conflict(GraspDBError):
+    """409: the resource's state does not allow it now."""
+
+
+class AmbiguousSelection(Conflict):
+    """409: several grippers or protocols have trials, and none was named."""
+
+
+class LeaseLost(Conflict):
+    """409: the job's lease is another worker's now, or the job was cancelled."""
+
+
+class TooLarge(GraspDBError):
+    """413: over a stated limit."""
+
+
+class TooManyRequests(GraspDBError):
+    """429: the service is busy; try again later."""
+
+
+class ServiceError(GraspDBError):
+    """5xx: the service failed."""
+
+
+class Infeasible(GraspDBError):
+    """No admissible grasp lies within any kernel's reach, or the object has no success yet.
+
+    ``nearest`` is the closest grasp outside the constraints, where there is one.
+    """
+
+    def __init__(self, message: str, *, nearest: object | None = None) -> None:
+        super().__init__(message)
+        self.nearest = nearest
+
+
+_BY_TYPE: dict[str, type[GraspDBError]] = {
+    "ambiguous-selection": AmbiguousSelection,
+    "lease-lost": LeaseLost,
+}
+_BY_STATUS: dict[int, type[GraspDBError]] = {
+    401: Unauthorized,
+    403: Forbidden,
+    404: NotFound,
+    409: Conflict,
+    413: TooLarge,
+    429: TooManyRequests,
+}
+
+
+def error_for(problem: Problem) -> GraspDBError:
+    """The exception that stands for a problem, its message complete with fields and request id."""
+    lines = [problem.title if problem.detail is None else f"{problem.title}: {problem.detail}"]
+    lines += [f"  {item.field}: {item.message}" for item in problem.errors]
+    if problem.request_id:
+        lines.append(f"  (request {problem.request_id})")
+    kind = _BY_TYPE.get(problem.type.rsplit("/", 1)[-1]) or _BY_STATUS.get(problem.status)
+    if kind is None:
+        kind = ServiceError if problem.status >= 500 else InvalidInput
+    return kind("\n".join(lines), problem=problem)

@@ -1,0 +1,163 @@
+"""HTTP to the service with retries: the part that the SDK and the worker share.
+
+A request is retried on connection errors, timeouts and 429, 502, 503 and 504, with exponential backoff
+and jitter, honouring Retry-After. That is safe for every verb the service has: GET, PUT and DELETE are
+idempotent, and every creating POST carries one Idempotency-Key through all its attempts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any
+
+import httpx
+from pydantic import BaseModel, ValidationError
+
+from graspdb.errors import Unreachable, error_for
+from graspdb.wire import Problem
+
+__all__ = ["DEFAULT_URL", "Transport"]
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+_RETRIED = frozenset({429, 502, 503, 504})
+
+
+class Transport:
+    """One connection pool to one service; safe to share between threads.
+
+    Parameters
+    ----------
+    url
+        Base address; by default ``$GRASPDB_URL``, else ``http://127.0.0.1:8000``.
+    api_key
+        Sent as a bearer token; by default ``$GRASPDB_API_KEY``.
+    timeout_s
+        Per attempt; computing requests can take as long.
+    retries
+        Attempts after the first.
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        api_key: str | None = None,
+        timeout_s: float = 120.0,
+        retries: int = 5,
+        user_agent: str = "graspdb",
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.url = (url or os.environ.get("GRASPDB_URL") or DEFAULT_URL).rstrip("/")
+        key = api_key or os.environ.get("GRASPDB_API_KEY")
+        headers = {"User-Agent": user_agent}
+        if key:
+            headers["Authorization"] = f"Bearer {key}"
+        self._retries = retries
+        self._sleep = sleep
+        self._http = httpx.Client(
+            base_url=self.url, headers=headers, timeout=httpx.Timeout(timeout_s, connect=10.0)
+        )
+
+    def close(self) -> None:
+        self._http.close()
+
+    def __enter__(self) -> Transport:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def request(
+        self,
+        method: str,
+        path: str,
+        *,
+        params: Mapping[str, Any] | None = None,
+        body: BaseModel | Mapping[str, Any] | list[Any] | None = None,
+        content: bytes | None = None,
+        headers: Mapping[str, str] | None = None,
+        idempotent: bool = False,
+        idempotency_key: str | None = None,
+        retries: int | None = None,
+    ) -> httpx.Response:
+        """Send and return a 2xx or 304 answer.
+
+        Parameters
+        ----------
+        body
+            Sent as JSON (a model without its unset fields).
+        content
+            A raw body; name its type in ``headers``.
+        idempotent
+            Give a creating POST an Idempotency-Key of its own, the same in every attempt.
+
+        Raises
+        ------
+        Unreachable
+            If no attempt got an answer.
+        GraspDBError
+            The typed error of the problem answered (:func:`graspdb.errors.error_for`).
+        """
+        send = dict(headers or {})
+        if body is not None:
+            text = (
+                body.model_dump_json(exclude_unset=True)
+                if isinstance(body, BaseModel)
+                else json.dumps(body, allow_nan=False)
+            )
+            content = text.encode()
+            send.setdefault("Content-Type", "application/json")
+        if idempotency_key or idempotent:
+            send["Idempotency-Key"] = idempotency_key or str(uuid.uuid4())
+        query = {key: value for key, value in (params or {}).items() if value is not None}
+        attempts = 1 + (self._retries if retries is None else retries)
+        for attempt in range(attempts):
+            last = attempt == attempts - 1
+            wait = min(0.2 * 2.0**attempt, 10.0) * random.uniform(0.5, 1.0)
+            try:
+                response = self._http.request(method, path, params=query, content=content, headers=send)
+            except httpx.TransportError as error:
+                if last:
+                    raise Unreachable(
+                        f"no answer from {self.url}: {error or type(error).__name__}."
+                        " Is the service running (graspdb-server serve), and is GRASPDB_URL right?"
+                    ) from error
+            else:
+                if response.is_success or response.status_code == 304:
+                    return response
+                if last or response.status_code not in _RETRIED:
+                    raise error_for(_problem(response))
+                wait = max(wait, _retry_after(response))
+            self._sleep(wait)
+        raise AssertionError("unreachable: the last attempt returns or raises")
+
+    def json(self, method: str, path: str, **options: Any) -> Any:
+        """:meth:`request`, and the answer's JSON."""
+        return self.request(method, path, **options).json()
+
+
+def _retry_after(response: httpx.Response) -> float:
+    try:
+        return min(float(response.headers.get("Retry-After", "0")), 60.0)
+    except ValueError:
+        return 0.0
+
+
+def _problem(response: httpx.Response) -> Problem:
+    try:
+        return Problem.model_validate(response.json())
+    except (ValueError, ValidationError):
+        return Problem(
+            type="about:blank",
+            title=f"{response.status_code} {response.reason_phrase}",
+            status=response.status_code,
+            detail=response.text[:300] or None,
+        )

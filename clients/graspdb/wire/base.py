@@ -1,0 +1,205 @@
+"""Poses, outcomes, pages and problems: the words every other model is made of."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+Outcome = Literal[
+    "failure",
+    "success",
+    "collision",
+    "missed",
+    "slipped",
+    "dropped",
+    "wrench_insufficient",
+    "timeout",
+    "simulation_error",
+]
+"""What became of a grasp. Every outcome but ``success`` is a failure; ``simulation_error`` is no attempt."""
+
+OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+OUTCOME_CODES: dict[str, int] = {name: code for code, name in enumerate(OUTCOMES)}
+"""The uint8 code of each outcome in packed results. Codes are stored: append, never renumber."""
+
+Source = Literal["simulation", "robot", "human", "import"]
+SOURCES: tuple[Source, ...] = get_args(Source)
+
+MAX_COORDINATE_M = 1_000.0
+"""Farther from the object's origin than this no grasp can be meant; most likely the unit is wrong."""
+
+UNIT_TOLERANCE = 1e-3
+"""A quaternion or rotation matrix this near to exact is normalised; farther off it is refused."""
+
+
+class Request(BaseModel):
+    """Base of what clients send: unknown fields and non-finite numbers are errors."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, validate_default=False)
+
+
+class Response(BaseModel):
+    """Base of what the service answers: clients ignore the fields that a newer service adds."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+
+def _split_commas(value: Any) -> Any:
+    """Accept ``"0,0,1"`` (as a query string gives it, alone or in a list of one) for a vector."""
+    if isinstance(value, (list, tuple)) and len(value) == 1 and isinstance(value[0], str):
+        value = value[0]
+    if isinstance(value, str):
+        return [part.strip() for part in value.split(",")]
+    return value
+
+
+def _within_reach(value: tuple[float, ...]) -> tuple[float, ...]:
+    if any(abs(x) > MAX_COORDINATE_M for x in value):
+        raise ValueError(
+            f"coordinates are metres and at most {MAX_COORDINATE_M:g} from the origin: is the unit right?"
+        )
+    return value
+
+
+def _unit(value: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.sqrt(sum(x * x for x in value))
+    if not abs(norm - 1.0) <= UNIT_TOLERANCE:
+        raise ValueError(
+            f"a quaternion (x, y, z, w) must have norm 1 within {UNIT_TOLERANCE:g}; this one has {norm:.6g}"
+        )
+    return tuple(x / norm for x in value)
+
+
+def _direction(value: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.sqrt(sum(x * x for x in value))
+    if norm < 1e-9 or not math.isfinite(norm):
+        raise ValueError("a direction must not be the zero vector")
+    return tuple(x / norm for x in value)
+
+
+Triple = tuple[float, float, float]
+Quadruple = tuple[float, float, float, float]
+
+Position = Annotated[Triple, BeforeValidator(_split_commas), AfterValidator(_within_reach)]
+"""Three coordinates in metres."""
+Quaternion = Annotated[Quadruple, BeforeValidator(_split_commas), AfterValidator(_unit)]
+"""A unit quaternion (x, y, z, w); ``q`` and ``-q`` are the same rotation."""
+Direction = Annotated[Triple, BeforeValidator(_split_commas), AfterValidator(_direction)]
+"""A direction; normalised on arrival."""
+Vector4 = Annotated[Quadruple, BeforeValidator(_split_commas)]
+Vector7 = Annotated[tuple[float, float, float, float, float, float, float], BeforeValidator(_split_commas)]
+Slug = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+"""An identifier that stands in a URL: letters, digits, ``.``, ``_``, ``-``; at most 64 characters."""
+Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: _no_nul(s))]
+Metadata = dict[str, Any]
+
+PositiveFloat = Annotated[float, Field(gt=0, le=1e12)]
+
+
+def _no_nul(text: str) -> str:
+    if "\x00" in text:
+        raise ValueError("text must not contain the NUL character")
+    return text
+
+
+def rotation_to_quaternion(matrix: list[list[float]]) -> Quadruple:
+    """The unit quaternion (x, y, z, w) of a 3x3 rotation matrix (Shepperd's method, 1978).
+
+    Raises
+    ------
+    ValueError
+        If the matrix is not a rotation within :data:`UNIT_TOLERANCE`.
+    """
+    for i in range(3):
+        for j in range(i, 3):
+            dot = sum(matrix[k][i] * matrix[k][j] for k in range(3))
+            if not abs(dot - (1.0 if i == j else 0.0)) <= 2 * UNIT_TOLERANCE:
+                raise ValueError(
+                    "the upper left 3x3 block must be a rotation: its columns are not orthonormal"
+                )
+    (a, b, c), (d, e, f), (g, h, i_) = (row[:3] for row in matrix[:3])
+    if a * (e * i_ - f * h) - b * (d * i_ - f * g) + c * (d * h - e * g) < 0:
+        raise ValueError("the upper left 3x3 block must be a rotation: this one is a reflection")
+    candidates = (
+        (1 + a - e - i_, (1 + a - e - i_, b + d, c + g, h - f)),
+        (1 - a + e - i_, (b + d, 1 - a + e - i_, f + h, c - g)),
+        (1 - a - e + i_, (c + g, f + h, 1 - a - e + i_, d - b)),
+        (1 + a + e + i_, (h - f, c - g, d - b, 1 + a + e + i_)),
+    )
+    _, best = max(candidates)
+    norm = math.sqrt(sum(x * x for x in best))
+    x, y, z, w = (value / norm for value in best)
+    return x, y, z, w
+
+
+def pose_from_matrix(matrix: Any) -> tuple[Triple, Quadruple]:
+    """Position and quaternion of a 4x4 homogeneous matrix, row-major, metres.
+
+    Raises
+    ------
+    ValueError
+        If the shape, the last row or the rotation block is not that of a rigid motion.
+    """
+    if not (isinstance(matrix, (list, tuple)) and len(matrix) == 4):
+        raise ValueError("a pose's matrix has shape (4, 4)")
+    rows: list[list[float]] = []
+    for row in matrix:
+        if not (isinstance(row, (list, tuple)) and len(row) == 4):
+            raise ValueError("a pose's matrix has shape (4, 4)")
+        if not all(isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in row):
+            raise ValueError("a pose's matrix holds 16 finite numbers")
+        rows.append([float(x) for x in row])
+    if any(abs(x - y) > 1e-6 for x, y in zip(rows[3], (0.0, 0.0, 0.0, 1.0), strict=True)):
+        raise ValueError("the last row of a pose's matrix is 0, 0, 0, 1")
+    return (rows[0][3], rows[1][3], rows[2][3]), rotation_to_quaternion(rows)
+
+
+def expand_matrix(data: Any) -> Any:
+    """Replace ``matrix`` in a pose's fields by ``position`` and ``quaternion_xyzw``; a `before` validator."""
+    if isinstance(data, dict) and data.get("matrix") is not None:
+        if "position" in data or "quaternion_xyzw" in data:
+            raise ValueError("give either matrix, or position and quaternion_xyzw, not both")
+        position, quaternion = pose_from_matrix(data["matrix"])
+        rest = {key: value for key, value in data.items() if key != "matrix"}
+        return {**rest, "position": position, "quaternion_xyzw": quaternion}
+    return data
+
+
+class Pose(Request):
+    """The tool frame in the object frame: ``{position, quaternion_xyzw}`` or a row-major 4x4 ``{matrix}``."""
+
+    position: Position
+    quaternion_xyzw: Quaternion
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_matrix(cls, data: Any) -> Any:
+        return expand_matrix(data)
+
+
+class FieldError(Response):
+    field: str
+    message: str
+
+
+class Problem(Response):
+    """An RFC 9457 problem: ``type`` is stable, ``title`` says what to do, ``errors`` name the fields."""
+
+    type: str
+    title: str
+    status: int
+    detail: str | None = None
+    request_id: str | None = None
+    errors: list[FieldError] = Field(default_factory=list)
+
+
+T = TypeVar("T")
+
+
+class Page(Response, Generic[T]):
+    """One page of a list; ``next`` is the cursor of the following page, null at the end."""
+
+    items: list[T]
+    next: str | None = None

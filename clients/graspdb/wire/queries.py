@@ -1,0 +1,221 @@
+"""Questions to a density and their answers: likelihood, best grasp, samples."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from graspdb.wire.base import (
+    Direction,
+    Pose,
+    Position,
+    Quadruple,
+    Quaternion,
+    Request,
+    Response,
+    Slug,
+    Source,
+    Triple,
+    Vector4,
+    Vector7,
+    _split_commas,
+    _unit,
+)
+
+WidthM = Annotated[float, Field(gt=0, le=1.0)]
+WidthDeg = Annotated[float, Field(gt=0, le=90.0)]
+Angle = Annotated[float, Field(gt=0, le=180.0)]
+
+
+class KernelSpec(Request):
+    """A kernel by its widths: standard deviations per axis. ``cutoff`` in sigmas; null means exact."""
+
+    kind: Literal["isotropic"] = "isotropic"
+    sigma_position_m: WidthM | None = None
+    sigma_rotation_deg: WidthDeg | None = None
+    cutoff: Annotated[float, Field(ge=2.0, le=20.0)] | None = None
+
+
+class Selection(Request):
+    """Which trials a density is built from, and with which kernel."""
+
+    gripper: Slug | None = None
+    protocol: Slug | None = None
+    source: Source | None = None
+    kernel: KernelSpec | Slug | None = None
+    sigma_position_m: WidthM | None = None
+    sigma_rotation_deg: WidthDeg | None = None
+
+
+class KernelInfo(Response):
+    """The kernel that answered; ``rule`` says how its widths were chosen."""
+
+    kind: str
+    sigma_position_m: float
+    sigma_rotation_deg: float
+    rule: str
+
+
+class DensityInfo(Response):
+    """``size`` successes shape the density; twins by the jaw's symmetry are implicit and not counted."""
+
+    object: str
+    revision: int
+    epoch: int
+    gripper: str | None
+    protocol: str | None
+    source: str | None
+    kernel: KernelInfo
+    size: int
+    outcomes: dict[str, int]
+    effective_sample_size: float
+    unit: str = "1/(m^3 rad^3)"
+    bytes: int
+    warnings: list[str] = Field(default_factory=list)
+
+
+class PoseColumns(Request):
+    position: Annotated[list[Position], Field(min_length=1)]
+    quaternion_xyzw: Annotated[list[Quaternion], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _same_length(self) -> PoseColumns:
+        if len(self.position) != len(self.quaternion_xyzw):
+            raise ValueError(
+                f"position has {len(self.position)} rows and quaternion_xyzw {len(self.quaternion_xyzw)}"
+            )
+        return self
+
+
+LikelihoodColumn = Literal[
+    "density",
+    "log_density",
+    "relative",
+    "success_probability",
+    "interval",
+    "effective_trials",
+    "collision_free",
+]
+
+
+class LikelihoodRequest(Selection):
+    poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns
+    include: list[LikelihoodColumn] | None = None
+
+
+class Intervals(Response):
+    level: float
+    low: list[float | None]
+    high: list[float | None]
+
+
+class Interval(Response):
+    level: float
+    low: float
+    high: float
+
+
+class Likelihoods(Response):
+    """Columns in the poses' order. Density in 1/(m^3 rad^3); the log of an exact zero is null."""
+
+    revision: int
+    kernel: KernelInfo
+    density: list[float] | None = None
+    log_density: list[float | None] | None = None
+    relative: list[float] | None = None
+    success_probability: list[float | None] | None = None
+    interval: Intervals | None = None
+    effective_trials: list[float] | None = None
+    collision_free: list[bool | None] | None = None
+
+
+def _object_pose(value: Any) -> Any:
+    if isinstance(value, dict):
+        pose = Pose.model_validate(value)
+        return (*pose.position, *pose.quaternion_xyzw)
+    value = _split_commas(value)
+    if isinstance(value, (list, tuple)) and len(value) == 7:
+        try:
+            numbers = [float(x) for x in value]
+        except (TypeError, ValueError):
+            return value
+        return (*numbers[:3], *_unit(tuple(numbers[3:])))
+    return value
+
+
+ObjectPose = Annotated[Vector7, BeforeValidator(_object_pose)]
+"""The object frame in the world frame: x, y, z, qx, qy, qz, qw (a pose's object is accepted too)."""
+
+
+class BestGraspRequest(Selection):
+    """The constrained maximum (figure 2).
+
+    All constraints are in ``frame``: world if ``object_pose`` is given, else object.
+    """
+
+    count: Annotated[int, Field(ge=1, le=1_000)] = 1
+    objective: Literal["density"] = "density"
+    box_min: Position | None = None
+    box_max: Position | None = None
+    sphere: Vector4 | None = None
+    above_plane: Vector4 | None = None
+    approach: Direction | None = None
+    approach_cone_deg: Angle | None = None
+    closing: Direction | None = None
+    closing_cone_deg: Angle | None = None
+    collision_free: bool | None = None
+    object_pose: ObjectPose | None = None
+    frame: Literal["world", "object"] | None = None
+    min_separation_m: Annotated[float, Field(gt=0, le=10)] | None = None
+    min_separation_deg: Angle | None = None
+
+
+class WorldPose(Response):
+    position: Triple
+    quaternion_xyzw: Quadruple
+
+
+class Grasp(Response):
+    """A grasp in the object frame, and in the world's where the object's pose was given."""
+
+    position: Triple
+    quaternion_xyzw: Quadruple
+    world: WorldPose | None = None
+    density: float
+    log_density: float
+    relative: float
+    success_probability: float | None = None
+    interval: Interval | None = None
+    effective_trials: float | None = None
+    collision_free: bool | None = None
+    width_m: float | None = None
+    nearest_trials: list[int] = Field(default_factory=list)
+    active_constraints: list[str] = Field(default_factory=list)
+
+
+class BestGrasps(Response):
+    """``fewer``: less than ``count`` distinct grasps exist; ``infeasible``: none within any kernel's reach,
+    and ``nearest`` is the best grasp that ignores the constraints' region but lies closest to it."""
+
+    status: Literal["ok", "fewer", "infeasible", "no_successes"]
+    grasps: list[Grasp]
+    nearest: Grasp | None = None
+    revision: int
+    kernel: KernelInfo
+
+
+class SamplesRequest(Selection):
+    count: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
+
+
+class Samples(Response):
+    """Poses drawn from a density, in columns; sent back with the trial, ``proposal_density`` weights it."""
+
+    revision: int
+    kernel: KernelInfo
+    seed: int
+    position: list[Triple]
+    quaternion_xyzw: list[Quadruple]
+    proposal_density: list[float]
