@@ -254,7 +254,9 @@ class PoseGrid:
         lower, upper = _box("lower, upper", self.lower, self.upper)
         first, last = _lattice_range(lower - margin, upper + margin, step)
         if np.any(last < first):
-            raise ValueError("position_step_m is too large: no multiple of it lies inside the box plus margin_m")
+            raise ValueError(
+                "position_step_m is too large: no multiple of it lies inside the box plus margin_m"
+            )
         kept_first, kept_last = first, last
         if self.region is not None:
             low, high = _lattice_range(*_box("region", self.region[0], self.region[1]), step)
