@@ -1,0 +1,153 @@
+"""What the physics is told of the two bodies: the gripper's dimensions and drive, the object's mass distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Part = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""A convex part: vertices (V, 3) in metres and outward faces (F, 3)."""
+
+HEAVY_KG = 0.3
+"""From this mass on the jaw closes with its full force."""
+LIGHT_FORCE_N = 10.0
+"""Below it with this one: light objects jitter between strong fingers. The contact forces are scaled back for the test."""
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """A parallel jaw in its tool frame: x finger width, y closing, z approach, origin midway between the fingers.
+
+    Attributes
+    ----------
+    max_opening_m, finger_width_m, finger_thickness_m, finger_length_m : float
+        Largest distance between the fingers and the fingers' sizes along x, y and z.
+    tip_offset_m : float
+        From the tool's origin to the fingertips along z.
+    palm_size_m : tuple
+        Box behind the fingers along x, y, z.
+    finger_mass_kg, max_speed_m_s : float
+    force_n : float
+        The gripper's closing force, to which contact forces are scaled.
+    closing_force_n : float
+        The force simulated, at most ``force_n``.
+    """
+
+    max_opening_m: float
+    finger_width_m: float
+    finger_thickness_m: float
+    finger_length_m: float
+    tip_offset_m: float
+    palm_size_m: tuple[float, float, float]
+    finger_mass_kg: float
+    max_speed_m_s: float
+    force_n: float
+    closing_force_n: float
+
+    @property
+    def finger_half_extents(self) -> tuple[float, float, float]:
+        return (0.5 * self.finger_width_m, 0.5 * self.finger_thickness_m, 0.5 * self.finger_length_m)
+
+    @property
+    def palm_half_extents(self) -> tuple[float, float, float]:
+        x, y, z = self.palm_size_m
+        return (0.5 * x, 0.5 * y, 0.5 * z)
+
+    @property
+    def palm_centre_z(self) -> float:
+        return self.tip_offset_m - self.finger_length_m - 0.5 * self.palm_size_m[2]
+
+
+def closing_force(force_n: float, mass_kg: float) -> float:
+    """Closing force to simulate with, in newtons, for an object of this mass."""
+    return force_n if mass_kg >= HEAVY_KG else min(force_n, LIGHT_FORCE_N)
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """Mass, centre and principal inertia of a solid of uniform density, in the object frame.
+
+    Attributes
+    ----------
+    mass_kg : float
+    centre : tuple
+        Centre of mass in the object frame, metres.
+    principal_xyzw : tuple
+        Rotation from the principal frame to the object frame.
+    inertia : tuple
+        Moments about the principal axes, kg m^2.
+    """
+
+    mass_kg: float
+    centre: tuple[float, float, float]
+    principal_xyzw: tuple[float, float, float, float]
+    inertia: tuple[float, float, float]
+    _axes: NDArray[np.float64]
+
+    def inverse_rotation(self) -> tuple[float, float, float, float]:
+        """Rotation from the object frame to the principal frame, xyzw."""
+        x, y, z, w = self.principal_xyzw
+        return (-x, -y, -z, w)
+
+    def to_principal(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) of the object frame in the principal frame."""
+        return np.asarray((points - np.array(self.centre)) @ self._axes, dtype=np.float64)
+
+
+def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
+    """Mass properties of a union of convex parts; where parts overlap, their common volume counts once for each.
+
+    Signed tetrahedra from the origin to every face: volume det/6, first moment det/24 (a + b + c), second moment
+    det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c.
+
+    Raises
+    ------
+    ValueError
+        For a mass that is not positive, or parts that enclose no volume.
+    """
+    if not (np.isfinite(mass_kg) and mass_kg > 0.0):
+        raise ValueError(f"mass must be positive and finite, got {mass_kg}")
+    volume, first, second = 0.0, np.zeros(3), np.zeros((3, 3))
+    for vertices, faces in parts:
+        a, b, c = (np.asarray(vertices, dtype=np.float64)[np.asarray(faces)[:, i]] for i in range(3))
+        det = np.einsum("ij,ij->i", a, np.cross(b, c))
+        total = a + b + c
+        moment = sum(np.einsum("i,ij,ik->jk", det, v, v) for v in (total, a, b, c)) / 120.0
+        # A part wound inwards counts like one wound outwards.
+        sign = 1.0 if det.sum() >= 0.0 else -1.0
+        volume += sign * det.sum() / 6.0
+        first += sign * (det[:, None] * total).sum(axis=0) / 24.0
+        second += sign * moment
+    if not volume > 0.0:
+        raise ValueError("the convex parts enclose no volume")
+    centre = first / volume
+    covariance = (second / volume - np.outer(centre, centre)) * mass_kg
+    moments, axes = np.linalg.eigh(np.trace(covariance) * np.eye(3) - covariance)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 2] *= -1.0
+    x, y, z = (float(m) for m in np.maximum(moments, 1e-12))
+    return MassProperties(
+        mass_kg=float(mass_kg),
+        centre=(float(centre[0]), float(centre[1]), float(centre[2])),
+        principal_xyzw=_quaternion(axes),
+        inertia=(x, y, z),
+        _axes=axes,
+    )
+
+
+def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Quaternion xyzw of a rotation matrix (3, 3): the largest eigenvector of Bar-Itzhack's symmetric matrix."""
+    m = matrix
+    k = np.array(
+        [
+            [m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] - m[1, 2]],
+            [m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2], m[0, 2] - m[2, 0]],
+            [m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
+        ]
+    )
+    q = np.linalg.eigh(k)[1][:, -1]
+    return (float(q[0]), float(q[1]), float(q[2]), float(q[3]))

@@ -1,0 +1,421 @@
+"""Closing a parallel jaw on a free-floating object in pybullet. The only module that imports pybullet.
+
+The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at the origin, its tool
+frame is the world frame; for every grasp the *object* is moved instead. Nothing weighs: the object floats, so that the jaw
+centres it as it closes, and gravity enters afterwards through the force test in :mod:`graspdb_simworker.labels`.
+
+What the solver does depends on what it did before: Bullet keeps contact caches and the order of overlapping pairs. Parking
+the object far away and stepping the world once after every grasp empties both, and results become bitwise independent of
+the order of grasps, of the process and of the world (saving and restoring Bullet's state does not achieve that).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+import pybullet
+from numpy.typing import NDArray
+
+from graspdb_simworker.bodies import Gripper, MassProperties, Part, mass_properties
+
+Fidelity = Literal["standard", "fine"]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+APPROACH_GAP_M = 0.0005
+"""The fingers start this far before their first contact: nothing can happen on the way there."""
+COLLISION_MARGIN_M = 0.0005
+"""Bullet inflates convex hulls by this much; boxes keep their size."""
+CONTACT_BREAKING_M = 0.002
+STALL_WINDOW_S = 0.030
+STALL_PROGRESS_M = 5e-5
+"""The jaw has stalled once it closed less than this within the window (at full speed it closes 3.6 mm)."""
+SLACK_S = 0.5
+"""A closing may last this much longer than the fingers need to meet at full speed."""
+_PARKED: Vector = (0.0, 0.0, -1000.0)
+_IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+_EMPTY_CHECK_STEPS = 16
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """How time is cut: until both fingers touch, and from then on."""
+
+    approach_dt_s: float
+    squeeze_dt_s: float
+    solver_iterations: int
+
+
+STEPPING: dict[str, Stepping] = {
+    "standard": Stepping(1.0 / 240.0, 1.0 / 480.0, 50),
+    "fine": Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200),
+}
+
+
+class End(Enum):
+    """Why a closing ended."""
+
+    STALLED = "stalled"
+    EMPTY = "empty"
+    TIMEOUT = "timeout"
+    UNSTABLE = "unstable"
+
+
+@dataclass(frozen=True)
+class Closing:
+    """The jaw after a closing.
+
+    Attributes
+    ----------
+    end : End
+    touched : bool
+        Both fingers had touched the object at the same time.
+    opening_m : float
+        Distance between the fingers.
+    normals : (K, 3) float64
+        Contact normals in the tool frame, pointing into the object.
+    forces : (K,) float64
+        Normal contact forces in newtons, as exerted with ``Gripper.closing_force_n``.
+    fingers : (K,) int64
+        Which body presses: 0 and 1 the fingers, -1 the palm.
+    position, quaternion_xyzw
+        The object's pose in the tool frame.
+    steps : int
+        Simulation steps spent.
+    """
+
+    end: End
+    touched: bool
+    opening_m: float
+    normals: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    fingers: NDArray[np.int64]
+    position: Vector
+    quaternion_xyzw: Quaternion
+    steps: int
+
+
+class GraspWorld:
+    """One object and one gripper in a headless Bullet world.
+
+    Parameters
+    ----------
+    parts : sequence of (vertices (V, 3), faces (F, 3))
+        Convex parts of the object in its own frame, metres.
+    mass_kg : float
+    friction : float
+        Coulomb friction coefficient between object and gripper.
+    gripper : Gripper
+    fidelity : {'standard', 'fine'}
+    """
+
+    def __init__(
+        self, parts: Sequence[Part], mass_kg: float, friction: float, gripper: Gripper, fidelity: Fidelity = "standard"
+    ) -> None:
+        self.gripper = gripper
+        self.stepping = STEPPING[fidelity]
+        self.mass = mass_properties(parts, mass_kg)
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise RuntimeError("pybullet could not open a DIRECT world")
+        self._to_body = self.mass.inverse_rotation()
+        try:
+            self._configure()
+            self._jaw = self._build_gripper()
+            self._object = self._build_object(parts, self.mass)
+            self._column = self._build_column()
+            self._finish_bodies(math.sqrt(friction))
+            self._park()
+        except BaseException:
+            self.close_world()
+            raise
+
+    def __enter__(self) -> GraspWorld:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close_world()
+
+    def close_world(self) -> None:
+        """Free Bullet's memory; the world can't be used afterwards."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    # -- building -----------------------------------------------------------------------------------------------
+
+    def _configure(self) -> None:
+        pybullet.resetSimulation(physicsClientId=self._client)
+        pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=self._client)
+        pybullet.setPhysicsEngineParameter(
+            numSolverIterations=self.stepping.solver_iterations,
+            contactBreakingThreshold=CONTACT_BREAKING_M,
+            deterministicOverlappingPairs=1,
+            numSubSteps=0,
+            physicsClientId=self._client,
+        )
+
+    def _build_gripper(self) -> int:
+        gripper = self.gripper
+        finger_half, palm_half = gripper.finger_half_extents, gripper.palm_half_extents
+        finger = self._box(finger_half)
+        palm = self._box(palm_half)
+        closed = gripper.tip_offset_m - finger_half[2]
+        frames = [(0.0, side * finger_half[1], closed) for side in (-1.0, 1.0)]
+        return int(
+            pybullet.createMultiBody(
+                baseMass=0.0,
+                # The base frame is the tool frame; the palm hangs behind it, so that links count from the tool.
+                baseCollisionShapeIndex=palm,
+                basePosition=(0.0, 0.0, gripper.palm_centre_z),
+                linkMasses=[gripper.finger_mass_kg] * 2,
+                linkCollisionShapeIndices=[finger, finger],
+                linkVisualShapeIndices=[-1, -1],
+                linkPositions=[(x, y, z - gripper.palm_centre_z) for x, y, z in frames],
+                linkOrientations=[_IDENTITY] * 2,
+                linkInertialFramePositions=[(0.0, 0.0, 0.0)] * 2,
+                linkInertialFrameOrientations=[_IDENTITY] * 2,
+                linkParentIndices=[0, 0],
+                linkJointTypes=[pybullet.JOINT_PRISMATIC] * 2,
+                linkJointAxis=[(0.0, -1.0, 0.0), (0.0, 1.0, 0.0)],
+                physicsClientId=self._client,
+            )
+        )
+
+    def _box(self, half_extents: Vector) -> int:
+        return int(
+            pybullet.createCollisionShape(
+                pybullet.GEOM_BOX, halfExtents=half_extents, physicsClientId=self._client
+            )
+        )
+
+    def _build_object(self, parts: Sequence[Part], mass: MassProperties) -> int:
+        # pybullet takes several hulls in one body only from an OBJ file, a group a part. In it the body frame is the
+        # principal frame of inertia, so that no inertial offset is left to go wrong.
+        with tempfile.TemporaryDirectory(prefix="graspdb-parts-") as folder:
+            path = Path(folder) / "parts.obj"
+            path.write_text(_obj_of_parts(parts, mass), encoding="ascii")
+            shape = pybullet.createCollisionShape(
+                pybullet.GEOM_MESH, fileName=os.fspath(path), physicsClientId=self._client
+            )
+            body = int(
+                pybullet.createMultiBody(
+                    baseMass=mass.mass_kg,
+                    baseCollisionShapeIndex=shape,
+                    basePosition=_PARKED,
+                    physicsClientId=self._client,
+                )
+            )
+        if shape < 0 or body < 0:
+            raise RuntimeError("pybullet refused the object's convex parts")
+        return body
+
+    def _build_column(self) -> int:
+        """A ghost as large as the space between the open fingers: it collides with nothing and answers one question."""
+        half = self.gripper.finger_half_extents
+        shape = self._box((half[0], 0.5 * self.gripper.max_opening_m, half[2]))
+        body = int(
+            pybullet.createMultiBody(
+                baseMass=0.0,
+                baseCollisionShapeIndex=shape,
+                basePosition=(0.0, 0.0, self.gripper.tip_offset_m - half[2]),
+                physicsClientId=self._client,
+            )
+        )
+        pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
+        return body
+
+    def _finish_bodies(self, friction_root: float) -> None:
+        # Bullet multiplies the coefficients of the two bodies, hence the root.
+        for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
+            for link in links:
+                pybullet.changeDynamics(
+                    body,
+                    link,
+                    lateralFriction=friction_root,
+                    spinningFriction=0.0,
+                    rollingFriction=0.0,
+                    restitution=0.0,
+                    linearDamping=0.0,
+                    angularDamping=0.0,
+                    jointDamping=0.0,
+                    collisionMargin=COLLISION_MARGIN_M,
+                    activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+                    physicsClientId=self._client,
+                )
+        pybullet.changeDynamics(
+            self._object, -1, localInertiaDiagonal=self.mass.inertia, physicsClientId=self._client
+        )
+
+    # -- one grasp ----------------------------------------------------------------------------------------------
+
+    def close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float = 0.0) -> Closing:
+        """Close the jaw at a pose of the tool frame in the object frame, until it stalls, is empty or times out.
+
+        Parameters
+        ----------
+        position, quaternion_xyzw
+            The grasp: pose of the tool frame in the object frame.
+        travel_m : float
+            How far each finger can close before the first of the two touches the object, from the exact geometry.
+        """
+        try:
+            return self._close(position, quaternion_xyzw, travel_m)
+        finally:
+            self._park()
+
+    def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
+        client, jaw, body = self._client, self._jaw, self._object
+        gripper, stepping = self.gripper, self.stepping
+        where, orientation = self._body_pose(position, quaternion_xyzw)
+        pybullet.resetBasePositionAndOrientation(body, where, orientation, physicsClientId=client)
+        pybullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
+        start = gripper.max_opening_m * 0.5 - max(0.0, travel_m - APPROACH_GAP_M)
+        for joint in (0, 1):
+            pybullet.resetJointState(jaw, joint, start, -gripper.max_speed_m_s, physicsClientId=client)
+
+        dt = stepping.approach_dt_s
+        self._drive(dt)
+        touched = False
+        elapsed = 0.0
+        limit = 2.0 * start / gripper.max_speed_m_s + SLACK_S
+        opening = 2.0 * start
+        # The opening at the beginning of the running stall window.
+        mark_opening, mark_time = opening, 0.0
+        steps = 0
+        end = End.TIMEOUT
+        while elapsed < limit:
+            pybullet.stepSimulation(physicsClientId=client)
+            steps += 1
+            elapsed += dt
+            first, second = pybullet.getJointStates(jaw, (0, 1), physicsClientId=client)
+            opening = first[0] + second[0]
+            if not math.isfinite(opening):
+                end = End.UNSTABLE
+                break
+            if opening <= 0.0:
+                end = End.EMPTY
+                break
+            if not touched:
+                pressing = 0
+                for contact in pybullet.getContactPoints(jaw, body, physicsClientId=client):
+                    if contact[9] > 0.0:
+                        pressing |= 1 << (contact[3] + 1)
+                if pressing & 0b110 == 0b110:
+                    touched = True
+                    dt = stepping.squeeze_dt_s
+                    if dt != stepping.approach_dt_s:
+                        self._drive(dt)
+                    mark_opening, mark_time = opening, elapsed
+            if mark_opening - opening > STALL_PROGRESS_M:
+                mark_opening, mark_time = opening, elapsed
+            elif elapsed - mark_time >= STALL_WINDOW_S - 1e-9:
+                end = End.STALLED
+                break
+            if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
+                end = End.EMPTY
+                break
+        return self._closing(end, touched, opening, steps)
+
+    def _body_pose(self, position: Vector, quaternion_xyzw: Quaternion) -> tuple[Vector, Quaternion]:
+        """Pose of the object's principal frame in the tool frame.
+
+        In scalars: a vectorised product may round differently with the length of its batch, and labels must not.
+        """
+        x, y, z, w = quaternion_xyzw
+        inverse = (-x, -y, -z, w)
+        centre = self.mass.centre
+        offset = (centre[0] - position[0], centre[1] - position[1], centre[2] - position[2])
+        return _rotate(inverse, offset), _multiply(inverse, self.mass.principal_xyzw)
+
+    def _drive(self, dt: float) -> None:
+        # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
+        pybullet.setPhysicsEngineParameter(fixedTimeStep=dt, physicsClientId=self._client)
+        speed, force = -self.gripper.max_speed_m_s, self.gripper.closing_force_n
+        for joint in (0, 1):
+            pybullet.setJointMotorControl2(
+                self._jaw,
+                joint,
+                pybullet.VELOCITY_CONTROL,
+                targetVelocity=speed,
+                force=force,
+                physicsClientId=self._client,
+            )
+
+    def _between(self) -> bool:
+        return bool(pybullet.getClosestPoints(self._object, self._column, 0.0, physicsClientId=self._client))
+
+    def _closing(self, end: End, touched: bool, opening: float, steps: int) -> Closing:
+        where, orientation = pybullet.getBasePositionAndOrientation(self._object, physicsClientId=self._client)
+        contacts: Sequence[Any] = ()
+        if not all(map(math.isfinite, (*where, *orientation))):
+            end = End.UNSTABLE
+        elif end is End.STALLED:
+            contacts = [
+                c
+                for c in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
+                if c[9] > 0.0
+            ]
+        # contactNormalOnB points from B, the object, to A: turned round it points into the object.
+        normals = np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3)
+        forces = np.array([contact[9] for contact in contacts], dtype=np.float64)
+        fingers = np.array([contact[3] for contact in contacts], dtype=np.int64)
+        quaternion = _multiply(orientation, self._to_body)
+        shift = _rotate(quaternion, self.mass.centre)
+        position = (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2])
+        return Closing(end, touched, opening, normals, forces, fingers, position, quaternion, steps)
+
+    def _park(self) -> None:
+        """Empty Bullet's caches: the object far away, one step without any contact."""
+        client, jaw = self._client, self._jaw
+        pybullet.resetBasePositionAndOrientation(self._object, _PARKED, _IDENTITY, physicsClientId=client)
+        pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
+        for joint in (0, 1):
+            pybullet.resetJointState(jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0, physicsClientId=client)
+        self._drive(self.stepping.approach_dt_s)
+        pybullet.stepSimulation(physicsClientId=client)
+
+
+def _obj_of_parts(parts: Sequence[Part], mass: MassProperties) -> str:
+    lines: list[str] = []
+    offset = 1
+    for number, (vertices, faces) in enumerate(parts):
+        lines.append(f"o part{number}")
+        for vertex in mass.to_principal(np.asarray(vertices, dtype=np.float64)):
+            lines.append("v {:.9g} {:.9g} {:.9g}".format(*vertex))
+        for face in np.asarray(faces):
+            lines.append("f {} {} {}".format(*(int(i) + offset for i in face)))
+        offset += len(vertices)
+    return "\n".join(lines) + "\n"
+
+
+def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def _rotate(q: Quaternion, v: Vector) -> Vector:
+    x, y, z, w = q
+    tx, ty, tz = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
+    return (
+        v[0] + w * tx + y * tz - z * ty,
+        v[1] + w * ty + z * tx - x * tz,
+        v[2] + w * tz + x * ty - y * tx,
+    )
