@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
@@ -93,7 +94,8 @@ Vector7 = Annotated[tuple[float, float, float, float, float, float, float], Befo
 Slug = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """An identifier that stands in a URL: letters, digits, ``.``, ``_``, ``-``; at most 64 characters."""
 Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: _no_nul(s))]
-Metadata = dict[str, Any]
+Metadata = Annotated[dict[str, Any], AfterValidator(lambda value: _storable(value))]
+"""Any JSON object of the user's: finite numbers only, at most 64 KiB as text."""
 
 PositiveFloat = Annotated[float, Field(gt=0, le=1e12)]
 
@@ -101,7 +103,24 @@ PositiveFloat = Annotated[float, Field(gt=0, le=1e12)]
 def _no_nul(text: str) -> str:
     if "\x00" in text:
         raise ValueError("text must not contain the NUL character")
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ValueError("text must be valid Unicode: a lone surrogate is none") from None
     return text
+
+
+def _storable(value: dict[str, Any]) -> dict[str, Any]:
+    try:
+        text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    except (ValueError, RecursionError):
+        raise ValueError("metadata must be JSON with finite numbers") from None
+    if len(text) > 65_536:
+        raise ValueError("metadata is at most 65,536 characters of JSON")
+    if "\\u0000" in text:
+        raise ValueError("text must not contain the NUL character")
+    _no_nul(text)
+    return value
 
 
 def rotation_to_quaternion(matrix: list[list[float]]) -> Quadruple:

@@ -1,0 +1,1 @@
+"""The HTTP contract: one router a noun; thin, for the use cases do the work."""

@@ -1,0 +1,55 @@
+"""Operations: liveness, readiness, metrics, versions and limits."""
+
+from __future__ import annotations
+
+import platform
+from typing import Any
+
+from fastapi import APIRouter, Response
+from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
+
+from graspdb_service import __version__
+from graspdb_service.api.routing import Ctx, scope
+from graspdb_service.problems import ProblemError
+from graspdb_service.settings import Settings
+
+router = APIRouter(tags=["operations"])
+
+
+@router.get("/livez", **scope("public"))
+async def livez() -> dict[str, str]:
+    """The process runs. Async, so that no computation keeps it waiting."""
+    return {"status": "alive"}
+
+
+@router.get("/readyz", **scope("public"))
+def readyz(ctx: Ctx) -> dict[str, str]:
+    """The database answers."""
+    try:
+        ctx.database.ping()
+    except Exception as error:
+        raise ProblemError(
+            503, "not-ready", "The database does not answer; try again", headers={"Retry-After": "1"}
+        ) from error
+    return {"status": "ready"}
+
+
+@router.get("/metrics", **scope("public"), response_class=Response)
+def metrics() -> Response:
+    """Prometheus metrics of this process."""
+    return Response(generate_latest(), media_type=CONTENT_TYPE_LATEST)
+
+
+@router.get("/info", **scope("public"))
+def info(ctx: Ctx) -> dict[str, Any]:
+    """Versions and limits."""
+    settings = ctx.settings
+    names = [name for name in Settings.model_fields if name.startswith("max_")]
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "database": ctx.database.url.get_backend_name(),
+        "limits": {name: getattr(settings, name) for name in names},
+        "lease_s": settings.lease_s,
+        "chunk_poses": settings.chunk_poses,
+    }

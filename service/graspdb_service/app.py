@@ -1,0 +1,191 @@
+"""The ASGI application: routers, problems, request ids, limits."""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import swagger_ui_bundle
+from fastapi import Depends, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.staticfiles import StaticFiles
+from prometheus_client import Counter, Histogram
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from graspdb_service import __version__
+from graspdb_service.api import operations
+from graspdb_service.api.routing import declared_parameters, refuse_unknown_parameters
+from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
+from graspdb_service.settings import Settings
+from graspdb_service.storage import schema
+from graspdb_service.storage.database import Database
+from graspdb_service.usecases.context import Context
+
+log = logging.getLogger("graspdb")
+
+REQUESTS = Counter("graspdb_http_requests_total", "Requests answered.", ["method", "route", "status"])
+LATENCY = Histogram(
+    "graspdb_http_request_seconds", "Time to the last byte of the answer.", ["method", "route"]
+)
+
+ROUTERS = [operations.router]
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The application over the database that the settings (by default the environment) name.
+
+    SQLite is created and migrated here; a PostgreSQL schema that is not current is refused.
+
+    Raises
+    ------
+    StaleSchema
+        If the PostgreSQL schema is not the one this version needs.
+    RuntimeError
+        If a route declares no scope.
+    """
+    settings = settings or Settings()
+    database = Database(settings.database_url)
+    try:
+        if database.is_sqlite:
+            schema.upgrade(database)
+        else:
+            schema.check(database)
+    except BaseException:
+        database.dispose()
+        raise
+    ctx = Context.create(settings, database)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        ctx.close()
+
+    app = FastAPI(
+        title="GraspDB",
+        summary="The grasp database that answers",
+        version=__version__,
+        lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
+        dependencies=[Depends(refuse_unknown_parameters)],
+        max_body_size=settings.max_body_bytes,
+    )
+    app.state.context = ctx
+    for router in ROUTERS:
+        app.include_router(router)
+    app.state.parameters = declared_parameters(app)
+    _add_docs(app)
+    _add_problems(app)
+    app.add_middleware(RequestTrace)
+    return app
+
+
+class RequestTrace:
+    """Gives every request an id, answers it as ``X-Request-ID``, and counts and times the request."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        request_id = uuid.uuid4().hex
+        scope.setdefault("state", {})["request_id"] = request_id
+        started = time.perf_counter()
+        status = 500
+
+        async def traced(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                message.setdefault("headers", []).append((b"x-request-id", request_id.encode()))
+            await send(message)
+
+        try:
+            await self.app(scope, receive, traced)
+        finally:
+            route = getattr(scope.get("route"), "path", "unmatched")
+            REQUESTS.labels(scope["method"], route, status).inc()
+            LATENCY.labels(scope["method"], route).observe(time.perf_counter() - started)
+
+
+def _add_docs(app: FastAPI) -> None:
+    """Swagger UI from a package: the page works without the internet."""
+    app.mount("/docs/assets", StaticFiles(directory=Path(swagger_ui_bundle.swagger_ui_path)), name="docs")
+
+    @app.get("/docs", include_in_schema=False)
+    def docs() -> HTMLResponse:
+        return get_swagger_ui_html(
+            openapi_url="/openapi.json",
+            title="GraspDB",
+            swagger_js_url="/docs/assets/swagger-ui-bundle.js",
+            swagger_css_url="/docs/assets/swagger-ui.css",
+            swagger_favicon_url="/docs/assets/favicon-32x32.png",
+        )
+
+
+def _add_problems(app: FastAPI) -> None:
+    def answer(request: Request, problem: ProblemError) -> Response:
+        request_id = getattr(request.state, "request_id", "")
+        return JSONResponse(
+            problem.document(request_id),
+            status_code=problem.status,
+            headers=problem.headers,
+            media_type="application/problem+json",
+        )
+
+    @app.exception_handler(ProblemError)
+    def on_problem(request: Request, error: ProblemError) -> Response:
+        return answer(request, error)
+
+    @app.exception_handler(RequestValidationError)
+    def on_invalid(request: Request, error: RequestValidationError) -> Response:
+        return answer(request, problem_of_validation(error.errors()))
+
+    @app.exception_handler(HTTPException)
+    def on_http(request: Request, error: HTTPException) -> Response:
+        kind = {404: "not-found", 405: "method-not-allowed", 413: "body-too-large"}.get(
+            error.status_code, phrase(error.status_code).lower().replace(" ", "-")
+        )
+        title = {
+            404: f"There is nothing at {request.url.path}",
+            405: f"{request.method} is not for {request.url.path}",
+            413: "The body is over the limit (see /info): send it in several requests",
+        }.get(error.status_code, str(error.detail))
+        problem = ProblemError(error.status_code, kind, title, headers=error.headers)
+        return answer(request, problem)
+
+    @app.exception_handler(Exception)
+    def on_bug(request: Request, error: Exception) -> Response:
+        request_id = getattr(request.state, "request_id", "")
+        log.exception("request %s failed", request_id, exc_info=error)
+        return answer(
+            request,
+            ProblemError(
+                500, "internal-error", "The service failed; the log has more under the request's id"
+            ),
+        )
+
+
+def problem_of_validation(errors: Any, title: str = "The request is not valid") -> ProblemError:
+    """A 422 that names each field and never echoes the input, which may hold NaN or megabytes."""
+    listed = []
+    for item in list(errors)[:20]:
+        place = [str(part) for part in item["loc"] if part not in ("body", "query", "path", "header")]
+        # pydantic names the branch of a union it tried; that is no part of the user's document.
+        place = [part for part in place if "[" not in part and not part[:1].isupper()]
+        listed.append((".".join(place) or "body", str(item["msg"]).removeprefix("Value error, ")))
+    unique = list(dict.fromkeys(listed))
+    return ProblemError(422, "invalid-request", title, errors=unique)
+
+
+__all__ = ["TYPE_PREFIX", "create_app", "problem_of_validation"]

@@ -1,0 +1,89 @@
+"""``graspdb-server``: serve and migrate."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import os
+import sys
+from typing import Annotated, Any, NoReturn
+
+try:
+    import typer
+    import uvicorn
+
+    from graspdb_service.app import create_app
+    from graspdb_service.settings import Settings
+    from graspdb_service.storage import schema
+    from graspdb_service.storage.database import Database, UnsupportedDatabase
+except ModuleNotFoundError as error:
+    sys.exit(f"graspdb-server needs {error.name}: pip install 'graspdb[service]'")
+
+cli = typer.Typer(add_completion=False, no_args_is_help=True, help="The GraspDB service.")
+
+DatabaseUrl = Annotated[
+    str | None, typer.Option("--database-url", help="sqlite:///FILE or postgresql://USER@HOST/NAME")
+]
+
+
+@cli.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on; 0 takes a free one.")] = None,
+    database_url: DatabaseUrl = None,
+    auth: Annotated[str | None, typer.Option(help="'off' serves without keys beyond loopback, too.")] = None,
+    log_level: Annotated[str, typer.Option(help="critical, error, warning, info or debug.")] = "info",
+) -> None:
+    """Serve the HTTP API. A SQLite database is created and migrated; PostgreSQL must be current."""
+    settings = _settings(host=host, port=port, database_url=database_url, auth=auth)
+    if settings.auth != "off" and not _is_loopback(settings.host):
+        _fail(
+            f"Serving on {settings.host} without keys would open the database to the network."
+            " Listen on 127.0.0.1, or say so explicitly: --auth off (GRASPDB_AUTH=off)."
+        )
+    # NumPy's BLAS would otherwise start a thread a core inside each compute thread.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    try:
+        app = create_app(settings)
+    except (schema.StaleSchema, UnsupportedDatabase) as error:
+        _fail(str(error))
+    uvicorn.run(
+        app, host=settings.host, port=settings.port, log_level=log_level, timeout_graceful_shutdown=10
+    )
+
+
+@cli.command()
+def migrate(database_url: DatabaseUrl = None) -> None:
+    """Bring the database's schema to this version; safe to run from several places at once."""
+    try:
+        database = Database(_settings(database_url=database_url).database_url)
+        typer.echo(f"The schema is at {schema.upgrade(database)}.")
+    except (schema.StaleSchema, UnsupportedDatabase) as error:
+        _fail(str(error))
+
+
+def _settings(**given: Any) -> Settings:
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValueError as error:
+        _fail(str(error))
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _fail(message: str) -> NoReturn:
+    typer.echo(message, err=True)
+    raise SystemExit(1)
+
+
+def main() -> None:
+    """Entry point."""
+    cli()

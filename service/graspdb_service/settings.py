@@ -1,0 +1,43 @@
+"""Settings from the environment (``GRASPDB_...``) or the command line."""
+
+from __future__ import annotations
+
+import os
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """What a service process is told; every limit is answered by ``GET /info``."""
+
+    model_config = SettingsConfigDict(env_prefix="GRASPDB_", extra="ignore", frozen=True)
+
+    database_url: str = "sqlite:///graspdb.sqlite"
+    """``sqlite:///relative.sqlite``, ``sqlite:////absolute.sqlite`` or ``postgresql://user@host/name``."""
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65_535)] = 8000
+    auth: Literal["off"] | None = None
+    """``off`` serves without keys on any address; unset, that is allowed on loopback only."""
+
+    threads: Annotated[int, Field(ge=1, le=256)] = max(1, os.cpu_count() or 1)
+    """Threads of the compute pool; BLAS threads stay at 1."""
+
+    max_body_bytes: Annotated[int, Field(ge=1_000)] = 256 * 2**20
+    max_mesh_bytes: Annotated[int, Field(ge=1_000)] = 64 * 2**20
+    max_mesh_seconds: Annotated[float, Field(gt=0)] = 20.0
+    max_mesh_memory_bytes: Annotated[int, Field(ge=2**28)] = 2 * 2**30
+    max_batch_trials: Annotated[int, Field(ge=1)] = 1_000_000
+    max_query_poses: Annotated[int, Field(ge=1)] = 1_000_000
+    max_samples: Annotated[int, Field(ge=1)] = 1_000_000
+    max_sweep_poses: Annotated[int, Field(ge=1)] = 100_000_000
+    max_density_cache_bytes: Annotated[int, Field(ge=2**20)] = 2**30
+
+    lease_s: Annotated[float, Field(gt=0)] = 60.0
+    """How long a worker keeps a job without renewing."""
+    max_attempts: Annotated[int, Field(ge=1)] = 4
+    """A job whose lease ran out this often is failed: it may be what kills the workers."""
+    chunk_poses: Annotated[int, Field(ge=1)] = 20_000
+    retry_after_s: Annotated[float, Field(gt=0)] = 2.0
+    """How long an idle worker is told to wait before it asks for jobs again."""

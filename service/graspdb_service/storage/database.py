@@ -1,0 +1,139 @@
+"""One database, SQLite or PostgreSQL: transactions for readers and writers, and the clock they share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TypeAlias
+
+from sqlalchemy import Connection, Double, Engine, create_engine, event, make_url, text
+from sqlalchemy.engine import URL
+from sqlalchemy.exc import ArgumentError
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import GenericFunction
+
+Tx: TypeAlias = Connection
+"""An open transaction, as the use cases pass it on."""
+
+SQLITE_BUSY_MS = 30_000
+
+
+class unix_now(GenericFunction[float]):
+    """Seconds since 1970 by the database's own clock, which every replica shares."""
+
+    type = Double()
+    inherit_cache = True
+
+
+@compiles(unix_now, "sqlite")
+def _sqlite_now(element: unix_now, compiler: Any, **_: Any) -> str:
+    return "((julianday('now') - 2440587.5) * 86400.0)"
+
+
+@compiles(unix_now, "postgresql")
+def _postgres_now(element: unix_now, compiler: Any, **_: Any) -> str:
+    return "extract(epoch from clock_timestamp())::double precision"
+
+
+class UnsupportedDatabase(ValueError):
+    """The database URL names neither a SQLite file nor PostgreSQL."""
+
+
+class Database:
+    """Connections to one database.
+
+    Writers on SQLite take ``BEGIN IMMEDIATE``, so that a read-modify-write can't lose another's update
+    nor fail halfway with "database is locked"; readers have an engine of their own and never take a write
+    lock. On PostgreSQL a reader sees one snapshot (REPEATABLE READ, read only).
+
+    Parameters
+    ----------
+    url
+        ``sqlite:///file`` or ``postgresql://...``.
+
+    Raises
+    ------
+    UnsupportedDatabase
+        If the URL is neither, or SQLite without a file.
+    """
+
+    def __init__(self, url: str, *, pool_size: int = 40) -> None:
+        self.url = _normalised(url)
+        self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        if self.is_sqlite:
+            self._writer = _sqlite_engine(self.url, "BEGIN IMMEDIATE", pool_size=2, query_only=False)
+            self._reader = _sqlite_engine(self.url, "BEGIN", pool_size=pool_size, query_only=True)
+        else:
+            self._writer = create_engine(self.url, pool_size=pool_size, max_overflow=0, pool_pre_ping=True)
+            self._reader = self._writer.execution_options(
+                isolation_level="REPEATABLE READ", postgresql_readonly=True
+            )
+
+    @contextmanager
+    def read(self) -> Iterator[Tx]:
+        """A read-only transaction: one snapshot of everything."""
+        with self._reader.begin() as tx:
+            yield tx
+
+    @contextmanager
+    def write(self) -> Iterator[Tx]:
+        """A writing transaction, committed when the block ends and rolled back if it raises."""
+        with self._writer.begin() as tx:
+            yield tx
+
+    def ping(self) -> None:
+        """Raise if the database can't be reached."""
+        with self.read() as tx:
+            tx.execute(text("SELECT 1"))
+
+    def dispose(self) -> None:
+        """Close every pooled connection."""
+        self._reader.dispose()
+        self._writer.dispose()
+
+
+def _normalised(url: str) -> URL:
+    try:
+        parsed = make_url(url)
+    except ArgumentError as error:
+        raise UnsupportedDatabase(f"GRASPDB_DATABASE_URL is no database URL: {error}") from None
+    backend = parsed.get_backend_name()
+    if backend == "sqlite":
+        if not parsed.database or parsed.database == ":memory:":
+            raise UnsupportedDatabase("SQLite needs a file, as in sqlite:///graspdb.sqlite")
+        return parsed.set(drivername="sqlite")
+    if backend in ("postgresql", "postgres"):
+        return parsed.set(drivername="postgresql+psycopg")
+    raise UnsupportedDatabase(
+        f"{backend} is not supported: use sqlite:///FILE or postgresql://USER@HOST/NAME"
+    )
+
+
+def _sqlite_engine(url: URL, begin: str, *, pool_size: int, query_only: bool) -> Engine:
+    engine = create_engine(
+        url,
+        pool_size=pool_size,
+        max_overflow=0,
+        # pysqlite's own transaction handling would BEGIN late and commit behind our back.
+        connect_args={"isolation_level": None, "check_same_thread": False, "timeout": SQLITE_BUSY_MS / 1000},
+    )
+
+    @event.listens_for(engine, "connect")
+    def _configure(connection: Any, _record: Any) -> None:
+        cursor = connection.cursor()
+        cursor.execute(f"PRAGMA busy_timeout={SQLITE_BUSY_MS}")
+        if not query_only:
+            cursor.execute("PRAGMA journal_mode=WAL")
+        # FULL: what was acknowledged survives a power cut, too.
+        cursor.execute("PRAGMA synchronous=FULL")
+        cursor.execute("PRAGMA foreign_keys=ON")
+        cursor.execute("PRAGMA cache_size=-65536")
+        if query_only:
+            cursor.execute("PRAGMA query_only=ON")
+        cursor.close()
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        connection.exec_driver_sql(begin)
+
+    return engine

@@ -1,0 +1,78 @@
+"""The schema's version: where the migrations are, what is applied, and applying the rest.
+
+Several replicas may start at once: an upgrade runs in one transaction under a lock (an advisory lock on
+PostgreSQL, BEGIN IMMEDIATE on SQLite), so one of them migrates and the others then find nothing to do.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from alembic import command
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import text
+
+from graspdb_service.storage.database import Database, Tx
+
+ADVISORY_LOCK = 4_707_204_120_121_130
+
+
+class StaleSchema(RuntimeError):
+    """The database's schema is not the one this version needs; the message names the way out."""
+
+
+def migrations_directory() -> Path:
+    """Where the Alembic history is: inside an installed wheel, or at the checkout's ``db/migrations``."""
+    package = Path(__file__).resolve().parents[1]
+    for candidate in (package / "migrations", package.parents[1] / "db" / "migrations"):
+        if (candidate / "env.py").is_file():
+            return candidate
+    raise FileNotFoundError("the migrations are missing from this installation of graspdb")
+
+
+def upgrade(database: Database, revision: str = "head") -> str:
+    """Bring the schema to ``revision`` and return what it then is; safe when several processes do it."""
+    with database.write() as tx:
+        if not database.is_sqlite:
+            tx.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": ADVISORY_LOCK})
+        _refuse_newer(tx)
+        command.upgrade(alembic_config(tx), revision)
+        return _current(tx) or "base"
+
+
+def check(database: Database) -> None:
+    """Raise :class:`StaleSchema` unless the schema is exactly the one this version was written for."""
+    with database.read() as tx:
+        _refuse_newer(tx)
+        current = _current(tx)
+    head = ScriptDirectory(str(migrations_directory())).get_current_head()
+    if current != head:
+        found = "has no schema yet" if current is None else f"is at schema {current}"
+        raise StaleSchema(
+            f"The database {found}, this version of graspdb needs {head}."
+            " Stop the other replicas' writes if you can, then run: graspdb-server migrate"
+        )
+
+
+def alembic_config(tx: Tx) -> Config:
+    """Alembic's configuration, bound to an open transaction."""
+    config = Config()
+    config.set_main_option("script_location", str(migrations_directory()).replace("%", "%%"))
+    config.attributes["connection"] = tx
+    return config
+
+
+def _current(tx: Tx) -> str | None:
+    return MigrationContext.configure(tx).get_current_revision()
+
+
+def _refuse_newer(tx: Tx) -> None:
+    current = _current(tx)
+    script = ScriptDirectory(str(migrations_directory()))
+    if current is not None and current not in {item.revision for item in script.walk_revisions()}:
+        raise StaleSchema(
+            f"The database is at schema {current}, which this version of graspdb does not know:"
+            " it was written by a newer one. Install that version or newer."
+        )

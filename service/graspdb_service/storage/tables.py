@@ -1,0 +1,275 @@
+"""The tables. Rows are the source of truth; everything else is derived and rebuildable.
+
+An object's row is its lock: whoever changes its trials, packed outcomes, mesh, parts or properties first
+updates that row, which assigns the new ``revision`` and the next ``seq`` numbers. Revisions and sequence
+numbers are therefore in commit order on both databases, which auto-increment ids on PostgreSQL are not.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    CheckConstraint,
+    Column,
+    DateTime,
+    Double,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    SmallInteger,
+    String,
+    Table,
+    Text,
+    TypeDecorator,
+    UniqueConstraint,
+    text,
+)
+from sqlalchemy.engine import Dialect
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(column_0_label)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "ck": "ck_%(table_name)s_%(constraint_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_N_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+# SQLite numbers rows only in a column declared INTEGER.
+BigId = BigInteger().with_variant(Integer(), "sqlite")
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """A time in UTC. SQLite keeps no zone, so it is put back on reading."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> Any:
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            value = value.replace(tzinfo=UTC)
+        value = value.astimezone(UTC)
+        return value.replace(tzinfo=None) if dialect.name == "sqlite" else value
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+grippers = Table(
+    "grippers",
+    metadata,
+    Column("id", String(64), primary_key=True),
+    Column("name", Text),
+    Column("profile", JSON, nullable=False),
+    Column("builtin", Boolean, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+)
+
+# Content-addressed: meshes and convex parts, stored once whoever uses them.
+assets = Table(
+    "assets",
+    metadata,
+    Column("sha256", String(64), primary_key=True),
+    Column("media_type", String(100), nullable=False),
+    Column("content", LargeBinary, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+)
+
+objects = Table(
+    "objects",
+    metadata,
+    # AUTOINCREMENT: an internal id is never reused, so a cache key made of it never lies.
+    Column("id", BigId, primary_key=True, autoincrement=True),
+    Column("slug", String(64), nullable=False, unique=True),
+    Column("name", Text),
+    Column("mass_kg", Double),
+    Column("density_kg_m3", Double),
+    Column("friction", Double),
+    Column("metadata", JSON),
+    Column("revision", BigInteger, nullable=False),
+    Column("epoch", BigInteger, nullable=False),
+    Column("last_seq", BigInteger, nullable=False),
+    Column("mesh_sha256", ForeignKey("assets.sha256")),
+    Column("mesh_info", JSON),
+    Column("parts_sha256", ForeignKey("assets.sha256")),
+    Column("parts_info", JSON),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+# Which gripper, source and protocol a trial had, once per combination instead of once per row.
+provenances = Table(
+    "provenances",
+    metadata,
+    Column("id", BigId, primary_key=True, autoincrement=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("gripper", ForeignKey("grippers.id")),
+    Column("source", String(16)),
+    Column("protocol", String(64)),
+)
+
+# Trials by provenance and outcome, kept in the transactions that change them: counting reads no trial.
+tallies = Table(
+    "tallies",
+    metadata,
+    Column("provenance_id", ForeignKey("provenances.id", ondelete="CASCADE"), primary_key=True),
+    Column("outcome", SmallInteger, primary_key=True, autoincrement=False),
+    Column("row_count", BigInteger, nullable=False),
+    Column("packed_count", BigInteger, nullable=False),
+)
+
+sweeps = Table(
+    "sweeps",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("provenance_id", ForeignKey("provenances.id", ondelete="CASCADE"), nullable=False),
+    Column("gripper", ForeignKey("grippers.id"), nullable=False),
+    Column("protocol", String(16), nullable=False),
+    Column("fidelity", String(16), nullable=False),
+    Column("purpose", String(16), nullable=False),
+    Column("plan", String(16), nullable=False),
+    # The request as it came, and the world as it then was: mesh and part hashes, mass, friction, profile.
+    Column("request", JSON, nullable=False),
+    Column("snapshot", JSON, nullable=False),
+    # float64 (n, 7) position and quaternion xyzw, for plans that are no grid.
+    Column("poses", LargeBinary),
+    Column("pose_count", BigInteger, nullable=False),
+    Column("chunk_poses", Integer, nullable=False),
+    Column("chunks", Integer, nullable=False),
+    Column("cancelled", Boolean, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("started_at", UtcDateTime),
+    Column("finished_at", UtcDateTime),
+)
+
+batches = Table(
+    "batches",
+    metadata,
+    Column("id", BigId, primary_key=True, autoincrement=True),
+    Column("key", String(36), nullable=False, unique=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("sweep_id", ForeignKey("sweeps.id", ondelete="SET NULL"), unique=True),
+    Column("revision", BigInteger, nullable=False),
+    # The trials of a batch lie between these; those of a sweep's share the range with others.
+    Column("first_seq", BigInteger),
+    Column("last_seq", BigInteger),
+    Column("inserted", BigInteger, nullable=False),
+    Column("packed", BigInteger, nullable=False),
+    Column("metadata", JSON),
+    Column("created_at", UtcDateTime, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+trials = Table(
+    "trials",
+    metadata,
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), primary_key=True, autoincrement=False),
+    Column("seq", BigInteger, primary_key=True, autoincrement=False),
+    Column("revision", BigInteger, nullable=False),
+    Column("batch_id", ForeignKey("batches.id"), nullable=False),
+    Column("provenance_id", ForeignKey("provenances.id"), nullable=False),
+    Column("outcome", SmallInteger, nullable=False),
+    Column("px", Double, nullable=False),
+    Column("py", Double, nullable=False),
+    Column("pz", Double, nullable=False),
+    Column("qx", Double, nullable=False),
+    Column("qy", Double, nullable=False),
+    Column("qz", Double, nullable=False),
+    Column("qw", Double, nullable=False),
+    Column("proposal_density", Double),
+    Column("quality", Double),
+    Column("width_m", Double),
+    Column("pose_index", BigInteger),
+    Column("measured_at", UtcDateTime),
+    Column("pose_covariance", JSON(none_as_null=True)),
+    Column("metadata", JSON(none_as_null=True)),
+    # Successes are what densities are built of and few among the trials: found without reading the rest.
+    Index(
+        "ix_trials_successes",
+        "object_id",
+        "seq",
+        sqlite_where=text("outcome = 1"),
+        postgresql_where=text("outcome = 1"),
+    ),
+    sqlite_with_rowid=False,
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("kind", String(16), nullable=False),
+    # What a worker must be able to do to take it: the kind, or a protocol of its own such as lift.
+    Column("capability", String(16), nullable=False),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("sweep_id", ForeignKey("sweeps.id", ondelete="CASCADE"), index=True),
+    Column("number", BigInteger, nullable=False),
+    Column("start", BigInteger, nullable=False),
+    Column("stop", BigInteger, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("attempts", Integer, nullable=False),
+    Column("lease_id", String(36)),
+    # Seconds since the epoch by the database's clock.
+    Column("lease_expires_at", Double),
+    Column("worker", String(200)),
+    Column("result_sha256", String(64)),
+    Column("answer", JSON(none_as_null=True)),
+    Column("counts", JSON(none_as_null=True)),
+    Column("error", Text),
+    Column("completed_at", Double),
+    UniqueConstraint("sweep_id", "number"),
+    CheckConstraint("state IN ('queued', 'leased', 'done', 'failed', 'cancelled')", name="state"),
+    Index("ix_jobs_claim", "state", "capability", "id"),
+)
+
+# One uint8 for every pose of a finished chunk, in the plan's order, and what physics measured for the
+# poses of a check, which never become trials.
+packed_outcomes = Table(
+    "packed_outcomes",
+    metadata,
+    Column("job_id", ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True),
+    Column("sweep_id", ForeignKey("sweeps.id", ondelete="CASCADE"), nullable=False, index=True),
+    Column("number", BigInteger, nullable=False),
+    Column("revision", BigInteger, nullable=False),
+    Column("outcomes", LargeBinary, nullable=False),
+)
+
+workers = Table(
+    "workers",
+    metadata,
+    Column("name", String(200), primary_key=True),
+    Column("capabilities", JSON, nullable=False),
+    Column("last_seen", Double, nullable=False),
+    Column("jobs_done", BigInteger, nullable=False),
+    Column("poses_done", BigInteger, nullable=False),
+)
+
+idempotency_keys = Table(
+    "idempotency_keys",
+    metadata,
+    # Method and path belong to the key: the same UUID at two resources is two requests.
+    Column("scope", String(300), primary_key=True),
+    Column("key", String(200), primary_key=True),
+    Column("request_sha256", String(64), nullable=False),
+    Column("status", Integer, nullable=False),
+    Column("location", Text),
+    Column("answer", JSON, nullable=False),
+    Column("batch_key", String(36), index=True),
+    # Its batch was deleted: the same request again is no retry but a mistake.
+    Column("revoked", Boolean, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+)
