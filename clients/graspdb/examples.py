@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,7 +80,7 @@ class ExampleObject:
         )
         record["normal"], record["corners"] = normals, corners
         header = f"GraspDB example {self.name}, metres".encode().ljust(80, b" ")
-        return header + np.uint32(len(faces)).astype("<u4").tobytes() + record.tobytes()
+        return header + len(faces).to_bytes(4, "little") + record.tobytes()
 
     def mesh(self) -> trimesh.Trimesh:
         """The surface as a trimesh object."""
@@ -96,7 +97,7 @@ class ExampleObject:
         for number, (vertices, faces) in enumerate(self.parts):
             part = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
             scene.add_geometry(part, geom_name=f"part_{number:04d}", node_name=f"part_{number:04d}")
-        data = scene.export(file_type="glb")
+        data = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
         if not isinstance(data, bytes):
             raise TypeError("trimesh did not export GLB as bytes")
         return data
@@ -140,7 +141,7 @@ def _stack(rings: list[FloatArray]) -> Polyhedron:
     """Solid between rings of equally many corners, capped at both ends; rings run around the growing axis."""
     count = len(rings[0])
     index = np.arange(len(rings) * count).reshape(len(rings), count)
-    faces = [_band(lower, upper) for lower, upper in zip(index[:-1], index[1:], strict=True)]
+    faces = [_band(lower, upper) for lower, upper in pairwise(index)]
     faces += [_fan(index[0])[:, ::-1], _fan(index[-1])]
     return np.concatenate(rings), np.concatenate(faces)
 
@@ -220,7 +221,7 @@ def _screwdriver() -> ExampleObject:
     count = 20 * len(rings)
     ring_index = np.arange(count).reshape(len(rings), 20)
     foot, top = np.arange(count, count + 12), np.arange(count + 12, count + 24)
-    faces = [_band(lower, upper) for lower, upper in zip(ring_index[:-1], ring_index[1:], strict=True)]
+    faces = [_band(lower, upper) for lower, upper in pairwise(ring_index)]
     faces += [
         _fan(ring_index[0])[:, ::-1],
         _zip_rings(foot, ring_index[-1]),
@@ -256,7 +257,7 @@ def _mug() -> ExampleObject:
         for loop, z in ((outer, low), (outer, high), (inner, high), (inner, floor))
     ]
     index = np.arange(4 * 24).reshape(4, 24)
-    faces = [_band(lower, upper) for lower, upper in zip(index[:-1], index[1:], strict=True)]
+    faces = [_band(lower, upper) for lower, upper in pairwise(index)]
     faces += [_fan(index[0])[:, ::-1], _fan(index[-1])]
     body = (np.concatenate(loops), np.concatenate(faces))
     return ExampleObject("mug", "Mug", tuple(parts), (body, handle))

@@ -60,7 +60,7 @@ class HopfGrid:
 
     @property
     def psi_count(self) -> int:
-        """Number of turns about each approach direction; even, so the jaw's half turn maps the grid onto itself."""
+        """Turns about each approach direction; even, so the jaw's half turn maps the grid onto itself."""
         return 6 * self.nside
 
     @property
@@ -111,8 +111,8 @@ def healpix_centres(nside: int) -> tuple[FloatArray, FloatArray]:
     cos_theta, phi : (12 nside^2,) float64
         Cosine of the colatitude, and longitude in [0, 2 pi).
     """
-    cosines: list[FloatArray] = []
-    longitudes: list[FloatArray] = []
+    cosines = []
+    longitudes = []
     for ring in range(1, 4 * nside):
         mirrored = 4 * nside - ring
         if ring < nside or mirrored < nside:  # polar caps: ring i holds 4 i pixels
@@ -140,7 +140,7 @@ def nside_of_step(step_deg: float) -> int:
     step = _finite("rotation_step_deg", step_deg)
     if not MIN_ROTATION_STEP_DEG <= step <= MAX_ROTATION_STEP_DEG:
         raise ValueError(
-            f"rotation_step_deg must lie between {MIN_ROTATION_STEP_DEG:g} and {MAX_ROTATION_STEP_DEG:g} degrees"
+            f"rotation_step_deg must lie between {MIN_ROTATION_STEP_DEG:g} and {MAX_ROTATION_STEP_DEG:g}"
         )
     return max(1, round(60.0 / step))
 
@@ -365,7 +365,7 @@ class PoseGrid:
         lattice = self._lattice
         position, rotation = np.divmod(index, self.rotation_count)
         cell = np.stack(np.unravel_index(position, tuple(int(n) for n in lattice.shape)), axis=-1)
-        positions: FloatArray = (cell + lattice.first) * float(self.position_step_m)
+        positions = np.asarray(cell + lattice.first, dtype=np.float64) * float(self.position_step_m)
         return positions, self.rotations.quaternions(rotation)
 
 

@@ -1,0 +1,229 @@
+"""Exact tests of a gripper's boxes against an object: does the open gripper collide, and what would it close on?
+
+Solids that only touch, or that overlap by less than :data:`TOUCH_TOLERANCE_M`, do not collide: lattice poses
+meet symmetric objects exactly face to face, and rounding must not decide those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError
+
+from graspdb_geometry import _convex_kernels
+from graspdb_geometry.grippers import GripperShape
+
+FloatArray = npt.NDArray[np.float64]
+CodeArray = npt.NDArray[np.uint8]
+Part = tuple[npt.ArrayLike, npt.ArrayLike]
+
+#: The open gripper overlaps the object.
+COLLIDES = 0
+#: No collision, and nothing in the column that the closing fingers sweep.
+EMPTY = 1
+#: No collision, and the fingers will meet the object.
+CONTACT = 2
+
+#: Overlaps shallower than this count as touching, which is no collision.  Far above the rounding of meshes
+#: stored as float32 (4e-9 m at 7 cm), far below what a simulator resolves.
+TOUCH_TOLERANCE_M = 1e-7
+
+#: Poses handed to a thread at once: long enough to hide the hand-over, short enough to balance the load.
+_BLOCK = 8192
+
+
+class Scene:
+    """An object as a union of convex solids, prepared for many collision tests; immutable, thread-safe.
+
+    Parameters
+    ----------
+    parts : sequence of (vertices (V, 3), faces (F, 3))
+        Convex polyhedra, metres, object frame.  A part stands for the convex hull of its vertices.
+
+    Raises
+    ------
+    ValueError
+        Without parts, or if a part is flat, has fewer than four vertices or a coordinate that is not finite.
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        if not parts:
+            raise ValueError("parts must hold at least one convex part")
+        solids = [_Solid(number, np.asarray(part[0], dtype=np.float64)) for number, part in enumerate(parts)]
+        self.part_count = len(solids)
+        self._model = (
+            np.concatenate([s.vertices for s in solids]),
+            _starts([len(s.vertices) for s in solids]),
+            np.concatenate([s.planes for s in solids]),
+            _starts([len(s.planes) for s in solids]),
+            np.concatenate([s.edges for s in solids]),
+            _starts([len(s.edges) for s in solids]),
+            np.stack([s.centre for s in solids]),
+            np.array([s.radius for s in solids]),
+        )
+
+    def classify(
+        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
+    ) -> tuple[CodeArray, FloatArray]:
+        """What the open gripper meets in each pose.
+
+        Parameters
+        ----------
+        positions : (n, 3) float
+            Tool origins in the object frame, metres.
+        quaternions : (n, 4) float
+            Unit quaternions xyzw of the tool in the object frame.
+        shape : GripperShape
+            Tested at its full opening.
+        threads : int
+            Threads to share the work; the kernels run without the interpreter's lock.
+
+        Returns
+        -------
+        codes : (n,) uint8
+            :data:`COLLIDES`, :data:`EMPTY` or :data:`CONTACT`.
+        first_contact : (n, 2) float64
+            For CONTACT the distance in metres that the finger at +y, and the one at -y, can close alone before
+            it meets the object; beyond the stroke if the object lies on one side only.  Otherwise NaN.
+        """
+        p, q = _poses(positions, quaternions)
+        boxes = _gripper_boxes(shape, None)
+        codes = np.empty(len(p), dtype=np.uint8)
+        extents = np.empty((len(p), 2))
+
+        def run(block: slice) -> None:
+            _convex_kernels.classify(
+                p[block], q[block], boxes, self._model, True, codes[block], extents[block]
+            )
+
+        _in_blocks(run, len(p), threads)
+        half = shape.max_opening_m / 2.0
+        travel = np.stack([half - extents[:, 1], half + extents[:, 0]], axis=-1)
+        return codes, np.maximum(travel, 0.0)
+
+    def collides(
+        self,
+        positions: npt.ArrayLike,
+        quaternions: npt.ArrayLike,
+        shape: GripperShape,
+        opening_m: float | None = None,
+        threads: int = 1,
+    ) -> npt.NDArray[np.bool_]:
+        """Whether the gripper, at an opening (its widest by default), overlaps the object in each pose.
+
+        Parameters and conventions as in :meth:`classify`; returns (n,) bool.
+        """
+        p, q = _poses(positions, quaternions)
+        boxes = _gripper_boxes(shape, opening_m)
+        codes = np.empty(len(p), dtype=np.uint8)
+        extents = np.empty((len(p), 2))
+
+        def run(block: slice) -> None:
+            _convex_kernels.classify(
+                p[block], q[block], boxes, self._model, False, codes[block], extents[block]
+            )
+
+        _in_blocks(run, len(p), threads)
+        hits: npt.NDArray[np.bool_] = codes == COLLIDES
+        return hits
+
+
+class _Solid:
+    """Vertices, supporting planes and edges of the convex hull of some points."""
+
+    #: Facets whose normals differ by less than this (radians) are one face: their common edge is flat and
+    #: can't hold a corner of an intersection deeper than the touch tolerance.
+    _COPLANAR = 1e-6
+
+    def __init__(self, number: int, points: FloatArray) -> None:
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
+            raise ValueError(f"part {number}: vertices must be (V, 3) with at least four rows")
+        if not np.all(np.isfinite(points)):
+            raise ValueError(f"part {number}: vertices must be finite")
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        try:
+            hull = ConvexHull(points - middle)
+        except QhullError:
+            raise ValueError(f"part {number} is flat: its vertices lie in one plane") from None
+        corners = np.asarray(hull.vertices)
+        self.vertices: FloatArray = points[corners]
+        renumber = np.full(len(points), -1)
+        renumber[corners] = np.arange(len(corners))
+
+        normals = np.asarray(hull.equations)[:, :3]
+        simplices, neighbours = np.asarray(hull.simplices), np.asarray(hull.neighbors)
+        face = np.full(len(normals), -1)
+        planes: list[FloatArray] = []
+        for seed in range(len(normals)):
+            if face[seed] >= 0:
+                continue
+            # One face: everything connected to the seed whose normal agrees with the seed's.
+            face[seed] = len(planes)
+            pending = [seed]
+            while pending:
+                for other in neighbours[pending.pop()]:
+                    if face[other] < 0 and np.linalg.norm(normals[other] - normals[seed]) < self._COPLANAR:
+                        face[other] = face[seed]
+                        pending.append(int(other))
+            offset = float(np.max(self.vertices @ normals[seed]))  # a plane that supports every vertex
+            planes.append(np.append(normals[seed], offset))
+        self.planes: FloatArray = np.stack(planes)
+
+        edges = set()
+        for simplex in range(len(simplices)):
+            for opposite, other in enumerate(neighbours[simplex]):
+                if face[simplex] < face[other]:
+                    a, b = np.delete(renumber[simplices[simplex]], opposite)
+                    edges.add((min(a, b), max(a, b)))
+        self.edges = np.array(sorted(edges), dtype=np.int64)
+        self.centre: FloatArray = (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
+        self.radius = float(np.max(np.linalg.norm(self.vertices - self.centre, axis=1))) * (1 + 1e-12)
+
+
+def _starts(counts: list[int]) -> npt.NDArray[np.int64]:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+def _gripper_boxes(shape: GripperShape, opening_m: float | None) -> FloatArray:
+    """Centres and half extents, less the touch tolerance, of both fingers, palm and column: (4, 2, 3)."""
+    half_extents, centres = shape.boxes(opening_m)
+    column_half, column_centre = shape.column(opening_m)
+    shrunk = np.maximum(half_extents - TOUCH_TOLERANCE_M, 0.0)
+    # The column keeps its full height in y, so that contact starts at the fingers' faces.
+    column_half = np.maximum(column_half - np.array([1.0, 0.0, 1.0]) * TOUCH_TOLERANCE_M, 0.0)
+    boxes: FloatArray = np.stack(
+        [np.concatenate([centres, [column_centre]]), np.concatenate([shrunk, [column_half]])], axis=1
+    )
+    return np.ascontiguousarray(boxes)
+
+
+def _poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    p = np.ascontiguousarray(positions, dtype=np.float64)
+    q = np.ascontiguousarray(quaternions, dtype=np.float64)
+    if p.ndim != 2 or p.shape[1] != 3:
+        raise ValueError("positions must have shape (n, 3)")
+    if q.shape != (len(p), 4):
+        raise ValueError("quaternions must have shape (n, 4), one for each position")
+    if not (np.all(np.isfinite(p)) and np.all(np.isfinite(q))):
+        raise ValueError("positions and quaternions must be finite")
+    norms = np.linalg.norm(q, axis=1)
+    if np.any(np.abs(norms - 1.0) > 1e-3):
+        raise ValueError("quaternions must have unit length")
+    return p, q / norms[:, None]
+
+
+def _in_blocks(run: Callable[[slice], Any], count: int, threads: int) -> None:
+    if threads < 1:
+        raise ValueError("threads must be at least 1")
+    blocks = [slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK)]
+    if threads == 1 or len(blocks) < 2:
+        for block in blocks:
+            run(block)
+        return
+    with ThreadPoolExecutor(min(threads, len(blocks))) as pool:
+        for _ in pool.map(run, blocks):
+            pass
