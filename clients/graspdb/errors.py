@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from graspdb.wire import FieldError, Problem
+from graspdb.wire.sweeps import FailedChunk
 
 __all__ = [
     "AmbiguousSelection",
@@ -14,6 +15,7 @@ __all__ = [
     "LeaseLost",
     "NotFound",
     "ServiceError",
+    "SweepFailed",
     "TooLarge",
     "TooManyRequests",
     "Unauthorized",
@@ -93,6 +95,14 @@ class Infeasible(GraspDBError):
     def __init__(self, message: str, *, nearest: object | None = None) -> None:
         super().__init__(message)
         self.nearest = nearest
+
+
+class SweepFailed(GraspDBError):
+    """Chunks of a sweep failed for good; ``failed_chunks`` says which and why."""
+
+    def __init__(self, message: str, *, failed_chunks: list[FailedChunk] | None = None) -> None:
+        super().__init__(message)
+        self.failed_chunks = failed_chunks or []
 
 
 _BY_TYPE: dict[str, type[GraspDBError]] = {

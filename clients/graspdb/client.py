@@ -1,0 +1,148 @@
+"""The synchronous client: ``with Client("http://127.0.0.1:8000") as db: ...``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any
+
+from graspdb import wire
+from graspdb.errors import GraspDBError
+from graspdb.objects import GraspObject, Objects
+from graspdb.pages import Listing, checked, segment
+from graspdb.results import table_html
+from graspdb.sweeps import Sweeps
+from graspdb.transport import Transport
+
+__all__ = ["Client", "Grippers"]
+
+
+class Client:
+    """A connection to a GraspDB service; safe to share between threads.
+
+    Parameters
+    ----------
+    url
+        Base address; by default ``$GRASPDB_URL``, else ``http://127.0.0.1:8000``.
+    api_key
+        By default ``$GRASPDB_API_KEY``.
+    timeout_s
+        Per attempt; a request that computes much may take as long.
+    retries
+        Attempts after the first, on connection errors, timeouts and 429, 502, 503, 504.
+
+    Attributes
+    ----------
+    objects, grippers, sweeps
+        The collections on the service.
+    """
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        api_key: str | None = None,
+        timeout_s: float = 120.0,
+        retries: int = 5,
+    ) -> None:
+        self._transport = Transport(
+            url, api_key=api_key, timeout_s=timeout_s, retries=retries, user_agent="graspdb-python"
+        )
+        self.objects = Objects(self._transport)
+        self.grippers = Grippers(self._transport)
+        self.sweeps = Sweeps(self._transport)
+
+    @property
+    def url(self) -> str:
+        """The service's base address."""
+        return self._transport.url
+
+    def info(self) -> dict[str, Any]:
+        """The service's versions and limits."""
+        answer: dict[str, Any] = self._transport.json("GET", "/info")
+        return answer
+
+    def ready(self) -> bool:
+        """True if the service answers and can reach its database; asked once, without retries."""
+        try:
+            return self._transport.request("GET", "/readyz", retries=0).is_success
+        except GraspDBError:
+            return False
+
+    def workers(self) -> list[wire.WorkerInfo]:
+        """The simulation workers that have asked for jobs."""
+        answer = self._transport.json("GET", "/workers")
+        items = answer["items"] if isinstance(answer, dict) else answer
+        return [wire.WorkerInfo.model_validate(item) for item in items]
+
+    def add_example(self, name: str) -> GraspObject:
+        """Create one of the paper's objects: ``cone``, ``elongated-d``, ``screwdriver`` or ``mug``.
+
+        With its mesh, its convex parts, mass and friction. Needs trimesh (extra ``examples``).
+
+        Raises
+        ------
+        ValueError
+            Listing the names, for any other.
+        Conflict
+            If it exists already.
+        """
+        from graspdb.examples import example
+
+        model = example(name)
+        try:
+            parts = model.parts_glb()
+        except ImportError as error:
+            raise ImportError("the examples need trimesh: pip install 'graspdb[examples]'") from error
+        return self.objects.create(
+            model.name,
+            name=model.title,
+            mesh=model.stl(),
+            unit="m",
+            media_type="model/stl",
+            convex_parts=parts,
+            mass_kg=model.mass_kg,
+            friction=model.friction,
+        )
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._transport.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Client({self.url!r})"
+
+    def _repr_html_(self) -> str:
+        return table_html("GraspDB", {"url": self.url, **self.info()})
+
+
+class Grippers:
+    """``db.grippers``: ``pg70``, ``panda`` and your own."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def create(self, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
+        """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
+        request = checked(wire.GripperCreate, {"id": id, "name": name, **profile})
+        answer = self._transport.json("POST", "/grippers", body=request, idempotent=True)
+        return wire.GripperInfo.model_validate(answer)
+
+    def get(self, id: str) -> wire.GripperInfo:
+        """The gripper with this id."""
+        return wire.GripperInfo.model_validate(self._transport.json("GET", f"/grippers/{segment(id)}"))
+
+    def list(self) -> Iterator[wire.GripperInfo]:
+        """All grippers."""
+        return iter(Listing(self._transport, "/grippers", wire.GripperInfo))
+
+    def __iter__(self) -> Iterator[wire.GripperInfo]:
+        return self.list()

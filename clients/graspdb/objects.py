@@ -1,0 +1,549 @@
+"""Objects: their mesh and convex parts, and every question that can be asked about grasping them."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from graspdb import wire
+from graspdb.errors import GraspDBError, Infeasible
+from graspdb.meshes import GLB, MeshLike, read_mesh, scene_of
+from graspdb.pages import Listing, checked, segment
+from graspdb.poses import as_poses, as_vector7
+from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses, table_html
+from graspdb.sweeps import Sweep, Sweeps, create_sweep
+from graspdb.transport import Transport
+from graspdb.trials import Batches, Trials
+
+__all__ = ["GraspObject", "Objects"]
+
+Kernel = wire.KernelSpec | Mapping[str, Any] | str
+
+QUERY_POSES = 100_000
+"""Poses a likelihood request: some 15 MB of JSON, well under the service's default body limit."""
+
+
+class GraspObject:
+    """An object on the service.
+
+    ``info`` is what the service said last; :meth:`refresh` asks again. ``trials`` and ``batches`` hold what
+    has been tried, the methods ask what follows from it. All poses are of the tool frame in the object
+    frame, in metres, quaternions xyzw.
+
+    Queries take the *selection* of trials a density is built from: ``gripper``, ``protocol``, ``source``,
+    and the ``kernel`` (``"isotropic"`` or its widths ``sigma_position_m``, ``sigma_rotation_deg``).
+    """
+
+    def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:
+        self._transport = transport
+        self._path = f"/objects/{segment(info.id)}"
+        self.info = info
+        self.trials = Trials(transport, info.id)
+        self.batches = Batches(transport, info.id)
+
+    @property
+    def id(self) -> str:
+        """The object's identifier."""
+        return self.info.id
+
+    def refresh(self) -> GraspObject:
+        """Ask the service for its present state."""
+        return self._update(self._transport.json("GET", self._path))
+
+    def patch(self, **changes: Any) -> GraspObject:
+        """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
+        answer = self._transport.json("PATCH", self._path, body=_patch(changes))
+        return self._update(answer)
+
+    def delete(self) -> None:
+        """Delete the object with everything that belongs to it."""
+        self._transport.request("DELETE", self._path)
+
+    def _update(self, answer: Any) -> GraspObject:
+        self.info = wire.ObjectInfo.model_validate(answer)
+        return self
+
+    # Mesh and convex parts
+
+    def upload_mesh(self, mesh: MeshLike, *, unit: str = "m", media_type: str | None = None) -> wire.MeshInfo:
+        """Store the object's mesh.
+
+        Parameters
+        ----------
+        mesh
+            A file (.stl, .obj, .ply, .glb), its bytes, or a trimesh object.
+        unit
+            Of its coordinates: ``m``, ``mm``, ``cm`` or ``in``.
+        media_type
+            Needed for bytes whose format they do not tell themselves.
+        """
+        content, kind = read_mesh(mesh, media_type)
+        answer = self._transport.json(
+            "PUT",
+            f"{self._path}/mesh",
+            params={"unit": unit},
+            content=content,
+            headers={"Content-Type": kind},
+        )
+        info = wire.MeshInfo.model_validate(answer)
+        self.refresh()
+        return info
+
+    def download_mesh(self) -> bytes:
+        """The mesh as it was uploaded."""
+        return self._transport.request("GET", f"{self._path}/mesh").content
+
+    def upload_convex_parts(self, parts: MeshLike | Sequence[Any]) -> wire.PartsInfo:
+        """Store the convex parts the object is made of, in metres.
+
+        Parameters
+        ----------
+        parts
+            A GLB file or its bytes with one geometry a part, a trimesh scene, or a sequence of meshes.
+        """
+        if isinstance(parts, Sequence) and not isinstance(parts, (str, bytes)):
+            parts = scene_of(parts)
+        content, kind = read_mesh(parts, None, prefer="glb")
+        if kind != GLB:
+            raise ValueError(f"convex parts come as GLB, one geometry a part; this is {kind}")
+        answer = self._transport.json(
+            "PUT", f"{self._path}/convex-parts", content=content, headers={"Content-Type": GLB}
+        )
+        info = wire.PartsInfo.model_validate(answer)
+        self.refresh()
+        return info
+
+    def download_convex_parts(self) -> bytes:
+        """The convex parts as GLB."""
+        return self._transport.request("GET", f"{self._path}/convex-parts").content
+
+    # Questions
+
+    def density(
+        self,
+        *,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: str | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+    ) -> wire.DensityInfo:
+        """The grasp density: kernel, widths and how they were chosen, counts, effective sample size."""
+        params = {
+            "gripper": gripper,
+            "protocol": protocol,
+            "source": source,
+            "kernel": kernel,
+            "sigma_position_m": sigma_position_m,
+            "sigma_rotation_deg": sigma_rotation_deg,
+        }
+        return wire.DensityInfo.model_validate(
+            self._transport.json("GET", f"{self._path}/density", params=params)
+        )
+
+    def likelihood(
+        self,
+        poses: ArrayLike | Any,
+        *,
+        include: Sequence[str] | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: Kernel | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+        chunk: int = QUERY_POSES,
+    ) -> LikelihoodArrays:
+        """How likely these grasps are, as NumPy arrays in the poses' order.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples.
+        include
+            Columns to compute: ``density``, ``log_density``, ``relative``, ``success_probability``,
+            ``interval``, ``effective_trials``, ``collision_free``; by default all.
+        chunk
+            Poses a request.
+        """
+        position, quaternion = as_poses(poses)
+        options = {
+            "include": None
+            if include is None
+            else [include]
+            if isinstance(include, str)
+            else builtins.list(include),
+            "gripper": gripper,
+            "protocol": protocol,
+            "source": source,
+            "kernel": kernel,
+            "sigma_position_m": sigma_position_m,
+            "sigma_rotation_deg": sigma_rotation_deg,
+        }
+        # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
+        probe = {"position": position[:1].tolist(), "quaternion_xyzw": quaternion[:1].tolist()}
+        request = checked(wire.LikelihoodRequest, {**options, "poses": probe}).model_dump(
+            mode="json", exclude_unset=True
+        )
+        answers: list[wire.Likelihoods] = []
+        for attempt in range(3):
+            answers = []
+            for start in range(0, len(position), chunk):
+                part = slice(start, start + chunk)
+                columns = {"position": position[part].tolist(), "quaternion_xyzw": quaternion[part].tolist()}
+                answer = self._transport.json(
+                    "POST", f"{self._path}/likelihood", body={**request, "poses": columns}
+                )
+                answers.append(wire.Likelihoods.model_validate(answer))
+                if answers[-1].revision != answers[0].revision and attempt < 2:
+                    break  # new trials came in between: one answer must rest on one revision
+            else:
+                break
+        return LikelihoodArrays.from_wire(answers)
+
+    def best_grasp(self, **constraints: Any) -> Grasp:
+        """The best grasp within constraints; those of :meth:`best_grasps`, without ``count``.
+
+        Raises
+        ------
+        Infeasible
+            If no admissible grasp lies within reach of what was tried, or nothing has succeeded yet.
+        """
+        if "count" in constraints:
+            raise TypeError("best_grasp() gives one grasp; use best_grasps(count=...)")
+        return self.best_grasps(count=1, **constraints)[0]
+
+    def best_grasps(
+        self,
+        *,
+        count: int = 5,
+        box: tuple[ArrayLike, ArrayLike] | None = None,
+        sphere: ArrayLike | None = None,
+        above_plane: ArrayLike | None = None,
+        approach: ArrayLike | None = None,
+        approach_cone_deg: float | None = None,
+        closing: ArrayLike | None = None,
+        closing_cone_deg: float | None = None,
+        collision_free: bool | None = None,
+        object_pose: ArrayLike | Any | None = None,
+        frame: str | None = None,
+        min_separation_m: float | None = None,
+        min_separation_deg: float | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: Kernel | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+    ) -> Grasps:
+        """At most ``count`` distinct grasps, best first.
+
+        All constraints are in ``frame``: the world's if ``object_pose`` is given, else the object's.
+
+        Parameters
+        ----------
+        box
+            Lower and upper corner (3,) of where the tool's origin may be, metres.
+        sphere
+            ``x, y, z, r``: the tool's origin is within ``r`` metres of the centre.
+        above_plane
+            ``nx, ny, nz, d``: n.x >= d at the tool's origin.
+        approach, approach_cone_deg
+            Direction (3,) of the tool's z axis, and the half angle of the cone about it.
+        closing, closing_cone_deg
+            The same for the tool's y axis, in which the fingers close.
+        collision_free
+            That the gripper does not touch the object before it closes; true where it can be known.
+        object_pose
+            The object in the world: (4, 4) or ``x y z qx qy qz qw``.
+        min_separation_m, min_separation_deg
+            How far apart two grasps are, in either, to count as distinct.
+
+        Raises
+        ------
+        Infeasible
+            If there is none; ``nearest`` is the closest grasp outside the constraints, where there is one.
+        """
+        fields: dict[str, Any] = {
+            "count": count,
+            "sphere": _numbers("sphere", sphere, 4, "x, y, z, r"),
+            "above_plane": _numbers("above_plane", above_plane, 4, "nx, ny, nz, d"),
+            "approach": _numbers("approach", approach, 3, "x, y, z"),
+            "approach_cone_deg": approach_cone_deg,
+            "closing": _numbers("closing", closing, 3, "x, y, z"),
+            "closing_cone_deg": closing_cone_deg,
+            "collision_free": collision_free,
+            "object_pose": None if object_pose is None else as_vector7(object_pose),
+            "frame": frame,
+            "min_separation_m": min_separation_m,
+            "min_separation_deg": min_separation_deg,
+            "gripper": gripper,
+            "protocol": protocol,
+            "source": source,
+            "kernel": kernel,
+            "sigma_position_m": sigma_position_m,
+            "sigma_rotation_deg": sigma_rotation_deg,
+        }
+        if box is not None:
+            if len(box) != 2:
+                raise ValueError("box is a pair: its lower and its upper corner, each x, y, z")
+            fields["box_min"] = _numbers("box's lower corner", box[0], 3, "x, y, z")
+            fields["box_max"] = _numbers("box's upper corner", box[1], 3, "x, y, z")
+        request = checked(wire.BestGraspRequest, fields)
+        answer = self._transport.json("POST", f"{self._path}/best-grasp", body=request)
+        grasps = Grasps(wire.BestGrasps.model_validate(answer))
+        if len(grasps):
+            return grasps
+        if grasps.status == "no_successes":
+            raise Infeasible(f"{self.id} has no successful trial yet, so there is no grasp to choose from")
+        where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
+        raise Infeasible(
+            f"no grasp of {self.id} fulfils the constraints within reach of what was tried{where}",
+            nearest=grasps.nearest,
+        )
+
+    def samples(
+        self,
+        count: int = 100,
+        *,
+        seed: int | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: Kernel | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+    ) -> SampledPoses:
+        """Poses drawn from the density; the same seed and revision give the same poses."""
+        fields = {
+            "count": count,
+            "seed": seed,
+            "gripper": gripper,
+            "protocol": protocol,
+            "source": source,
+            "kernel": kernel,
+            "sigma_position_m": sigma_position_m,
+            "sigma_rotation_deg": sigma_rotation_deg,
+        }
+        request = checked(wire.SamplesRequest, fields)
+        answer = wire.Samples.model_validate(
+            self._transport.json("POST", f"{self._path}/samples", body=request)
+        )
+        return SampledPoses(
+            position=np.array(answer.position, dtype=np.float64).reshape(-1, 3),
+            quaternion_xyzw=np.array(answer.quaternion_xyzw, dtype=np.float64).reshape(-1, 4),
+            proposal_density=np.array(answer.proposal_density, dtype=np.float64),
+            seed=answer.seed,
+            revision=answer.revision,
+            kernel=answer.kernel,
+        )
+
+    def sweep(
+        self,
+        *,
+        max_poses: int | None = None,
+        position_step_m: float | None = None,
+        rotation_step_deg: float | None = None,
+        margin_m: float | None = None,
+        region: tuple[ArrayLike, ArrayLike] | None = None,
+        seed: int | None = None,
+        poses: ArrayLike | Any | None = None,
+        sample: int | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        fidelity: str | None = None,
+        purpose: str | None = None,
+        chunk_poses: int | None = None,
+    ) -> Sweep:
+        """Have workers simulate grasps: over a grid (the default), given ``poses``, or ``sample`` draws.
+
+        Parameters
+        ----------
+        max_poses
+            A random part of the grid, by ``seed``; without it the whole grid.
+        position_step_m, rotation_step_deg, margin_m, region
+            The grid: its steps, its margin about the bounding box, and the box (lower, upper) it is cut to.
+        poses
+            Exactly these.
+        sample
+            So many draws from the density.
+        gripper
+            Its profile's id, by default ``pg70``.
+        protocol
+            ``wrench`` (the contact forces can counter gravity in every direction) or ``lift``.
+        fidelity
+            ``standard`` or ``fine`` (smaller time step).
+        purpose
+            ``collect``, or ``check``: outcomes are stored but enter no density.
+        """
+        grid = {
+            "max_poses": max_poses,
+            "position_step_m": position_step_m,
+            "rotation_step_deg": rotation_step_deg,
+            "margin_m": margin_m,
+        }
+        if region is not None:
+            grid["region"] = {  # type: ignore[assignment]
+                "lower": _numbers("region's lower corner", region[0], 3, "x, y, z"),
+                "upper": _numbers("region's upper corner", region[1], 3, "x, y, z"),
+            }
+        grid = {key: value for key, value in grid.items() if value is not None}
+        if (poses is not None) + (sample is not None) + bool(grid) > 1:
+            raise ValueError(
+                f"give grid options ({', '.join(grid) or 'none'}), poses or sample, one of the three"
+            )
+        if poses is not None and seed is not None:
+            raise ValueError("seed is for a grid or for sample: given poses are simulated as they are")
+        drawn = None
+        if sample is not None:
+            drawn = {"count": sample} | ({} if seed is None else {"seed": seed})
+        elif poses is None:
+            grid |= {} if seed is None else {"seed": seed}
+        return create_sweep(
+            self._transport,
+            self.id,
+            grid=grid if poses is None and sample is None else None,
+            poses=poses,
+            sample=drawn,
+            gripper=gripper,
+            protocol=protocol,
+            fidelity=fidelity,
+            purpose=purpose,
+            chunk_poses=chunk_poses,
+        )
+
+    def sweeps(self) -> Iterator[Sweep]:
+        """The sweeps of this object."""
+        return Sweeps(self._transport).list(object=self.id)
+
+    def summary(self) -> dict[str, str]:
+        """What a person wants to know of it, in words."""
+        info = self.info
+        rows = {"object": info.id}
+        if info.name:
+            rows["name"] = info.name
+        for label, value, unit in (
+            ("mass", info.mass_kg, "kg"),
+            ("density", info.density_kg_m3, "kg/m³"),
+            ("friction", info.friction, ""),
+        ):
+            if value is not None:
+                rows[label] = f"{value:g} {unit}".rstrip()
+        if info.mesh is not None:
+            size = np.subtract(info.mesh.bounding_box.upper, info.mesh.bounding_box.lower) * 1000
+            rows["mesh"] = (
+                f"{size[0]:.1f} x {size[1]:.1f} x {size[2]:.1f} mm, {info.mesh.faces:,} triangles, "
+                + ("watertight" if info.mesh.watertight else "not watertight")
+            )
+            for number, warning in enumerate(info.mesh.warnings, start=1):
+                rows[f"mesh warning {number}"] = warning
+        if info.convex_parts is not None:
+            rows["convex parts"] = f"{info.convex_parts.parts}"
+        rows["trials"] = f"{info.trials:,}"
+        if info.outcomes:
+            rows["outcomes"] = ", ".join(f"{n:,} {name}" for name, n in info.outcomes.items())
+        rows["revision"] = str(info.revision)
+        return rows
+
+    def __repr__(self) -> str:
+        info = self.info
+        return (
+            f"GraspObject({info.id!r}, trials={info.trials}, successes={info.outcomes.get('success', 0)}, "
+            f"mesh={'yes' if info.mesh else 'no'}, revision={info.revision})"
+        )
+
+    def _repr_html_(self) -> str:
+        return table_html(f"Object {self.info.name or self.info.id}", self.summary())
+
+
+class Objects:
+    """``db.objects``: create, find, list and delete objects."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def create(
+        self,
+        id: str,
+        *,
+        mesh: MeshLike | None = None,
+        unit: str = "m",
+        media_type: str | None = None,
+        convex_parts: MeshLike | Sequence[Any] | None = None,
+        name: str | None = None,
+        mass_kg: float | None = None,
+        density_kg_m3: float | None = None,
+        friction: float | None = None,
+        metadata: Mapping[str, Any] | None = None,
+    ) -> GraspObject:
+        """Create an object, with its mesh and convex parts if given: all of it or nothing.
+
+        ``id`` is a slug; ``mesh``, ``unit`` and ``media_type`` as in :meth:`GraspObject.upload_mesh`,
+        ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`.
+
+        Raises
+        ------
+        Conflict
+            If an object has this id already.
+        InvalidInput
+            If a property or the mesh is refused.
+        """
+        fields = {
+            "id": id,
+            "name": name,
+            "mass_kg": mass_kg,
+            "density_kg_m3": density_kg_m3,
+            "friction": friction,
+            "metadata": metadata,
+        }
+        request = checked(wire.ObjectCreate, fields)
+        loaded = None if mesh is None else read_mesh(mesh, media_type)
+        answer = self._transport.json("POST", "/objects", body=request, idempotent=True)
+        created = GraspObject(self._transport, wire.ObjectInfo.model_validate(answer))
+        try:
+            if loaded is not None:
+                created.upload_mesh(loaded[0], unit=unit, media_type=loaded[1])
+            if convex_parts is not None:
+                created.upload_convex_parts(convex_parts)
+        except (GraspDBError, OSError, ValueError, TypeError, ImportError):
+            created.delete()
+            raise
+        return created
+
+    def get(self, id: str) -> GraspObject:
+        """The object with this id."""
+        answer = self._transport.json("GET", f"/objects/{segment(id)}")
+        return GraspObject(self._transport, wire.ObjectInfo.model_validate(answer))
+
+    def list(self) -> Iterator[GraspObject]:
+        """All objects."""
+        for info in Listing(self._transport, "/objects", wire.ObjectInfo):
+            yield GraspObject(self._transport, info)
+
+    def __iter__(self) -> Iterator[GraspObject]:
+        return self.list()
+
+    def delete(self, id: str) -> None:
+        """Delete an object with everything that belongs to it."""
+        self._transport.request("DELETE", f"/objects/{segment(id)}")
+
+
+def _patch(changes: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Nulls are meant in a patch, so it is checked without dropping them."""
+    checked(wire.ObjectPatch, changes)
+    return dict(changes)
+
+
+def _numbers(name: str, values: ArrayLike | None, count: int, what: str) -> list[float] | None:
+    if values is None:
+        return None
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (count,):
+        raise ValueError(f"{name} has shape {array.shape}; expected {count} numbers: {what}")
+    numbers: list[float] = array.tolist()
+    return numbers

@@ -1,0 +1,86 @@
+"""Reading the service's lists page by page, and sending small requests made of Python values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Generic, TypeVar
+from urllib.parse import quote
+
+from pydantic import BaseModel, ValidationError
+
+from graspdb.errors import InvalidInput
+from graspdb.transport import Transport
+from graspdb.wire import FieldError, Problem
+
+__all__ = ["PAGE", "Listing", "checked", "segment"]
+
+PAGE = 1_000
+"""The most items the service puts on a page."""
+
+Item = TypeVar("Item", bound=BaseModel)
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def segment(identifier: str) -> str:
+    """An identifier as one segment of a path: nothing in it can reach another resource."""
+    if not identifier or identifier in {".", ".."}:
+        raise ValueError(f"{identifier!r} is no identifier")
+    return quote(identifier, safe="")
+
+
+def checked(model: type[Model], fields: Mapping[str, Any]) -> Model:
+    """Build a request from what was given (None means not given).
+
+    Raises
+    ------
+    InvalidInput
+        Naming every wrong field, before anything is sent.
+    """
+    try:
+        return model.model_validate({key: value for key, value in fields.items() if value is not None})
+    except ValidationError as error:
+        wrong = [
+            FieldError(field=".".join(str(part) for part in e["loc"]) or "request", message=e["msg"])
+            for e in error.errors(include_url=False, include_context=False, include_input=False)
+        ]
+        problem = Problem(type="about:blank", title="Invalid input", status=422, errors=wrong)
+        text = "\n".join(["invalid input:", *(f"  {item.field}: {item.message}" for item in wrong)])
+        raise InvalidInput(text, problem=problem) from None
+
+
+class Listing(Generic[Item]):
+    """A list on the service, read as it is iterated; every iteration asks anew."""
+
+    def __init__(
+        self, transport: Transport, path: str, item: type[Item], params: Mapping[str, Any] | None = None
+    ) -> None:
+        self._transport = transport
+        self._path = path
+        self._item = item
+        self._params = dict(params or {})
+
+    def pages(self, limit: int = PAGE) -> Iterator[list[Item]]:
+        """Lists of at most ``limit`` items."""
+        cursor: str | None = None
+        while True:
+            params = {**self._params, "limit": limit, "cursor": cursor}
+            answer = self._transport.json("GET", self._path, params=params)
+            yield [self._item.model_validate(item) for item in answer["items"]]
+            cursor = answer.get("next")
+            if cursor is None:
+                return
+
+    def __iter__(self) -> Iterator[Item]:
+        for page in self.pages():
+            yield from page
+
+    def first(self, count: int) -> list[Item]:
+        """At most the first ``count`` items."""
+        found: list[Item] = []
+        if count < 1:
+            return found
+        for page in self.pages(min(count, PAGE)):
+            found += page
+            if len(found) >= count:
+                break
+        return found[:count]

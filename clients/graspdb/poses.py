@@ -1,0 +1,155 @@
+"""Poses as arrays: what the SDK accepts, and 4x4 matrices of what it gives back.
+
+Positions in metres, quaternions xyzw, matrices homogeneous and row-major. Rotations within 1e-3 of
+exact are normalised and anything farther off is refused, as the service does, so that a bad pose is
+named before anything is sent.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
+
+__all__ = ["as_poses", "as_vector7", "as_vectors7", "matrices", "quaternions_of"]
+
+Floats = NDArray[np.float64]
+
+
+def as_poses(poses: ArrayLike | Any) -> tuple[Floats, Floats]:
+    """Positions (N, 3) and unit quaternions xyzw (N, 4) of one or many poses.
+
+    Parameters
+    ----------
+    poses
+        (N, 4, 4) or (4, 4) homogeneous matrices, or (N, 7) or (7,) rows ``x y z qx qy qz qw``; anything
+        with ``position`` and ``quaternion_xyzw`` (a grasp, samples) is taken too, and a list of such.
+
+    Raises
+    ------
+    ValueError
+        If the shape is none of these, a number is not finite, a position lies beyond 1 km or a rotation
+        is farther than 1e-3 from exact; the message names the first bad pose.
+    """
+    if hasattr(poses, "position") and hasattr(poses, "quaternion_xyzw"):
+        position, quaternion = np.asarray(poses.position, float), np.asarray(poses.quaternion_xyzw, float)
+        return as_poses(np.concatenate([np.atleast_2d(position), np.atleast_2d(quaternion)], axis=1))
+    if isinstance(poses, (list, tuple)) and len(poses) and all(hasattr(p, "quaternion_xyzw") for p in poses):
+        parts = [as_poses(p) for p in poses]
+        return np.concatenate([p for p, _ in parts]), np.concatenate([q for _, q in parts])
+    try:
+        array = np.asarray(poses, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            "poses must be numbers of shape (N, 4, 4), (N, 7) [x y z qx qy qz qw], (4, 4) or (7,)"
+        ) from error
+    if array.shape == (4, 4) or array.shape == (7,):
+        array = array[None]
+    if array.ndim == 3 and array.shape[1:] == (4, 4):
+        _refuse(~np.isfinite(array).all(axis=(1, 2)), "has numbers that are not finite")
+        last = np.abs(array[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1, initial=0.0)
+        _refuse(last > 1e-6, "must have the last row 0, 0, 0, 1")
+        position, quaternion = array[:, :3, 3].copy(), quaternions_of(array[:, :3, :3])
+    elif array.ndim == 2 and array.shape[1] == 7:
+        _refuse(~np.isfinite(array).all(axis=1), "has numbers that are not finite")
+        position, quaternion = array[:, :3].copy(), array[:, 3:].copy()
+        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        _refuse(
+            np.abs(norm[:, 0] - 1.0) > UNIT_TOLERANCE,
+            f"must have a unit quaternion (x, y, z, w) in its last four numbers, within {UNIT_TOLERANCE:g}",
+        )
+        quaternion /= norm
+    else:
+        raise ValueError(
+            f"poses have shape {array.shape}; expected (N, 4, 4), (N, 7) [x y z qx qy qz qw], (4, 4) or (7,)"
+        )
+    if len(position) == 0:
+        raise ValueError("give at least one pose")
+    _refuse(
+        np.abs(position).max(axis=1) > MAX_COORDINATE_M,
+        "lies more than 1 km from the origin: coordinates are metres",
+    )
+    return position, quaternion
+
+
+def _refuse(bad: ArrayLike, what: str) -> None:
+    if np.any(bad):
+        raise ValueError(f"pose {int(np.argmax(bad))} {what}")
+
+
+def as_vector7(pose: ArrayLike | Any) -> tuple[float, ...]:
+    """One pose as ``(x, y, z, qx, qy, qz, qw)``; see :func:`as_poses` for what is accepted.
+
+    Raises
+    ------
+    ValueError
+        If it is no single valid pose.
+    """
+    position, quaternion = as_poses(pose)
+    if len(position) != 1:
+        raise ValueError(f"expected one pose, got {len(position)}")
+    return (*position[0].tolist(), *quaternion[0].tolist())
+
+
+def as_vectors7(position: ArrayLike, quaternion_xyzw: ArrayLike) -> Floats:
+    """Rows ``x y z qx qy qz qw`` (N, 7)."""
+    return np.concatenate(
+        [np.reshape(np.asarray(position, float), (-1, 3)), np.reshape(quaternion_xyzw, (-1, 4))], axis=1
+    )
+
+
+def quaternions_of(rotations: Floats) -> Floats:
+    """Unit quaternions xyzw (N, 4) of rotation matrices (N, 3, 3): Shepperd's method (1978), vectorised.
+
+    Raises
+    ------
+    ValueError
+        If a matrix is no rotation within 1e-3; the message names the first such pose.
+    """
+    gram = np.einsum("nki,nkj->nij", rotations, rotations)
+    _refuse(
+        np.abs(gram - np.eye(3)).max(axis=(1, 2), initial=0.0) > 2 * UNIT_TOLERANCE,
+        "must have a rotation in its upper left 3x3 block: the columns are not orthonormal",
+    )
+    _refuse(np.linalg.det(rotations) < 0, "must have a rotation, not a reflection, in its upper left block")
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotations, 0, 2)
+    # Row k is the quaternion times four times its k-th component: the largest of the four divides safest.
+    rows = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )
+    best = np.argmax(np.einsum("kkn->kn", rows), axis=0)
+    quaternion = rows[best, :, np.arange(len(rotations))]
+    return np.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), dtype=np.float64)
+
+
+def matrices(position: ArrayLike, quaternion_xyzw: ArrayLike) -> Floats:
+    """Homogeneous matrices (..., 4, 4) of positions (..., 3) and unit quaternions xyzw (..., 4)."""
+    p, q = np.asarray(position, dtype=np.float64), np.asarray(quaternion_xyzw, dtype=np.float64)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    out = np.zeros((*p.shape[:-1], 4, 4))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+    )
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = (
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+    )
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = (
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
+    )
+    out[..., :3, 3] = p
+    out[..., 3, 3] = 1.0
+    return out

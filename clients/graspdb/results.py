@@ -1,0 +1,392 @@
+"""What queries answer, as NumPy arrays and poses that a robot program can use at once."""
+
+from __future__ import annotations
+
+import html
+import importlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb import wire
+from graspdb.poses import as_vectors7, matrices
+
+__all__ = [
+    "Grasp",
+    "Grasps",
+    "IntervalArrays",
+    "LikelihoodArrays",
+    "SampledPoses",
+    "TrialArrays",
+    "table_html",
+]
+
+Floats = NDArray[np.float64]
+
+
+def to_pandas(columns: Mapping[str, Any]) -> Any:
+    """A DataFrame of equally long columns.
+
+    Raises
+    ------
+    ImportError
+        If pandas is not installed; the message says how to install it.
+    """
+    try:
+        pandas = importlib.import_module("pandas")
+    except ImportError as error:
+        raise ImportError("to_pandas() needs pandas: pip install 'graspdb[pandas]'") from error
+    return pandas.DataFrame(dict(columns))
+
+
+def pose_columns(position: Floats, quaternion_xyzw: Floats) -> dict[str, Floats]:
+    """Seven columns x, y, z, qx, qy, qz, qw."""
+    rows = as_vectors7(position, quaternion_xyzw)
+    return {name: rows[:, i] for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw"))}
+
+
+def table_html(title: str, rows: Mapping[str, Any]) -> str:
+    """A two-column table for a notebook."""
+    cells = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(str(key))}</th>"
+        f"<td style='text-align:left'>{html.escape(str(value))}</td></tr>"
+        for key, value in rows.items()
+    )
+    return f"<table><caption>{html.escape(title)}</caption>{cells}</table>"
+
+
+def _vector(values: Any, digits: int = 4) -> str:
+    return "[" + ", ".join(f"{float(v):.{digits}f}" for v in values) + "]"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Grasp:
+    """A grasp: the pose of the tool frame in the object frame, and what is known about it.
+
+    Attributes
+    ----------
+    position
+        (3,) metres, object frame.
+    quaternion_xyzw
+        (4,) unit quaternion, object frame.
+    world
+        The same grasp in the world frame, (4, 4); None unless the query gave the object's pose.
+    density, log_density
+        Grasp density in 1/(m^3 rad^3), and its natural logarithm.
+    relative
+        Density over the density's global maximum: 1 at the best grasp there is.
+    success_probability, interval, effective_trials
+        Estimate, its interval and the trials it rests on; None where the service gives none.
+    collision_free
+        None until mesh and gripper are known.
+    width_m
+        Opening of the jaw at the grasp, metres.
+    nearest_trials
+        ``seq`` of the trials nearest to it.
+    active_constraints
+        The constraints that hold it where it is.
+    """
+
+    position: Floats
+    quaternion_xyzw: Floats
+    density: float
+    log_density: float
+    relative: float
+    world: Floats | None = None
+    success_probability: float | None = None
+    interval: wire.Interval | None = None
+    effective_trials: float | None = None
+    collision_free: bool | None = None
+    width_m: float | None = None
+    nearest_trials: tuple[int, ...] = ()
+    active_constraints: tuple[str, ...] = ()
+    raw: wire.Grasp | None = field(default=None)
+
+    @classmethod
+    def from_wire(cls, grasp: wire.Grasp) -> Grasp:
+        """From the service's answer."""
+        world = grasp.world
+        return cls(
+            position=np.array(grasp.position),
+            quaternion_xyzw=np.array(grasp.quaternion_xyzw),
+            world=None if world is None else matrices(world.position, world.quaternion_xyzw),
+            density=grasp.density,
+            log_density=grasp.log_density,
+            relative=grasp.relative,
+            success_probability=grasp.success_probability,
+            interval=grasp.interval,
+            effective_trials=grasp.effective_trials,
+            collision_free=grasp.collision_free,
+            width_m=grasp.width_m,
+            nearest_trials=tuple(grasp.nearest_trials),
+            active_constraints=tuple(grasp.active_constraints),
+            raw=grasp,
+        )
+
+    @property
+    def matrix(self) -> Floats:
+        """(4, 4) homogeneous matrix: tool frame in the object frame, metres."""
+        return matrices(self.position, self.quaternion_xyzw)
+
+    @property
+    def approach(self) -> Floats:
+        """(3,) direction in which the tool moves to the object: the tool's z axis, object frame."""
+        return self.matrix[:3, 2]
+
+    @property
+    def closing(self) -> Floats:
+        """(3,) direction in which the fingers close: the tool's y axis, object frame."""
+        return self.matrix[:3, 1]
+
+    def _rows(self) -> dict[str, str]:
+        rows = {
+            "position [m]": _vector(self.position),
+            "quaternion xyzw": _vector(self.quaternion_xyzw),
+            "approach": _vector(self.approach, 2),
+            "density [1/(m³ rad³)]": f"{self.density:.4g}",
+            "relative": f"{self.relative:.3f}",
+        }
+        if self.world is not None:
+            rows["position in the world [m]"] = _vector(self.world[:3, 3])
+        if self.success_probability is not None:
+            rows["success probability"] = f"{self.success_probability:.2f}" + (
+                f" ({self.interval.low:.2f} to {self.interval.high:.2f})" if self.interval else ""
+            )
+        if self.collision_free is not None:
+            rows["collision-free"] = "yes" if self.collision_free else "no"
+        if self.width_m is not None:
+            rows["width [m]"] = f"{self.width_m:.4f}"
+        if self.active_constraints:
+            rows["held by"] = ", ".join(self.active_constraints)
+        return rows
+
+    def __repr__(self) -> str:
+        return (
+            f"Grasp(position={_vector(self.position)}, quaternion_xyzw={_vector(self.quaternion_xyzw)}, "
+            f"density={self.density:.4g}, relative={self.relative:.3f})"
+        )
+
+    def _repr_html_(self) -> str:
+        return table_html("Grasp (tool frame in the object frame)", self._rows())
+
+
+class Grasps(Sequence[Grasp]):
+    """Distinct grasps, best first.
+
+    ``status`` is ``ok``, or ``fewer`` if less than the asked number exist, or ``infeasible`` or
+    ``no_successes`` if there is none; ``nearest`` is then the closest grasp outside the constraints.
+    """
+
+    def __init__(self, answer: wire.BestGrasps) -> None:
+        self.status = answer.status
+        self.revision = answer.revision
+        self.kernel = answer.kernel
+        self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest)
+        self._grasps = tuple(Grasp.from_wire(grasp) for grasp in answer.grasps)
+
+    @overload
+    def __getitem__(self, index: int) -> Grasp: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Grasp, ...]: ...
+    def __getitem__(self, index: int | slice) -> Grasp | tuple[Grasp, ...]:
+        return self._grasps[index]
+
+    def __len__(self) -> int:
+        return len(self._grasps)
+
+    def __iter__(self) -> Iterator[Grasp]:
+        return iter(self._grasps)
+
+    @property
+    def matrices(self) -> Floats:
+        """(N, 4, 4) tool frames in the object frame."""
+        return np.array([grasp.matrix for grasp in self._grasps]).reshape(-1, 4, 4)
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a grasp (extra ``pandas``)."""
+        position = np.array([g.position for g in self]).reshape(-1, 3)
+        quaternion = np.array([g.quaternion_xyzw for g in self]).reshape(-1, 4)
+        names = ("density", "log_density", "relative", "success_probability", "collision_free", "width_m")
+        columns = {name: [getattr(g, name) for g in self] for name in names}
+        return to_pandas(pose_columns(position, quaternion) | columns)
+
+    def __repr__(self) -> str:
+        lines = "".join(f"\n  {grasp!r}," for grasp in self._grasps)
+        return (
+            f"Grasps(status={self.status!r}, [{lines}\n])" if lines else f"Grasps(status={self.status!r}, [])"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class IntervalArrays:
+    """Bounds (N,) that hold the success probability with the given level; NaN where unknown."""
+
+    level: float
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LikelihoodArrays:
+    """Answers for N poses, in their order; a column not asked for or not known is None.
+
+    ``density`` in 1/(m^3 rad^3); ``log_density`` natural, minus infinity where the density is exactly
+    zero; ``relative`` to the density's global maximum.
+    """
+
+    revision: int
+    kernel: wire.KernelInfo
+    density: Floats | None = None
+    log_density: Floats | None = None
+    relative: Floats | None = None
+    success_probability: Floats | None = None
+    interval: IntervalArrays | None = None
+    effective_trials: Floats | None = None
+    collision_free: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
+        """From the answers to consecutive parts of the poses."""
+        free = _joined(answers, "collision_free")
+        intervals = [a.interval for a in answers if a.interval is not None and a.interval.low]
+        return cls(
+            revision=answers[-1].revision,
+            kernel=answers[-1].kernel,
+            density=_floats(_joined(answers, "density"), np.nan),
+            log_density=_floats(_joined(answers, "log_density"), -np.inf),
+            relative=_floats(_joined(answers, "relative"), np.nan),
+            success_probability=_floats(_joined(answers, "success_probability"), np.nan),
+            effective_trials=_floats(_joined(answers, "effective_trials"), np.nan),
+            interval=IntervalArrays(
+                intervals[0].level,
+                _of([x for i in intervals for x in i.low], np.nan),
+                _of([x for i in intervals for x in i.high], np.nan),
+            )
+            if intervals
+            else None,
+            collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
+        )
+
+    def _columns(self) -> dict[str, Any]:
+        names = (
+            "density",
+            "log_density",
+            "relative",
+            "success_probability",
+            "effective_trials",
+            "collision_free",
+        )
+        columns = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if self.interval is not None:
+            columns |= {"low": self.interval.low, "high": self.interval.high}
+        return columns
+
+    def __len__(self) -> int:
+        return next((len(column) for column in self._columns().values()), 0)
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a pose (extra ``pandas``)."""
+        return to_pandas(self._columns())
+
+    def __repr__(self) -> str:
+        return f"LikelihoodArrays({len(self)} poses: {', '.join(self._columns())}; revision {self.revision})"
+
+
+def _joined(answers: Sequence[wire.Likelihoods], name: str) -> list[Any] | None:
+    columns = [getattr(answer, name) for answer in answers]
+    if any(column is None for column in columns):
+        return None
+    joined = [value for column in columns for value in column]
+    # A column of nothing but nulls says that the service does not know; minus infinity is no such null.
+    return None if name != "log_density" and all(v is None for v in joined) else joined
+
+
+def _floats(values: list[Any] | None, null: float) -> Floats | None:
+    return None if values is None else _of(values, null)
+
+
+def _of(values: Sequence[float | None], null: float) -> Floats:
+    return np.array([null if v is None else v for v in values], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SampledPoses:
+    """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials."""
+
+    position: Floats
+    quaternion_xyzw: Floats
+    proposal_density: Floats
+    seed: int
+    revision: int
+    kernel: wire.KernelInfo
+
+    @property
+    def matrices(self) -> Floats:
+        """(N, 4, 4) tool frames in the object frame."""
+        return matrices(self.position, self.quaternion_xyzw)
+
+    @property
+    def poses(self) -> Floats:
+        """(N, 7) rows x y z qx qy qz qw."""
+        return as_vectors7(self.position, self.quaternion_xyzw)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a pose (extra ``pandas``)."""
+        columns = pose_columns(self.position, self.quaternion_xyzw)
+        return to_pandas(columns | {"proposal_density": self.proposal_density})
+
+    def __repr__(self) -> str:
+        return f"SampledPoses({len(self)} poses, seed={self.seed}, revision={self.revision})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrialArrays:
+    """Stored trials as columns. ``outcome`` (N,) holds names; ``success`` (N,) is True for successes."""
+
+    seq: NDArray[np.int64]
+    position: Floats
+    quaternion_xyzw: Floats
+    outcome: NDArray[np.str_]
+    trials: tuple[wire.TrialOut, ...]
+
+    @classmethod
+    def of(cls, trials: Sequence[wire.TrialOut]) -> TrialArrays:
+        """The columns of these trials."""
+        return cls(
+            seq=np.array([t.seq for t in trials], dtype=np.int64),
+            position=np.array([t.position for t in trials], dtype=np.float64).reshape(-1, 3),
+            quaternion_xyzw=np.array([t.quaternion_xyzw for t in trials], dtype=np.float64).reshape(-1, 4),
+            outcome=np.array([t.outcome for t in trials], dtype=np.str_),
+            trials=tuple(trials),
+        )
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """(N,) True where the grasp held."""
+        return np.asarray(self.outcome == "success")
+
+    @property
+    def matrices(self) -> Floats:
+        """(N, 4, 4) tool frames in the object frame."""
+        return matrices(self.position, self.quaternion_xyzw)
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a trial (extra ``pandas``)."""
+        names = ["gripper", "source", "protocol", "batch", "sweep", "pose_index", "quality", "width_m"]
+        names += ["proposal_density", "measured_at", "revision"]
+        columns: dict[str, Any] = {"seq": self.seq, **pose_columns(self.position, self.quaternion_xyzw)}
+        columns["outcome"] = self.outcome
+        columns |= {name: [getattr(t, name) for t in self.trials] for name in names}
+        return to_pandas(columns)
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    def __repr__(self) -> str:
+        return f"TrialArrays({len(self)} trials, {int(self.success.sum())} successes)"

@@ -1,0 +1,314 @@
+"""Sweeps from the client's side: wait for them, cancel, retry, and read every pose's outcome."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from graspdb import wire
+from graspdb.errors import SweepFailed
+from graspdb.pages import Listing, checked, segment
+from graspdb.poses import as_poses, matrices
+from graspdb.results import pose_columns, table_html, to_pandas
+from graspdb.transport import Transport
+
+__all__ = ["OutcomeArrays", "Sweep", "Sweeps", "create_sweep"]
+
+ProgressCallback = Callable[[wire.SweepInfo], None]
+FINISHED = frozenset({"done", "failed", "cancelled"})
+_WORKER_SILENT_S = 30.0
+_FIRST_POLL_S, _LAST_POLL_S = 0.2, 2.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OutcomeArrays:
+    """Every simulated pose of a sweep, collisions included: ``pose_index`` (N,), poses, ``outcome`` (N,)."""
+
+    sweep: str
+    pose_index: NDArray[np.int64]
+    position: NDArray[np.float64]
+    quaternion_xyzw: NDArray[np.float64]
+    outcome: NDArray[np.str_]
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """(N,) True where the grasp held."""
+        return np.asarray(self.outcome == "success")
+
+    @property
+    def matrices(self) -> NDArray[np.float64]:
+        """(N, 4, 4) tool frames in the object frame."""
+        return matrices(self.position, self.quaternion_xyzw)
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a pose (extra ``pandas``)."""
+        columns: dict[str, Any] = {"pose_index": self.pose_index}
+        columns |= pose_columns(self.position, self.quaternion_xyzw)
+        return to_pandas(columns | {"outcome": self.outcome})
+
+    def __len__(self) -> int:
+        return len(self.pose_index)
+
+    def __repr__(self) -> str:
+        return f"OutcomeArrays({len(self)} poses of {self.sweep}, {int(self.success.sum())} successes)"
+
+
+class Sweep:
+    """A sweep on the service. ``info`` is its state when last heard of; :meth:`refresh` asks again."""
+
+    def __init__(self, transport: Transport, info: wire.SweepInfo) -> None:
+        self._transport = transport
+        self._path = f"/sweeps/{segment(info.id)}"
+        self.info = info
+
+    @property
+    def id(self) -> str:
+        """The sweep's identifier."""
+        return self.info.id
+
+    @property
+    def state(self) -> str:
+        """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``, when last heard of."""
+        return self.info.state
+
+    @property
+    def finished(self) -> bool:
+        """True if nothing more will happen to it by itself."""
+        return self.info.state in FINISHED
+
+    def refresh(self) -> Sweep:
+        """Ask the service how far it is."""
+        return self._update(self._transport.json("GET", self._path))
+
+    def cancel(self) -> Sweep:
+        """Stop it; what is already stored stays."""
+        return self._update(self._transport.json("POST", f"{self._path}/cancel", idempotent=True))
+
+    def retry(self) -> Sweep:
+        """Queue the failed and cancelled chunks again."""
+        return self._update(self._transport.json("POST", f"{self._path}/retry", idempotent=True))
+
+    def _update(self, answer: Any) -> Sweep:
+        self.info = wire.SweepInfo.model_validate(answer)
+        return self
+
+    def wait(self, *, progress: bool | ProgressCallback = False, timeout: float | None = None) -> Sweep:
+        """Wait until the sweep has finished.
+
+        Parameters
+        ----------
+        progress
+            True shows a bar with rate and time left; a function is called with each
+            :class:`graspdb.wire.SweepInfo`.
+        timeout
+            Seconds to wait at most; None waits for ever.
+
+        Raises
+        ------
+        SweepFailed
+            If chunks failed for good; ``sweep.retry()`` queues them again.
+        TimeoutError
+            If it has not finished in time; it goes on all the same.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        bar: AbstractContextManager[ProgressCallback]
+        if progress is True:
+            bar = _Bar(self)
+        else:
+            bar = nullcontext(progress if callable(progress) else lambda _: None)
+        poll = _FIRST_POLL_S
+        with bar as report:
+            while True:
+                self.refresh()
+                report(self.info)
+                if self.finished:
+                    break
+                if deadline is not None and time.monotonic() + poll > deadline:
+                    raise TimeoutError(
+                        f"sweep {self.id} is still {self.state} after {timeout:g} s"
+                        f" ({self.info.poses_done} of {self.info.poses} poses done); it goes on"
+                    )
+                time.sleep(poll)
+                poll = min(poll * 1.5, _LAST_POLL_S)
+        if self.info.state == "failed":
+            first = self.info.failed_chunks[0].error if self.info.failed_chunks else "no reason given"
+            raise SweepFailed(
+                f"sweep {self.id}: {self.info.chunks_failed} of {self.info.chunks} chunks failed; the first: "
+                f"{first}. `retry` queues them again.",
+                failed_chunks=list(self.info.failed_chunks),
+            )
+        return self
+
+    def hint(self) -> str | None:
+        """Why nothing happens, if that is for want of a worker."""
+        if self.info.state != "queued":
+            return None
+        answer = self._transport.json("GET", "/workers")
+        items = answer["items"] if isinstance(answer, dict) else answer
+        if items:
+            return None
+        return f"no worker has come yet: graspdb-simworker run --url {self._transport.url}"
+
+    def outcomes(self) -> OutcomeArrays:
+        """Every pose of the finished chunks with its outcome, as arrays."""
+        cursor: str | None = None
+        pages: list[wire.SweepOutcomes] = []
+        while True:
+            answer = self._transport.json("GET", f"{self._path}/outcomes", params={"cursor": cursor})
+            page = wire.SweepOutcomes.model_validate(answer)
+            pages.append(page)
+            cursor = page.next
+            if cursor is None:
+                break
+        return OutcomeArrays(
+            sweep=self.id,
+            pose_index=np.concatenate([np.array(p.pose_index, dtype=np.int64) for p in pages]),
+            position=np.concatenate([np.array(p.position, dtype=np.float64).reshape(-1, 3) for p in pages]),
+            quaternion_xyzw=np.concatenate(
+                [np.array(p.quaternion_xyzw, dtype=np.float64).reshape(-1, 4) for p in pages]
+            ),
+            outcome=np.concatenate([np.array(p.outcome, dtype=np.str_) for p in pages]),
+        )
+
+    def summary(self) -> dict[str, str]:
+        """What a person wants to know of it, in words."""
+        info = self.info
+        rows = {
+            "sweep": info.id,
+            "object": info.object,
+            "plan": f"{info.plan}, {info.protocol}, {info.fidelity}, {info.purpose}",
+            "gripper": info.gripper,
+            "state": info.state,
+            "poses": f"{info.poses_done:,} of {info.poses:,}",
+            "chunks": f"{info.chunks_done:,} of {info.chunks:,}"
+            + (f", {info.chunks_failed:,} failed" if info.chunks_failed else ""),
+            "outcomes": ", ".join(f"{n:,} {name}" for name, n in info.outcomes.items()) or "none yet",
+        }
+        if info.rate_poses_s is not None and not self.finished:
+            rows["rate"] = f"{info.rate_poses_s:,.0f} poses/s"
+        if info.time_left_s is not None and not self.finished:
+            rows["time left"] = duration(info.time_left_s)
+        for chunk in info.failed_chunks[:3]:
+            rows[f"chunk {chunk.chunk} failed"] = chunk.error.strip().splitlines()[-1] if chunk.error else ""
+        return rows
+
+    def __repr__(self) -> str:
+        info = self.info
+        return (
+            f"Sweep({info.id!r}, object={info.object!r}, state={info.state!r}, "
+            f"{info.poses_done}/{info.poses} poses)"
+        )
+
+    def _repr_html_(self) -> str:
+        return table_html("Sweep", self.summary())
+
+
+class Sweeps:
+    """``db.sweeps``: every object's sweeps."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def get(self, sweep: str) -> Sweep:
+        """The sweep with this identifier."""
+        answer = self._transport.json("GET", f"/sweeps/{segment(sweep)}")
+        return Sweep(self._transport, wire.SweepInfo.model_validate(answer))
+
+    def list(self, *, object: str | None = None, state: str | None = None) -> Iterator[Sweep]:
+        """The sweeps, of one object and in one state if said."""
+        for info in Listing(self._transport, "/sweeps", wire.SweepInfo):
+            if object in (None, info.object) and state in (None, info.state):
+                yield Sweep(self._transport, info)
+
+
+def create_sweep(
+    transport: Transport,
+    object_id: str,
+    *,
+    grid: Mapping[str, Any] | None = None,
+    poses: ArrayLike | Any | None = None,
+    sample: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Sweep:
+    """Queue a sweep: POST /objects/{object_id}/sweeps; see :meth:`graspdb.objects.GraspObject.sweep`."""
+    columns = None
+    if poses is not None:
+        position, quaternion = as_poses(poses)
+        columns = {"position": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
+    request = checked(wire.SweepCreate, {"grid": grid, "poses": columns, "sample": sample, **options})
+    answer = transport.json("POST", f"/objects/{segment(object_id)}/sweeps", body=request, idempotent=True)
+    return Sweep(transport, wire.SweepInfo.model_validate(answer))
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: ``45 s``, ``3 min 20 s``, ``2 h 05 min``."""
+    whole = round(seconds)
+    if whole < 90:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+class _Bar(AbstractContextManager[ProgressCallback]):
+    """A progress bar that follows a sweep, on stderr so that stdout stays clean for data."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        self._sweep = sweep
+        self._silent_since = time.monotonic()
+        self._hint: str | None = None
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+            console=Console(stderr=True),
+        )
+
+    def __enter__(self) -> ProgressCallback:
+        info = self._sweep.info
+        self._task = self._progress.add_task(
+            f"sweep {info.object}", total=info.poses, completed=info.poses_done, rate="", left=""
+        )
+        self._progress.start()
+        return self._show
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def _show(self, info: wire.SweepInfo) -> None:
+        waiting = info.state == "queued" and time.monotonic() - self._silent_since > _WORKER_SILENT_S
+        if waiting:
+            self._silent_since = time.monotonic()
+            self._hint = self._sweep.hint()
+        if info.state != "queued":
+            self._hint = None
+        rate = "" if info.rate_poses_s is None else f"{info.rate_poses_s:,.0f} poses/s"
+        left = ""
+        if self._hint:
+            left = self._hint
+        elif info.state in FINISHED or info.state == "queued":
+            left = info.state
+        elif info.time_left_s is not None:
+            left = f"{duration(info.time_left_s)} left"
+        self._progress.update(
+            self._task, total=info.poses, completed=info.poses_done, rate=rate, left=left, refresh=True
+        )
