@@ -1,0 +1,62 @@
+# Two commands from nothing: `make demo` and `make test`. Both install what they need into .venv.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PACKAGES := graspdb_density graspdb_geometry graspdb_service graspdb_simworker graspdb
+# How many processes run tests; the suite is made for two cores.
+JOBS ?= 2
+KEEP ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-core test-long check format bench openapi requirements clean
+
+help:  ## What can be made
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
+
+install: $(VENV)/installed  ## Install everything, pinned and hashed, into .venv
+
+$(VENV)/installed: requirements.txt pyproject.toml
+	@PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/install
+	@touch $@
+
+demo: install  ## Real physics on the mug: from nothing to a best grasp (KEEP=1 leaves the service running)
+	$(BIN)/graspdb demo $(if $(KEEP),--keep)
+
+test: check  ## Every check and every test, on SQLite and on a real PostgreSQL
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long"
+
+test-core: install  ## The tests without a browser
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long and not browser"
+
+test-long: install  ## Also what takes many minutes
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+check: install  ## Format, lint, types, import rules
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy $(addprefix -p ,$(PACKAGES))
+	$(BIN)/lint-imports
+
+format: install  ## Mend what the formatter and the linter can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: install  ## Measure speed: a table with medians and ratios taken in one run
+	$(BIN)/python tests/benchmarks
+
+openapi: install  ## Write docs/openapi.json anew
+	$(BIN)/graspdb-server openapi > docs/openapi.json
+
+PIP_COMPILE = $(BIN)/python -m piptools compile --quiet --generate-hashes --allow-unsafe --strip-extras \
+  --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
+
+requirements:  ## Pin anew what pyproject.toml allows: for development, and for the two images
+	$(PIP_COMPILE) --upgrade --all-extras --output-file requirements.txt pyproject.toml
+	$(PIP_COMPILE) -c requirements.txt --extra service --extra postgres --build-deps-for wheel \
+	  --output-file service/requirements.txt pyproject.toml
+	$(PIP_COMPILE) -c requirements.txt --extra sim --build-deps-for wheel \
+	  --output-file simworker/requirements.txt pyproject.toml
+
+clean:  ## Remove the environment and what tools left behind
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo dist
