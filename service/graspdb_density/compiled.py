@@ -1,0 +1,432 @@
+"""Compiled loops over kernels: the hot path of every density.
+
+Layout. Kernels are float32 structures of arrays, rows of ``data`` (8, N): x, y, z, then the quaternion's x,
+y, z, w, then the weight. Positions are centred and divided by ``sigma sqrt(2)``, so a squared distance is the
+exponent itself. Kernels are sorted by grid cell with z fastest, so that what a query reaches in one column of
+cells is one contiguous run.
+
+``table`` (S, COLUMNS) describes the segments: kernels are kept in a few independently sorted ranges, one for
+rows with the jaw's symmetry and one for rows without, each followed by a short tail of what came later.
+
+The exponential is the Cephes expf scheme: range reduction by 1/ln 2, a fifth-degree polynomial, the power of
+two by its bit pattern. LLVM turns the whole loop into vector code only with unsigned indices (signed ones
+wrap around in Python) and without slices, whose reference counts would cost more than a short run;
+``tests/benchmarks`` notice a loss.
+
+Accumulation is float32 within a block of at most ``BLOCK`` kernels and float64 across.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba import types
+from numba.extending import intrinsic
+
+from .compiler import fast, inlined
+
+F32 = np.float32
+BLOCK = 2048
+
+#: Columns of the segment table.
+OFFSET, COUNT, STARTS, NX, NY, NZ, OX, OY, OZ, EDGE, EDGE_Z, TWIN, LOW, HIGH = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+    10,
+    11,
+    12,
+    15,
+)
+COLUMNS = 18
+#: Most columns of cells a query may reach; `cells.build` keeps edges wide enough for it.
+MAX_RUNS = 8192
+
+_LOG2E = F32(1.44269504088896341)
+_LN2_HIGH = F32(0.693359375)
+_LN2_LOW = F32(-2.12194440e-4)
+_C0, _C1, _C2 = F32(1.9875691500e-4), F32(1.3981999507e-3), F32(8.3334519073e-3)
+_C3, _C4, _C5 = F32(4.1665795894e-2), F32(1.6666665459e-1), F32(5.0000001201e-1)
+_ONE, _HALF, _ZERO = F32(1.0), F32(0.5), F32(0.0)
+_FLOOR = F32(-87.0)
+_BIAS, _MANTISSA = F32(127.0), F32(8388608.0)
+
+
+@intrinsic
+def _float_of_bits(typing_context: Any, bits: Any) -> Any:
+    """Reinterpret an int32 as a float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+@inlined
+def _exp(x: Any) -> Any:
+    """e^x in float32, relative error below 2e-7 for -87 <= x <= 80; smaller arguments give e^-87."""
+    x = max(x, _FLOOR)
+    k = np.floor(x * _LOG2E + _HALF)
+    r = x - k * _LN2_HIGH
+    r = r - k * _LN2_LOW
+    y = _C0 * r + _C1
+    y = y * r + _C2
+    y = y * r + _C3
+    y = y * r + _C4
+    y = y * r + _C5
+    y = y * r * r + r + _ONE
+    return y * _float_of_bits(np.int32((k + _BIAS) * _MANTISSA))  # type: ignore[call-arg]
+
+
+@fast
+def _run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # type: ignore[no-untyped-def]
+    """Sum of kernels whose antipode's and farther twin's share is negligible; (qx..qw) is kappa times the
+    quaternion.
+    """
+    total = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        near = max(abs(a), abs(b))
+        total += data[7, i] * _exp(near - kappa - (dx * dx + dy * dy + dz * dz))
+    return total
+
+
+@fast
+def _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # type: ignore[no-untyped-def]
+    """Sum of kernels with every term: both twins, each with its antipode."""
+    total = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        base = -kappa - (dx * dx + dy * dy + dz * dz)
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        own = _exp(base + a) + _exp(base - a)
+        other = _exp(base + b) + _exp(base - b)
+        total += data[7, i] * (own + twin * other)
+    return total
+
+
+@fast
+def _moments_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, sums):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` (9,): k, k (p_i - p), the signed pull k mu_i of the quaternion, and k r^2, scaled
+    units.
+
+    ``wide`` is 1 to sum both twins and antipodes, 0 to take the nearest only.
+    """
+    s = _ZERO
+    sx, sy, sz = _ZERO, _ZERO, _ZERO
+    m0, m1, m2, m3 = _ZERO, _ZERO, _ZERO, _ZERO
+    rr = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        r2 = dx * dx + dy * dy + dz * dz
+        u0, u1, u2, u3 = data[3, i], data[4, i], data[5, i], data[6, i]
+        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
+        b = (u0 * qy - u1 * qx + u2 * qw - u3 * qz) * twin
+        base = -kappa - r2
+        w = data[7, i]
+        large, small = max(abs(a), abs(b)), min(abs(a), abs(b))
+        k1 = w * _exp(base + large)
+        k2 = w * wide * twin * _exp(base + small)
+        k3 = w * wide * _exp(base - large)
+        k4 = w * wide * twin * _exp(base - small)
+        own_near = abs(a) >= abs(b)
+        ga = (k1 - k3) if own_near else (k2 - k4)
+        gb = (k2 - k4) if own_near else (k1 - k3)
+        ga = ga if a >= _ZERO else -ga
+        gb = gb if b >= _ZERO else -gb
+        k = k1 + k2 + k3 + k4
+        s += k
+        sx += k * dx
+        sy += k * dy
+        sz += k * dz
+        # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z), as b pairs it with q.
+        m0 += ga * u0 - gb * u1
+        m1 += ga * u1 + gb * u0
+        m2 += ga * u2 - gb * u3
+        m3 += ga * u3 + gb * u2
+        rr += k * r2
+    sums[0] += s
+    sums[1] += sx
+    sums[2] += sy
+    sums[3] += sz
+    sums[4] += m0
+    sums[5] += m1
+    sums[6] += m2
+    sums[7] += m3
+    sums[8] += rr
+
+
+@fast
+def _runs(start, table, s, px, py, pz, radius, runs):  # type: ignore[no-untyped-def]
+    """Ranges of kernels in the cells of segment ``s`` that a ball reaches, into ``runs`` (MAX_RUNS, 2); their
+    number.
+
+    Cells at the border of the grid are unbounded outwards: they hold the outliers that the grid does not
+    span.
+    """
+    row = table[s]
+    for axis in range(3):
+        p = px if axis == 0 else (py if axis == 1 else pz)
+        if p < row[LOW + axis] - radius or p > row[HIGH + axis] + radius:
+            return 0
+    nx, ny, nz = int(row[NX]), int(row[NY]), int(row[NZ])
+    edge, edge_z = row[EDGE], row[EDGE_Z]
+    base, offset = int(row[STARTS]), int(row[OFFSET])
+    x, y, z = px - row[OX], py - row[OY], pz - row[OZ]
+    x0 = min(max(math.floor((x - radius) / edge), 0), nx - 1)
+    x1 = min(max(math.floor((x + radius) / edge), 0), nx - 1)
+    y0 = min(max(math.floor((y - radius) / edge), 0), ny - 1)
+    y1 = min(max(math.floor((y + radius) / edge), 0), ny - 1)
+    count = 0
+    for ix in range(x0, x1 + 1):
+        gap_x = 0.0
+        if ix > 0 and x < ix * edge:
+            gap_x = ix * edge - x
+        elif ix < nx - 1 and x > (ix + 1) * edge:
+            gap_x = x - (ix + 1) * edge
+        for iy in range(y0, y1 + 1):
+            gap_y = 0.0
+            if iy > 0 and y < iy * edge:
+                gap_y = iy * edge - y
+            elif iy < ny - 1 and y > (iy + 1) * edge:
+                gap_y = y - (iy + 1) * edge
+            left = radius * radius - gap_x * gap_x - gap_y * gap_y
+            if left < 0.0:
+                continue
+            reach = math.sqrt(left)
+            z0 = min(max(math.floor((z - reach) / edge_z), 0), nz - 1)
+            z1 = min(max(math.floor((z + reach) / edge_z), 0), nz - 1)
+            column = base + (ix * ny + iy) * nz
+            begin, end = start[column + z0], start[column + z1 + 1]
+            if end > begin and count < runs.shape[0]:
+                runs[count, 0] = offset + begin
+                runs[count, 1] = offset + end
+                count += 1
+    return count
+
+
+@fast
+def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):  # type: ignore[no-untyped-def]
+    """Sum of weights times kernels (1 at a kernel's centre) within ``radius``, position in scaled units."""
+    fx, fy, fz = F32(px), F32(py), F32(pz)
+    k = F32(kappa)
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    total = 0.0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, TWIN])
+        for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+            begin, end = runs[r, 0], runs[r, 1]
+            while begin < end:
+                stop = min(begin + BLOCK, end)
+                if wide:
+                    total += _run_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
+                else:
+                    total += _run_narrow(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
+                begin = stop
+    return total
+
+
+@fast
+def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums):  # type: ignore[no-untyped-def]
+    """Fill ``sums`` (9,) with the moments of `_moments_run` over the kernels within ``radius``."""
+    fx, fy, fz = F32(px), F32(py), F32(pz)
+    k = F32(kappa)
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    every = F32(1.0) if wide else F32(0.0)
+    sums[:] = 0.0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, TWIN])
+        for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+            begin, end = runs[r, 0], runs[r, 1]
+            while begin < end:
+                stop = min(begin + BLOCK, end)
+                _moments_run(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, every, sums)
+                begin = stop
+
+
+@fast
+def _top_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # type: ignore[no-untyped-def]
+    """Largest exponent of a run, float64."""
+    top = -1e300
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = np.float64(data[0, i]) - px
+        dy = np.float64(data[1, i]) - py
+        dz = np.float64(data[2, i]) - pz
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        top = max(top, max(abs(a), abs(b)) - kappa - (dx * dx + dy * dy + dz * dz))
+    return top
+
+
+@fast
+def _sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):  # type: ignore[no-untyped-def]
+    """Sum of every term of a run relative to e^top, exponents in float64."""
+    total = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = np.float64(data[0, i]) - px
+        dy = np.float64(data[1, i]) - py
+        dz = np.float64(data[2, i]) - pz
+        base = -kappa - (dx * dx + dy * dy + dz * dz) - top
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        own = _exp(F32(base + a)) + _exp(F32(base - a))
+        other = _exp(F32(base + b)) + _exp(F32(base - b))
+        total += data[7, i] * (own + F32(twin) * other)
+    return total
+
+
+@fast
+def exact_log_sum(data, blocks, boxes, px, py, pz, q, kappa, margin):  # type: ignore[no-untyped-def]
+    """Log of the sum over all kernels, without a cut-off; right however far the pose is from data.
+
+    Blocks of kernels whose bounding box proves every exponent to lie ``margin`` nats below the largest one
+    found are left out: with ``margin = 16 + log(total weight / least weight)`` the sum is short of less than
+    1.2e-7 of itself.
+
+    Parameters
+    ----------
+    blocks : (B, 3) int64, first and last + 1 of a block, 1 for rows with a twin
+    boxes : (B, 6) float32, lowest and highest corner of the positions, scaled units
+    """
+    q0, q1, q2, q3 = q[0] * kappa, q[1] * kappa, q[2] * kappa, q[3] * kappa
+    count = blocks.shape[0]
+    bound = np.empty(count)
+    first = 0
+    for j in range(count):
+        gx = max(max(boxes[j, 0] - px, px - boxes[j, 3]), 0.0)
+        gy = max(max(boxes[j, 1] - py, py - boxes[j, 4]), 0.0)
+        gz = max(max(boxes[j, 2] - pz, pz - boxes[j, 5]), 0.0)
+        bound[j] = -(gx * gx + gy * gy + gz * gz)
+        if bound[j] > bound[first]:
+            first = j
+    twin = float(blocks[first, 2])
+    top = _top_of_run(data, blocks[first, 0], blocks[first, 1], px, py, pz, q0, q1, q2, q3, kappa, twin)
+    total = 0.0
+    for j in range(count):
+        if bound[j] < top - margin:
+            continue
+        twin = float(blocks[j, 2])
+        here = _top_of_run(data, blocks[j, 0], blocks[j, 1], px, py, pz, q0, q1, q2, q3, kappa, twin)
+        if here > top:
+            total *= math.exp(top - here)
+            top = here
+        elif here < top - margin:
+            continue
+        total += _sum_of_run(data, blocks[j, 0], blocks[j, 1], px, py, pz, q0, q1, q2, q3, kappa, twin, top)
+    return top + math.log(total)
+
+
+@fast
+def log_sums(  # type: ignore[no-untyped-def]
+    data,
+    start,
+    table,
+    blocks,
+    boxes,
+    centre,
+    scale,
+    positions,
+    quaternions,
+    kappa,
+    radius,
+    wide,
+    floor,
+    margin,
+    out,
+):
+    """Log of the weighted kernel sum at every pose into ``out`` (M,).
+
+    Sums below ``floor`` are taken again without a cut-off: there what was cut could be all there is. A
+    ``radius`` that is not positive asks for that everywhere.
+    """
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        total = 0.0
+        if radius > 0.0:
+            total = _sum_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs)
+        if total > floor:
+            out[j] = math.log(total)
+        else:
+            out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
+
+
+@fast
+def sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):  # type: ignore[no-untyped-def]
+    """The weighted kernel sum within ``radius`` at every pose, zero where nothing is in reach."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        out[j] = _sum_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs)
+
+
+@fast
+def moments(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):  # type: ignore[no-untyped-def]
+    """The moments at every pose into ``out`` (M, 9)."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        moments_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs, out[j])
+
+
+@fast
+def _scatter_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, weight, out):  # type: ignore[no-untyped-def]
+    """Add one kernel's value at every kernel centre of a run."""
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        base = -kappa - (dx * dx + dy * dy + dz * dz)
+        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
+        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        large, small = max(a, b), min(a, b)
+        rest = _exp(base - large) + twin * (_exp(base + small) + _exp(base - small))
+        out[i] += weight * (_exp(base + large) + wide * rest)
+
+
+@fast
+def scatter_sums(  # type: ignore[no-untyped-def]
+    data, start, table, centre, scale, positions, quaternions, weights, twins, kappa, radius, wide, out
+):
+    """Add the kernels of the given rows to the sums ``out`` (N,) at every sorted kernel's centre."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    every = F32(1.0) if wide else F32(0.0)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        twin = F32(1.0) if twins[j] else F32(0.0)
+        weight = F32(weights[j] * (0.5 if twins[j] else 1.0))
+        for s in range(table.shape[0]):
+            for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+                _scatter_run(
+                    data, runs[r, 0], runs[r, 1], F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin,
+                    every, weight, out,
+                )  # fmt: skip

@@ -1,0 +1,416 @@
+"""Kernel density estimates on R^3 x SO(3), evaluated fast.
+
+A density is ``d(x) = sum_i w_i (K(x; x_i) + K(x; x_i M)) / 2`` with weights that sum to 1, M the jaw's turn
+(right multiplication by half a turn about tool z); a row that is not symmetric has no twin. Unit: 1/(m^3
+rad^3), see `kernels`.
+
+Error. Against the float64 sum over every row (`reference`), see `GraspDensity.log_density`.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import compiled, reference, se3
+from .cells import Cells
+from .kernels import IsotropicKernel
+from .se3 import Floats
+from .threads import for_blocks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .maximum import Maximum
+    from .region import Region
+
+__all__ = ["CUTOFF", "WIDE_ROTATION", "GraspDensity"]
+
+#: Default cut-off in standard deviations of position.
+CUTOFF = 4.0
+#: From this rotation width on, a pose's farther twin and antipode are summed; below, the nearest stands
+#: for all.
+WIDE_ROTATION = math.radians(20.5)
+_CUTOFF_LIMITS = (2.0, 10.0)
+_QUERY_BLOCK = 1024
+
+
+class GraspDensity:
+    """An immutable density. Use `build` and `extend`; every method is safe to call from several threads."""
+
+    def __init__(
+        self,
+        kernel: IsotropicKernel,
+        positions: Floats,
+        quaternions: Floats,
+        weights: Floats,
+        symmetric: NDArray[np.bool_],
+        cells: Cells,
+        unit: float,
+        centre_sums: Floats | None = None,
+    ) -> None:
+        self._kernel = kernel
+        self._positions = positions
+        self._quaternions = quaternions
+        self._weights = weights
+        self._symmetric = symmetric
+        self._cells = cells
+        self._unit = unit
+        self._total = float(weights.sum())
+        self._lock = threading.Lock()
+        self._centre_sums = centre_sums
+        self._global: Maximum | None = None
+
+    # -- building
+    # ---------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def build(
+        cls,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        kernel: IsotropicKernel,
+        weights: ArrayLike | None = None,
+        symmetric: ArrayLike | bool = True,
+    ) -> GraspDensity:
+        """Build from grasps in the object frame.
+
+        Parameters
+        ----------
+        positions : (N, 3) metres, N at least 1
+        quaternions_xyzw : (N, 4) unit within 1e-3
+        kernel
+            Widths.
+        weights : (N,) or None
+            Positive, in any unit; normalised to sum to 1. None: equal.
+        symmetric : bool or (N,)
+            Whether the row's jaw is mirror-symmetric.
+
+        Raises
+        ------
+        ValueError
+            For wrong shapes, values that are not finite, weights that are not positive, or no row.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        if not len(p):
+            raise ValueError("a density needs at least one grasp")
+        w, flags = _row_values(weights, symmetric, len(p))
+        unit = float(w.mean())
+        cells = Cells.build(p, q, w / unit, flags, kernel.sigma_position_m)
+        return cls(kernel, p, q, w, flags, cells, unit)
+
+    def extend(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        weights: ArrayLike | None = None,
+        symmetric: ArrayLike | bool = True,
+    ) -> GraspDensity:
+        """A density with further rows, weights in the unit of the first ones (None: their mean).
+
+        Equal to building from all rows within 1e-5 of the density. The cost is that of the rows added and a
+        copy.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        if not len(p):
+            return self
+        w, flags = _row_values(weights, symmetric, len(p), fill=self._total / self.size)
+        cells = self._cells.extend(p, q, w / self._unit, flags)
+        return GraspDensity(
+            self._kernel,
+            np.concatenate([self._positions, p]),
+            np.concatenate([self._quaternions, q]),
+            np.concatenate([self._weights, w]),
+            np.concatenate([self._symmetric, flags]),
+            cells,
+            self._unit,
+            self._centre_sums,
+        )
+
+    # -- what it holds
+    # ----------------------------------------------------------------------------------------------
+
+    @property
+    def kernel(self) -> IsotropicKernel:
+        return self._kernel
+
+    @property
+    def size(self) -> int:
+        """Rows; the twins of symmetric ones are not counted."""
+        return len(self._positions)
+
+    @property
+    def positions(self) -> Floats:
+        """(N, 3) metres, read-only use."""
+        return self._positions
+
+    @property
+    def quaternions_xyzw(self) -> Floats:
+        """(N, 4), read-only use."""
+        return self._quaternions
+
+    @property
+    def weights(self) -> Floats:
+        """(N,) summing to 1."""
+        return np.asarray(self._weights / self._total, dtype=np.float64)
+
+    @property
+    def symmetric(self) -> NDArray[np.bool_]:
+        """(N,) whether a row has a twin."""
+        return self._symmetric
+
+    @property
+    def effective_sample_size(self) -> float:
+        """(sum w)^2 / sum w^2."""
+        return float(self._total**2 / np.dot(self._weights, self._weights))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of every array held, caches included."""
+        own = (self._positions, self._quaternions, self._weights, self._symmetric)
+        cached = self._centre_sums
+        return sum(a.nbytes for a in own) + self._cells.nbytes + (0 if cached is None else cached.nbytes)
+
+    @property
+    def cells(self) -> Cells:
+        """The sorted kernels, for the compiled loops of this package."""
+        return self._cells
+
+    @property
+    def wide(self) -> bool:
+        """Whether every twin and antipode is summed."""
+        return self._kernel.sigma_rotation > WIDE_ROTATION
+
+    @property
+    def log_unit(self) -> float:
+        """What turns the log of a compiled kernel sum into a log density."""
+        return self._kernel.log_peak - math.log(self._total / self._unit)
+
+    # -- evaluation
+    # -------------------------------------------------------------------------------------------------
+
+    def log_density(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        cutoff: float | None = CUTOFF,
+        threads: int = 1,
+    ) -> Floats:
+        """Log density at poses, nats of 1/(m^3 rad^3), finite and right however far from data.
+
+        Parameters
+        ----------
+        positions, quaternions_xyzw : (M, 3), (M, 4)
+        cutoff
+            Kernels further than this many standard deviations of position are left out, at least; None leaves
+            none out. Where the rest is too little to trust, the pose is evaluated again without a cut-off.
+        threads
+            At most this many, of the package's own pool.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        radius = 0.0 if cutoff is None else scaled_radius(cutoff)
+        cells = self._cells
+        # The least weight there can be bounds what skipping far blocks may lose.
+        margin = 16.0 + math.log(self._total / float(self._weights.min()))
+        floor = self._trusted_sum(cutoff)
+        out = np.empty(len(p))
+
+        def work(begin: int, end: int) -> None:
+            compiled.log_sums(
+                cells.data, cells.start, cells.table, cells.blocks, cells.boxes, cells.centre, cells.scale,
+                p[begin:end], q[begin:end], self._kernel.kappa, radius, self.wide, floor, margin,
+                out[begin:end],
+            )  # fmt: skip
+
+        for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
+        out += self.log_unit
+        return out
+
+    def density(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        cutoff: float | None = CUTOFF,
+        threads: int = 1,
+    ) -> Floats:
+        """Density at poses, 1/(m^3 rad^3); underflows to 0 only below 1e-300."""
+        return np.exp(self.log_density(positions, quaternions_xyzw, cutoff=cutoff, threads=threads))
+
+    def _trusted_sum(self, cutoff: float | None) -> float:
+        """Kernel sums below this are evaluated again without a cut-off."""
+        return 1e-6 if cutoff is None else math.exp(-0.5 * cutoff * cutoff)
+
+    def gradient(
+        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, cutoff: float = 6.0
+    ) -> tuple[Floats, Floats]:
+        """Gradient of the log density.
+
+        Returns
+        -------
+        position_gradient : (M, 3) 1/m
+        quaternion_gradient : (M, 4)
+            Tangent to the unit sphere at each quaternion. The rate along a rotation vector r in the tool
+            frame (``q <- q exp(r)``) is its product with ``multiply(q, (r, 0)) / 2``.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        moments = self.moments(p, q, cutoff=cutoff)
+        total = moments[:, :1]
+        kappa, scale = self._kernel.kappa, self._cells.scale
+        near = total[:, 0] > self._trusted_sum(cutoff)
+        safe = np.where(near[:, None], total, 1.0)
+        along = moments[:, 1:4] / safe * (2.0 * scale)
+        pull = moments[:, 4:8] / safe * kappa
+        around = pull - np.sum(pull * q, axis=1, keepdims=True) * q
+        for i in np.flatnonzero(~near):
+            along[i], around[i] = reference.gradient(
+                self._kernel, self._positions, self._quaternions, p[i], q[i],
+                weights=self._weights, symmetric=self._symmetric,
+            )  # fmt: skip
+        return along, around
+
+    def moments(self, positions: Floats, quaternions: Floats, *, cutoff: float) -> Floats:
+        """Kernel sums, displacements and pulls (M, 9) as `compiled.moments` lays them out; poses already
+        checked.
+        """
+        cells = self._cells
+        out = np.empty((len(positions), 9))
+        compiled.moments(
+            cells.data, cells.start, cells.table, cells.centre, cells.scale,
+            positions, quaternions, self._kernel.kappa, scaled_radius(cutoff), self.wide, out,
+        )  # fmt: skip
+        return out
+
+    # -- sampling
+    # ---------------------------------------------------------------------------------------------------
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Draw grasps, both twins of symmetric rows alike.
+
+        Returns
+        -------
+        positions : (count, 3) metres
+        quaternions_xyzw : (count, 4)
+        """
+        if count < 0:
+            raise ValueError(f"cannot draw {count} samples")
+        edges = np.cumsum(self._weights)
+        row = np.minimum(np.searchsorted(edges, rng.random(count) * edges[-1], side="right"), self.size - 1)
+        centre = self._quaternions[row]
+        turned = self._symmetric[row] & (rng.random(count) < 0.5)
+        centre = np.where(turned[:, None], se3.jaw_twin(centre), centre)
+        translations, turns = self._kernel.sample_displacements(count, rng)
+        return self._positions[row] + translations, se3.multiply(centre, turns)
+
+    # -- maxima
+    # -----------------------------------------------------------------------------------------------------
+
+    def centre_sums(self, threads: int = 1) -> Floats:
+        """Kernel sum at every row (N,), cached; carried over by `extend` and completed with what is new."""
+        with self._lock:
+            known = self._centre_sums
+            if known is not None and len(known) == self.size:
+                return known
+            fresh = self._compute_centre_sums(known, threads)
+            self._centre_sums = fresh
+            return fresh
+
+    def _compute_centre_sums(self, known: Floats | None, threads: int) -> Floats:
+        cells = self._cells
+        # Three standard deviations rank centres well enough; the refinement that follows uses the full reach.
+        radius = scaled_radius(3.0)
+        kappa, wide = self._kernel.kappa, self.wide
+        carried = 0 if known is None or 8 * (self.size - len(known)) > self.size else len(known)
+        ordered = np.empty(self.size)
+        if known is not None and carried:
+            old = cells.rows < carried
+            ordered[old] = known[cells.rows[old]]
+            ordered[~old] = 0.0
+            new = np.arange(carried, self.size)
+            compiled.scatter_sums(
+                cells.data, cells.start, cells.table, cells.centre, cells.scale,
+                self._positions[new], self._quaternions[new],
+                self._weights[new] / self._unit, self._symmetric[new], kappa, radius, wide, ordered,
+            )  # fmt: skip
+            todo = np.flatnonzero(~old)
+        else:
+            todo = np.arange(self.size)
+        rows = cells.rows[todo]
+        positions, quaternions = self._positions[rows], self._quaternions[rows]
+        out = np.empty(len(rows))
+
+        def work(begin: int, end: int) -> None:
+            compiled.sums(
+                cells.data, cells.start, cells.table, cells.centre, cells.scale,
+                positions[begin:end], quaternions[begin:end], kappa, radius, wide, out[begin:end],
+            )  # fmt: skip
+
+        for_blocks(work, len(rows), block=_QUERY_BLOCK, threads=threads)
+        ordered[todo] = out
+        result = np.empty(self.size)
+        result[cells.rows] = ordered
+        return result
+
+    def maximum(
+        self,
+        region: Region | None = None,
+        *,
+        count: int = 1,
+        min_separation_m: float = 0.01,
+        min_separation: float = math.radians(20.0),
+        admissible: Callable[[Floats, Floats], NDArray[np.bool_]] | None = None,
+        threads: int = 1,
+    ) -> list[Maximum]:
+        """The best grasps inside a region, best first; see `maximum.search`."""
+        from .maximum import search
+
+        return search(
+            self,
+            region,
+            count=count,
+            min_separation_m=min_separation_m,
+            min_separation=min_separation,
+            admissible=admissible,
+            threads=threads,
+        )
+
+    def global_maximum(self, threads: int = 1) -> Maximum:
+        """The highest point of the whole density, computed once; `relative` values divide by it."""
+        known = self._global
+        if known is None:
+            known = self.maximum(None, count=1, threads=threads)[0]
+            self._global = known
+        return known
+
+
+def scaled_radius(cutoff: float) -> float:
+    """A cut-off in standard deviations as a length of the compiled loops.
+
+    Raises
+    ------
+    ValueError
+        Outside 2 to 10.
+    """
+    if not (math.isfinite(cutoff) and _CUTOFF_LIMITS[0] <= cutoff <= _CUTOFF_LIMITS[1]):
+        raise ValueError(f"cutoff must be between 2 and 10 standard deviations or None, not {cutoff!r}")
+    return cutoff / math.sqrt(2.0)
+
+
+def _row_values(
+    weights: ArrayLike | None, symmetric: ArrayLike | bool, count: int, fill: float = 1.0
+) -> tuple[Floats, NDArray[np.bool_]]:
+    w = np.full(count, fill) if weights is None else np.array(weights, dtype=np.float64)
+    if w.shape != (count,):
+        raise ValueError(f"weights have shape ({count},), not {w.shape}")
+    if not (np.isfinite(w).all() and (w > 0.0).all()):
+        raise ValueError("weights must be positive and finite")
+    flags = np.asarray(symmetric, dtype=bool)
+    if flags.ndim and flags.shape != (count,):
+        raise ValueError(f"symmetric is one flag or has shape ({count},), not {flags.shape}")
+    return w, np.array(np.broadcast_to(flags, (count,)))
