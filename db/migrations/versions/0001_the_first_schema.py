@@ -249,8 +249,8 @@ def upgrade() -> None:
         ),
         sa.Column("seq", sa.BigInteger(), autoincrement=False, nullable=False),
         sa.Column("revision", sa.BigInteger(), nullable=False),
-        sa.Column("batch_id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
-        sa.Column("provenance_id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
+        sa.Column("batch_id", sa.BigInteger(), nullable=False),
+        sa.Column("provenance_id", sa.BigInteger(), nullable=False),
         sa.Column("outcome", sa.SmallInteger(), nullable=False),
         sa.Column("px", sa.Double(), nullable=False),
         sa.Column("py", sa.Double(), nullable=False),
@@ -266,12 +266,8 @@ def upgrade() -> None:
         sa.Column("measured_at", sa.DateTime(timezone=True), nullable=True),
         sa.Column("pose_covariance", sa.JSON(none_as_null=True), nullable=True),
         sa.Column("metadata", sa.JSON(none_as_null=True), nullable=True),
-        sa.ForeignKeyConstraint(["batch_id"], ["batches.id"], name=op.f("fk_trials_batch_id_batches")),
         sa.ForeignKeyConstraint(
             ["object_id"], ["objects.id"], name=op.f("fk_trials_object_id_objects"), ondelete="CASCADE"
-        ),
-        sa.ForeignKeyConstraint(
-            ["provenance_id"], ["provenances.id"], name=op.f("fk_trials_provenance_id_provenances")
         ),
         sa.PrimaryKeyConstraint("object_id", "seq", name=op.f("pk_trials")),
         sqlite_with_rowid=False,

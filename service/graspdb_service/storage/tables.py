@@ -180,8 +180,10 @@ trials = Table(
     Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), primary_key=True, autoincrement=False),
     Column("seq", BigInteger, primary_key=True, autoincrement=False),
     Column("revision", BigInteger, nullable=False),
-    Column("batch_id", ForeignKey("batches.id"), nullable=False),
-    Column("provenance_id", ForeignKey("provenances.id"), nullable=False),
+    # No foreign keys: deleting a batch would search every trial for each of them, for want of an index that
+    # no query needs. A batch's trials lie in its seq range, and leave with it under the object's lock.
+    Column("batch_id", BigInteger, nullable=False),
+    Column("provenance_id", BigInteger, nullable=False),
     Column("outcome", SmallInteger, nullable=False),
     Column("px", Double, nullable=False),
     Column("py", Double, nullable=False),

@@ -1,0 +1,174 @@
+"""Batches: the trials of one POST, or everything one sweep wrote."""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Row, Select, delete, func, insert, select, update
+
+from graspdb_service.storage import trials as trial_rows
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.tables import batches, idempotency_keys, packed_outcomes, sweeps, trials
+
+
+@dataclass(frozen=True)
+class BatchRow:
+    """A batch as stored; ``key`` is what users see. A sweep's names its provenance and purpose."""
+
+    id: int
+    key: str
+    object_id: int
+    sweep_id: str | None
+    revision: int
+    first_seq: int | None
+    last_seq: int | None
+    inserted: int
+    packed: int
+    metadata: dict[str, Any] | None
+    created_at: datetime
+    provenance_id: int | None
+    purpose: str | None
+
+
+def create(
+    tx: Tx,
+    object_id: int,
+    *,
+    revision: int,
+    sweep_id: str | None = None,
+    metadata: dict[str, Any] | None = None,
+) -> tuple[int, str]:
+    """An empty batch: its internal id and its key."""
+    key = str(uuid.uuid4())
+    statement = (
+        insert(batches)
+        .values(
+            key=key,
+            object_id=object_id,
+            sweep_id=sweep_id,
+            revision=revision,
+            inserted=0,
+            packed=0,
+            metadata=metadata,
+            created_at=datetime.now(UTC),
+        )
+        .returning(batches.c.id)
+    )
+    return int(tx.execute(statement).scalar_one()), key
+
+
+def grow(
+    tx: Tx,
+    batch_id: int,
+    *,
+    first_seq: int | None,
+    last_seq: int | None,
+    inserted: int,
+    packed: int,
+    revision: int | None = None,
+) -> None:
+    """Count rows and packed outcomes that were just written; the range is None where there are no rows."""
+    values: dict[str, Any] = {
+        "inserted": batches.c.inserted + inserted,
+        "packed": batches.c.packed + packed,
+    }
+    if first_seq is not None and last_seq is not None and inserted:
+        # Sequence numbers only rise, so a first one stays the first.
+        values["first_seq"] = func.coalesce(batches.c.first_seq, first_seq)
+        values["last_seq"] = last_seq
+    if revision is not None:
+        values["revision"] = revision
+    tx.execute(update(batches).where(batches.c.id == batch_id).values(values))
+
+
+def find(tx: Tx, object_id: int, key: str) -> BatchRow | None:
+    """The object's batch with this key."""
+    row = tx.execute(_query().where(batches.c.object_id == object_id, batches.c.key == key)).first()
+    return None if row is None else _batch(row)
+
+
+def of_sweep(tx: Tx, sweep_id: str) -> BatchRow | None:
+    """The batch a sweep writes; None once it was deleted."""
+    row = tx.execute(_query().where(batches.c.sweep_id == sweep_id)).first()
+    return None if row is None else _batch(row)
+
+
+def page(tx: Tx, object_id: int, *, after: int, limit: int) -> list[BatchRow]:
+    """Up to ``limit`` batches in the order of their making, from the one after the internal id ``after``."""
+    query = _query().where(batches.c.object_id == object_id, batches.c.id > after)
+    return [_batch(row) for row in tx.execute(query.order_by(batches.c.id).limit(limit))]
+
+
+def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
+    """Trial rows of a batch by (provenance, outcome code)."""
+    if batch.first_seq is None:
+        return {}
+    query = (
+        select(trials.c.provenance_id, trials.c.outcome, func.count())
+        .where(*_rows(batch))
+        .group_by(trials.c.provenance_id, trials.c.outcome)
+    )
+    return {(int(p), int(outcome)): int(n) for p, outcome, n in tx.execute(query)}
+
+
+def outcome_counts(tx: Tx, batch: BatchRow) -> dict[int, int]:
+    """Everything a batch holds by outcome code: rows, and the packed outcomes of its sweep."""
+    if batch.sweep_id is not None:
+        # A sweep's packed outcomes have every pose, those that became rows included.
+        return _packed_codes(tx, batch.sweep_id)
+    counts: dict[int, int] = {}
+    for (_, outcome), number in row_counts(tx, batch).items():
+        counts[outcome] = counts.get(outcome, 0) + number
+    return counts
+
+
+def remove(tx: Tx, batch: BatchRow) -> None:
+    """Delete a batch, its rows and packed outcomes, and take both out of the tallies.
+
+    Call it under the object's lock, with :func:`graspdb_service.storage.objects.advance` in the same
+    transaction where the batch was collected.
+    """
+    rows = row_counts(tx, batch)
+    if batch.sweep_id is not None:
+        if batch.purpose == "collect" and batch.provenance_id is not None:
+            packed = _packed_codes(tx, batch.sweep_id)
+            for (_, outcome), number in rows.items():
+                packed[outcome] = packed.get(outcome, 0) - number
+            trial_rows.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items() if n})
+        tx.execute(delete(packed_outcomes).where(packed_outcomes.c.sweep_id == batch.sweep_id))
+    if batch.first_seq is not None:
+        tx.execute(delete(trials).where(*_rows(batch)))
+    for (provenance_id, outcome), number in rows.items():
+        trial_rows.add_tally(tx, provenance_id, outcome, rows=-number)
+    tx.execute(update(idempotency_keys).where(idempotency_keys.c.batch_key == batch.key).values(revoked=True))
+    tx.execute(delete(batches).where(batches.c.id == batch.id))
+
+
+def _rows(batch: BatchRow) -> tuple[Any, ...]:
+    return (
+        trials.c.object_id == batch.object_id,
+        trials.c.seq.between(batch.first_seq, batch.last_seq),
+        trials.c.batch_id == batch.id,
+    )
+
+
+def _packed_codes(tx: Tx, sweep_id: str) -> dict[int, int]:
+    total = np.zeros(256, dtype=np.int64)
+    query = select(packed_outcomes.c.outcomes).where(packed_outcomes.c.sweep_id == sweep_id)
+    for (content,) in tx.execute(query):
+        total += np.bincount(np.frombuffer(content, dtype=np.uint8), minlength=256)
+    return {int(code): int(total[code]) for code in np.flatnonzero(total)}
+
+
+def _query() -> Select[Any]:
+    return select(batches, sweeps.c.provenance_id, sweeps.c.purpose).select_from(
+        batches.outerjoin(sweeps, sweeps.c.id == batches.c.sweep_id)
+    )
+
+
+def _batch(row: Row[Any]) -> BatchRow:
+    return BatchRow(**row._mapping)

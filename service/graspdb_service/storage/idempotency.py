@@ -1,0 +1,74 @@
+"""Idempotency keys: what was answered to a creating request, kept in the transaction that created."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import select, update
+
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.tables import idempotency_keys
+from graspdb_service.storage.upsert import insert
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """An earlier request under the same key, and its answer."""
+
+    request_sha256: str
+    status: int
+    location: str | None
+    answer: Any
+    revoked: bool
+
+
+def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | None:
+    """Take the key, or return the request that has it.
+
+    Of two transactions claiming the same key at once the second waits here until the first has ended:
+    PostgreSQL at the unique index, SQLite at BEGIN IMMEDIATE.
+    """
+    statement = (
+        insert(tx, idempotency_keys)
+        .values(
+            scope=scope,
+            key=key,
+            request_sha256=request_sha256,
+            status=0,
+            answer=None,
+            revoked=False,
+            created_at=datetime.now(UTC),
+        )
+        .on_conflict_do_nothing()
+        .returning(idempotency_keys.c.key)
+    )
+    if tx.execute(statement).first() is not None:
+        return None
+    query = select(
+        idempotency_keys.c.request_sha256,
+        idempotency_keys.c.status,
+        idempotency_keys.c.location,
+        idempotency_keys.c.answer,
+        idempotency_keys.c.revoked,
+    ).where(idempotency_keys.c.scope == scope, idempotency_keys.c.key == key)
+    return Remembered(**tx.execute(query).one()._mapping)
+
+
+def remember(
+    tx: Tx,
+    scope: str,
+    key: str,
+    *,
+    status: int,
+    location: str | None,
+    answer: Any,
+    batch_key: str | None,
+) -> None:
+    """Complete a claimed key with the answer; ``batch_key`` revokes it when that batch is deleted."""
+    tx.execute(
+        update(idempotency_keys)
+        .where(idempotency_keys.c.scope == scope, idempotency_keys.c.key == key)
+        .values(status=status, location=location, answer=answer, batch_key=batch_key)
+    )
