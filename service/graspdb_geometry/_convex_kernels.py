@@ -13,12 +13,20 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+#: Vertices (V, 3) and where each part's begin (parts + 1), planes (P, 4) as n, d with n.x <= d inside and
+#: where they begin, edges (E, 2) as vertex numbers within the part and where they begin, bounding spheres'
+#: centres (parts, 3) and radii (parts).
+Model = tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray, IntArray, FloatArray, FloatArray]
 
 _INF = np.inf
 
 
-@nb.njit(cache=True, inline="always")  # type: ignore[misc]
-def _clip_slab(a, b, low, high, t0, t1):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, inline="always")
+def _clip_slab(a: float, b: float, low: float, high: float, t0: float, t1: float) -> tuple[float, float]:
     """Clip the parameters of the segment a + t (b - a) to low <= . <= high on one axis."""
     d = b - a
     if d == 0.0:
@@ -32,8 +40,8 @@ def _clip_slab(a, b, low, high, t0, t1):  # type: ignore[no-untyped-def]
     return max(t0, u), min(t1, v)
 
 
-@nb.njit(cache=True, inline="always")  # type: ignore[misc]
-def _segment_in_box(va, vb, c, h):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, inline="always")
+def _segment_in_box(va: FloatArray, vb: FloatArray, c: FloatArray, h: FloatArray) -> tuple[float, float]:
     """Parameters of the piece of a segment inside the box with centre c and half extents h."""
     t0, t1 = _clip_slab(va[0], vb[0], c[0] - h[0], c[0] + h[0], 0.0, 1.0)
     if t0 <= t1:
@@ -43,8 +51,8 @@ def _segment_in_box(va, vb, c, h):  # type: ignore[no-untyped-def]
     return t0, t1
 
 
-@nb.njit(cache=True)  # type: ignore[misc]
-def _box_edge_meets_part(c, h, planes, count):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True)
+def _box_edge_meets_part(c: FloatArray, h: FloatArray, planes: FloatArray, count: int) -> bool:
     """Does one of the box's twelve edges meet the solid of the given half-spaces (tool frame)?"""
     for axis in range(3):
         j = (axis + 1) % 3
@@ -70,8 +78,11 @@ def _box_edge_meets_part(c, h, planes, count):  # type: ignore[no-untyped-def]
     return False
 
 
-@nb.njit(cache=True)  # type: ignore[misc]
-def _part_edge_meets_box(c, h, points, edges, first, last):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True)
+def _part_edge_meets_box(
+    c: FloatArray, h: FloatArray, points: FloatArray, edges: IntArray, first: int, last: int
+) -> bool:
+    """Does one of the part's edges first..last meet the solid box?"""
     for e in range(first, last):
         t0, t1 = _segment_in_box(points[edges[e, 0]], points[edges[e, 1]], c, h)
         if t0 <= t1:
@@ -79,8 +90,17 @@ def _part_edge_meets_box(c, h, points, edges, first, last):  # type: ignore[no-u
     return False
 
 
-@nb.njit(cache=True)  # type: ignore[misc]
-def _extent_in_column(c, h, points, edges, first, last, planes, count):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True)
+def _extent_in_column(
+    c: FloatArray,
+    h: FloatArray,
+    points: FloatArray,
+    edges: IntArray,
+    first: int,
+    last: int,
+    planes: FloatArray,
+    count: int,
+) -> tuple[float, float]:
     """Least and greatest y of the part's solid inside the column; (inf, -inf) if it misses the column."""
     low = _INF
     high = -_INF
@@ -115,8 +135,8 @@ def _extent_in_column(c, h, points, edges, first, last, planes, count):  # type:
     return low, high
 
 
-@nb.njit(cache=True, inline="always")  # type: ignore[misc]
-def _rotation(q, r):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, inline="always")
+def _rotation(q: FloatArray, r: FloatArray) -> None:
     """Fill r with the matrix of the unit quaternion q (xyzw)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     r[0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -130,8 +150,9 @@ def _rotation(q, r):  # type: ignore[no-untyped-def]
     r[2, 2] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@nb.njit(cache=True, inline="always")  # type: ignore[misc]
-def _to_tool(v, p, r, out):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, inline="always")
+def _to_tool(v: FloatArray, p: FloatArray, r: FloatArray, out: FloatArray) -> None:
+    """Fill out with R^T (v - p), a point of the object seen from the tool."""
     dx = v[0] - p[0]
     dy = v[1] - p[1]
     dz = v[2] - p[2]
@@ -140,11 +161,21 @@ def _to_tool(v, p, r, out):  # type: ignore[no-untyped-def]
     out[2] = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
 
 
-@nb.njit(cache=True)  # type: ignore[misc]
-def _near(part, first_box, last_box, p, r, boxes, model, points, planes):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True)
+def _near(
+    part: int,
+    first_box: int,
+    last_box: int,
+    p: FloatArray,
+    r: FloatArray,
+    boxes: FloatArray,
+    model: Model,
+    points: FloatArray,
+    planes: FloatArray,
+) -> int:
     """Bit mask of the boxes that the cheap tests can't separate from a part.
 
-    Unless the mask is 0, ``points`` and ``planes`` then hold the part's vertices and planes in the tool frame.
+    Unless the mask is 0, ``points`` and ``planes`` then hold the part's vertices and planes, tool frame.
     """
     vertices, vertex_start, all_planes, plane_start, _, _, centres, radii = model
     centre = points[0]
@@ -210,15 +241,23 @@ def _near(part, first_box, last_box, p, r, boxes, model, points, planes):  # typ
     return mask
 
 
-@nb.njit(cache=True, nogil=True)  # type: ignore[misc]
-def classify(positions, quaternions, boxes, model, contact, codes, extents):  # type: ignore[no-untyped-def]
+@nb.njit(cache=True, nogil=True)
+def classify(
+    positions: FloatArray,
+    quaternions: FloatArray,
+    boxes: FloatArray,
+    model: Model,
+    contact: bool,
+    codes: npt.NDArray[np.uint8],
+    extents: FloatArray,
+) -> None:
     """Fill codes (0 collides, 1 empty, 2 contact) and extents (least and greatest y between the fingers).
 
-    positions (n, 3) and quaternions (n, 4) place the tool in the object frame; boxes (4, 2, 3) hold centre and
-    half extents of three gripper boxes and of the column between the fingers; without ``contact`` only the
-    collision test is made, and 1 means free.
+    positions (n, 3) and quaternions (n, 4) place the tool in the object frame; boxes (4, 2, 3) hold centre
+    and half extents of three gripper boxes and of the column between the fingers; without ``contact`` only
+    the collision test is made, and 1 means free.
     """
-    vertices, vertex_start, all_planes, plane_start, edges, edge_start, _, _ = model
+    _, vertex_start, _, plane_start, edges, edge_start, _, _ = model
     parts = vertex_start.size - 1
     most_points = 1
     most_planes = 1

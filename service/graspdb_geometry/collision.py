@@ -1,4 +1,4 @@
-"""Exact tests of a gripper's boxes against an object: does the open gripper collide, and what would it close on?
+"""Exact tests of a gripper's boxes against an object: does the gripper collide, what would it close on?
 
 Solids that only touch, or that overlap by less than :data:`TOUCH_TOLERANCE_M`, do not collide: lattice poses
 meet symmetric objects exactly face to face, and rounding must not decide those.
@@ -87,8 +87,8 @@ class Scene:
         codes : (n,) uint8
             :data:`COLLIDES`, :data:`EMPTY` or :data:`CONTACT`.
         first_contact : (n, 2) float64
-            For CONTACT the distance in metres that the finger at +y, and the one at -y, can close alone before
-            it meets the object; beyond the stroke if the object lies on one side only.  Otherwise NaN.
+            For CONTACT the distance in metres that the finger at +y, and the one at -y, can close alone
+            before it meets the object; beyond the stroke if the object lies on one side only.  Otherwise NaN.
         """
         p, q = _poses(positions, quaternions)
         boxes = _gripper_boxes(shape, None)
@@ -135,8 +135,8 @@ class Scene:
 class _Solid:
     """Vertices, supporting planes and edges of the convex hull of some points."""
 
-    #: Facets whose normals differ by less than this (radians) are one face: their common edge is flat and
-    #: can't hold a corner of an intersection deeper than the touch tolerance.
+    #: Facets whose normals differ by less than this (radians) are one face; treating it as flat displaces it
+    #: by at most this share of its size, less than the touch tolerance for a part of 10 cm.
     _COPLANAR = 1e-6
 
     def __init__(self, number: int, points: FloatArray) -> None:
