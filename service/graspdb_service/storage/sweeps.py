@@ -1,0 +1,420 @@
+"""Sweeps: their plan and snapshot, their jobs, and the packed outcomes of finished chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
+
+from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.tables import batches, jobs, objects, packed_outcomes, sweeps
+
+#: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
+POSE_COLUMNS = 8
+_POSE_BYTES = 8 * POSE_COLUMNS
+_JOBS_PER_INSERT = 10_000
+_OPEN = ("queued", "leased")
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """A sweep as it is stored. ``batch`` is null once its batch was deleted."""
+
+    id: str
+    object_id: int
+    provenance_id: int
+    gripper: str
+    protocol: str
+    fidelity: str
+    purpose: str
+    plan: str
+    request: dict[str, Any]
+    snapshot: dict[str, Any]
+    pose_count: int
+    chunk_poses: int
+    chunks: int
+    cancelled: bool
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    object: str
+    batch_id: int | None
+    batch: str | None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a sweep's jobs add up to. ``recent_poses`` were finished within the last ``window_s``."""
+
+    states: dict[str, int]
+    poses_done: int
+    counts: dict[str, int]
+    failed: list[tuple[int, int, str]]
+    recent_poses: int
+    window_s: float
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """The packed outcomes of one finished chunk: uint8 codes of the plan's poses ``start`` to ``stop``."""
+
+    number: int
+    start: int
+    stop: int
+    outcomes: bytes
+
+
+_STORED = [
+    sweeps.c[name]
+    for name in SweepRow.__dataclass_fields__
+    if name in sweeps.c  # the poses of a plan may be many megabytes: they are read by slices only
+]
+
+
+def _query() -> Select[Any]:
+    return (
+        select(
+            *_STORED,
+            objects.c.slug.label("object"),
+            batches.c.id.label("batch_id"),
+            batches.c.key.label("batch"),
+        )
+        .join(objects, objects.c.id == sweeps.c.object_id)
+        .outerjoin(batches, batches.c.sweep_id == sweeps.c.id)
+    )
+
+
+def lock_object(tx: Tx, object_id: int) -> bool:
+    """Take the object's row lock without a new revision; False if the object is gone."""
+    query = select(objects.c.id).where(objects.c.id == object_id).with_for_update(key_share=True)
+    return tx.scalar(query) is not None
+
+
+def create(
+    tx: Tx,
+    *,
+    sweep_id: str,
+    object_id: int,
+    provenance_id: int,
+    gripper: str,
+    protocol: str,
+    fidelity: str,
+    purpose: str,
+    plan: str,
+    request: Mapping[str, Any],
+    snapshot: Mapping[str, Any],
+    poses: npt.NDArray[np.float64] | None,
+    pose_count: int,
+    chunk_poses: int,
+    capability: str,
+    job_ids: Sequence[str],
+) -> None:
+    """Store a sweep and queue its jobs, one for every ``chunk_poses`` poses of the plan.
+
+    Parameters
+    ----------
+    poses : (pose_count, 8) float64 or None
+        Position, quaternion xyzw and proposal density (NaN: none) of a plan that is no grid.
+    """
+    tx.execute(
+        insert(sweeps).values(
+            id=sweep_id,
+            object_id=object_id,
+            provenance_id=provenance_id,
+            gripper=gripper,
+            protocol=protocol,
+            fidelity=fidelity,
+            purpose=purpose,
+            plan=plan,
+            request=dict(request),
+            snapshot=dict(snapshot),
+            poses=None if poses is None else np.ascontiguousarray(poses, dtype="<f8").tobytes(),
+            pose_count=pose_count,
+            chunk_poses=chunk_poses,
+            chunks=len(job_ids),
+            cancelled=False,
+            created_at=datetime.now(UTC),
+        )
+    )
+    for first in range(0, len(job_ids), _JOBS_PER_INSERT):
+        tx.execute(
+            insert(jobs),
+            [
+                {
+                    "id": job_id,
+                    "kind": "simulate",
+                    "capability": capability,
+                    "object_id": object_id,
+                    "sweep_id": sweep_id,
+                    "number": number,
+                    "start": number * chunk_poses,
+                    "stop": min((number + 1) * chunk_poses, pose_count),
+                    "state": "queued",
+                    "attempts": 0,
+                }
+                for number, job_id in enumerate(job_ids[first : first + _JOBS_PER_INSERT], first)
+            ],
+        )
+
+
+def find(tx: Tx, sweep_id: str) -> SweepRow | None:
+    """The sweep with this id."""
+    row = tx.execute(_query().where(sweeps.c.id == sweep_id)).first()
+    return None if row is None else SweepRow(**row._mapping)
+
+
+def find_many(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, SweepRow]:
+    """The sweeps with these ids."""
+    rows = tx.execute(_query().where(sweeps.c.id.in_(sweep_ids)))
+    return {row.id: SweepRow(**row._mapping) for row in rows}
+
+
+def state_of(sweep: SweepRow, failed_chunks: int) -> str:
+    """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``."""
+    if sweep.cancelled:
+        return "cancelled"
+    if sweep.finished_at is not None:
+        return "failed" if failed_chunks else "done"
+    return "queued" if sweep.started_at is None else "running"
+
+
+def _in_state(state: str) -> ColumnElement[bool]:
+    ended = and_(not_(sweeps.c.cancelled), sweeps.c.finished_at.is_not(None))
+    going = and_(not_(sweeps.c.cancelled), sweeps.c.finished_at.is_(None))
+    any_failed = exists().where(jobs.c.sweep_id == sweeps.c.id, jobs.c.state == "failed")
+    return {
+        "cancelled": sweeps.c.cancelled,
+        "failed": and_(ended, any_failed),
+        "done": and_(ended, not_(any_failed)),
+        "queued": and_(going, sweeps.c.started_at.is_(None)),
+        "running": and_(going, sweeps.c.started_at.is_not(None)),
+    }[state]
+
+
+def listing(
+    tx: Tx, *, object_id: int | None, state: str | None, before: str | None, limit: int
+) -> list[SweepRow]:
+    """Sweeps, the newest first; ``before`` is the id of the last one of the page before."""
+    query = _query().order_by(sweeps.c.id.desc()).limit(limit)
+    if object_id is not None:
+        query = query.where(sweeps.c.object_id == object_id)
+    if state is not None:
+        query = query.where(_in_state(state))
+    if before is not None:
+        query = query.where(sweeps.c.id < before)
+    return [SweepRow(**row._mapping) for row in tx.execute(query)]
+
+
+def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
+    """Chunks by state, outcomes of every finished one, and how fast the last ones went."""
+    states: dict[str, int] = {}
+    poses_done = 0
+    totals = (
+        select(jobs.c.state, func.count(), func.sum(jobs.c.stop - jobs.c.start))
+        .where(jobs.c.sweep_id == sweep.id)
+        .group_by(jobs.c.state)
+    )
+    for state, count, poses in tx.execute(totals):
+        states[state] = int(count)
+        if state == "done":
+            poses_done = int(poses)
+    counts: dict[str, int] = {}
+    done = select(jobs.c.counts).where(jobs.c.sweep_id == sweep.id, jobs.c.state == "done")
+    for (stored,) in tx.execute(done):
+        for code, count in stored["all"].items():
+            counts[code] = counts.get(code, 0) + count
+    failed: list[tuple[int, int, str]] = []
+    if states.get("failed"):
+        ended = (
+            select(jobs.c.number, jobs.c.attempts, jobs.c.error)
+            .where(jobs.c.sweep_id == sweep.id, jobs.c.state == "failed")
+            .order_by(jobs.c.number)
+            .limit(100)
+        )
+        failed = [(int(number), int(attempts), error or "") for number, attempts, error in tx.execute(ended)]
+    recent = select(func.sum(jobs.c.stop - jobs.c.start), unix_now()).where(
+        jobs.c.sweep_id == sweep.id, jobs.c.state == "done", jobs.c.completed_at > unix_now() - window_s
+    )
+    recent_poses, now = tx.execute(recent).one()
+    if sweep.started_at is not None:
+        window_s = min(window_s, max(now - sweep.started_at.timestamp(), 1e-3))
+    return Progress(states, poses_done, counts, failed, int(recent_poses or 0), window_s)
+
+
+def count_states(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Chunks by state, for several sweeps at once."""
+    query = (
+        select(jobs.c.sweep_id, jobs.c.state, func.count())
+        .where(jobs.c.sweep_id.in_(sweep_ids))
+        .group_by(jobs.c.sweep_id, jobs.c.state)
+    )
+    found: dict[str, dict[str, int]] = {sweep_id: {} for sweep_id in sweep_ids}
+    for sweep_id, state, count in tx.execute(query):
+        found[sweep_id][state] = int(count)
+    return found
+
+
+def note_started(tx: Tx, sweep_ids: Sequence[str]) -> None:
+    """Set the start of sweeps whose first job was just claimed."""
+    tx.execute(
+        update(sweeps)
+        .where(sweeps.c.id.in_(sweep_ids), sweeps.c.started_at.is_(None))
+        .values(started_at=datetime.now(UTC))
+    )
+
+
+def note_finished(tx: Tx, sweep_id: str) -> bool:
+    """Set the end of a sweep if none of its jobs is open; call it under the object's lock."""
+    # From the last chunk backwards: while a sweep runs, that is where the open ones are.
+    still_open = (
+        select(jobs.c.id)
+        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(_OPEN))
+        .order_by(jobs.c.number.desc())
+        .limit(1)
+    )
+    if tx.scalar(still_open) is not None:
+        return False
+    tx.execute(
+        update(sweeps)
+        .where(sweeps.c.id == sweep_id, sweeps.c.finished_at.is_(None))
+        .values(finished_at=datetime.now(UTC))
+    )
+    return True
+
+
+def cancel(tx: Tx, sweep_id: str) -> bool:
+    """Cancel what is not finished; under the object's lock. False if nothing was open."""
+    # The lease stays, so that its holder is told to stop rather than that the lease is lost.
+    stopped = tx.execute(
+        update(jobs)
+        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(_OPEN))
+        .values(state="cancelled", completed_at=unix_now())
+    )
+    if stopped.rowcount == 0:
+        return False
+    tx.execute(
+        update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=True, finished_at=datetime.now(UTC))
+    )
+    return True
+
+
+def retry(tx: Tx, sweep_id: str) -> int:
+    """Queue failed and cancelled chunks again, with all their attempts; under the object's lock."""
+    again = tx.execute(
+        update(jobs)
+        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(["failed", "cancelled"]))
+        .values(
+            state="queued",
+            attempts=0,
+            lease_id=None,
+            lease_expires_at=None,
+            worker=None,
+            error=None,
+            completed_at=None,
+        )
+    )
+    if again.rowcount:
+        tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=False, finished_at=None))
+    return again.rowcount
+
+
+def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> npt.NDArray[np.float64]:
+    """Poses ``start`` to ``stop`` of a plan that is no grid: (n, 8) float64, see :data:`POSE_COLUMNS`."""
+    part = func.substr(sweeps.c.poses, start * _POSE_BYTES + 1, (stop - start) * _POSE_BYTES)
+    content = tx.scalar(select(part).where(sweeps.c.id == sweep_id))
+    return np.frombuffer(content or b"", dtype="<f8").reshape(-1, POSE_COLUMNS)
+
+
+def store_outcomes(
+    tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, outcomes: bytes
+) -> None:
+    """Keep a chunk's uint8 outcome codes, one for every pose of it."""
+    tx.execute(
+        insert(packed_outcomes).values(
+            job_id=job_id, sweep_id=sweep_id, number=number, revision=revision, outcomes=outcomes
+        )
+    )
+
+
+def outcome_chunks(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[Chunk]:
+    """Finished chunks from ``first_number`` on, in order, until they hold at least ``poses`` poses."""
+    listed = (
+        select(jobs.c.id, jobs.c.number, jobs.c.start, jobs.c.stop)
+        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
+        .where(packed_outcomes.c.sweep_id == sweep_id, packed_outcomes.c.number >= first_number)
+        .order_by(packed_outcomes.c.number)
+    )
+    wanted: dict[str, tuple[int, int, int]] = {}
+    enough = 0
+    for job_id, number, start, stop in tx.execute(listed):
+        wanted[job_id] = (number, start, stop)
+        enough += stop - start
+        if enough >= poses:
+            break
+    chunks = []
+    ids = list(wanted)
+    for first in range(0, len(ids), 500):
+        query = select(packed_outcomes.c.job_id, packed_outcomes.c.outcomes).where(
+            packed_outcomes.c.job_id.in_(ids[first : first + 500])
+        )
+        chunks += [Chunk(*wanted[job_id], bytes(content)) for job_id, content in tx.execute(query)]
+    return sorted(chunks, key=lambda chunk: chunk.number)
+
+
+def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
+    """Other collecting grid sweeps of the same object, gripper, protocol and fidelity, with their batch."""
+    query = _query().where(
+        sweeps.c.object_id == sweep.object_id,
+        sweeps.c.provenance_id == sweep.provenance_id,
+        sweeps.c.fidelity == sweep.fidelity,
+        sweeps.c.purpose == "collect",
+        sweeps.c.plan == "grid",
+        sweeps.c.id != sweep.id,
+        batches.c.id.is_not(None),
+    )
+    return [SweepRow(**row._mapping) for row in tx.execute(query.order_by(sweeps.c.id))]
+
+
+def done_ranges(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
+    """Places (start, stop) in their plans of the finished chunks of these sweeps."""
+    query = (
+        select(jobs.c.sweep_id, jobs.c.start, jobs.c.stop)
+        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
+        .order_by(jobs.c.sweep_id, jobs.c.start)
+    )
+    found: dict[str, list[tuple[int, int]]] = {sweep_id: [] for sweep_id in sweep_ids}
+    for sweep_id, start, stop in tx.execute(query):
+        found[sweep_id].append((int(start), int(stop)))
+    return found
+
+
+def count_done(tx: Tx, sweep_ids: Sequence[str]) -> int:
+    """Finished chunks of these sweeps that still have their batch."""
+    query = (
+        select(func.count())
+        .select_from(jobs)
+        .join(batches, batches.c.sweep_id == jobs.c.sweep_id)
+        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
+    )
+    return int(tx.scalar(query) or 0)
+
+
+def packed_counts(tx: Tx, sweep_id: str) -> tuple[int, dict[int, int]]:
+    """The provenance and, by outcome code, the packed outcomes that this sweep added to its tallies.
+
+    Empty for a check, whose outcomes are counted nowhere.
+    """
+    provenance_id = tx.scalar(select(sweeps.c.provenance_id).where(sweeps.c.id == sweep_id))
+    if provenance_id is None:
+        raise LookupError(sweep_id)
+    counts: dict[int, int] = {}
+    query = select(jobs.c.counts).where(jobs.c.sweep_id == sweep_id, jobs.c.state == "done")
+    for (stored,) in tx.execute(query):
+        for code, count in stored["packed"].items():
+            counts[int(code)] = counts.get(int(code), 0) + count
+    return provenance_id, counts
