@@ -1,25 +1,30 @@
-"""What the physics is told of the two bodies: the gripper's dimensions and drive, the object's mass distribution."""
+"""What the physics is told of the two bodies, and what it answers: gripper, mass distribution, closing."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 Part = tuple[NDArray[np.float64], NDArray[np.int64]]
 """A convex part: vertices (V, 3) in metres and outward faces (F, 3)."""
 
 HEAVY_KG = 0.3
 """From this mass on the jaw closes with its full force."""
 LIGHT_FORCE_N = 10.0
-"""Below it with this one: light objects jitter between strong fingers. The contact forces are scaled back for the test."""
+"""Below it with this one: light objects jitter between strong fingers. The contact forces are scaled
+back for the test."""
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """A parallel jaw in its tool frame: x finger width, y closing, z approach, origin midway between the fingers.
+    """A parallel jaw in its tool frame: x finger width, y closing, z approach, origin midway between
+    the fingers.
 
     Attributes
     ----------
@@ -98,10 +103,11 @@ class MassProperties:
 
 
 def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
-    """Mass properties of a union of convex parts; where parts overlap, their common volume counts once for each.
+    """Mass properties of a union of convex parts; where parts overlap, their common volume counts once
+    for each.
 
-    Signed tetrahedra from the origin to every face: volume det/6, first moment det/24 (a + b + c), second moment
-    det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c.
+    Signed tetrahedra from the origin to every face: volume det/6, first moment det/24 (a + b + c),
+    second moment det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c.
 
     Raises
     ------
@@ -139,7 +145,8 @@ def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
 
 
 def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Quaternion xyzw of a rotation matrix (3, 3): the largest eigenvector of Bar-Itzhack's symmetric matrix."""
+    """Quaternion xyzw of a rotation matrix (3, 3): the largest eigenvector of Bar-Itzhack's symmetric
+    matrix."""
     m = matrix
     k = np.array(
         [
@@ -151,3 +158,46 @@ def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float
     )
     q = np.linalg.eigh(k)[1][:, -1]
     return (float(q[0]), float(q[1]), float(q[2]), float(q[3]))
+
+
+class End(Enum):
+    """Why a closing ended."""
+
+    STALLED = "stalled"
+    EMPTY = "empty"
+    TIMEOUT = "timeout"
+    UNSTABLE = "unstable"
+
+
+@dataclass(frozen=True)
+class Closing:
+    """The jaw after a closing.
+
+    Attributes
+    ----------
+    end : End
+    touched : bool
+        Both fingers had touched the object at the same time.
+    opening_m : float
+        Distance between the fingers.
+    normals : (K, 3) float64
+        Contact normals in the tool frame, pointing into the object.
+    forces : (K,) float64
+        Normal contact forces in newtons, as exerted with ``Gripper.closing_force_n``.
+    fingers : (K,) int64
+        Which body presses: 0 and 1 the fingers, -1 the palm.
+    position, quaternion_xyzw
+        The object's pose in the tool frame.
+    steps : int
+        Simulation steps spent.
+    """
+
+    end: End
+    touched: bool
+    opening_m: float
+    normals: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    fingers: NDArray[np.int64]
+    position: Vector
+    quaternion_xyzw: Quaternion
+    steps: int

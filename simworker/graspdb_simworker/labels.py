@@ -1,15 +1,17 @@
 """From a closing to a label: can the contact forces hold the object against gravity, whichever way down is?
 
-The test is the paper's: forces only. Two contacts may be enough although the object could turn about the line through
-them; with torques no grasp by two contacts would pass at all.
+The test is the paper's: forces only. Two contacts may be enough although the object could turn about
+the line through them; with torques no grasp by two contacts would pass at all.
 
-A contact i with normal n_i (into the object) and measured normal force f_i can exert any force of its capped friction cone
+A contact i with normal n_i (into the object) and measured normal force f_i can exert any force of its
+capped friction cone
 
     C_i = { a n_i + t : t perpendicular to n_i, |t| <= mu a, 0 <= a <= f_i }.
 
-The object is held against a weight m g in direction u if -m g u lies in the sum W of the C_i. Which way is down is not
-known when a grasp is rated in the object's frame, so the **worst direction** counts: W must contain the ball of radius m g.
-W is convex and contains 0, hence the largest such radius is the minimum of its support function over unit directions d
+The object is held against a weight m g in direction u if -m g u lies in the sum W of the C_i. Which way
+is down is not known when a grasp is rated in the object's frame, so the **worst direction** counts: W
+must contain the ball of radius m g. W is convex and contains 0, hence the largest such radius is the
+minimum of its support function over unit directions d
 
     h(d) = sum_i f_i max(0, n_i . d + mu sqrt(1 - (n_i . d)^2)).
 
@@ -27,7 +29,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from graspdb_simworker.bodies import Gripper
+from graspdb_simworker.bodies import Closing, End, Gripper
 
 GRAVITY_M_S2 = 9.80665
 MERGE_COSINE = 1.0 - 1e-8
@@ -63,13 +65,16 @@ class Label:
     width_m : float
         Distance between the fingers at the end.
     quality : float
-        Largest weight the contacts hold in the worst direction, over the object's weight: success from 1 on. NaN where no
-        force was measured.
+        Largest weight the contacts hold in the worst direction, over the object's weight: success from
+        1 on. NaN where no force was measured.
     """
 
     outcome: Outcome
     width_m: float
     quality: float
+
+
+SIMULATION_ERROR = Label(Outcome.SIMULATION_ERROR, math.nan, math.nan)
 
 
 def _fibonacci_directions(count: int) -> NDArray[np.float64]:
@@ -119,7 +124,8 @@ def _merge(normals, forces, merged, sums):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _tangents(x, y, z):  # type: ignore[no-untyped-def]
-    """Two unit vectors that complete a unit vector to an orthonormal frame, built on the axis least along it."""
+    """Two unit vectors that complete a unit vector to an orthonormal frame, built on the axis least
+    along it."""
     if abs(x) <= abs(y) and abs(x) <= abs(z):
         ax, ay, az = 0.0, z, -y
     elif abs(y) <= abs(z):
@@ -133,7 +139,8 @@ def _tangents(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _descend(normals, forces, count, friction, x, y, z):  # type: ignore[no-untyped-def]
-    """Pattern search on the sphere: eight compass points in the tangent plane, the step halved where none is lower."""
+    """Pattern search on the sphere: eight compass points in the tangent plane, the step halved where
+    none is lower."""
     best = _support(normals, forces, count, friction, x, y, z)
     step = 0.2
     while step > 1e-4:
@@ -205,8 +212,9 @@ def _on_circle(normals, forces, count, friction, contact, best, where):  # type:
 def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
     """Global minimum of h over the sphere.
 
-    h is smooth but for convex kinks: at d = n_i, and on the circle where contact i begins to push. So its minimum is one of
-    the n_i, or where two circles cross, or the lowest point of a circle, or smooth. All four kinds are searched.
+    h is smooth but for convex kinks: at d = n_i, and on the circle where contact i begins to push. So
+    its minimum is one of the n_i, or where two circles cross, or the lowest point of a circle, or
+    smooth. All four kinds are searched.
     """
     merged = np.empty((forces.shape[0], 3))
     sums = np.empty(forces.shape[0])
@@ -269,7 +277,8 @@ def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
 def weakest_force(
     normals: NDArray[np.float64], forces: NDArray[np.float64], friction: float
 ) -> tuple[float, NDArray[np.float64]]:
-    """Largest force the contacts can resist in every direction, and the direction in which they resist no more.
+    """Largest force the contacts can resist in every direction, and the direction in which they resist
+    no more.
 
     Parameters
     ----------
@@ -294,3 +303,24 @@ def weakest_force(
         float(friction),
     )
     return float(value), direction
+
+
+def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float) -> Label:
+    """Name a closing's outcome and rate it.
+
+    ``missed``: nothing was between the fingers, or the object was pushed out before both touched it;
+    ``slipped``: both had touched it and it was squeezed out; ``timeout``: the jaw neither stalled nor
+    closed; ``simulation_error``: a pose that is not finite any more; ``wrench_insufficient``: the force
+    test failed.
+    """
+    width = max(0.0, closing.opening_m)
+    if closing.end is End.EMPTY:
+        return Label(Outcome.SLIPPED if closing.touched else Outcome.MISSED, width, 0.0)
+    if closing.end is End.TIMEOUT:
+        return Label(Outcome.TIMEOUT, width, math.nan)
+    if closing.end is End.UNSTABLE:
+        return SIMULATION_ERROR
+    scale = gripper.force_n / gripper.closing_force_n
+    force, _ = weakest_force(closing.normals, closing.forces * scale, friction)
+    quality = force / (mass_kg * GRAVITY_M_S2)
+    return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)

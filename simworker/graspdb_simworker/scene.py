@@ -1,12 +1,14 @@
 """Closing a parallel jaw on a free-floating object in pybullet. The only module that imports pybullet.
 
-The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at the origin, its tool
-frame is the world frame; for every grasp the *object* is moved instead. Nothing weighs: the object floats, so that the jaw
-centres it as it closes, and gravity enters afterwards through the force test in :mod:`graspdb_simworker.labels`.
+The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at
+the origin, its tool frame is the world frame; for every grasp the *object* is moved instead. Nothing
+weighs: the object floats, so that the jaw centres it as it closes, and gravity enters afterwards
+through the force test in :mod:`graspdb_simworker.labels`.
 
-What the solver does depends on what it did before: Bullet keeps contact caches and the order of overlapping pairs. Parking
-the object far away and stepping the world once after every grasp empties both, and results become bitwise independent of
-the order of grasps, of the process and of the world (saving and restoring Bullet's state does not achieve that).
+What the solver does depends on what it did before: Bullet keeps contact caches and the order of
+overlapping pairs. Parking the object far away and stepping the world once after every grasp empties
+both, and results become bitwise independent of the order of grasps, of the process and of the world
+(saving and restoring Bullet's state does not achieve that).
 """
 
 from __future__ import annotations
@@ -16,20 +18,25 @@ import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
 import pybullet
-from numpy.typing import NDArray
 
-from graspdb_simworker.bodies import Gripper, MassProperties, Part, mass_properties
+from graspdb_simworker.bodies import (
+    Closing,
+    End,
+    Gripper,
+    MassProperties,
+    Part,
+    Quaternion,
+    Vector,
+    mass_properties,
+)
 
 Fidelity = Literal["standard", "fine"]
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 APPROACH_GAP_M = 0.0005
 """The fingers start this far before their first contact: nothing can happen on the way there."""
@@ -61,49 +68,6 @@ STEPPING: dict[str, Stepping] = {
 }
 
 
-class End(Enum):
-    """Why a closing ended."""
-
-    STALLED = "stalled"
-    EMPTY = "empty"
-    TIMEOUT = "timeout"
-    UNSTABLE = "unstable"
-
-
-@dataclass(frozen=True)
-class Closing:
-    """The jaw after a closing.
-
-    Attributes
-    ----------
-    end : End
-    touched : bool
-        Both fingers had touched the object at the same time.
-    opening_m : float
-        Distance between the fingers.
-    normals : (K, 3) float64
-        Contact normals in the tool frame, pointing into the object.
-    forces : (K,) float64
-        Normal contact forces in newtons, as exerted with ``Gripper.closing_force_n``.
-    fingers : (K,) int64
-        Which body presses: 0 and 1 the fingers, -1 the palm.
-    position, quaternion_xyzw
-        The object's pose in the tool frame.
-    steps : int
-        Simulation steps spent.
-    """
-
-    end: End
-    touched: bool
-    opening_m: float
-    normals: NDArray[np.float64]
-    forces: NDArray[np.float64]
-    fingers: NDArray[np.int64]
-    position: Vector
-    quaternion_xyzw: Quaternion
-    steps: int
-
-
 class GraspWorld:
     """One object and one gripper in a headless Bullet world.
 
@@ -119,7 +83,12 @@ class GraspWorld:
     """
 
     def __init__(
-        self, parts: Sequence[Part], mass_kg: float, friction: float, gripper: Gripper, fidelity: Fidelity = "standard"
+        self,
+        parts: Sequence[Part],
+        mass_kg: float,
+        friction: float,
+        gripper: Gripper,
+        fidelity: Fidelity = "standard",
     ) -> None:
         self.gripper = gripper
         self.stepping = STEPPING[fidelity]
@@ -153,7 +122,7 @@ class GraspWorld:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
 
-    # -- building -----------------------------------------------------------------------------------------------
+    # -- building ------------------------------------------------------------------------------------------
 
     def _configure(self) -> None:
         pybullet.resetSimulation(physicsClientId=self._client)
@@ -176,7 +145,8 @@ class GraspWorld:
         return int(
             pybullet.createMultiBody(
                 baseMass=0.0,
-                # The base frame is the tool frame; the palm hangs behind it, so that links count from the tool.
+                # The base frame is the tool frame; the palm hangs behind it, so that links count from
+                # the tool.
                 baseCollisionShapeIndex=palm,
                 basePosition=(0.0, 0.0, gripper.palm_centre_z),
                 linkMasses=[gripper.finger_mass_kg] * 2,
@@ -201,8 +171,8 @@ class GraspWorld:
         )
 
     def _build_object(self, parts: Sequence[Part], mass: MassProperties) -> int:
-        # pybullet takes several hulls in one body only from an OBJ file, a group a part. In it the body frame is the
-        # principal frame of inertia, so that no inertial offset is left to go wrong.
+        # pybullet takes several hulls in one body only from an OBJ file, a group a part. In it the body
+        # frame is the principal frame of inertia, so that no inertial offset is left to go wrong.
         with tempfile.TemporaryDirectory(prefix="graspdb-parts-") as folder:
             path = Path(folder) / "parts.obj"
             path.write_text(_obj_of_parts(parts, mass), encoding="ascii")
@@ -222,7 +192,8 @@ class GraspWorld:
         return body
 
     def _build_column(self) -> int:
-        """A ghost as large as the space between the open fingers: it collides with nothing and answers one question."""
+        """A ghost as large as the space between the open fingers: it collides with nothing and answers
+        one question."""
         half = self.gripper.finger_half_extents
         shape = self._box((half[0], 0.5 * self.gripper.max_opening_m, half[2]))
         body = int(
@@ -258,17 +229,19 @@ class GraspWorld:
             self._object, -1, localInertiaDiagonal=self.mass.inertia, physicsClientId=self._client
         )
 
-    # -- one grasp ----------------------------------------------------------------------------------------------
+    # -- one grasp -----------------------------------------------------------------------------------------
 
     def close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float = 0.0) -> Closing:
-        """Close the jaw at a pose of the tool frame in the object frame, until it stalls, is empty or times out.
+        """Close the jaw at a pose of the tool frame in the object frame, until it stalls, is empty or
+        times out.
 
         Parameters
         ----------
         position, quaternion_xyzw
             The grasp: pose of the tool frame in the object frame.
         travel_m : float
-            How far each finger can close before the first of the two touches the object, from the exact geometry.
+            How far each finger can close before the first of the two touches the object, from the exact
+            geometry.
         """
         try:
             return self._close(position, quaternion_xyzw, travel_m)
@@ -331,7 +304,8 @@ class GraspWorld:
     def _body_pose(self, position: Vector, quaternion_xyzw: Quaternion) -> tuple[Vector, Quaternion]:
         """Pose of the object's principal frame in the tool frame.
 
-        In scalars: a vectorised product may round differently with the length of its batch, and labels must not.
+        In scalars: a vectorised product may round differently with the length of its batch, and labels
+        must not.
         """
         x, y, z, w = quaternion_xyzw
         inverse = (-x, -y, -z, w)
@@ -357,7 +331,9 @@ class GraspWorld:
         return bool(pybullet.getClosestPoints(self._object, self._column, 0.0, physicsClientId=self._client))
 
     def _closing(self, end: End, touched: bool, opening: float, steps: int) -> Closing:
-        where, orientation = pybullet.getBasePositionAndOrientation(self._object, physicsClientId=self._client)
+        where, orientation = pybullet.getBasePositionAndOrientation(
+            self._object, physicsClientId=self._client
+        )
         contacts: Sequence[Any] = ()
         if not all(map(math.isfinite, (*where, *orientation))):
             end = End.UNSTABLE
@@ -368,7 +344,9 @@ class GraspWorld:
                 if c[9] > 0.0
             ]
         # contactNormalOnB points from B, the object, to A: turned round it points into the object.
-        normals = np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3)
+        normals = np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(
+            -1, 3
+        )
         forces = np.array([contact[9] for contact in contacts], dtype=np.float64)
         fingers = np.array([contact[3] for contact in contacts], dtype=np.int64)
         quaternion = _multiply(orientation, self._to_body)
@@ -382,7 +360,9 @@ class GraspWorld:
         pybullet.resetBasePositionAndOrientation(self._object, _PARKED, _IDENTITY, physicsClientId=client)
         pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
         for joint in (0, 1):
-            pybullet.resetJointState(jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0, physicsClientId=client)
+            pybullet.resetJointState(
+                jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0, physicsClientId=client
+            )
         self._drive(self.stepping.approach_dt_s)
         pybullet.stepSimulation(physicsClientId=client)
 

@@ -1,0 +1,206 @@
+"""One chunk of a sweep, from its payload to one outcome for every pose.
+
+    poses of the plan -> exact geometry: collides | nothing between the fingers | needs physics ->
+    closing -> label
+
+A chunk gives the same bytes whatever ran before it, in whatever order, process or world.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from graspdb.wire import GripperProfile, ResultRows, SimulatePayload, SimulateResult
+from graspdb_geometry import collision
+from graspdb_geometry.grids import PoseGrid
+from graspdb_geometry.grippers import GripperShape
+from numpy.typing import NDArray
+
+from graspdb_simworker.bodies import Gripper, Part, closing_force
+from graspdb_simworker.labels import Label, Outcome, label_of
+from graspdb_simworker.scene import GraspWorld
+
+PROTOCOLS = ("wrench",)
+"""Protocols this worker can simulate."""
+
+
+class UnsupportedProtocol(ValueError):
+    """The chunk asks for a protocol that this worker does not have."""
+
+
+def ignore_start(row: int) -> None:
+    """Take no note of a grasp about to be simulated."""
+
+
+def ignore_end(row: int, label: Label) -> None:
+    """Take no note of a grasp's label."""
+
+
+@dataclass(frozen=True)
+class Workpiece:
+    """An object ready to be grasped: collision scene and physics world. Reused from chunk to chunk."""
+
+    parts: Sequence[Part]
+    scene: collision.Scene
+    world: GraspWorld
+    gripper: Gripper
+    shape: GripperShape
+    mass_kg: float
+    friction: float
+
+    def simulate(
+        self, position: NDArray[np.float64], quaternion: NDArray[np.float64], travel_m: float
+    ) -> Label:
+        """Close the jaw at one pose (tool in the object frame) and label the outcome."""
+        px, py, pz = (float(v) for v in position)
+        x, y, z, w = (float(v) for v in quaternion)
+        closing = self.world.close((px, py, pz), (x, y, z, w), travel_m)
+        return label_of(closing, self.gripper, self.mass_kg, self.friction)
+
+    def close(self) -> None:
+        self.world.close_world()
+
+
+def prepare(payload: SimulatePayload, parts: Sequence[Part]) -> Workpiece:
+    """Build what the payload's chunks are simulated with.
+
+    Raises
+    ------
+    UnsupportedProtocol
+    ValueError
+        For parts or a gripper that no physics can be done with.
+    """
+    if payload.protocol not in PROTOCOLS:
+        raise UnsupportedProtocol(
+            f"this worker simulates {', '.join(PROTOCOLS)}; the sweep asks for {payload.protocol!r}"
+        )
+    gripper = gripper_of(payload.gripper, payload.mass_kg)
+    return Workpiece(
+        parts=parts,
+        scene=collision.Scene(parts),
+        world=GraspWorld(parts, payload.mass_kg, payload.friction, gripper, payload.fidelity),
+        gripper=gripper,
+        shape=shape_of(payload.gripper),
+        mass_kg=payload.mass_kg,
+        friction=payload.friction,
+    )
+
+
+def shape_of(profile: GripperProfile) -> GripperShape:
+    """The boxes of a gripper profile."""
+    return GripperShape(
+        max_opening_m=profile.max_opening_m,
+        finger_width_m=profile.finger.width_m,
+        finger_thickness_m=profile.finger.thickness_m,
+        finger_length_m=profile.finger.length_m,
+        tip_offset_m=profile.tip_offset_m,
+        palm_size_m=profile.palm_size_m,
+    )
+
+
+def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:
+    """A gripper profile as the physics sees it, closing on an object of this mass."""
+    return Gripper(
+        max_opening_m=profile.max_opening_m,
+        finger_width_m=profile.finger.width_m,
+        finger_thickness_m=profile.finger.thickness_m,
+        finger_length_m=profile.finger.length_m,
+        tip_offset_m=profile.tip_offset_m,
+        palm_size_m=profile.palm_size_m,
+        finger_mass_kg=profile.finger_mass_kg,
+        max_speed_m_s=profile.max_speed_m_s,
+        force_n=profile.force_n,
+        closing_force_n=closing_force(profile.force_n, mass_kg),
+    )
+
+
+def poses_of(
+    payload: SimulatePayload,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """The chunk's pose indices (n,), positions (n, 3) and quaternions xyzw (n, 4), tool in the object frame.
+
+    Raises
+    ------
+    ValueError
+        If the payload has neither grid nor poses, or as many poses as it does not say.
+    """
+    if payload.grid is not None:
+        plan = payload.grid
+        grid = PoseGrid(
+            lower=plan.lower,
+            upper=plan.upper,
+            position_step_m=plan.position_step_m,
+            rotation_step_deg=plan.rotation_step_deg,
+            margin_m=plan.margin_m,
+            symmetric=plan.symmetric,
+            max_poses=plan.max_poses,
+            seed=plan.seed,
+            region=plan.region,
+        )
+        indices = grid.pose_indices(payload.start, payload.stop)
+        positions, quaternions = grid.poses(indices)
+        return indices, positions, quaternions
+    if payload.poses is None:
+        raise ValueError("a simulate job has either a grid or poses")
+    positions = np.asarray(payload.poses.position, dtype=np.float64).reshape(-1, 3)
+    quaternions = np.asarray(payload.poses.quaternion_xyzw, dtype=np.float64).reshape(-1, 4)
+    indices = np.arange(payload.start, payload.stop, dtype=np.int64)
+    if not len(positions) == len(quaternions) == len(indices):
+        raise ValueError(f"the chunk names {len(indices)} poses and holds {len(positions)}")
+    return indices, positions, quaternions
+
+
+def simulate_chunk(
+    payload: SimulatePayload,
+    workpiece: Workpiece,
+    *,
+    known: Mapping[int, Label] | None = None,
+    before: Callable[[int], None] = ignore_start,
+    after: Callable[[int, Label], None] = ignore_end,
+) -> SimulateResult:
+    """Simulate a chunk.
+
+    Parameters
+    ----------
+    payload : SimulatePayload
+    workpiece : Workpiece
+        From :func:`prepare`, for a payload with the same parts, mass, friction, gripper and fidelity.
+    known : mapping of row to Label
+        Rows of the chunk that need no physics any more, because an earlier process simulated them or
+        died of them.
+    before, after
+        Called around each closing with the row within the chunk.
+
+    Returns
+    -------
+    SimulateResult
+        An outcome for every pose, and rows for those that met physics.
+    """
+    known = known or {}
+    indices, positions, quaternions = poses_of(payload)
+    codes, first_contact = workpiece.scene.classify(positions, quaternions, workpiece.shape)
+    outcomes = np.full(len(indices), Outcome.MISSED, dtype=np.uint8)
+    outcomes[codes == collision.COLLIDES] = Outcome.COLLISION
+    physical = np.flatnonzero(codes == collision.CONTACT)
+    rows = ResultRows(pose_index=[], width_m=[], quality=[])
+    for row in physical.tolist():
+        label = known.get(row)
+        if label is None:
+            travel = min(float(first_contact[row].min()), 0.5 * workpiece.shape.max_opening_m)
+            before(row)
+            label = workpiece.simulate(positions[row], quaternions[row], travel)
+            after(row, label)
+        outcomes[row] = label.outcome
+        rows.pose_index.append(int(indices[row]))
+        rows.width_m.append(_finite(label.width_m, 7))
+        rows.quality.append(_finite(label.quality, 4))
+    return SimulateResult(outcomes=base64.b64encode(outcomes.tobytes()), rows=rows)
+
+
+def _finite(value: float, digits: int) -> float | None:
+    """Rounded for the wire, where a missing measurement is null: beyond 0.1 um, digits say nothing."""
+    return round(min(value, 1e9), digits) if math.isfinite(value) else None

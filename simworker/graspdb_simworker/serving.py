@@ -1,0 +1,51 @@
+"""The child's work: chunks in, labels and results out. Imported only where pybullet is."""
+
+from __future__ import annotations
+
+import signal
+
+from graspdb.wire import SimulatePayload
+from graspdb_geometry import meshes
+
+from graspdb_simworker import chunks, messages
+from graspdb_simworker.labels import Label
+
+WORKPIECE_FIELDS = {"parts_sha256", "mass_kg", "friction", "gripper", "protocol", "fidelity"}
+"""Chunks that agree in these share a world."""
+
+
+def serve(source: int, sink: int) -> None:
+    """Answer chunks until the worker closes the pipe (which raises :class:`messages.Closed`)."""
+    messages.send(sink, messages.READY)
+    key: str | None = None
+    workpiece: chunks.Workpiece | None = None
+    while True:
+        kind, body = messages.receive(source, poll_s=3600.0)
+        if kind != messages.CHUNK:
+            raise messages.Closed(f"unexpected message {kind!r}")
+        try:
+            chunk = messages.unpack_chunk(body)
+            payload = SimulatePayload.model_validate_json(chunk.payload_json)
+            wanted = payload.model_dump_json(include=WORKPIECE_FIELDS)
+            if workpiece is None or key != wanted:
+                if workpiece is not None:
+                    workpiece.close()
+                workpiece, key = None, None
+                workpiece, key = chunks.prepare(payload, meshes.parts_from_glb(chunk.parts_glb)), wanted
+
+            def before(row: int, limit: float = chunk.pose_s) -> None:
+                messages.send(sink, messages.BEFORE, messages.pack_row(row))
+                signal.setitimer(signal.ITIMER_REAL, limit)
+
+            def after(row: int, label: Label) -> None:
+                signal.setitimer(signal.ITIMER_REAL, 0.0)
+                messages.send(sink, messages.AFTER, messages.pack_label(row, label))
+
+            result = chunks.simulate_chunk(payload, workpiece, known=chunk.known, before=before, after=after)
+        except messages.Closed:
+            raise
+        except Exception as error:  # noqa: BLE001 - the chunk's failure, told to the worker
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            messages.send(sink, messages.ERROR, f"{type(error).__name__}: {error}".encode())
+            continue
+        messages.send(sink, messages.RESULT, result.model_dump_json().encode())
