@@ -141,7 +141,8 @@ class Grasp:
         """(3,) direction in which the fingers close: the tool's y axis, object frame."""
         return self.matrix[:3, 1]
 
-    def _rows(self) -> dict[str, str]:
+    def summary(self) -> dict[str, str]:
+        """What a person wants to know of it, in words."""
         rows = {
             "position [m]": _vector(self.position),
             "quaternion xyzw": _vector(self.quaternion_xyzw),
@@ -170,7 +171,7 @@ class Grasp:
         )
 
     def _repr_html_(self) -> str:
-        return table_html("Grasp (tool frame in the object frame)", self._rows())
+        return table_html("Grasp (tool frame in the object frame)", self.summary())
 
 
 class Grasps(Sequence[Grasp]):

@@ -27,7 +27,7 @@ from graspdb.poses import as_poses, matrices
 from graspdb.results import pose_columns, table_html, to_pandas
 from graspdb.transport import Transport
 
-__all__ = ["OutcomeArrays", "Sweep", "Sweeps", "create_sweep"]
+__all__ = ["OutcomeArrays", "Sweep", "SweepBar", "Sweeps", "create_sweep", "duration"]
 
 ProgressCallback = Callable[[wire.SweepInfo], None]
 FINISHED = frozenset({"done", "failed", "cancelled"})
@@ -128,7 +128,7 @@ class Sweep:
         deadline = None if timeout is None else time.monotonic() + timeout
         bar: AbstractContextManager[ProgressCallback]
         if progress is True:
-            bar = _Bar(self)
+            bar = SweepBar(self)
         else:
             bar = nullcontext(progress if callable(progress) else lambda _: None)
         poll = _FIRST_POLL_S
@@ -265,11 +265,12 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-class _Bar(AbstractContextManager[ProgressCallback]):
+class SweepBar(AbstractContextManager[ProgressCallback]):
     """A progress bar that follows a sweep, on stderr so that stdout stays clean for data."""
 
-    def __init__(self, sweep: Sweep) -> None:
+    def __init__(self, sweep: Sweep, title: str | None = None) -> None:
         self._sweep = sweep
+        self._title = title or f"sweep {sweep.info.object}"
         self._silent_since = time.monotonic()
         self._hint: str | None = None
         self._progress = Progress(
@@ -286,7 +287,7 @@ class _Bar(AbstractContextManager[ProgressCallback]):
     def __enter__(self) -> ProgressCallback:
         info = self._sweep.info
         self._task = self._progress.add_task(
-            f"sweep {info.object}", total=info.poses, completed=info.poses_done, rate="", left=""
+            self._title, total=info.poses, completed=info.poses_done, rate="", left=""
         )
         self._progress.start()
         return self._show

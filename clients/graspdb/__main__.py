@@ -1,0 +1,5 @@
+"""``python -m graspdb``."""
+
+from graspdb.cli import main
+
+main()

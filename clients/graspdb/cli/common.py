@@ -1,0 +1,137 @@
+"""What the commands share: the connection, vectors on the command line, tables and JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from pydantic import BaseModel
+from rich.console import Console
+from rich.table import Table
+
+from graspdb.client import Client
+
+__all__ = ["State", "out", "show_rows", "show_table", "state_of", "vector"]
+
+ERRORS = Console(stderr=True)
+
+
+@dataclasses.dataclass
+class State:
+    """The global options, and the one connection of this run."""
+
+    url: str | None
+    api_key: str | None
+    json: bool
+
+    def client(self) -> Client:
+        """Connect; a person waits in front of it, so fewer retries than a program's."""
+        return Client(self.url, api_key=self.api_key, retries=2)
+
+
+def state_of(context: typer.Context) -> State:
+    """The global options of this run."""
+    state = context.find_root().obj
+    if not isinstance(state, State):
+        raise TypeError("commands run below the graspdb callback, which sets the state")
+    return state
+
+
+def console() -> Console:
+    """Standard output; wide where nobody looks, so that pipes get whole lines."""
+    return Console() if sys.stdout.isatty() or "COLUMNS" in os.environ else Console(width=160)
+
+
+def vector(count: int, names: str) -> Any:
+    """A parser for ``count`` comma-separated numbers."""
+
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            numbers = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != count or not all(np.isfinite(numbers)):
+            raise typer.BadParameter(f"{text!r} is not {count} finite numbers {names}")
+        return numbers
+
+    parse.__name__ = names
+    return parse
+
+
+Vector3 = tuple[float, ...]
+
+
+def vector_option(help: str, *names: str, count: int = 3, metavar: str = "x,y,z") -> Any:
+    """An option that takes a vector."""
+    return typer.Option(*names, help=help, parser=vector(count, metavar), metavar=metavar)
+
+
+Gripper = Annotated[str | None, typer.Option(help="Only trials with this gripper.")]
+Protocol = Annotated[str | None, typer.Option(help="Only trials with this protocol.")]
+Source = Annotated[str | None, typer.Option(help="Only trials from: simulation, robot, human, import.")]
+SigmaPosition = Annotated[
+    float | None, typer.Option("--sigma-position-m", help="Kernel width in position, metres.")
+]
+SigmaRotation = Annotated[
+    float | None, typer.Option("--sigma-rotation-deg", help="Kernel width in rotation, degrees.")
+]
+ObjectId = Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.", show_default=False)]
+
+
+def plain(value: Any) -> Any:
+    """As JSON can hold it: models, arrays and dataclasses as mappings and lists, no infinities."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name != "raw"}
+        return {name: plain(item) for name, item in fields.items()}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def out(value: Any) -> None:
+    """JSON on standard output."""
+    sys.stdout.write(json.dumps(plain(value), allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def show_rows(rows: Mapping[str, Any]) -> None:
+    """Names and values below each other."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows.items():
+        table.add_row(name, str(value))
+    console().print(table)
+
+
+def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, empty: str) -> None:
+    """A table; numbers stand to the right."""
+    body = [[("" if cell is None else cell) for cell in row] for row in rows]
+    if not body:
+        console().print(empty)
+        return
+    table = Table(header_style="bold", box=None, pad_edge=False)
+    for index, name in enumerate(columns):
+        numeric = all(isinstance(row[index], (int, float)) or row[index] == "" for row in body)
+        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+    for row in body:
+        table.add_row(*(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in row))
+    console().print(table)
+
+
+def numbers(values: Any, digits: int = 4) -> str:
+    """A vector in a cell."""
+    return " ".join(f"{float(value):+.{digits}f}" for value in values)

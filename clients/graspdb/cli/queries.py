@@ -1,0 +1,272 @@
+"""``graspdb density``, ``best-grasp``, ``likelihood`` and ``samples``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from graspdb.cli.common import (
+    ERRORS,
+    Gripper,
+    ObjectId,
+    Protocol,
+    SigmaPosition,
+    SigmaRotation,
+    Source,
+    Vector3,
+    numbers,
+    out,
+    show_rows,
+    show_table,
+    state_of,
+    vector_option,
+)
+from graspdb.errors import Infeasible
+from graspdb.files import read_poses
+
+
+def density(
+    context: typer.Context,
+    id: ObjectId,
+    gripper: Gripper = None,
+    protocol: Protocol = None,
+    source: Source = None,
+    sigma_position_m: SigmaPosition = None,
+    sigma_rotation_deg: SigmaRotation = None,
+) -> None:
+    """Show an object's grasp density: kernel, widths, counts, effective sample size."""
+    state = state_of(context)
+    with state.client() as db:
+        found = db.objects.get(id).density(
+            gripper=gripper,
+            protocol=protocol,
+            source=source,
+            sigma_position_m=sigma_position_m,
+            sigma_rotation_deg=sigma_rotation_deg,
+        )
+    if state.json:
+        out(found)
+        return
+    kernel = found.kernel
+    rows: dict[str, Any] = {
+        "object": f"{found.object}, revision {found.revision}",
+        "kernel": f"{kernel.kind}, {kernel.sigma_position_m * 1e3:.1f} mm, {kernel.sigma_rotation_deg:.1f}°",
+        "widths": kernel.rule,
+        "selection": ", ".join(x for x in (found.gripper, found.protocol, found.source) if x) or "all trials",
+        "successes": f"{found.size:,}",
+        "effective sample size": f"{found.effective_sample_size:,.0f}",
+        "outcomes": ", ".join(f"{n:,} {name}" for name, n in found.outcomes.items()) or "none",
+        "memory": f"{found.bytes / 2**20:.1f} MiB",
+    }
+    for number, warning in enumerate(found.warnings, start=1):
+        rows[f"warning {number}"] = warning
+    show_rows(rows)
+
+
+def best_grasp(
+    context: typer.Context,
+    id: ObjectId,
+    count: Annotated[int, typer.Option(min=1, max=1_000, help="So many distinct grasps.")] = 1,
+    box_min: Annotated[Vector3 | None, vector_option("Lower corner of the workspace.", "--box-min")] = None,
+    box_max: Annotated[Vector3 | None, vector_option("Upper corner of the workspace.", "--box-max")] = None,
+    sphere: Annotated[
+        Vector3 | None, vector_option("Centre and radius.", "--sphere", count=4, metavar="x,y,z,r")
+    ] = None,
+    above_plane: Annotated[
+        Vector3 | None,
+        vector_option("Keep n.x >= d.", "--above-plane", count=4, metavar="nx,ny,nz,d"),
+    ] = None,
+    approach: Annotated[Vector3 | None, vector_option("Approach direction (tool z).", "--approach")] = None,
+    approach_cone_deg: Annotated[float | None, typer.Option(help="Half angle about --approach.")] = None,
+    closing: Annotated[Vector3 | None, vector_option("Closing direction (tool y).", "--closing")] = None,
+    closing_cone_deg: Annotated[float | None, typer.Option(help="Half angle about --closing.")] = None,
+    collision_free: Annotated[
+        bool | None, typer.Option("--collision-free/--any", help="Whether the gripper must clear the object.")
+    ] = None,
+    object_pose: Annotated[
+        Vector3 | None,
+        vector_option("The object in the world.", "--object-pose", count=7, metavar="x,y,z,qx,qy,qz,qw"),
+    ] = None,
+    frame: Annotated[str | None, typer.Option(help="Frame of the constraints: world or object.")] = None,
+    min_separation_m: Annotated[float | None, typer.Option(help="Distinct from this distance on.")] = None,
+    min_separation_deg: Annotated[float | None, typer.Option(help="Distinct from this angle on.")] = None,
+    gripper: Gripper = None,
+    protocol: Protocol = None,
+    source: Source = None,
+    sigma_position_m: SigmaPosition = None,
+    sigma_rotation_deg: SigmaRotation = None,
+) -> None:
+    """Find the best grasp within constraints.
+
+    All constraints are in the world's frame if --object-pose is given, else in the object's.
+    """
+    if (box_min is None) != (box_max is None):
+        raise typer.BadParameter("--box-min and --box-max go together")
+    state = state_of(context)
+    with state.client() as db:
+        try:
+            found = db.objects.get(id).best_grasps(
+                count=count,
+                box=None if box_min is None or box_max is None else (box_min, box_max),
+                sphere=sphere,
+                above_plane=above_plane,
+                approach=approach,
+                approach_cone_deg=approach_cone_deg,
+                closing=closing,
+                closing_cone_deg=closing_cone_deg,
+                collision_free=collision_free,
+                object_pose=object_pose,
+                frame=frame,
+                min_separation_m=min_separation_m,
+                min_separation_deg=min_separation_deg,
+                gripper=gripper,
+                protocol=protocol,
+                source=source,
+                sigma_position_m=sigma_position_m,
+                sigma_rotation_deg=sigma_rotation_deg,
+            )
+        except Infeasible as error:
+            if state.json:
+                out({"status": "infeasible", "grasps": [], "nearest": error.nearest, "message": str(error)})
+                raise typer.Exit(1) from None
+            raise
+    if state.json:
+        out(
+            {
+                "status": found.status,
+                "revision": found.revision,
+                "kernel": found.kernel,
+                "grasps": list(found),
+            }
+        )
+        return
+    if count == 1:
+        rows = found[0].summary()
+        show_rows(rows)
+        return
+    world = object_pose is not None
+    show_table(
+        (
+            "",
+            "position [m]",
+            "quaternion xyzw",
+            *(["in the world [m]"] if world else []),
+            "density",
+            "relative",
+        ),
+        [
+            (
+                number,
+                numbers(g.position),
+                numbers(g.quaternion_xyzw),
+                *([numbers(g.world[:3, 3]) if g.world is not None else ""] if world else []),
+                f"{g.density:.4g}",
+                f"{g.relative:.3f}",
+            )
+            for number, g in enumerate(found, start=1)
+        ],
+        empty="No grasp.",
+    )
+    if found.status == "fewer":
+        ERRORS.print(f"Only {len(found)} distinct grasps exist.")
+
+
+def likelihood(
+    context: typer.Context,
+    id: ObjectId,
+    file: Annotated[
+        str | None, typer.Argument(help="Poses: .csv (x,y,z,qx,qy,qz,qw), .npy, .json, NDJSON.")
+    ] = None,
+    pose: Annotated[
+        Vector3 | None, vector_option("One pose instead.", "--pose", count=7, metavar="x,y,z,qx,qy,qz,qw")
+    ] = None,
+    gripper: Gripper = None,
+    protocol: Protocol = None,
+    source: Source = None,
+    sigma_position_m: SigmaPosition = None,
+    sigma_rotation_deg: SigmaRotation = None,
+    limit: Annotated[int, typer.Option(min=1, help="Rows of the table; --json gives all.")] = 20,
+) -> None:
+    """Say how likely grasps are."""
+    if (file is None) == (pose is None):
+        raise typer.BadParameter("give a file or --pose")
+    state = state_of(context)
+    poses = np.array([pose]) if file is None else read_poses(file)
+    with state.client() as db:
+        found = db.objects.get(id).likelihood(
+            poses,
+            gripper=gripper,
+            protocol=protocol,
+            source=source,
+            sigma_position_m=sigma_position_m,
+            sigma_rotation_deg=sigma_rotation_deg,
+        )
+    if state.json:
+        out(found)
+        return
+    names = [
+        name
+        for name in ("density", "log_density", "relative", "success_probability", "collision_free")
+        if getattr(found, name) is not None
+    ]
+    show_table(
+        ("", "position [m]", *(name.replace("_", " ") for name in names)),
+        [
+            (row, numbers(poses[row, :3]), *(_cell(getattr(found, name)[row]) for name in names))
+            for row in range(min(limit, len(poses)))
+        ],
+        empty="No poses.",
+    )
+    if len(poses) > limit:
+        ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json gives all.")
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (bool, np.bool_)):
+        return "yes" if value else "no"
+    return f"{value:.5g}"
+
+
+def samples(
+    context: typer.Context,
+    id: ObjectId,
+    count: Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")] = 10,
+    seed: Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")] = None,
+    gripper: Gripper = None,
+    protocol: Protocol = None,
+    source: Source = None,
+    sigma_position_m: SigmaPosition = None,
+    sigma_rotation_deg: SigmaRotation = None,
+    csv: Annotated[
+        bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")
+    ] = False,
+) -> None:
+    """Draw grasps from an object's density."""
+    state = state_of(context)
+    with state.client() as db:
+        found = db.objects.get(id).samples(
+            count,
+            seed=seed,
+            gripper=gripper,
+            protocol=protocol,
+            source=source,
+            sigma_position_m=sigma_position_m,
+            sigma_rotation_deg=sigma_rotation_deg,
+        )
+    if csv:
+        typer.echo("x,y,z,qx,qy,qz,qw,proposal_density")
+        for row, weight in zip(found.poses.tolist(), found.proposal_density.tolist(), strict=True):
+            typer.echo(",".join(repr(value) for value in (*row, weight)))
+    elif state.json:
+        out(found)
+    else:
+        show_table(
+            ("position [m]", "quaternion xyzw", "density"),
+            [
+                (numbers(p), numbers(q), f"{d:.4g}")
+                for p, q, d in zip(found.position, found.quaternion_xyzw, found.proposal_density, strict=True)
+            ],
+            empty="No samples.",
+        )

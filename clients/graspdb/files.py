@@ -1,0 +1,183 @@
+"""Trials and poses in files: JSON, NDJSON and CSV, and poses in .npy.
+
+CSV has a header line. A pose is ``x,y,z,qx,qy,qz,qw``; a trial adds ``outcome`` and, where wanted,
+``gripper``, ``source``, ``protocol``, ``proposal_density``, ``quality``, ``width_m``, ``measured_at``;
+an empty cell is a value not given. JSON is what the HTTP interface takes: one trial, a list of trials,
+``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values shared by all beside them.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.poses import as_poses, as_vectors7
+
+__all__ = ["read_poses", "read_trials"]
+
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at"})
+_NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
+
+
+class FileProblem(ValueError):
+    """A file that cannot be read as trials or poses; the message names it and the line."""
+
+
+def read_trials(path: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Trials as mappings, and the values shared by all; ``-`` reads NDJSON or JSON from standard input.
+
+    Raises
+    ------
+    FileProblem
+        Naming file and line.
+    OSError
+        If the file cannot be read.
+    """
+    if path.lower().endswith(".csv"):
+        return _csv(path, trials=True), {}
+    data = _json_or_ndjson(path)
+    if isinstance(data, list):
+        records, shared = data, {}
+    elif isinstance(data, dict) and "trials" in data:
+        shared = {key: value for key, value in data.items() if key != "trials"}
+        records = data["trials"]
+    elif isinstance(data, dict) and "columns" in data:
+        shared = {key: value for key, value in data.items() if key != "columns"}
+        records = _rows(path, data["columns"])
+    else:
+        records, shared = [data], {}
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise FileProblem(f"{path}: trials are JSON objects, in a list or one a line")
+    if not records:
+        raise FileProblem(f"{path} has no trials")
+    return records, shared
+
+
+def read_poses(path: str) -> NDArray[np.float64]:
+    """Poses as rows x y z qx qy qz qw (N, 7), from .csv, .npy, .json or NDJSON.
+
+    Raises
+    ------
+    FileProblem
+        Naming file and line.
+    ValueError
+        If a pose is wrong.
+    """
+    if path.lower().endswith(".npy"):
+        return as_vectors7(*as_poses(np.load(path, allow_pickle=False)))
+    if path.lower().endswith(".csv"):
+        records = _csv(path, trials=False)
+    else:
+        data = _json_or_ndjson(path)
+        if isinstance(data, dict) and "poses" in data:
+            data = data["poses"]
+        if isinstance(data, dict) and "columns" in data:
+            data = data["columns"]
+        if isinstance(data, dict) and isinstance(data.get("quaternion_xyzw"), list):
+            nested = data["quaternion_xyzw"] and isinstance(data["quaternion_xyzw"][0], list)
+            columns = {key: data.get(key) for key in ("position", "quaternion_xyzw")}
+            data = _rows(path, columns) if nested else [data]
+        records = data if isinstance(data, list) else [data]
+    if not records:
+        raise FileProblem(f"{path} has no poses")
+    rows = []
+    for number, record in enumerate(records):
+        try:
+            if isinstance(record, dict):
+                pose = (
+                    record["matrix"]
+                    if "matrix" in record
+                    else [*record["position"], *record["quaternion_xyzw"]]
+                )
+            else:
+                pose = record
+            rows.append(np.concatenate([part[0] for part in as_poses(pose)]))
+        except (KeyError, TypeError, ValueError) as error:
+            reason = f"has no {error}" if isinstance(error, KeyError) else str(error)
+            raise FileProblem(f"{path}, pose {number}: {reason}") from error
+    return np.array(rows)
+
+
+def _json_or_ndjson(path: str) -> Any:
+    text = sys.stdin.read() if path == "-" else Path(path).read_text(encoding="utf-8")
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        whole = error
+    records = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            records.append(json.loads(line))
+        except ValueError as error:
+            if number == 1:
+                raise FileProblem(f"{path} is neither JSON nor NDJSON: {whole}") from error
+            raise FileProblem(f"{path}, line {number}: {error}") from error
+    return records
+
+
+def _rows(path: str, columns: Any) -> list[dict[str, Any]]:
+    if not isinstance(columns, dict) or not all(
+        isinstance(c, list) for c in columns.values() if c is not None
+    ):
+        raise FileProblem(f"{path}: columns are lists of equal length")
+    given = {name: values for name, values in columns.items() if values is not None}
+    lengths = {name: len(values) for name, values in given.items()}
+    if len(set(lengths.values())) > 1:
+        raise FileProblem(f"{path}: the columns differ in length: {lengths}")
+    count = next(iter(lengths.values()), 0)
+    return [
+        {name: values[i] for name, values in given.items() if values[i] is not None} for i in range(count)
+    ]
+
+
+def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
+    with Path(path).open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file, skipinitialspace=True)
+        names = set(reader.fieldnames or ())
+        wanted = {*POSE_COLUMNS, "outcome"} if trials else set(POSE_COLUMNS)
+        if missing := sorted(wanted - names):
+            raise FileProblem(f"{path} needs a header line with {','.join(POSE_COLUMNS)}; it lacks {missing}")
+        if trials and (unknown := sorted(names - wanted - _TEXT_COLUMNS - _NUMBER_COLUMNS)):
+            raise FileProblem(f"{path} has unknown columns {unknown}")
+        records = []
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            if None in row or any(value is None for value in row.values()):
+                raise FileProblem(f"{where}: the number of cells differs from the header's")
+            numbers = [_number(where, name, row[name]) for name in POSE_COLUMNS]
+            record: dict[str, Any] = {"position": numbers[:3], "quaternion_xyzw": numbers[3:]}
+            if trials:
+                for name in (_TEXT_COLUMNS | _NUMBER_COLUMNS) & names:
+                    text = row[name].strip()
+                    if text:
+                        record[name] = _number(where, name, text) if name in _NUMBER_COLUMNS else text
+                record["outcome"] = _outcome(record.get("outcome"))
+            records.append(record)
+    if not records:
+        raise FileProblem(f"{path} has a header but no rows")
+    return records
+
+
+def _outcome(text: Any) -> Any:
+    """CSV has no booleans; the service names what is left wrong."""
+    return {"true": True, "1": True, "false": False, "0": False}.get(str(text).lower(), text)
+
+
+def _number(where: str, name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise FileProblem(f"{where}: {name} is {text!r}, which is no number") from error
+    if not math.isfinite(value):
+        raise FileProblem(f"{where}: {name} is {text}; numbers must be finite")
+    return value
