@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
+from graspdb_service.usecases.compute import Compute
+from graspdb_service.usecases.densities import Densities
+from graspdb_service.usecases.scenes import Scenes
 
 
 @dataclass
@@ -14,10 +17,21 @@ class Context:
 
     settings: Settings
     database: Database
+    compute: Compute
+    densities: Densities
+    scenes: Scenes
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
-        return cls(settings=settings, database=database)
+        compute = Compute(settings.threads)
+        return cls(
+            settings=settings,
+            database=database,
+            compute=compute,
+            densities=Densities(database, compute, settings.max_density_cache_bytes),
+            scenes=Scenes(database, compute),
+        )
 
     def close(self) -> None:
+        self.compute.close()
         self.database.dispose()

@@ -1,0 +1,65 @@
+"""The service's compute pool: a few threads for numbers, so that the rest of the service stays quick."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+from graspdb_service.problems import ProblemError
+
+T = TypeVar("T")
+
+#: Queries under way or waiting. The server has 40 threads for requests: the others must find some free.
+MAX_QUERIES = 28
+
+
+class Compute:
+    """Runs computations on a bounded number of threads and refuses more queries than it can hold.
+
+    Parameters
+    ----------
+    threads
+        Computations at a time.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="graspdb-compute")
+        self._room = threading.BoundedSemaphore(MAX_QUERIES)
+
+    @contextmanager
+    def admitted(self) -> Iterator[None]:
+        """A query's place, from its first computation to its last.
+
+        Raises
+        ------
+        ProblemError
+            429 where all places are taken.
+        """
+        if not self._room.acquire(blocking=False):
+            raise ProblemError(
+                429,
+                "busy",
+                "All places for queries are taken: try again in a second, or ask for fewer poses at a time",
+                headers={"Retry-After": "1"},
+            )
+        try:
+            yield
+        finally:
+            self._room.release()
+
+    def run(self, work: Callable[[], T]) -> T:
+        """Do ``work`` in the pool and wait for it. Never call it from inside the pool or a transaction."""
+        return self._pool.submit(work).result()
+
+    def blocks(self, count: int, block: int, work: Callable[[slice], None]) -> None:
+        """Do ``work`` on consecutive slices of ``range(count)``, queued one by one so that others get between."""
+        for start in range(0, count, block):
+            part = slice(start, min(start + block, count))
+            self.run(lambda part=part: work(part))  # type: ignore[misc]
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,322 @@
+"""Densities built on demand and kept: extended when trials come, rebuilt when the past changes."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import KernelInfo, KernelSpec, Selection
+from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
+from graspdb_density.density import CUTOFF
+from graspdb_density.kernels import POSITION_LIMITS_M, ROTATION_LIMITS
+from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.storage import trials
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.cache import SingleFlightCache
+from graspdb_service.usecases.compute import Compute
+from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.selection import Filters, Selected, resolve
+
+Floats = NDArray[np.float64]
+
+DEFAULT_SIGMA_POSITION_M = 0.015
+DEFAULT_SIGMA_ROTATION_DEG = 15.0
+#: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
+_LARGEST_CUTOFF = 10.0
+#: Weights are told apart in float32: a row that counts less than this share of the heaviest gets this share.
+_LEAST_SHARE = 1e-30
+_RESOLVED = 4_096
+
+
+@dataclass(frozen=True)
+class KernelChoice:
+    """The kernel a request asks for; None: widths by the default rule."""
+
+    sigma_position_m: float | None = None
+    sigma_rotation_deg: float | None = None
+
+    @property
+    def by_default(self) -> bool:
+        return self.sigma_position_m is None and self.sigma_rotation_deg is None
+
+
+def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
+    """The kernel and the cut-off (None: exact) that a request asks for.
+
+    Raises
+    ------
+    ProblemError
+        422 for widths given twice; 409 or 404 for a kernel that does not exist, naming those that do.
+    """
+    choice, cutoff = _choice(request)
+    for name, value, (low, high) in (
+        ("sigma_position_m", choice.sigma_position_m, POSITION_LIMITS_M),
+        ("sigma_rotation_deg", choice.sigma_rotation_deg, np.degrees(ROTATION_LIMITS)),
+    ):
+        if value is not None and not low <= value <= high:
+            raise invalid(name, f"a width must be between {low:g} and {high:g}")
+    return choice, cutoff
+
+
+def _choice(request: Selection) -> tuple[KernelChoice, float | None]:
+    beside = KernelChoice(request.sigma_position_m, request.sigma_rotation_deg)
+    kernel = request.kernel
+    if isinstance(kernel, KernelSpec):
+        inside = KernelChoice(kernel.sigma_position_m, kernel.sigma_rotation_deg)
+        twice = [
+            name
+            for name in ("sigma_position_m", "sigma_rotation_deg")
+            if getattr(inside, name) is not None and getattr(beside, name) is not None
+        ]
+        if twice:
+            raise ProblemError(
+                422,
+                "invalid-request",
+                "A width is given both in kernel and beside it",
+                errors=[(name, "give it once, in kernel or beside it") for name in twice],
+            )
+        choice = KernelChoice(
+            inside.sigma_position_m if beside.sigma_position_m is None else beside.sigma_position_m,
+            inside.sigma_rotation_deg if beside.sigma_rotation_deg is None else beside.sigma_rotation_deg,
+        )
+        if "cutoff" not in kernel.model_fields_set:
+            return choice, CUTOFF
+        exact = kernel.cutoff is None or kernel.cutoff > _LARGEST_CUTOFF
+        return choice, None if exact else kernel.cutoff
+    if kernel == "anisotropic":
+        raise conflict(
+            "kernel-not-fitted",
+            "No anisotropic kernel has been fitted for this object and gripper; kernels there are: isotropic",
+            kernels=["isotropic"],
+        )
+    if kernel not in (None, "isotropic"):
+        raise not_found("kernel", str(kernel), "kernels there are: isotropic")
+    return beside, CUTOFF
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A density and what it was built of, immutable.
+
+    Attributes
+    ----------
+    density
+        None where no trial of the selection succeeded.
+    seq
+        (N,) sequence numbers of its rows, ascending.
+    proposal_density
+        (N,) NaN where unknown; None where none is known.
+    weight_unit
+        Weight times proposal density, the same for every row that has one.
+    """
+
+    revision: int
+    epoch: int
+    last_seq: int
+    object_row: ObjectRow
+    selected: Selected
+    kernel: KernelInfo
+    density: GraspDensity | None
+    seq: NDArray[np.int64]
+    proposal_density: Floats | None
+    weight_unit: float | None
+
+    @property
+    def nbytes(self) -> int:
+        own = self.seq.nbytes + (0 if self.proposal_density is None else self.proposal_density.nbytes)
+        return own + (0 if self.density is None else self.density.nbytes) + 4_096
+
+
+@dataclass(frozen=True)
+class _Key:
+    object_id: int
+    filters: Filters
+    kernel: KernelChoice
+
+
+class Densities:
+    """The densities of one service process, over a database that others may share.
+
+    Every query reads the object's revision, one indexed row. Trials that came since are read as a tail and
+    extend the density; any other change (a new epoch) rebuilds it. So what another process committed is in
+    the next answer of this one. Nothing is computed inside a transaction.
+    """
+
+    def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
+        self._database = database
+        self._compute = compute
+        self._cache: SingleFlightCache[_Key, Built] = SingleFlightCache(max_bytes, lambda b: b.nbytes)
+        self._resolved: OrderedDict[tuple[int, Filters], tuple[int, Selected]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def current(self, slug: str, filters: Filters) -> tuple[ObjectRow, Selected]:
+        """The object as it is now, and which of its trials the filters select.
+
+        Raises
+        ------
+        ProblemError
+            404 for the object or gripper, 409 for an ambiguous selection.
+        """
+        with self._database.read() as tx:
+            row = require(tx, slug)
+            with self._lock:
+                known = self._resolved.get((row.id, filters))
+            if known is not None and known[0] == row.revision:
+                return row, known[1]
+            selected = resolve(tx, row.id, filters)
+        with self._lock:
+            self._resolved[row.id, filters] = row.revision, selected
+            self._resolved.move_to_end((row.id, filters))
+            while len(self._resolved) > _RESOLVED:
+                self._resolved.popitem(last=False)
+        return row, selected
+
+    def get(self, slug: str, filters: Filters, kernel: KernelChoice) -> Built:
+        """The density at least as new as the object is now.
+
+        Raises
+        ------
+        ProblemError
+            As :meth:`current`.
+        """
+        row, selected = self.current(slug, filters)
+        key = _Key(row.id, selected.filters, kernel)
+        return self._cache.get(
+            key,
+            lambda built: built.revision >= row.revision,
+            lambda before: self._refresh(key, slug, before),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        return self._cache.nbytes
+
+    def __len__(self) -> int:
+        return len(self._cache)
+
+    def _refresh(self, key: _Key, slug: str, before: Built | None) -> Built:
+        with self._database.read() as tx:
+            row = require(tx, slug)
+            if row.id != key.object_id:
+                raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
+            selected = resolve(tx, row.id, key.filters)
+            if before is not None and before.epoch != row.epoch:
+                before = None
+            rows = trials.read(
+                tx,
+                row.id,
+                provenance_ids=list(selected.provenances),
+                successes_only=True,
+                after_seq=0 if before is None else before.last_seq,
+            )
+        if before is not None and not len(rows):
+            return replace(
+                before, revision=row.revision, last_seq=row.last_seq, object_row=row, selected=selected
+            )
+        return self._compute.run(lambda: _build(key.kernel, row, selected, rows, before))
+
+
+def _build(
+    choice: KernelChoice, row: ObjectRow, selected: Selected, rows: trials.Columns, before: Built | None
+) -> Built:
+    """Extend the density there was, or build it from all rows where that is not possible."""
+    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
+    proposal = None if np.isnan(rows.proposal_density).all() else rows.proposal_density
+    old = None if before is None else before.density
+    position, quaternion, seq = rows.position, rows.quaternion_xyzw, rows.seq
+    if before is not None and old is not None:
+        seq = np.concatenate([before.seq, rows.seq])
+        proposal = _joined(before.proposal_density, len(before.seq), proposal, len(rows))
+    built = Built(
+        revision=row.revision,
+        epoch=row.epoch,
+        last_seq=row.last_seq,
+        object_row=row,
+        selected=selected,
+        kernel=_info(choice),
+        density=None,
+        seq=seq,
+        proposal_density=proposal,
+        weight_unit=None,
+    )
+    if not len(seq):
+        return built
+    if before is not None and old is not None:
+        if before.kernel == built.kernel:
+            extended = _extended(before, old, rows, symmetric, proposal)
+            if extended is not None:
+                return replace(built, density=extended, weight_unit=before.weight_unit)
+        position = np.concatenate([old.positions, position])
+        quaternion = np.concatenate([old.quaternions_xyzw, quaternion])
+        symmetric = np.concatenate([old.symmetric, symmetric])
+    weights = None if proposal is None else _weights(proposal)
+    unit = None
+    if weights is not None and proposal is not None:
+        first = int(np.flatnonzero(~np.isnan(proposal))[0])
+        unit = float(weights[first] * proposal[first])
+    density = GraspDensity.build(
+        position,
+        quaternion,
+        kernel=IsotropicKernel(
+            built.kernel.sigma_position_m, math.radians(built.kernel.sigma_rotation_deg)
+        ),
+        weights=weights,
+        symmetric=symmetric,
+    )
+    return replace(built, density=density, weight_unit=unit)
+
+
+def _extended(
+    before: Built, old: GraspDensity, rows: trials.Columns, symmetric: NDArray[np.bool_], proposal: Floats | None
+) -> GraspDensity | None:
+    """The density with further rows; None where they change the weights of the first ones."""
+    weights = None
+    if proposal is not None:
+        # A trial without a proposal density takes the mean weight of the rest, which the new rows move.
+        if before.weight_unit is None or np.isnan(proposal).any():
+            return None
+        with np.errstate(over="ignore"):
+            weights = before.weight_unit / rows.proposal_density
+        if not (np.isfinite(weights).all() and (weights > 0).all()):
+            return None
+    return old.extend(rows.position, rows.quaternion_xyzw, weights=weights, symmetric=symmetric)
+
+
+def _weights(proposal: Floats) -> Floats:
+    """Weights of eq 1, no row lost to rounding."""
+    weights = importance_weights(proposal)
+    return np.maximum(weights, weights.max() * _LEAST_SHARE)
+
+
+def _joined(first: Floats | None, first_count: int, second: Floats | None, second_count: int) -> Floats | None:
+    if first is None and second is None:
+        return None
+    return np.concatenate(
+        [
+            np.full(first_count, np.nan) if first is None else first,
+            np.full(second_count, np.nan) if second is None else second,
+        ]
+    )
+
+
+def _info(choice: KernelChoice) -> KernelInfo:
+    position, rotation = choice.sigma_position_m, choice.sigma_rotation_deg
+    default = f"{DEFAULT_SIGMA_POSITION_M * 1000:g} mm and {DEFAULT_SIGMA_ROTATION_DEG:g} degrees"
+    if choice.by_default:
+        rule = f"default: {default}"
+    elif position is None or rotation is None:
+        rule = f"as asked; the width not named by default ({default})"
+    else:
+        rule = "as asked"
+    return KernelInfo(
+        kind="isotropic",
+        sigma_position_m=DEFAULT_SIGMA_POSITION_M if position is None else position,
+        sigma_rotation_deg=DEFAULT_SIGMA_ROTATION_DEG if rotation is None else rotation,
+        rule=rule,
+    )

@@ -1,0 +1,362 @@
+"""Questions to a density: what it is, how likely poses are, which grasp is best, draws from it."""
+
+from __future__ import annotations
+
+import math
+import secrets
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import BestGraspRequest, BestGrasps, DensityInfo, Grasp, KernelInfo, Selection, WorldPose
+from graspdb.wire.queries import LikelihoodColumn
+from graspdb_density import GraspDensity, Region, se3
+from graspdb_density.density import CUTOFF
+from graspdb_density.weights import LOW_EFFECTIVE_SHARE
+from graspdb_service.problems import ProblemError, conflict
+from graspdb_service.usecases.constraints import Constraints, constraints
+from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.densities import Built, kernel_of
+from graspdb_service.usecases.scenes import CollisionTest
+from graspdb_service.usecases.selection import Filters
+
+Floats = NDArray[np.float64]
+
+#: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
+_BLOCK = 16_384
+_SEPARATION_M = 0.01
+_SEPARATION_DEG = 20.0
+_NEAREST_TRIALS = 5
+#: Ratios and draws see more of the kernels' tails than a plain question.
+_PRECISE_CUTOFF = 5.0
+
+
+def built_for(ctx: Context, slug: str, request: Selection) -> Built:
+    """The density that a request is about."""
+    choice, _ = kernel_of(request)
+    return ctx.densities.get(slug, Filters.of(request), choice)
+
+
+# -- the density itself ------------------------------------------------------------------------------------
+
+
+def density_info(ctx: Context, slug: str, request: Selection) -> tuple[DensityInfo, int]:
+    """What is known of a density, and the object's internal id."""
+    with ctx.compute.admitted():
+        built = built_for(ctx, slug, request)
+    density, selected = built.density, built.selected
+    size = 0 if density is None else density.size
+    effective = 0.0 if density is None else density.effective_sample_size
+    warnings = []
+    if size and effective < LOW_EFFECTIVE_SHARE * size:
+        warnings.append(
+            f"the weights are very uneven: {size} successes count like {effective:.0f};"
+            " check the proposal densities of the trials"
+        )
+    info = DensityInfo(
+        object=slug,
+        revision=built.revision,
+        epoch=built.epoch,
+        gripper=selected.gripper,
+        protocol=selected.protocol,
+        source=selected.source,
+        kernel=built.kernel,
+        size=size,
+        outcomes=dict(selected.outcomes),
+        effective_sample_size=effective,
+        bytes=built.nbytes,
+        warnings=warnings,
+    )
+    return info, built.object_row.id
+
+
+# -- likelihood ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodAnswer:
+    """Columns (n,) in the poses' order, None where not asked for or not known.
+
+    ``log_density`` is minus infinity where the density is exactly zero.
+    """
+
+    object_id: int
+    revision: int
+    kernel: KernelInfo
+    density: Floats | None = None
+    log_density: Floats | None = None
+    relative: Floats | None = None
+    collision_free: NDArray[np.bool_] | None = None
+
+
+def likelihood(
+    ctx: Context,
+    slug: str,
+    request: Selection,
+    positions: Floats,
+    quaternions: Floats,
+    include: Collection[LikelihoodColumn] | None,
+) -> LikelihoodAnswer:
+    """How likely poses (n, 3), (n, 4) in the object frame are under the density of the successes."""
+    count = len(positions)
+    if count > ctx.settings.max_query_poses:
+        raise ProblemError(
+            413,
+            "too-many-poses",
+            f"{count} poses are over the limit of {ctx.settings.max_query_poses}: send them in several requests",
+            errors=[("poses", f"at most {ctx.settings.max_query_poses}")],
+        )
+    _, cutoff = kernel_of(request)
+
+    def asked(*names: LikelihoodColumn) -> bool:
+        return include is None or any(name in include for name in names)
+
+    threads = ctx.compute.threads
+    with ctx.compute.admitted():
+        built = built_for(ctx, slug, request)
+        logs = relative = free = None
+        if asked("density", "log_density", "relative"):
+            logs = np.full(count, -np.inf)
+            relative = np.zeros(count)
+            density = built.density
+            if density is not None:
+                ctx.compute.blocks(count, _BLOCK, _into(density, positions, quaternions, cutoff, threads, logs))
+                if asked("relative"):
+                    # Rounding may lift a pose at the very maximum above it.
+                    relative = np.minimum(np.exp(logs - _global_maximum(ctx, density)), 1.0)
+        if asked("collision_free"):
+            test = ctx.scenes.test(built.object_row, built.selected)
+            if test is not None:
+                free = _free(ctx, test, positions, quaternions)
+    return LikelihoodAnswer(
+        object_id=built.object_row.id,
+        revision=built.revision,
+        kernel=built.kernel,
+        density=np.exp(logs) if logs is not None and asked("density") else None,
+        log_density=logs if asked("log_density") else None,
+        relative=relative if asked("relative") else None,
+        collision_free=free,
+    )
+
+
+def _into(
+    density: GraspDensity, positions: Floats, quaternions: Floats, cutoff: float | None, threads: int, out: Floats
+):  # type: ignore[no-untyped-def]
+    def work(part: slice) -> None:
+        out[part] = density.log_density(positions[part], quaternions[part], cutoff=cutoff, threads=threads)
+
+    return work
+
+
+def _free(ctx: Context, test: CollisionTest, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
+    free = np.empty(len(positions), dtype=bool)
+
+    def work(part: slice) -> None:
+        free[part] = test.free(positions[part], quaternions[part], threads=ctx.compute.threads)
+
+    ctx.compute.blocks(len(positions), _BLOCK, work)
+    return free
+
+
+def _global_maximum(ctx: Context, density: GraspDensity) -> float:
+    return ctx.compute.run(lambda: density.global_maximum(ctx.compute.threads)).log_density
+
+
+# -- the best grasps -------------------------------------------------------------------------------------------
+
+
+def best_grasps(ctx: Context, slug: str, request: BestGraspRequest) -> tuple[BestGrasps, int]:
+    """The best distinct grasps under the request's constraints, and the object's internal id."""
+    kernel_of(request)
+    constraints(request)
+    with ctx.compute.admitted():
+        built = built_for(ctx, slug, request)
+        limits = constraints(request, jaw_symmetric=built.selected.jaw_symmetric)
+        if request.collision_free:
+            test: CollisionTest | None = ctx.scenes.require(built.object_row, built.selected)
+        else:
+            test = ctx.scenes.test(built.object_row, built.selected)
+        must_be_free = request.collision_free is not False and test is not None
+        density = built.density
+        if density is None:
+            return _answer(built, "no_successes", []), built.object_row.id
+        admissible = test.free if must_be_free and test is not None else None
+        threads = ctx.compute.threads
+        found = ctx.compute.run(
+            lambda: density.maximum(
+                limits.region,
+                count=request.count,
+                min_separation_m=_or(request.min_separation_m, _SEPARATION_M),
+                min_separation=math.radians(_or(request.min_separation_deg, _SEPARATION_DEG)),
+                admissible=admissible,
+                threads=threads,
+            )
+        )
+        top = _global_maximum(ctx, density)
+
+        def describe(position: Floats, quaternion: Floats, log: float, active: tuple[str, ...]) -> Grasp:
+            return _grasp(built, density, limits, test, position, quaternion, log, top, active)
+
+        if found:
+            grasps = ctx.compute.run(
+                lambda: [
+                    describe(m.position, m.quaternion_xyzw, m.log_density, m.active_constraints) for m in found
+                ]
+            )
+            status = "ok" if len(grasps) >= request.count else "fewer"
+            return _answer(built, status, grasps), built.object_row.id
+
+        def closest() -> Grasp | None:
+            row = _closest_row(density, limits.region, admissible)
+            if row is None:
+                return None
+            p, q = density.positions[row], density.quaternions_xyzw[row]
+            return describe(p, q, float(density.log_density(p[None], q[None])[0]), ())
+
+        return _answer(built, "infeasible", [], ctx.compute.run(closest)), built.object_row.id
+
+
+def _answer(built: Built, status: str, grasps: list[Grasp], nearest: Grasp | None = None) -> BestGrasps:
+    return BestGrasps.model_validate(
+        {
+            "status": status,
+            "grasps": grasps,
+            "nearest": nearest,
+            "revision": built.revision,
+            "kernel": built.kernel,
+        }
+    )
+
+
+def _grasp(
+    built: Built,
+    density: GraspDensity,
+    limits: Constraints,
+    test: CollisionTest | None,
+    position: Floats,
+    quaternion: Floats,
+    log: float,
+    top: float,
+    active: tuple[str, ...],
+) -> Grasp:
+    world = limits.to_world(position, quaternion)
+    return Grasp(
+        position=_numbers(position),  # type: ignore[arg-type]
+        quaternion_xyzw=_numbers(quaternion),  # type: ignore[arg-type]
+        world=None
+        if world is None
+        else WorldPose(position=_numbers(world[0]), quaternion_xyzw=_numbers(world[1])),  # type: ignore[arg-type]
+        density=math.exp(log),
+        log_density=log,
+        relative=min(math.exp(log - top), 1.0),
+        collision_free=None if test is None else bool(test.free(position[None], quaternion[None])[0]),
+        nearest_trials=_nearest_trials(built, density, position, quaternion),
+        active_constraints=limits.named(active),
+    )
+
+
+def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quaternion: Floats) -> list[int]:
+    """Sequence numbers of the successes that weigh most at a pose, the nearest in the kernel's own measure."""
+    kernel = density.kernel
+    centres, rotations = density.positions, density.quaternions_xyzw
+    cosine = np.abs(rotations @ quaternion)
+    turned = np.abs(rotations @ se3.jaw_twin(quaternion))
+    cosine = np.where(density.symmetric, np.maximum(cosine, turned), cosine)
+    value = kernel.kappa * cosine - 0.5 * np.sum((centres - position) ** 2, axis=1) / kernel.sigma_position_m**2
+    count = min(_NEAREST_TRIALS, len(value))
+    best = np.argpartition(-value, count - 1)[:count]
+    best = best[np.argsort(-value[best], kind="stable")]
+    return [int(seq) for seq in built.seq[best]]
+
+
+def _closest_row(density: GraspDensity, region: Region, admissible: object) -> int | None:
+    """The success that violates the region least, in widths of the kernel, and is admissible."""
+    kernel = density.kernel
+    p, q, _ = region.project(density.positions, density.quaternions_xyzw)
+    shift = np.sum((p - density.positions) ** 2, axis=1) / kernel.sigma_position_m**2
+    turn = se3.angle_between(q, density.quaternions_xyzw) ** 2 / kernel.sigma_rotation**2
+    order = np.argsort(shift + turn, kind="stable")
+    if admissible is None:
+        return int(order[0])
+    for start in range(0, len(order), 4_096):
+        rows = order[start : start + 4_096]
+        free = np.flatnonzero(admissible(density.positions[rows], density.quaternions_xyzw[rows]))  # type: ignore[operator]
+        if free.size:
+            return int(rows[free[0]])
+    return None
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value
+
+
+def _numbers(values: Floats) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+# -- samples ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """Poses (n, 3), (n, 4) drawn from a density, with the density (n,) they were drawn with, 1/(m^3 rad^3)."""
+
+    object_id: int
+    revision: int
+    kernel: KernelInfo
+    seed: int
+    position: Floats
+    quaternion_xyzw: Floats
+    proposal_density: Floats
+
+
+def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
+    """Draw grasps; the same revision, selection, kernel, count and seed give the same ones.
+
+    Parameters
+    ----------
+    seed
+        None: one is made up, and answered.
+
+    Raises
+    ------
+    ProblemError
+        413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
+    """
+    limit = ctx.settings.max_samples
+    if count > limit:
+        raise ProblemError(
+            413,
+            "too-many-samples",
+            f"{count} samples are over the limit of {limit}: draw them in several requests with other seeds",
+            errors=[("count", f"at most {limit}")],
+        )
+    chosen = secrets.randbits(63) if seed is None else seed
+    with ctx.compute.admitted():
+        built = built_for(ctx, slug, selection)
+        density = built.density
+        if density is None:
+            raise conflict(
+                "no-successes",
+                "No trial of this selection succeeded, so there is no density to draw from:"
+                f" post trials (POST /objects/{slug}/trials) or sweep a grid first",
+            )
+        position, quaternion = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
+        logs = np.empty(count)
+        ctx.compute.blocks(
+            count, _BLOCK, _into(density, position, quaternion, _PRECISE_CUTOFF, ctx.compute.threads, logs)
+        )
+    return Draw(
+        object_id=built.object_row.id,
+        revision=built.revision,
+        kernel=built.kernel,
+        seed=chosen,
+        position=position,
+        quaternion_xyzw=se3.canonical(quaternion),
+        proposal_density=np.exp(logs),
+    )
+
+
+__all__ = ["CUTOFF", "Draw", "LikelihoodAnswer", "best_grasps", "density_info", "draw", "likelihood"]

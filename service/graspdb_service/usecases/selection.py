@@ -1,0 +1,134 @@
+"""Which trials a question is about: by gripper, protocol and source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from graspdb.wire import OUTCOMES, GripperProfile, Selection
+from graspdb_service.problems import conflict, not_found
+from graspdb_service.storage import grippers, trials
+from graspdb_service.storage.database import Tx
+
+
+@dataclass(frozen=True)
+class Filters:
+    """What a request names; None: not named."""
+
+    gripper: str | None = None
+    protocol: str | None = None
+    source: str | None = None
+
+    @classmethod
+    def of(cls, request: Selection) -> Filters:
+        return cls(request.gripper, request.protocol, request.source)
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """What the filters mean for an object as it was when they were resolved.
+
+    Attributes
+    ----------
+    gripper, protocol
+        The one named, else the only one among the trials, else None.
+    profile
+        The gripper's profile, where there is a gripper.
+    provenances
+        Internal ids of the selected trials' provenances, each with whether its jaw is mirror-symmetric.
+    outcomes
+        Selected trials by outcome, packed ones included.
+    """
+
+    gripper: str | None
+    protocol: str | None
+    source: str | None
+    profile: GripperProfile | None
+    provenances: Mapping[int, bool]
+    outcomes: Mapping[str, int]
+
+    @property
+    def filters(self) -> Filters:
+        """The filters that select the same trials whatever else is added to the object."""
+        return Filters(self.gripper, self.protocol, self.source)
+
+    @property
+    def jaw_symmetric(self) -> bool:
+        return self.profile is None or self.profile.symmetric
+
+    @property
+    def successes(self) -> int:
+        return self.outcomes.get("success", 0)
+
+
+def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
+    """Find the provenances that pass the filters.
+
+    A trial without gripper or protocol fits every selection and makes none ambiguous.
+
+    Raises
+    ------
+    ProblemError
+        404 for a gripper that does not exist; 409 ``ambiguous-selection`` where several grippers or
+        protocols are left and none is named.
+    """
+    profiles: dict[str, GripperProfile] = {}
+    if filters.gripper is not None:
+        profiles[filters.gripper] = _profile(tx, filters.gripper)
+    counts: dict[int, dict[str, int]] = {}
+    for provenance, code, rows, packed in trials.tallies(tx, object_id):
+        if rows + packed:
+            counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
+    # A provenance all of whose trials were deleted is none of the object's any more.
+    candidates = [
+        item
+        for item in trials.provenances(tx, object_id)
+        if item.id in counts
+        and filters.source in (None, item.source)
+        and (filters.gripper is None or item.gripper in (None, filters.gripper))
+        and (filters.protocol is None or item.protocol in (None, filters.protocol))
+    ]
+    found = {
+        name: _distinct(getattr(item, name) for item in candidates) for name in ("gripper", "protocol")
+    }
+    ambiguous = [
+        name for name, values in found.items() if len(values) > 1 and getattr(filters, name) is None
+    ]
+    if ambiguous:
+        told = "; ".join(f"{name}: {', '.join(found[name])}" for name in ambiguous)
+        raise conflict(
+            "ambiguous-selection",
+            f"The trials are of several {' and '.join(name + 's' for name in ambiguous)}: name one ({told})",
+            grippers=found["gripper"],
+            protocols=found["protocol"],
+        )
+    chosen = {
+        name: getattr(filters, name) or (values[0] if values else None) for name, values in found.items()
+    }
+    for name in _distinct([chosen["gripper"], *(item.gripper for item in candidates)]):
+        profiles.setdefault(name, _profile(tx, name))
+    outcomes: dict[str, int] = {}
+    for item in candidates:
+        for outcome, number in counts[item.id].items():
+            outcomes[outcome] = outcomes.get(outcome, 0) + number
+    return Selected(
+        gripper=chosen["gripper"],
+        protocol=chosen["protocol"],
+        source=filters.source,
+        profile=profiles.get(chosen["gripper"] or ""),
+        provenances={
+            item.id: item.gripper is None or profiles[item.gripper].symmetric for item in candidates
+        },
+        outcomes={name: outcomes[name] for name in OUTCOMES if name in outcomes},
+    )
+
+
+def _profile(tx: Tx, name: str) -> GripperProfile:
+    row = grippers.find(tx, name)
+    if row is None:
+        raise not_found("gripper", name, "GET /grippers lists those there are")
+    return GripperProfile.model_validate(row.profile)
+
+
+def _distinct(values: Iterable[str | None]) -> list[str]:
+    return sorted({value for value in values if value is not None})
