@@ -7,17 +7,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 import pytest
+from graspdb_geometry import grippers
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-
-from graspdb_geometry import grippers
 
 FloatArray = npt.NDArray[np.float64]
 
 
 class Oracle:
-    """The gripper against convex parts, each question as a linear programme over half-spaces (object frame)."""
+    """The gripper against convex parts, each question a linear programme over half-spaces (object frame)."""
 
     def __init__(self, parts: Sequence[FloatArray]) -> None:
         self.parts = [np.asarray(p, dtype=np.float64) for p in parts]
