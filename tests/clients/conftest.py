@@ -1,0 +1,116 @@
+"""The real service in a process of its own, shared by the tests of the clients."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from graspdb import Client
+
+
+def _command(name: str) -> str:
+    return str(Path(sys.executable).with_name(name))
+
+
+@pytest.fixture(scope="session")
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """``graspdb-server serve`` on a scratch SQLite; its address."""
+    folder = tmp_path_factory.mktemp("service")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    url = f"http://127.0.0.1:{port}"
+    log = folder / "log"
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [_command("graspdb-server"), "serve", "--host", "127.0.0.1", "--port", str(port)],
+            env={**os.environ, "GRASPDB_DATABASE_URL": f"sqlite:///{folder / 'graspdb.sqlite'}"},
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        deadline = time.monotonic() + 60
+        while True:
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < deadline, log.read_text()
+            try:
+                if httpx.get(f"{url}/readyz").is_success:
+                    break
+            except httpx.TransportError:
+                pass
+            time.sleep(0.05)
+        yield url
+    finally:
+        process.terminate()
+        try:
+            process.wait(15)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="session")
+def worker(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """``graspdb-simworker run`` beside the service."""
+    log = tmp_path_factory.mktemp("worker") / "log"
+    with log.open("wb") as output:
+        process = subprocess.Popen(
+            [_command("graspdb-simworker"), "run", "--url", service_url, "--processes", "1"],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        yield
+        assert process.poll() is None, log.read_text()
+    finally:
+        process.terminate()
+        try:
+            process.wait(30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def db(service_url: str) -> Iterator[Client]:
+    """A client of the service."""
+    with Client(service_url, retries=1) as client:
+        yield client
+
+
+@pytest.fixture
+def fresh_id() -> str:
+    """An object's id that no other test has."""
+    return f"object-{uuid.uuid4().hex[:12]}"
+
+
+Cluster = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.fixture
+def clusters() -> Callable[..., np.ndarray]:
+    """Poses (N, 7) about centres: Gaussian in position and, by small rotation vectors, in rotation."""
+
+    def make(centres: list[tuple[list[float], list[float]]], count: int, seed: int = 0) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        rows = []
+        for position, quaternion in centres:
+            half = rng.normal(size=(count, 3)) * 0.04
+            turn = np.concatenate([half, np.sqrt(1 - (half**2).sum(1, keepdims=True))], axis=1)
+            a, b = np.broadcast_to(quaternion, (count, 4)), turn
+            vector = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
+            scalar = a[:, 3] * b[:, 3] - (a[:, :3] * b[:, :3]).sum(1)
+            rows.append(np.column_stack([position + rng.normal(size=(count, 3)) * 0.005, vector, scalar]))
+        return np.concatenate(rows)
+
+    return make

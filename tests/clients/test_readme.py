@@ -1,0 +1,96 @@
+"""The README's commands, as a newcomer copies them, against the real service and a real worker."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from graspdb import Client
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+URL = "http://127.0.0.1:8000"
+
+
+def _blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def test_curl_alone_registers_an_object_posts_trials_and_gets_a_best_grasp(service_url: str) -> None:
+    commands = [block for block in _blocks("bash") if block.startswith("curl")]
+    assert len(commands) == 3
+    answers = []
+    for command in commands:
+        assert URL in command
+        done = subprocess.run(
+            ["sh", "-ec", command.replace(URL, service_url)], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        answers.append(json.loads(done.stdout))
+    created, receipt, best = answers
+    assert created["id"] == "bottle"
+    assert receipt["inserted"] == 5
+    assert best["status"] == "ok"
+    (grasp,) = best["grasps"]
+    # The two coinciding successes outweigh the tilted third; the slipped one and the side grasp are out.
+    assert grasp["position"] == pytest.approx([0.002, 0.001, 0.09], abs=0.003)
+    assert abs(grasp["quaternion_xyzw"][0]) > 0.99
+    again = subprocess.run(
+        ["sh", "-ec", commands[1].replace(URL, service_url)], capture_output=True, text=True, check=True
+    )
+    assert json.loads(again.stdout) == receipt
+
+
+@pytest.mark.usefixtures("worker")
+def test_the_python_examples_run(service_url: str, tmp_path: Path) -> None:
+    programs = _blocks("python")
+    assert len(programs) == 2
+    outputs = []
+    for program in programs:
+        assert URL in program
+        done = subprocess.run(
+            [sys.executable, "-c", program.replace(URL, service_url)],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        outputs.append(done.stdout)
+    assert outputs[0].startswith("Grasp(")
+    assert "'success'" in outputs[1]
+    with Client(service_url) as db:
+        assert db.objects.get("can").info.trials == 200
+        assert db.objects.get("mug").info.trials == 50_000
+
+
+def test_the_commands_it_names_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert {"demo", "test", "install"} <= targets & set(re.findall(r"make ([a-z]+)", README))
+    for program, *arguments in re.findall(r"^(graspdb[a-z-]*) ([a-z-]+)(?: ([a-z]+))?", README, re.MULTILINE):
+        words = [word for word in arguments if word in {"serve", "run", "add"}] or arguments[:1]
+        if arguments[0] == "trials":
+            words = arguments
+        done = subprocess.run(
+            [str(Path(sys.executable).with_name(program)), *words, "--help"], capture_output=True, check=False
+        )
+        assert done.returncode == 0, (program, words, done.stderr)
+
+
+def test_its_links_lead_somewhere() -> None:
+    links = re.findall(r"\]\(([^)#\s]+)(?:#([^)\s]+))?\)", README)
+    assert links
+    for target, anchor in links:
+        path = ROOT / target
+        assert path.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            slugs = {
+                re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings
+            }
+            assert anchor in slugs, (target, anchor)
