@@ -56,7 +56,7 @@ class Compute:
         return self._pool.submit(work).result()
 
     def blocks(self, count: int, block: int, work: Callable[[slice], None]) -> None:
-        """Do ``work`` on consecutive slices of ``range(count)``, queued one by one so that others get between."""
+        """Do ``work`` on consecutive slices of ``range(count)``, one by one so that others get between."""
         for start in range(0, count, block):
             part = slice(start, min(start + block, count))
             self.run(lambda part=part: work(part))  # type: ignore[misc]

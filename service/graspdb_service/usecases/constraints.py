@@ -106,7 +106,8 @@ def constraints(request: BestGraspRequest, *, jaw_symmetric: bool = True) -> Con
         )
     except ValueError as error:
         # What is left to contradict after the checks above are the two cones.
-        raise _contradiction([(name, str(error)) for name in ("approach_cone_deg", "closing_cone_deg")]) from None
+        cones = ("approach_cone_deg", "closing_cone_deg")
+        raise _contradiction([(name, str(error)) for name in cones]) from None
     return Constraints(region, tuple(names), pose)
 
 

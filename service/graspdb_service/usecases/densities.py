@@ -15,13 +15,13 @@ from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
 from graspdb_density.density import CUTOFF
 from graspdb_density.kernels import POSITION_LIMITS_M, ROTATION_LIMITS
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
-from graspdb_service.storage import trials
-from graspdb_service.storage.database import Database
+from graspdb_service.storage import objects, trials
+from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.compute import Compute
-from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.selection import Filters, Selected, resolve
+from graspdb_service.usecases.slugs import is_slug
 
 Floats = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ class Densities:
             404 for the object or gripper, 409 for an ambiguous selection.
         """
         with self._database.read() as tx:
-            row = require(tx, slug)
+            row = _require(tx, slug)
             with self._lock:
                 known = self._resolved.get((row.id, filters))
             if known is not None and known[0] == row.revision:
@@ -202,7 +202,7 @@ class Densities:
 
     def _refresh(self, key: _Key, slug: str, before: Built | None) -> Built:
         with self._database.read() as tx:
-            row = require(tx, slug)
+            row = _require(tx, slug)
             if row.id != key.object_id:
                 raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
             selected = resolve(tx, row.id, key.filters)
@@ -220,6 +220,14 @@ class Densities:
                 before, revision=row.revision, last_seq=row.last_seq, object_row=row, selected=selected
             )
         return self._compute.run(lambda: _build(key.kernel, row, selected, rows, before))
+
+
+def _require(tx: Tx, slug: str) -> ObjectRow:
+    # The use cases of objects need the context, which needs this module.
+    row = objects.find(tx, slug) if is_slug(slug) else None
+    if row is None:
+        raise not_found("object", slug[:80], "GET /objects lists those there are")
+    return row
 
 
 def _build(
@@ -263,9 +271,7 @@ def _build(
     density = GraspDensity.build(
         position,
         quaternion,
-        kernel=IsotropicKernel(
-            built.kernel.sigma_position_m, math.radians(built.kernel.sigma_rotation_deg)
-        ),
+        kernel=IsotropicKernel(built.kernel.sigma_position_m, math.radians(built.kernel.sigma_rotation_deg)),
         weights=weights,
         symmetric=symmetric,
     )
@@ -273,7 +279,11 @@ def _build(
 
 
 def _extended(
-    before: Built, old: GraspDensity, rows: trials.Columns, symmetric: NDArray[np.bool_], proposal: Floats | None
+    before: Built,
+    old: GraspDensity,
+    rows: trials.Columns,
+    symmetric: NDArray[np.bool_],
+    proposal: Floats | None,
 ) -> GraspDensity | None:
     """The density with further rows; None where they change the weights of the first ones."""
     weights = None
@@ -291,10 +301,12 @@ def _extended(
 def _weights(proposal: Floats) -> Floats:
     """Weights of eq 1, no row lost to rounding."""
     weights = importance_weights(proposal)
-    return np.maximum(weights, weights.max() * _LEAST_SHARE)
+    return np.asarray(np.maximum(weights, weights.max() * _LEAST_SHARE), dtype=np.float64)
 
 
-def _joined(first: Floats | None, first_count: int, second: Floats | None, second_count: int) -> Floats | None:
+def _joined(
+    first: Floats | None, first_count: int, second: Floats | None, second_count: int
+) -> Floats | None:
     if first is None and second is None:
         return None
     return np.concatenate(

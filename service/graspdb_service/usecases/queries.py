@@ -6,6 +6,7 @@ import math
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from graspdb.wire import BestGraspRequest, BestGrasps, DensityInfo, Grasp, KernelInfo, Selection, WorldPose
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density import GraspDensity, Region, se3
-from graspdb_density.density import CUTOFF
 from graspdb_density.weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.constraints import Constraints, constraints
@@ -105,7 +105,7 @@ def likelihood(
         raise ProblemError(
             413,
             "too-many-poses",
-            f"{count} poses are over the limit of {ctx.settings.max_query_poses}: send them in several requests",
+            f"{count} poses are over the limit of {ctx.settings.max_query_poses}: send several requests",
             errors=[("poses", f"at most {ctx.settings.max_query_poses}")],
         )
     _, cutoff = kernel_of(request)
@@ -113,16 +113,15 @@ def likelihood(
     def asked(*names: LikelihoodColumn) -> bool:
         return include is None or any(name in include for name in names)
 
-    threads = ctx.compute.threads
     with ctx.compute.admitted():
         built = built_for(ctx, slug, request)
         logs = relative = free = None
         if asked("density", "log_density", "relative"):
-            logs = np.full(count, -np.inf)
-            relative = np.zeros(count)
             density = built.density
-            if density is not None:
-                ctx.compute.blocks(count, _BLOCK, _into(density, positions, quaternions, cutoff, threads, logs))
+            if density is None:
+                logs, relative = np.full(count, -np.inf), np.zeros(count)
+            else:
+                logs = _log_density(ctx, density, positions, quaternions, cutoff)
                 if asked("relative"):
                     # Rounding may lift a pose at the very maximum above it.
                     relative = np.minimum(np.exp(logs - _global_maximum(ctx, density)), 1.0)
@@ -141,13 +140,18 @@ def likelihood(
     )
 
 
-def _into(
-    density: GraspDensity, positions: Floats, quaternions: Floats, cutoff: float | None, threads: int, out: Floats
-):  # type: ignore[no-untyped-def]
-    def work(part: slice) -> None:
-        out[part] = density.log_density(positions[part], quaternions[part], cutoff=cutoff, threads=threads)
+def _log_density(
+    ctx: Context, density: GraspDensity, positions: Floats, quaternions: Floats, cutoff: float | None
+) -> Floats:
+    logs = np.empty(len(positions))
 
-    return work
+    def work(part: slice) -> None:
+        logs[part] = density.log_density(
+            positions[part], quaternions[part], cutoff=cutoff, threads=ctx.compute.threads
+        )
+
+    ctx.compute.blocks(len(positions), _BLOCK, work)
+    return logs
 
 
 def _free(ctx: Context, test: CollisionTest, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
@@ -164,7 +168,7 @@ def _global_maximum(ctx: Context, density: GraspDensity) -> float:
     return ctx.compute.run(lambda: density.global_maximum(ctx.compute.threads)).log_density
 
 
-# -- the best grasps -------------------------------------------------------------------------------------------
+# -- the best grasps ---------------------------------------------------------------------------------------
 
 
 def best_grasps(ctx: Context, slug: str, request: BestGraspRequest) -> tuple[BestGrasps, int]:
@@ -202,7 +206,8 @@ def best_grasps(ctx: Context, slug: str, request: BestGraspRequest) -> tuple[Bes
         if found:
             grasps = ctx.compute.run(
                 lambda: [
-                    describe(m.position, m.quaternion_xyzw, m.log_density, m.active_constraints) for m in found
+                    describe(m.position, m.quaternion_xyzw, m.log_density, m.active_constraints)
+                    for m in found
                 ]
             )
             status = "ok" if len(grasps) >= request.count else "fewer"
@@ -243,11 +248,11 @@ def _grasp(
 ) -> Grasp:
     world = limits.to_world(position, quaternion)
     return Grasp(
-        position=_numbers(position),  # type: ignore[arg-type]
-        quaternion_xyzw=_numbers(quaternion),  # type: ignore[arg-type]
+        position=_numbers(position),
+        quaternion_xyzw=_numbers(quaternion),
         world=None
         if world is None
-        else WorldPose(position=_numbers(world[0]), quaternion_xyzw=_numbers(world[1])),  # type: ignore[arg-type]
+        else WorldPose(position=_numbers(world[0]), quaternion_xyzw=_numbers(world[1])),
         density=math.exp(log),
         log_density=log,
         relative=min(math.exp(log - top), 1.0),
@@ -258,13 +263,14 @@ def _grasp(
 
 
 def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quaternion: Floats) -> list[int]:
-    """Sequence numbers of the successes that weigh most at a pose, the nearest in the kernel's own measure."""
+    """Sequence numbers of the successes nearest to a pose in the kernel's own measure."""
     kernel = density.kernel
     centres, rotations = density.positions, density.quaternions_xyzw
     cosine = np.abs(rotations @ quaternion)
     turned = np.abs(rotations @ se3.jaw_twin(quaternion))
     cosine = np.where(density.symmetric, np.maximum(cosine, turned), cosine)
-    value = kernel.kappa * cosine - 0.5 * np.sum((centres - position) ** 2, axis=1) / kernel.sigma_position_m**2
+    squared = np.sum((centres - position) ** 2, axis=1) / kernel.sigma_position_m**2
+    value = kernel.kappa * cosine - 0.5 * squared
     count = min(_NEAREST_TRIALS, len(value))
     best = np.argpartition(-value, count - 1)[:count]
     best = best[np.argsort(-value[best], kind="stable")]
@@ -292,16 +298,16 @@ def _or(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
-def _numbers(values: Floats) -> tuple[float, ...]:
+def _numbers(values: Floats) -> Any:
     return tuple(float(value) for value in values)
 
 
-# -- samples ---------------------------------------------------------------------------------------------------
+# -- samples -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """Poses (n, 3), (n, 4) drawn from a density, with the density (n,) they were drawn with, 1/(m^3 rad^3)."""
+    """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with."""
 
     object_id: int
     revision: int
@@ -344,10 +350,7 @@ def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | 
                 f" post trials (POST /objects/{slug}/trials) or sweep a grid first",
             )
         position, quaternion = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
-        logs = np.empty(count)
-        ctx.compute.blocks(
-            count, _BLOCK, _into(density, position, quaternion, _PRECISE_CUTOFF, ctx.compute.threads, logs)
-        )
+        logs = _log_density(ctx, density, position, quaternion, _PRECISE_CUTOFF)
     return Draw(
         object_id=built.object_row.id,
         revision=built.revision,
@@ -357,6 +360,3 @@ def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | 
         quaternion_xyzw=se3.canonical(quaternion),
         proposal_density=np.exp(logs),
     )
-
-
-__all__ = ["CUTOFF", "Draw", "LikelihoodAnswer", "best_grasps", "density_info", "draw", "likelihood"]

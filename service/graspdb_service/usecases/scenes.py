@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import GripperProfile
+from graspdb_geometry import meshes
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import GripperShape
 from graspdb_service.problems import conflict
@@ -84,20 +85,25 @@ class Scenes:
 
     def _scene(self, row: ObjectRow) -> Scene | None:
         if row.parts_sha256 is not None:
-            from graspdb_geometry import meshes
+            return self._prepared(row.parts_sha256, lambda content, _: meshes.parts_from_glb(content))
+        info = row.mesh_info
+        if row.mesh_sha256 is None or info is None or not info["convex"]:
+            return None
 
-            return self._prepared(row.parts_sha256, lambda content: meshes.parts_from_glb(content))
-        return None
+        def own_part(content: bytes, media_type: str) -> list[meshes.Part]:
+            mesh = meshes.load(content, media_type, info["unit"])
+            return [(mesh.vertices, mesh.faces)]
 
-    def _prepared(self, sha256: str, parts: Callable[[bytes], object]) -> Scene | None:
+        return self._prepared(row.mesh_sha256, own_part)
+
+    def _prepared(self, sha256: str, parts: Callable[[bytes, str], list[meshes.Part]]) -> Scene:
         def make(_: _Prepared | None) -> _Prepared:
             with self._database.read() as tx:
                 found = assets.get(tx, sha256)
             if found is None:
-                raise conflict("object-changed", "The object's parts were replaced just now: ask again")
-            content = found[0]
-            scene = self._compute.run(lambda: Scene(parts(content)))  # type: ignore[arg-type]
-            return _Prepared(scene, _GROWTH * len(content))
+                raise conflict("object-changed", "The object's geometry was replaced just now: ask again")
+            scene = self._compute.run(lambda: Scene(parts(*found)))
+            return _Prepared(scene, _GROWTH * len(found[0]))
 
         return self._cache.get(sha256, lambda _: True, make).scene
 

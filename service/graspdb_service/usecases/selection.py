@@ -88,12 +88,8 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
         and (filters.gripper is None or item.gripper in (None, filters.gripper))
         and (filters.protocol is None or item.protocol in (None, filters.protocol))
     ]
-    found = {
-        name: _distinct(getattr(item, name) for item in candidates) for name in ("gripper", "protocol")
-    }
-    ambiguous = [
-        name for name, values in found.items() if len(values) > 1 and getattr(filters, name) is None
-    ]
+    found = {name: _distinct(getattr(item, name) for item in candidates) for name in ("gripper", "protocol")}
+    ambiguous = [name for name, values in found.items() if len(values) > 1 and getattr(filters, name) is None]
     if ambiguous:
         told = "; ".join(f"{name}: {', '.join(found[name])}" for name in ambiguous)
         raise conflict(

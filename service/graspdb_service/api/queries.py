@@ -1,0 +1,176 @@
+"""Questions to an object's density: ``/objects/{id}/density``, likelihood, best-grasp, samples."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, BeforeValidator, ValidationError
+
+from graspdb.wire import (
+    BestGraspRequest,
+    BestGrasps,
+    DensityInfo,
+    LikelihoodRequest,
+    Likelihoods,
+    Samples,
+    SamplesRequest,
+    Selection,
+    Slug,
+)
+from graspdb.wire.base import Position, Quaternion
+from graspdb.wire.queries import LikelihoodColumn
+from graspdb_service import __version__
+from graspdb_service.api.columns import columns_json, read_object, read_poses
+from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
+from graspdb_service.problems import ProblemError
+from graspdb_service.usecases import queries
+from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.selection import Filters
+
+router = APIRouter(tags=["queries"])
+
+
+def _listed(value: Any) -> Any:
+    """``include=density,relative`` and ``include=density&include=relative`` mean the same."""
+    if isinstance(value, list):
+        return [
+            part.strip() for item in value for part in (item.split(",") if isinstance(item, str) else [item])
+        ]
+    return value
+
+
+class SelectionQuery(Selection):
+    """A selection in a query string, where a kernel is a name with widths beside it."""
+
+    kernel: Slug | None = None
+
+
+class LikelihoodQuery(SelectionQuery):
+    """One pose in a query string."""
+
+    position: Position
+    quaternion_xyzw: Quaternion
+    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
+
+
+class BestGraspQuery(BestGraspRequest):
+    """The best grasp's constraints in a query string."""
+
+    kernel: Slug | None = None
+
+
+class LikelihoodOptions(Selection):
+    """A likelihood request without its poses, which are read as arrays."""
+
+    include: list[LikelihoodColumn] | None = None
+
+
+@router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read"))
+def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQuery, Query()]) -> Response:
+    """The density of a selection of trials: kernel, widths and their rule, counts, effective sample size."""
+    known = _known(ctx, id, request, query)
+    if known is not None:
+        return known
+    info, object_id = queries.density_info(ctx, id, query)
+    return _json(info, _tag(object_id, info.revision, query))
+
+
+@router.get("/objects/{id}/likelihood", response_model=Likelihoods, **scope("read"))
+def get_likelihood(
+    ctx: Ctx, id: str, request: Request, query: Annotated[LikelihoodQuery, Query()]
+) -> Response:
+    """How likely one grasp is; columns of length one."""
+    known = _known(ctx, id, request, query)
+    if known is not None:
+        return known
+    positions, quaternions = read_poses(
+        {"position": [list(query.position)], "quaternion_xyzw": [list(query.quaternion_xyzw)]}
+    )
+    answer = queries.likelihood(ctx, id, query, positions, quaternions, query.include)
+    return _likelihoods(answer, {"ETag": _tag(answer.object_id, answer.revision, query)})
+
+
+@router.post(
+    "/objects/{id}/likelihood",
+    response_model=Likelihoods,
+    **scope("read", body={"application/json": LikelihoodRequest}),
+)
+def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
+    """How likely each of many grasps is: columns in the poses' order."""
+    sent = media_type(request)
+    if sent and not sent.endswith("json"):
+        raise ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json")
+    content = read_object(body)
+    poses = content.pop("poses", None)
+    try:
+        options = LikelihoodOptions.model_validate(content)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors(include_input=False)) from None
+    positions, quaternions = read_poses(poses)
+    answer = queries.likelihood(ctx, id, options, positions, quaternions, options.include)
+    return _likelihoods(answer)
+
+
+@router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
+def get_best_grasp(
+    ctx: Ctx, id: str, request: Request, query: Annotated[BestGraspQuery, Query()]
+) -> Response:
+    """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
+    known = _known(ctx, id, request, query)
+    if known is not None:
+        return known
+    answer, object_id = queries.best_grasps(ctx, id, query)
+    return _json(answer, _tag(object_id, answer.revision, query))
+
+
+@router.post("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
+def post_best_grasp(ctx: Ctx, id: str, query: BestGraspRequest) -> Response:
+    """As GET, the constraints as JSON."""
+    answer, _ = queries.best_grasps(ctx, id, query)
+    return _json(answer)
+
+
+@router.post("/objects/{id}/samples", response_model=Samples, **scope("read"))
+def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
+    """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
+    drawn = queries.draw(ctx, id, query, query.count, query.seed)
+    return columns_json(
+        {"revision": drawn.revision, "kernel": drawn.kernel.model_dump(), "seed": drawn.seed},
+        {
+            "position": drawn.position,
+            "quaternion_xyzw": drawn.quaternion_xyzw,
+            "proposal_density": drawn.proposal_density,
+        },
+    )
+
+
+def _likelihoods(answer: queries.LikelihoodAnswer, headers: dict[str, str] | None = None) -> Response:
+    columns = {
+        name: getattr(answer, name)
+        for name in ("density", "log_density", "relative", "collision_free")
+        if getattr(answer, name) is not None
+    }
+    return columns_json({"revision": answer.revision, "kernel": answer.kernel.model_dump()}, columns, headers)
+
+
+def _json(answer: BaseModel, tag: str | None = None) -> Response:
+    return Response(
+        answer.model_dump_json(), media_type="application/json", headers={} if tag is None else {"ETag": tag}
+    )
+
+
+def _known(ctx: Context, slug: str, request: Request, query: Selection) -> Response | None:
+    """304 where the client has the answer of this revision already."""
+    if "if-none-match" not in request.headers:
+        return None
+    row, _ = ctx.densities.current(slug, Filters.of(query))
+    return not_modified(request, _tag(row.id, row.revision, query))
+
+
+def _tag(object_id: int, revision: int, query: Selection) -> str:
+    """What an answer depends on: the object, its revision, the question, and who answers."""
+    question = hashlib.sha256(f"{type(query).__name__} {query.model_dump_json()}".encode()).hexdigest()[:24]
+    return etag(object_id, revision, question, __version__)
