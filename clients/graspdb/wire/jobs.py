@@ -117,6 +117,14 @@ class FailureReport(Request):
     error: Text
 
 
+class FailureNoted(Response):
+    """``state`` is ``queued`` while attempts are left, then ``failed``."""
+
+    job: str
+    state: str
+    attempts: int
+
+
 class WorkerInfo(Response):
     worker: str
     capabilities: list[str]
@@ -131,6 +139,7 @@ __all__ = [
     "ClaimResponse",
     "ClaimedJob",
     "DecomposePayload",
+    "FailureNoted",
     "FailureReport",
     "GridPlan",
     "JobKind",

@@ -42,9 +42,11 @@ class GridSpec(Request):
 
 
 class SampleSpec(Request):
-    """Draws from the object's density."""
+    """Draws from the object's density for the sweep's gripper; ``protocol`` names whose trials it is built
+    from, where there are several."""
 
     kernel: KernelSpec | None = None
+    protocol: Slug | None = None
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
 

@@ -272,7 +272,7 @@ def worker_age(tx: Tx, name: str) -> float | None:
     return tx.scalar(select(unix_now() - workers.c.last_seen).where(workers.c.name == name))
 
 
-def list_workers(tx: Tx, *, after: str, limit: int) -> list[WorkerRow]:
+def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerRow]:
     """Workers by name."""
     leased = (
         select(func.count())
@@ -289,8 +289,8 @@ def list_workers(tx: Tx, *, after: str, limit: int) -> list[WorkerRow]:
             workers.c.jobs_done,
             workers.c.poses_done,
         )
-        .where(workers.c.name > after)
         .order_by(workers.c.name)
         .limit(limit)
+        .offset(skip)
     )
     return [WorkerRow(**row._mapping) for row in tx.execute(query)]

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
 
 from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.storage.tables import batches, jobs, objects, packed_outcomes, sweeps
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
@@ -89,10 +90,24 @@ def _query() -> Select[Any]:
     )
 
 
-def lock_object(tx: Tx, object_id: int) -> bool:
-    """Take the object's row lock without a new revision; False if the object is gone."""
-    query = select(objects.c.id).where(objects.c.id == object_id).with_for_update(key_share=True)
-    return tx.scalar(query) is not None
+def lock_object(tx: Tx, object_id: int) -> None:
+    """Take the object's row lock without a new revision."""
+    tx.execute(select(objects.c.id).where(objects.c.id == object_id).with_for_update(key_share=True))
+
+
+def lock_and_read_revision(tx: Tx, object_id: int) -> int:
+    """Take the object's row lock; its revision, which stays as it is.
+
+    Raises
+    ------
+    ObjectGone
+        If the object was deleted.
+    """
+    query = select(objects.c.revision).where(objects.c.id == object_id).with_for_update(key_share=True)
+    revision = tx.scalar(query)
+    if revision is None:
+        raise ObjectGone(f"object {object_id} was deleted")
+    return int(revision)
 
 
 def create(
@@ -160,6 +175,11 @@ def create(
                 for number, job_id in enumerate(job_ids[first : first + _JOBS_PER_INSERT], first)
             ],
         )
+
+
+def keep_snapshot(tx: Tx, sweep_id: str, snapshot: Mapping[str, Any]) -> None:
+    """Complete the snapshot with what was not known when the sweep was stored."""
+    tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(snapshot=dict(snapshot)))
 
 
 def find(tx: Tx, sweep_id: str) -> SweepRow | None:

@@ -1,0 +1,100 @@
+"""Jobs and workers: ``/jobs``, ``/workers``. The worker's side of the protocol is in graspdb.wire.jobs."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeVar
+
+from fastapi import APIRouter, Query, Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+
+from graspdb.wire import (
+    ClaimRequest,
+    ClaimResponse,
+    FailureReport,
+    LeaseRenewed,
+    Page,
+    ResultAccepted,
+    SimulateResult,
+    WorkerInfo,
+)
+from graspdb.wire.jobs import FailureNoted
+from graspdb_service.api.routing import (
+    Ctx,
+    Cursor,
+    Limit,
+    RawBody,
+    encode_cursor,
+    media_type,
+    number_cursor,
+    scope,
+)
+from graspdb_service.problems import ProblemError
+from graspdb_service.usecases import jobs
+
+router = APIRouter(tags=["jobs"])
+
+LeaseId = Annotated[
+    str, Query(min_length=1, max_length=64, pattern=r"^[\x21-\x7e]+$", description="As the claim gave it.")
+]
+JobId = str
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def parse(model: type[Model], request: Request, body: bytes) -> Model:
+    """A body that the route reads itself, because it is large or its bytes count, as its model.
+
+    Raises
+    ------
+    ProblemError
+        415 for another media type than JSON.
+    RequestValidationError
+        For a body that does not fit, as FastAPI raises it.
+    """
+    sent = media_type(request)
+    if sent and not sent.endswith("json"):
+        raise ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json")
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors(include_input=False, include_url=False)) from None
+
+
+@router.post("/jobs/claim", **scope("jobs:work"))
+def claim_jobs(ctx: Ctx, request: ClaimRequest) -> ClaimResponse:
+    """Lease up to ``limit`` jobs that a worker with these capabilities can do, and register it."""
+    return jobs.claim(ctx, request)
+
+
+@router.put("/jobs/{id}/lease", **scope("jobs:work"))
+def renew_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> LeaseRenewed:
+    """Keep a job; ``cancel`` says that it is no longer wanted. 409 ``lease-lost`` if another has it."""
+    return jobs.renew(ctx, id, lease_id)
+
+
+@router.delete("/jobs/{id}/lease", status_code=204, **scope("jobs:work"))
+def release_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> None:
+    """Give a job back unfinished, as a worker does that is told to stop; it counts as no attempt."""
+    jobs.release(ctx, id, lease_id)
+
+
+@router.put("/jobs/{id}/result", **scope("jobs:work", body={"application/json": SimulateResult}))
+def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: RawBody) -> ResultAccepted:
+    """Store a chunk's outcomes and complete its job, in one transaction.
+
+    The same body under the same lease again is answered the same again.
+    """
+    return jobs.complete(ctx, id, lease_id, body, parse(SimulateResult, request, body))
+
+
+@router.put("/jobs/{id}/failure", **scope("jobs:work"))
+def put_failure(ctx: Ctx, id: JobId, lease_id: LeaseId, report: FailureReport) -> FailureNoted:
+    """Report that an attempt failed: the job is queued again, or failed after its last attempt."""
+    return jobs.fail(ctx, id, lease_id, report)
+
+
+@router.get("/workers", **scope("read"))
+def list_workers(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[WorkerInfo]:
+    """The workers that ever asked for jobs, by name."""
+    items, after = jobs.workers(ctx, skip=number_cursor(cursor), limit=limit)
+    return Page(items=items, next=encode_cursor(after))

@@ -1,0 +1,88 @@
+"""Sweeps: ``/objects/{id}/sweeps``, ``/sweeps``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import orjson
+from fastapi import APIRouter, Query, Request, Response
+
+from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
+from graspdb.wire.sweeps import SweepState
+from graspdb_service.api.jobs import parse
+from graspdb_service.api.routing import (
+    Ctx,
+    Cursor,
+    IdempotencyKey,
+    Limit,
+    RawBody,
+    encode_cursor,
+    name_cursor,
+    scope,
+)
+from graspdb_service.usecases import sweeps
+
+router = APIRouter(tags=["sweeps"])
+
+PosesLimit = Annotated[int, Query(ge=1, le=100_000, description="At most this many poses.")]
+
+
+@router.post(
+    "/objects/{id}/sweeps",
+    status_code=202,
+    response_model=SweepInfo,
+    **scope("admin", body={"application/json": SweepCreate}),
+)
+def create_sweep(
+    ctx: Ctx, id: str, request: Request, response: Response, body: RawBody, key: IdempotencyKey
+) -> object:
+    """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
+    draws from its density. Workers take its chunks."""
+    spec = parse(SweepCreate, request, body or b"{}")
+    made = sweeps.create(ctx, id, spec, key=key, request=body)
+    response.headers["Location"] = made.location
+    return made.body
+
+
+@router.get("/sweeps", **scope("read"))
+def list_sweeps(
+    ctx: Ctx,
+    object: Annotated[str | None, Query(max_length=64, description="Of this object only.")] = None,
+    state: Annotated[SweepState | None, Query(description="In this state only.")] = None,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Page[SweepInfo]:
+    """The sweeps, the newest first."""
+    items, after = sweeps.listing(
+        ctx, slug=object, state=state, cursor=name_cursor(cursor) or None, limit=limit
+    )
+    return Page(items=items, next=encode_cursor(after))
+
+
+@router.get("/sweeps/{id}", **scope("read"))
+def get_sweep(ctx: Ctx, id: str) -> SweepInfo:
+    """How far a sweep has come, what it found, how long it will take, and what failed."""
+    return sweeps.get(ctx, id)
+
+
+@router.post("/sweeps/{id}/cancel", **scope("admin"))
+def cancel_sweep(ctx: Ctx, id: str) -> SweepInfo:
+    """Stop a sweep; what is stored stays. A finished one is left as it is."""
+    return sweeps.cancel(ctx, id)
+
+
+@router.post("/sweeps/{id}/retry", **scope("admin"))
+def retry_sweep(ctx: Ctx, id: str) -> SweepInfo:
+    """Queue a sweep's failed and cancelled chunks again. 409 once its batch was deleted."""
+    return sweeps.retry(ctx, id)
+
+
+@router.get("/sweeps/{id}/outcomes", response_model=SweepOutcomes, **scope("read"))
+def get_outcomes(ctx: Ctx, id: str, limit: PosesLimit = 10_000, cursor: Cursor = None) -> Response:
+    """Every pose of the finished chunks with its outcome, collisions included, in columns.
+
+    Pages are stable once the sweep has finished; while it runs, chunks join between those already read.
+    """
+    columns = sweeps.outcomes(ctx, id, limit=limit, cursor=name_cursor(cursor) or None)
+    content = {**columns, "next": encode_cursor(columns["next"])}
+    return Response(orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY), media_type="application/json")

@@ -1,0 +1,134 @@
+"""A sweep's plan: which poses it simulates, in which order, and which of them are stored already.
+
+A grid is never stored: its poses follow from the snapshot. Poses that were given or drawn are, as float64.
+A pose of a plan has a *place* (0 to the number of poses), by which chunks are cut, and a *pose index*, which
+results name: for a grid the index in the full grid, otherwise the place itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graspdb.wire import GridPlan
+from graspdb_geometry.grids import PoseGrid
+from graspdb_service.storage import sweeps
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.sweeps import SweepRow
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+#: Volume of SO(3) in rad^3 under the measure that the densities use.
+ROTATION_VOLUME = 8.0 * np.pi**2
+
+
+@dataclass(frozen=True)
+class ChunkPoses:
+    """The poses of a chunk, in the order of its outcomes.
+
+    Attributes
+    ----------
+    pose_index : (n,) int64
+        Ascending.
+    position, quaternion_xyzw : (n, 3), (n, 4) float64
+        The tool frame in the object frame, metres.
+    proposal_density : (n,) float64
+        What each pose was drawn with, 1/(m^3 rad^3); NaN where it was chosen by hand.
+    """
+
+    pose_index: IntArray
+    position: FloatArray
+    quaternion_xyzw: FloatArray
+    proposal_density: FloatArray
+
+
+def grid_of(sweep: SweepRow) -> PoseGrid:
+    """The grid of a sweep that has one."""
+    return pose_grid(GridPlan.model_validate(sweep.snapshot["grid"]))
+
+
+def pose_grid(plan: GridPlan) -> PoseGrid:
+    """The grid as the worker makes it from the same plan.
+
+    Raises
+    ------
+    ValueError
+        Naming the field that is out of range.
+    """
+    return PoseGrid(**{name: getattr(plan, name) for name in GridPlan.model_fields})
+
+
+def repeat_key(world: dict[str, Any], protocol: str, fidelity: str, grid: GridPlan) -> str:
+    """Equal for sweeps in which one pose index means one and the same simulation.
+
+    ``region``, ``max_poses`` and ``seed`` choose among the indices of a grid and change none of them.
+    """
+    lattice = grid.model_dump(exclude={"region", "max_poses", "seed"})
+    document = {"world": world, "protocol": protocol, "fidelity": fidelity, "grid": lattice}
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def chunk_poses(tx: Tx, sweep: SweepRow, start: int, stop: int) -> ChunkPoses | None:
+    """The stored poses of a chunk; None for a grid, whose poses :func:`grid_poses` computes."""
+    if sweep.plan == "grid":
+        return None
+    stored = sweeps.poses(tx, sweep.id, start, stop)
+    return ChunkPoses(
+        np.arange(start, stop, dtype=np.int64), stored[:, :3], stored[:, 3:7], np.asarray(stored[:, 7])
+    )
+
+
+def grid_poses(grid: PoseGrid, start: int, stop: int) -> ChunkPoses:
+    """The poses of a grid's chunk, each drawn uniformly from the grid's volume times all rotations."""
+    index = grid.pose_indices(start, stop)
+    position, quaternion = grid.poses(index)
+    density = np.full(len(index), 1.0 / (ROTATION_VOLUME * grid.volume_m3))
+    return ChunkPoses(index, position, quaternion, density)
+
+
+def not_stored_yet(
+    grid: PoseGrid,
+    start: int,
+    stop: int,
+    pose_index: IntArray,
+    others: Sequence[tuple[PoseGrid, Sequence[tuple[int, int]]]],
+) -> npt.NDArray[np.bool_]:
+    """Which poses of a chunk no other sweep with the same repeat key has finished: each counts once.
+
+    Parameters
+    ----------
+    grid, start, stop, pose_index
+        The chunk, and its indices as ``grid.pose_indices(start, stop)``.
+    others
+        The other sweeps' grids, and the places of their finished chunks.
+
+    Returns
+    -------
+    (stop - start,) bool
+    """
+    fresh = np.ones(len(pose_index), dtype=np.bool_)
+    for other, ranges in others:
+        in_order = other.max_poses is None
+        # Two plans of one order share places, so that only the overlap has to be looked at.
+        same_order = other.region == grid.region and (
+            (in_order and grid.max_poses is None)
+            or (not in_order and grid.max_poses is not None and other.seed == grid.seed)
+        )
+        for first, last in ranges:
+            low, high = (max(first, start), min(last, stop)) if same_order else (first, last)
+            if low >= high:
+                continue
+            if in_order and (
+                other.pose_indices(low, low + 1)[0] > pose_index[-1]
+                or other.pose_indices(high - 1, high)[0] < pose_index[0]
+            ):
+                continue
+            fresh &= ~np.isin(pose_index, other.pose_indices(low, high), assume_unique=True)
+    return fresh

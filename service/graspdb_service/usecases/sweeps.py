@@ -1,0 +1,451 @@
+"""Sweeps: plan them with every check that can be made before a worker starts, follow, stop, repeat."""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graspdb.wire import (
+    OUTCOMES,
+    GridPlan,
+    GridSpec,
+    GripperProfile,
+    PoseColumns,
+    SampleSpec,
+    Selection,
+    SweepCreate,
+    SweepInfo,
+)
+from graspdb.wire.sweeps import FailedChunk
+from graspdb_geometry.grids import PoseGrid
+from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.storage import batches, grippers, jobs, sweeps, trials
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
+from graspdb_service.usecases import plans, queries
+from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.idempotency import Created, replay_or
+from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.scenes import shape_of
+
+#: More chunks than this are bookkeeping without a use: no lab has so many workers.
+MAX_CHUNKS = 100_000
+#: A plan is cut into at least about this many chunks, so that several processes share a small one ...
+WANTED_CHUNKS = 16
+#: ... down to these many poses. Given and drawn poses lie at the object, where each needs physics.
+MIN_GRID_CHUNK, MIN_POSES_CHUNK, MAX_POSES_CHUNK = 1_000, 10, 2_000
+#: An object's longest side in openings of the gripper, beyond which its unit is wrong or its gripper.
+MAX_SIZE_IN_OPENINGS, MIN_SIZE_IN_OPENINGS = 40.0, 0.01
+MIN_OPENING_M = 1e-3
+
+_CURSOR = re.compile(r"(\d{1,9})\.(\d{1,9})")
+
+
+@dataclass(frozen=True)
+class _World:
+    """What a sweep's physics depends on, as it is when the sweep is made."""
+
+    object: ObjectRow
+    snapshot: dict[str, Any]
+    profile: GripperProfile
+
+    def still_holds(self, row: ObjectRow) -> bool:
+        names = ("id", "mesh_sha256", "parts_sha256", "mass_kg", "density_kg_m3", "friction")
+        return all(getattr(row, name) == getattr(self.object, name) for name in names)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What to simulate: a grid, or poses (n, 8) as :func:`graspdb_service.storage.sweeps.create` has them."""
+
+    kind: str
+    count: int
+    grid: GridPlan | None = None
+    full_count: int | None = None
+    poses: npt.NDArray[np.float64] | None = None
+
+
+def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
+    """Check and queue a sweep.
+
+    Parameters
+    ----------
+    key, request
+        The Idempotency-Key and the body it belongs to.
+
+    Raises
+    ------
+    ProblemError
+        404 without the object, 409 while it lacks its mesh or parts, 422 for what can't be simulated.
+    """
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        gripper = grippers.find(tx, spec.gripper)
+    if gripper is None:
+        raise invalid("gripper", f"there is no gripper {spec.gripper!r}: GET /grippers lists them")
+    world = _world(row, GripperProfile.model_validate(gripper.profile))
+    plan = _plan(ctx, slug, spec, world)
+    chunk = _chunk_size(ctx, spec, plan)
+    # In memory and in one go, before the transaction, that it may be short.
+    created_ms = time.time_ns() // 1_000_000
+    numbers = jobs.job_ids(created_ms, -(-plan.count // chunk), urgent=spec.purpose == "check")
+    snapshot: dict[str, Any] = {"world": world.snapshot, "full_count": plan.full_count}
+    if plan.grid is not None:
+        snapshot["grid"] = plan.grid.model_dump(mode="json")
+        snapshot["repeat_key"] = plans.repeat_key(world.snapshot, spec.protocol, spec.fidelity, plan.grid)
+    wish = spec.model_dump(mode="json", exclude={"poses"}, exclude_none=True)
+    if plan.grid is not None:
+        wish["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
+
+    def store(tx: Tx) -> Created:
+        locked = require(tx, slug, lock=True)
+        if not world.still_holds(locked):
+            raise conflict("object-changed", f"Object {slug!r} was changed at the same moment: send it again")
+        sweep_id = _new_id(created_ms)
+        provenance_id = trials.provenance(tx, locked.id, spec.gripper, "simulation", spec.protocol)
+        sweeps.create(
+            tx,
+            sweep_id=sweep_id,
+            object_id=locked.id,
+            provenance_id=provenance_id,
+            gripper=spec.gripper,
+            protocol=spec.protocol,
+            fidelity=spec.fidelity,
+            purpose=spec.purpose,
+            plan=plan.kind,
+            request=wish,
+            snapshot=snapshot,
+            poses=plan.poses,
+            pose_count=plan.count,
+            chunk_poses=chunk,
+            capability="simulate" if spec.protocol == "wrench" else spec.protocol,
+            job_ids=numbers,
+        )
+        _, batch = batches.create(tx, locked.id, revision=locked.revision, sweep_id=sweep_id)
+        sweeps.keep_snapshot(tx, sweep_id, {**snapshot, "batch": batch})
+        info = _info(tx, _require(tx, sweep_id))
+        return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
+
+    return replay_or(ctx, scope=f"POST /objects/{slug}/sweeps", key=key, request=request, create=store)
+
+
+def _new_id(created_ms: int) -> str:
+    """A UUID of version 7 (RFC 9562): sweeps sort by their creation."""
+    random = uuid.uuid4().int
+    return str(
+        uuid.UUID(int=(created_ms << 80) | (7 << 76) | (random & ((1 << 76) - 1) & ~(3 << 62)) | (2 << 62))
+    )
+
+
+# --- checks before anything is simulated ----------------------------------------------------------------
+
+
+def _world(row: ObjectRow, profile: GripperProfile) -> _World:
+    if row.mesh_info is None or row.mesh_sha256 is None:
+        raise conflict("mesh-missing", f"Object {row.slug!r} has no mesh: PUT /objects/{row.slug}/mesh first")
+    if row.parts_sha256 is None or row.parts_info is None:
+        raise conflict(
+            "convex-parts-missing",
+            f"The mesh of {row.slug!r} is not convex, and physics and collision test need convex parts:"
+            f" PUT /objects/{row.slug}/convex-parts (a GLB with one geometry a part)",
+        )
+    try:
+        shape_of(profile)
+    except ValueError as error:
+        raise invalid("gripper", str(error), "This gripper can't be simulated") from None
+    if profile.max_opening_m < MIN_OPENING_M:
+        raise invalid(
+            "gripper",
+            f"max_opening_m is {profile.max_opening_m:g}, below {MIN_OPENING_M:g}: metres are meant",
+            "This gripper can't be simulated",
+        )
+    box = row.mesh_info["bounding_box"]
+    lower, upper = np.array(box["lower"]), np.array(box["upper"])
+    _check_size(row, float(np.max(upper - lower)), profile)
+    return _World(
+        row,
+        {
+            "mesh_sha256": row.mesh_sha256,
+            "parts_sha256": row.parts_sha256,
+            "mass_kg": _mass(row),
+            "friction": row.friction if row.friction is not None else profile.friction,
+            "gripper": profile.model_dump(mode="json"),
+            "lower": lower.tolist(),
+            "upper": upper.tolist(),
+        },
+        profile,
+    )
+
+
+def _check_size(row: ObjectRow, longest: float, profile: GripperProfile) -> None:
+    opening = profile.max_opening_m
+    if MIN_SIZE_IN_OPENINGS * opening <= longest <= MAX_SIZE_IN_OPENINGS * opening:
+        return
+    unit = (row.mesh_info or {}).get("unit", "m")
+    size = "large" if longest > opening else "small"
+    raise ProblemError(
+        422,
+        "mesh-size",
+        f"The mesh of {row.slug!r} is {longest:g} m long, far too {size} for a gripper that opens"
+        f" {opening:g} m. It was sent with unit={unit}: is that right?"
+        f" PUT /objects/{row.slug}/mesh?unit=mm|cm|m|in again, or take another gripper",
+        errors=[("mesh", f"{longest:g} m long")],
+    )
+
+
+def _mass(row: ObjectRow) -> float:
+    if row.mass_kg is not None:
+        return row.mass_kg
+    volume = float((row.parts_info or {}).get("volume_m3") or 0.0)
+    if row.density_kg_m3 is not None and volume > 0.0:
+        return row.density_kg_m3 * volume
+    raise invalid(
+        "mass_kg",
+        f"unknown: PATCH /objects/{row.slug} with mass_kg, or with density_kg_m3",
+        "The object's mass is needed: a grasp must hold its weight",
+    )
+
+
+def _plan(ctx: Context, slug: str, spec: SweepCreate, world: _World) -> _Plan:
+    if spec.poses is not None:
+        return _given(ctx, spec.poses)
+    if spec.sample is not None:
+        return _drawn(ctx, slug, spec, spec.sample)
+    wish = spec.grid or GridSpec()
+    region = None if wish.region is None else (wish.region.lower, wish.region.upper)
+    plan = GridPlan(
+        **wish.model_dump(exclude={"region"}),
+        lower=world.snapshot["lower"],
+        upper=world.snapshot["upper"],
+        region=region,
+        symmetric=world.profile.symmetric,
+    )
+    try:
+        grid = plans.pose_grid(plan)
+        count, full = grid.total, grid.full_total
+    except ValueError as error:
+        text = str(error)
+        fields = ("region", "position_step_m", "rotation_step_deg", "margin_m", "max_poses", "seed")
+        field = next((name for name in fields if name in text), "position_step_m")
+        raise invalid(f"grid.{field}", text) from None
+    if count > ctx.settings.max_sweep_poses:
+        raise _too_many(wish, grid, count, ctx.settings.max_sweep_poses)
+    return _Plan("grid", count, grid=plan, full_count=full)
+
+
+def _too_many(wish: GridSpec, grid: PoseGrid, count: int, limit: int) -> ProblemError:
+    # Positions are in a volume: the step's cube makes their number.
+    step = float(np.ceil(wish.position_step_m * (grid.candidate_total / limit) ** (1 / 3) * 2000) / 2000)
+    ways = f"max_poses of at most {limit} (a random part of the grid)"
+    if step <= 1.0:
+        ways += f", a position_step_m of about {step:g}"
+    return ProblemError(
+        422,
+        "too-many-poses",
+        f"The grid has {count} poses, and a sweep at most {limit} (max_sweep_poses in /info). Shrink it by"
+        f" {ways}, a larger rotation_step_deg, a smaller margin_m or a region",
+        errors=[("grid", f"{count} poses")],
+    )
+
+
+def _given(ctx: Context, poses: Any) -> _Plan:
+    if isinstance(poses, PoseColumns):
+        position, quaternion = poses.position, poses.quaternion_xyzw
+    else:
+        position = [pose.position for pose in poses]
+        quaternion = [pose.quaternion_xyzw for pose in poses]
+    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
+    if len(position) > limit:
+        raise invalid("poses", f"{len(position)} are more than {limit}: make several sweeps of them")
+    table = np.full((len(position), POSE_COLUMNS), np.nan)
+    table[:, :3] = position
+    table[:, 3:7] = quaternion
+    return _Plan("poses", len(table), poses=table)
+
+
+def _drawn(ctx: Context, slug: str, spec: SweepCreate, sample: SampleSpec) -> _Plan:
+    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
+    if sample.count > limit:
+        raise invalid("sample.count", f"at most {limit}")
+    selection = Selection(gripper=spec.gripper, protocol=sample.protocol, kernel=sample.kernel)
+    drawn = queries.draw(ctx, slug, selection, sample.count, sample.seed)
+    table = np.column_stack([drawn.position, drawn.quaternion_xyzw, drawn.proposal_density])
+    return _Plan("sample", len(table), poses=table)
+
+
+def _chunk_size(ctx: Context, spec: SweepCreate, plan: _Plan) -> int:
+    if spec.chunk_poses is not None:
+        size = spec.chunk_poses
+    else:
+        most, least = ctx.settings.chunk_poses, MIN_GRID_CHUNK
+        if plan.kind != "grid":
+            most, least = min(most, MAX_POSES_CHUNK), MIN_POSES_CHUNK
+        size = min(most, max(least, -(-plan.count // WANTED_CHUNKS)))
+    if plan.count > size * MAX_CHUNKS:
+        raise invalid(
+            "chunk_poses",
+            f"{plan.count} poses in chunks of {size} are more than {MAX_CHUNKS} chunks:"
+            f" take at least {-(-plan.count // MAX_CHUNKS)}",
+        )
+    return size
+
+
+# --- following, stopping, repeating ---------------------------------------------------------------------
+
+
+def _require(tx: Tx, sweep_id: str) -> SweepRow:
+    row = sweeps.find(tx, sweep_id) if len(sweep_id) == 36 and sweep_id.isascii() else None
+    if row is None:
+        raise not_found("sweep", sweep_id[:80], "GET /sweeps lists them")
+    return row
+
+
+def get(ctx: Context, sweep_id: str) -> SweepInfo:
+    """A sweep and how far it has come."""
+    with ctx.database.read() as tx:
+        return _info(tx, _require(tx, sweep_id))
+
+
+def listing(
+    ctx: Context, *, slug: str | None, state: str | None, cursor: str | None, limit: int
+) -> tuple[list[SweepInfo], str | None]:
+    """A page of sweeps, the newest first, and the cursor of the next one."""
+    with ctx.database.read() as tx:
+        object_id = None if slug is None else require(tx, slug).id
+        rows = sweeps.listing(tx, object_id=object_id, state=state, before=cursor, limit=limit + 1)
+        page = [_info(tx, row) for row in rows[:limit]]
+    return page, page[-1].id if len(rows) > limit else None
+
+
+def cancel(ctx: Context, sweep_id: str) -> SweepInfo:
+    """Stop what is not finished; what is stored stays. A finished sweep is left as it is."""
+    with ctx.database.read() as tx:
+        row = _require(tx, sweep_id)
+    with ctx.database.write() as tx:
+        sweeps.lock_object(tx, row.object_id)
+        sweeps.cancel(tx, sweep_id)
+        return _info(tx, _require(tx, sweep_id))
+
+
+def retry(ctx: Context, sweep_id: str) -> SweepInfo:
+    """Queue failed and cancelled chunks again; without any it changes nothing.
+
+    Raises
+    ------
+    ProblemError
+        409 if the batch was deleted: what the sweep had found is gone, so the rest would mislead.
+    """
+    with ctx.database.read() as tx:
+        row = _require(tx, sweep_id)
+    with ctx.database.write() as tx:
+        sweeps.lock_object(tx, row.object_id)
+        if _require(tx, sweep_id).batch is None:
+            raise conflict("batch-deleted", "This sweep's batch was deleted: make a new sweep")
+        sweeps.retry(tx, sweep_id)
+        return _info(tx, _require(tx, sweep_id))
+
+
+def _info(tx: Tx, row: SweepRow) -> SweepInfo:
+    done = sweeps.progress(tx, row)
+    state = sweeps.state_of(row, done.states.get("failed", 0))
+    rate = _rate(row, done)
+    left = row.pose_count - done.poses_done
+    grid = row.request.get("grid")
+    sample = row.request.get("sample")
+    return SweepInfo(
+        id=row.id,
+        object=row.object,
+        batch=row.snapshot["batch"],
+        gripper=row.gripper,
+        protocol=row.protocol,
+        fidelity=row.fidelity,
+        purpose=row.purpose,
+        plan=row.plan,
+        grid=None if grid is None else GridSpec.model_validate(grid),
+        seed=(grid or sample or {}).get("seed"),
+        state=state,
+        chunks=row.chunks,
+        chunks_done=done.states.get("done", 0),
+        chunks_failed=done.states.get("failed", 0),
+        poses=row.pose_count,
+        poses_done=done.poses_done,
+        full_grid_poses=row.snapshot.get("full_count"),
+        outcomes={name: done.counts[name] for name in OUTCOMES if name in done.counts},
+        rate_poses_s=rate,
+        time_left_s=left / rate if rate and state == "running" else None,
+        failed_chunks=[
+            FailedChunk(chunk=number, attempts=attempts, error=error)
+            for number, attempts, error in done.failed
+        ],
+        created_at=row.created_at,
+        started_at=row.started_at,
+        finished_at=row.finished_at,
+    )
+
+
+def _rate(row: SweepRow, done: Progress) -> float | None:
+    """Poses a second: of late while it runs, over the whole run afterwards."""
+    if row.finished_at is not None:
+        if row.started_at is None or not done.poses_done:
+            return None
+        return done.poses_done / max((row.finished_at - row.started_at).total_seconds(), 1e-3)
+    return done.recent_poses / done.window_s if done.recent_poses else None
+
+
+def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> Mapping[str, Any]:
+    """Columns of every pose of finished chunks, in the plan's order; arrays, for orjson.
+
+    While a sweep runs, a page has the chunks that are finished by then: read it again at the end.
+    """
+    number, skip = 0, 0
+    if cursor is not None:
+        match = _CURSOR.fullmatch(cursor)
+        if match is None:
+            raise invalid("cursor", "take it from `next` of the page before")
+        number, skip = int(match[1]), int(match[2])
+    with ctx.database.read() as tx:
+        row = _require(tx, sweep_id)
+        # One pose more than asked for tells whether there is another page.
+        chunks = sweeps.outcome_chunks(tx, sweep_id, first_number=number, poses=limit + skip + 1)
+        stored = {chunk.number: plans.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
+    grid = plans.grid_of(row) if row.plan == "grid" else None
+    columns: dict[str, list[npt.NDArray[Any]]] = {
+        "pose_index": [], "position": [], "quaternion_xyzw": [], "outcome": []
+    }  # fmt: skip
+    names = np.array(OUTCOMES)
+    following = None
+    for chunk in chunks:
+        first = skip if chunk.number == number else 0
+        last = min(chunk.stop - chunk.start, first + limit)
+        if limit == 0:
+            following = f"{chunk.number}.{first}"
+            break
+        if first >= last:
+            continue
+        poses = stored[chunk.number]
+        if poses is None:
+            assert grid is not None
+            poses = plans.grid_poses(grid, chunk.start, chunk.stop)
+        codes = np.frombuffer(chunk.outcomes, dtype=np.uint8)
+        part = slice(first, last)
+        columns["pose_index"].append(poses.pose_index[part])
+        columns["position"].append(poses.position[part])
+        columns["quaternion_xyzw"].append(poses.quaternion_xyzw[part])
+        columns["outcome"].append(names[codes[part]])
+        limit -= last - first
+        if last < chunk.stop - chunk.start:
+            following = f"{chunk.number}.{last}"
+            break
+    joined = {
+        name: np.ascontiguousarray(np.concatenate(parts)) if parts else np.empty(0)
+        for name, parts in columns.items()
+    }
+    return {"sweep": sweep_id, **joined, "outcome": joined["outcome"].tolist(), "next": following}
