@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 import uuid
@@ -14,20 +15,23 @@ import swagger_ui_bundle
 from fastapi import Depends, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.docs import get_swagger_ui_html
-from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import Counter, Histogram
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspdb_service import __version__
-from graspdb_service.api import operations
-from graspdb_service.api.routing import declared_parameters, refuse_unknown_parameters
+from graspdb_service.api import grippers, objects, operations, queries, trials
+from graspdb_service.api.document import document
+from graspdb_service.api.routing import declared_parameters, media_type, refuse_unknown_parameters
 from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
+from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.grippers import seed
 
 log = logging.getLogger("graspdb")
 
@@ -36,7 +40,13 @@ LATENCY = Histogram(
     "graspdb_http_request_seconds", "Time to the last byte of the answer.", ["method", "route"]
 )
 
-ROUTERS = [operations.router]
+ROUTERS = [
+    operations.router,
+    objects.router,
+    grippers.router,
+    trials.router,
+    queries.router,
+]
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -58,6 +68,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             schema.upgrade(database)
         else:
             schema.check(database)
+        seed(database)
     except BaseException:
         database.dispose()
         raise
@@ -81,6 +92,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.context = ctx
     for router in ROUTERS:
         app.include_router(router)
+    app.openapi = lambda: document(app)  # type: ignore[method-assign]
     app.state.parameters = declared_parameters(app)
     _add_docs(app)
     _add_problems(app)
@@ -136,8 +148,10 @@ def _add_docs(app: FastAPI) -> None:
 def _add_problems(app: FastAPI) -> None:
     def answer(request: Request, problem: ProblemError) -> Response:
         request_id = getattr(request.state, "request_id", "")
-        return JSONResponse(
-            problem.document(request_id),
+        # A field's name may be anything the client sent, half a surrogate pair included.
+        body = json.dumps(problem.document(request_id), ensure_ascii=False).encode("utf-8", "replace")
+        return Response(
+            body,
             status_code=problem.status,
             headers=problem.headers,
             media_type="application/problem+json",
@@ -149,7 +163,18 @@ def _add_problems(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     def on_invalid(request: Request, error: RequestValidationError) -> Response:
-        return answer(request, problem_of_validation(error.errors()))
+        errors = error.errors()
+        sent = media_type(request)
+        if any(item["loc"] == ("body",) for item in errors) and sent and not sent.endswith("json"):
+            return answer(
+                request,
+                ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json"),
+            )
+        return answer(request, problem_of_validation(errors))
+
+    @app.exception_handler(ObjectGone)
+    def on_gone(request: Request, _: ObjectGone) -> Response:
+        return answer(request, ProblemError(404, "not-found", "The object has just been deleted"))
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
@@ -180,6 +205,9 @@ def problem_of_validation(errors: Any, title: str = "The request is not valid") 
     """A 422 that names each field and never echoes the input, which may hold NaN or megabytes."""
     listed = []
     for item in list(errors)[:20]:
+        if item["type"] == "json_invalid":
+            listed.append(("body", f"not valid JSON: {item.get('ctx', {}).get('error', item['msg'])}"))
+            continue
         place = [str(part) for part in item["loc"] if part not in ("body", "query", "path", "header")]
         # pydantic names the branch of a union it tried; that is no part of the user's document.
         place = [part for part in place if "[" not in part and not part[:1].isupper()]

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import hashlib
+import json
 import re
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
-from fastapi import Depends, FastAPI, Header, Request, Response
+import orjson
+from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from pydantic import BaseModel
 
 from graspdb_service.problems import ProblemError, invalid
 from graspdb_service.usecases.context import Context
@@ -15,9 +22,31 @@ SCOPES: tuple[Scope, ...] = get_args(Scope)
 SCOPE_FIELD = "x-required-scope"
 
 
-def scope(name: Scope) -> dict[str, Any]:
-    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``."""
-    return {"openapi_extra": {SCOPE_FIELD: name}}
+BODY_MODELS: dict[str, type[BaseModel]] = {}
+"""Models of bodies that a route reads itself, for the OpenAPI document."""
+
+
+def scope(name: Scope, *, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``.
+
+    ``body`` documents a body that the route reads itself (:data:`RawBody`): by media type a model, a tuple
+    of models or a JSON schema.
+    """
+    extra: dict[str, Any] = {SCOPE_FIELD: name}
+    if body is not None:
+        content = {media: {"schema": _schema(given)} for media, given in body.items()}
+        extra["requestBody"] = {"required": True, "content": content}
+    return {"openapi_extra": extra}
+
+
+def _schema(given: Any) -> dict[str, Any]:
+    if isinstance(given, tuple):
+        return {"anyOf": [_schema(item) for item in given]}
+    if isinstance(given, type) and issubclass(given, BaseModel):
+        BODY_MODELS[given.__name__] = given
+        return {"$ref": f"#/components/schemas/{given.__name__}"}
+    schema: dict[str, Any] = given
+    return schema
 
 
 def declared_parameters(app: FastAPI) -> dict[tuple[str, str], frozenset[str]]:
@@ -56,6 +85,56 @@ def _key(idempotency_key: Annotated[str | None, Header()] = None) -> str | None:
 IdempotencyKey = Annotated[str | None, Depends(_key)]
 
 
+async def _raw_body(request: Request) -> bytes:
+    return await request.body()
+
+
+RawBody = Annotated[bytes, Depends(_raw_body)]
+"""The body's bytes. A large body must never be a FastAPI parameter, which would validate it row by row."""
+
+Limit = Annotated[int, Query(ge=1, le=1_000, description="At most this many items.")]
+Cursor = Annotated[str | None, Query(max_length=500, description="`next` of the page before.")]
+
+
+def media_type(request: Request) -> str:
+    """The body's media type without parameters, lower case; empty where none is given."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+def encode_cursor(position: int | str | None) -> str | None:
+    """An opaque cursor of the place after which the next page starts; None at the end."""
+    if position is None:
+        return None
+    return base64.urlsafe_b64encode(json.dumps(position).encode()).decode().rstrip("=")
+
+
+def number_cursor(cursor: str | None) -> int:
+    """The number in a cursor that this service made, 0 without one."""
+    position = 0 if cursor is None else _decode_cursor(cursor)
+    if type(position) is not int or not 0 <= position < 2**63:
+        raise _bad_cursor()
+    return position
+
+
+def name_cursor(cursor: str | None) -> str:
+    """The name in a cursor that this service made, empty without one."""
+    position = "" if cursor is None else _decode_cursor(cursor)
+    if not isinstance(position, str) or not re.fullmatch(r"[A-Za-z0-9._-]{0,64}", position):
+        raise _bad_cursor()
+    return position
+
+
+def _decode_cursor(cursor: str) -> Any:
+    try:
+        return json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
+    except (ValueError, RecursionError, binascii.Error):
+        raise _bad_cursor() from None
+
+
+def _bad_cursor() -> ProblemError:
+    return invalid("cursor", "a cursor is the `next` of the page before, unchanged")
+
+
 def refuse_unknown_parameters(request: Request) -> None:
     """422 for a query parameter that the route does not know: a typing error must not be ignored."""
     path = getattr(request.scope.get("route"), "path", None)
@@ -87,3 +166,11 @@ def not_modified(request: Request, tag: str) -> Response | None:
     if "*" in tags or tag.removeprefix("W/") in tags:
         return Response(status_code=304, headers={"ETag": tag})
     return None
+
+
+def tagged_json(request: Request, content: Any, *, tag: str | None = None) -> Response:
+    """A JSON answer with an ETag (by default of its content), or 304 where the client has it already."""
+    model = isinstance(content, BaseModel)
+    body = content.model_dump_json().encode() if model else orjson.dumps(content)
+    tag = tag or etag(hashlib.sha256(body).hexdigest()[:32])
+    return not_modified(request, tag) or Response(body, media_type="application/json", headers={"ETag": tag})

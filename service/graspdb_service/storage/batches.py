@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -101,6 +102,13 @@ def page(tx: Tx, object_id: int, *, after: int, limit: int) -> list[BatchRow]:
     """Up to ``limit`` batches in the order of their making, from the one after the internal id ``after``."""
     query = _query().where(batches.c.object_id == object_id, batches.c.id > after)
     return [_batch(row) for row in tx.execute(query.order_by(batches.c.id).limit(limit))]
+
+
+def names(tx: Tx, ids: Iterable[int]) -> dict[int, tuple[str, str | None, dict[str, Any] | None]]:
+    """Key, sweep and metadata of batches by internal id."""
+    query = select(batches.c.id, batches.c.key, batches.c.sweep_id, batches.c.metadata)
+    rows = tx.execute(query.where(batches.c.id.in_(sorted(set(ids)))))
+    return {int(number): (key, sweep, metadata) for number, key, sweep, metadata in rows}
 
 
 def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:

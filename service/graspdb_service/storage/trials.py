@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import and_, func, select
+from sqlalchemy import Row, and_, func, literal_column, select
 from sqlalchemy import insert as plain_insert
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import provenances as provenance_table
 from graspdb_service.storage.tables import tallies as tally_table
+from graspdb_service.storage.tables import trials as trial_table
 from graspdb_service.storage.upsert import insert as upsert
 
 FloatArray = npt.NDArray[np.float64]
@@ -435,3 +436,44 @@ def _postgres_time(value: datetime | None) -> int | None:
         return None
     since = value.astimezone(UTC) - _POSTGRES_EPOCH
     return (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
+
+
+# --- reading rows ---------------------------------------------------------------------------------------
+
+
+def page(
+    tx: Tx,
+    object_id: int,
+    *,
+    after_seq: int,
+    limit: int,
+    up_to_seq: int | None = None,
+    outcome: int | None = None,
+    provenance_ids: Sequence[int] | None = None,
+    batch_id: int | None = None,
+    since_revision: int | None = None,
+) -> list[Row[Any]]:
+    """Up to ``limit`` trials after a sequence number, as rows with the table's column names.
+
+    ``since_revision`` keeps what was stored after that revision.
+    """
+    query = (
+        select(trial_table)
+        .where(trial_table.c.object_id == object_id, trial_table.c.seq > after_seq)
+        .order_by(trial_table.c.seq)
+        .limit(limit)
+    )
+    if up_to_seq is not None:
+        query = query.where(trial_table.c.seq <= up_to_seq)
+    if outcome == SUCCESS:
+        # Said literally, as the partial index has it.
+        query = query.where(literal_column("outcome") == literal_column(str(SUCCESS)))
+    elif outcome is not None:
+        query = query.where(trial_table.c.outcome == outcome)
+    if provenance_ids is not None:
+        query = query.where(trial_table.c.provenance_id.in_(provenance_ids))
+    if batch_id is not None:
+        query = query.where(trial_table.c.batch_id == batch_id)
+    if since_revision is not None:
+        query = query.where(trial_table.c.revision > since_revision)
+    return list(tx.execute(query))

@@ -2,24 +2,101 @@
 
 from __future__ import annotations
 
-import re
+from typing import Any
 
-from graspdb_service.problems import ProblemError, not_found
-from graspdb_service.storage import objects
+from graspdb.wire import OUTCOMES, MeshInfo, ObjectCreate, ObjectInfo, ObjectPatch, PartsInfo
+from graspdb_service.problems import conflict, not_found
+from graspdb_service.storage import assets, objects, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.idempotency import Created, replay_or
+from graspdb_service.usecases.slugs import is_slug
 
-SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
+def create(ctx: Context, request: ObjectCreate, *, key: str | None, body: bytes) -> Created:
+    """Store a new object, without mesh and trials."""
 
-def missing(slug: str) -> ProblemError:
-    """404 for an object."""
-    return not_found("object", slug[:80], "POST /objects makes one")
+    def make(tx: Tx) -> Created:
+        if not objects.create(tx, request.id, request.model_dump(exclude={"id"})):
+            raise conflict("already-exists", f"There is an object {request.id!r} already: choose another id")
+        return Created(
+            info(require(tx, request.id), {}).model_dump(mode="json"), location=f"/objects/{request.id}"
+        )
+
+    return replay_or(ctx, scope="POST /objects", key=key, request=body, create=make)
 
 
 def require(tx: Tx, slug: str, *, lock: bool = False) -> ObjectRow:
     """The object with this slug, or a 404; ``lock`` holds it until the transaction ends."""
-    row = objects.find(tx, slug, lock=lock) if SLUG.fullmatch(slug) else None
+    row = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
     if row is None:
-        raise missing(slug)
+        raise not_found("object", slug[:80], "GET /objects lists them, POST /objects makes one")
     return row
+
+
+def get(ctx: Context, slug: str) -> tuple[ObjectRow, ObjectInfo]:
+    """One object: as stored, and as the wire has it."""
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        return row, info(row, trials.outcome_counts(tx, [row.id])[row.id])
+
+
+def page(ctx: Context, *, after: str, limit: int) -> tuple[list[ObjectInfo], str | None]:
+    """A page of objects by id, and where the next one starts."""
+    with ctx.database.read() as tx:
+        rows = objects.page(tx, after=after, limit=limit + 1)
+        counts = trials.outcome_counts(tx, [row.id for row in rows])
+    items = [info(row, counts[row.id]) for row in rows[:limit]]
+    return items, items[-1].id if len(rows) > limit else None
+
+
+def change(ctx: Context, slug: str, patch: ObjectPatch) -> ObjectInfo:
+    """Set the properties that are given; an explicit null clears one."""
+    given = patch.model_dump(exclude_unset=True)
+    with ctx.database.write() as tx:
+        row = require(tx, slug, lock=True)
+        different = {name: value for name, value in given.items() if getattr(row, name) != value}
+        if different:
+            objects.advance(tx, row.id, append=False)
+            objects.change(tx, row.id, different)
+            row = require(tx, slug)
+        return info(row, trials.outcome_counts(tx, [row.id])[row.id])
+
+
+def remove(ctx: Context, slug: str) -> None:
+    """Delete an object and everything of it; 409 while a sweep runs, which would write on."""
+    with ctx.database.write() as tx:
+        row = require(tx, slug, lock=True)
+        if objects.has_running_sweep(tx, row.id):
+            raise conflict(
+                "sweep-running",
+                f"A sweep of {slug!r} is running: cancel it (POST /sweeps/{{id}}/cancel) or wait for its end",
+            )
+        objects.remove(tx, row)
+    with ctx.database.write() as tx:
+        assets.drop_unused(tx, {h for h in (row.mesh_sha256, row.parts_sha256) if h})
+
+
+def info(row: ObjectRow, counts: dict[int, int]) -> ObjectInfo:
+    """An object as the wire has it; ``counts`` are of all its collected trials by outcome code."""
+    return ObjectInfo(
+        id=row.slug,
+        name=row.name,
+        mass_kg=row.mass_kg,
+        density_kg_m3=row.density_kg_m3,
+        friction=row.friction,
+        metadata=row.metadata,
+        revision=row.revision,
+        epoch=row.epoch,
+        mesh=_model(MeshInfo, row.mesh_info),
+        convex_parts=_model(PartsInfo, row.parts_info),
+        trials=sum(counts.values()),
+        outcomes={OUTCOMES[code]: number for code, number in sorted(counts.items())},
+        created_at=row.created_at,
+        updated_at=row.updated_at,
+    )
+
+
+def _model(kind: Any, document: dict[str, Any] | None) -> Any:
+    return None if document is None else kind.model_validate(document)

@@ -1,0 +1,44 @@
+"""Grippers: ``/grippers``."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+
+from graspdb.wire import GripperCreate, GripperInfo, Page
+from graspdb_service.api.routing import (
+    Ctx,
+    Cursor,
+    IdempotencyKey,
+    Limit,
+    RawBody,
+    encode_cursor,
+    name_cursor,
+    scope,
+    tagged_json,
+)
+from graspdb_service.usecases import grippers
+
+router = APIRouter(tags=["grippers"])
+
+
+@router.post("/grippers", status_code=201, response_model=GripperInfo, **scope("admin"))
+def create_gripper(
+    ctx: Ctx, request: GripperCreate, response: Response, body: RawBody, key: IdempotencyKey
+) -> object:
+    """Store a parallel-jaw gripper's profile."""
+    made = grippers.create(ctx, request, key=key, body=body)
+    response.headers["Location"] = made.location
+    return made.body
+
+
+@router.get("/grippers", **scope("read"))
+def list_grippers(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[GripperInfo]:
+    """The grippers, by id."""
+    items, after = grippers.page(ctx, after=name_cursor(cursor), limit=limit)
+    return Page(items=items, next=encode_cursor(after))
+
+
+@router.get("/grippers/{gripper}", response_model=GripperInfo, **scope("read"))
+def get_gripper(ctx: Ctx, gripper: str, request: Request) -> Response:
+    """One gripper's profile."""
+    return tagged_json(request, grippers.get(ctx, gripper))

@@ -1,0 +1,58 @@
+"""Objects, their meshes and convex parts: ``/objects``."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+
+from graspdb.wire import ObjectCreate, ObjectInfo, ObjectPatch, Page
+from graspdb_service.api.routing import (
+    Ctx,
+    Cursor,
+    IdempotencyKey,
+    Limit,
+    RawBody,
+    encode_cursor,
+    etag,
+    name_cursor,
+    scope,
+    tagged_json,
+)
+from graspdb_service.usecases import objects
+
+router = APIRouter(tags=["objects"])
+
+
+@router.post("/objects", status_code=201, response_model=ObjectInfo, **scope("admin"))
+def create_object(
+    ctx: Ctx, request: ObjectCreate, response: Response, body: RawBody, key: IdempotencyKey
+) -> object:
+    """Register an object; its mesh and its trials follow."""
+    made = objects.create(ctx, request, key=key, body=body)
+    response.headers["Location"] = made.location
+    return made.body
+
+
+@router.get("/objects", **scope("read"))
+def list_objects(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[ObjectInfo]:
+    """The objects, by id."""
+    items, after = objects.page(ctx, after=name_cursor(cursor), limit=limit)
+    return Page(items=items, next=encode_cursor(after))
+
+
+@router.get("/objects/{id}", response_model=ObjectInfo, **scope("read"))
+def get_object(ctx: Ctx, id: str, request: Request) -> Response:
+    """One object: properties, mesh, and how many trials it has by outcome."""
+    row, info = objects.get(ctx, id)
+    return tagged_json(request, info, tag=etag(row.id, row.revision))
+
+
+@router.patch("/objects/{id}", **scope("admin"))
+def change_object(ctx: Ctx, id: str, request: ObjectPatch) -> ObjectInfo:
+    """Change properties: a field left out stays, an explicit null clears it."""
+    return objects.change(ctx, id, request)
+
+
+@router.delete("/objects/{id}", status_code=204, **scope("admin"))
+def delete_object(ctx: Ctx, id: str) -> None:
+    """Delete an object, its trials, densities and sweeps; 409 while a sweep of it runs."""
+    objects.remove(ctx, id)

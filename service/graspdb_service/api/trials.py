@@ -1,0 +1,126 @@
+"""Trials and batches: ``/objects/{id}/trials``, ``/objects/{id}/batches``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import orjson
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import StreamingResponse
+
+from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, TrialIn, TrialOut, TrialsIn
+from graspdb.wire.trials import TrialColumnsIn
+from graspdb_service.api.routing import (
+    Ctx,
+    Cursor,
+    IdempotencyKey,
+    Limit,
+    RawBody,
+    encode_cursor,
+    etag,
+    media_type,
+    not_modified,
+    number_cursor,
+    scope,
+    tagged_json,
+)
+from graspdb_service.problems import ProblemError
+from graspdb_service.usecases import batches, objects, trials
+from graspdb_service.usecases.trial_bodies import JSON, NDJSON
+
+router = APIRouter(tags=["trials"])
+
+BODY = {
+    JSON: (TrialIn, TrialsIn, TrialColumnsIn),
+    NDJSON: {"type": "string", "description": "One trial as JSON a line"},
+}
+
+
+@router.post(
+    "/objects/{id}/trials",
+    status_code=201,
+    response_model=BatchReceipt,
+    **scope("trials:write", body=BODY),
+)
+def add_trials(
+    ctx: Ctx, id: str, request: Request, response: Response, body: RawBody, key: IdempotencyKey
+) -> object:
+    """Store one trial, a list, columns or lines as one batch: whole, or not at all."""
+    made = trials.add(ctx, id, body=body, media=media_type(request), key=key)
+    response.headers["Location"] = made.location
+    return made.body
+
+
+@router.get(
+    "/objects/{id}/trials",
+    response_model=Page[TrialOut],
+    responses={200: {"content": {NDJSON: {"schema": {"type": "string"}}}}},
+    **scope("read"),
+)
+def list_trials(
+    ctx: Ctx,
+    id: str,
+    request: Request,
+    outcome: Outcome | None = None,
+    source: Source | None = None,
+    gripper: Slug | None = None,
+    protocol: Slug | None = None,
+    batch: Annotated[str | None, Query(max_length=64)] = None,
+    since_revision: Annotated[
+        int | None, Query(ge=0, lt=2**63, description="Only what was stored after this revision.")
+    ] = None,
+    limit: Annotated[
+        int | None,
+        Query(ge=1, le=1_000, description="At most this many; 100, or all of them as lines, if not given."),
+    ] = None,
+    cursor: Cursor = None,
+) -> Response:
+    """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) all of them."""
+    chosen = trials.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
+    kind = _accepted(request)
+    after = number_cursor(cursor)
+    row, _ = objects.get(ctx, id)
+    tag = etag(row.id, row.revision, kind.rpartition("/")[2], request.url.query)
+    fresh = not_modified(request, tag)
+    if fresh is not None:
+        return fresh
+    headers = {"ETag": tag, "Vary": "Accept"}
+    if kind == NDJSON and limit is None:
+        lines = trials.stream(ctx, id, chosen, after=after)
+        return StreamingResponse(lines, media_type=NDJSON, headers=headers)
+    items, last = trials.page(ctx, id, chosen, after=after, limit=limit or 100)
+    if kind == NDJSON:
+        body = b"".join(orjson.dumps(item, option=orjson.OPT_APPEND_NEWLINE) for item in items)
+    else:
+        body = orjson.dumps({"items": items, "next": encode_cursor(last)})
+    return Response(body, media_type=kind, headers=headers)
+
+
+def _accepted(request: Request) -> str:
+    """The first of the media types in Accept that trials come in."""
+    for item in request.headers.get("accept", "*/*").split(","):
+        kind = item.partition(";")[0].strip().lower()
+        if kind == NDJSON:
+            return NDJSON
+        if kind in (JSON, "application/*", "*/*", ""):
+            return JSON
+    raise ProblemError(406, "not-acceptable", f"Trials come as {JSON} or {NDJSON}: say which by Accept")
+
+
+@router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))
+def list_batches(ctx: Ctx, id: str, request: Request, limit: Limit = 100, cursor: Cursor = None) -> Response:
+    """An object's batches in the order of their making."""
+    items, after = batches.page(ctx, id, after=number_cursor(cursor), limit=limit)
+    return tagged_json(request, Page[BatchInfo](items=items, next=encode_cursor(after)))
+
+
+@router.get("/objects/{id}/batches/{batch}", response_model=BatchInfo, **scope("read"))
+def get_batch(ctx: Ctx, id: str, batch: str, request: Request) -> Response:
+    """One batch, with everything it holds by outcome."""
+    return tagged_json(request, batches.get(ctx, id, batch))
+
+
+@router.delete("/objects/{id}/batches/{batch}", status_code=204, **scope("trials:write"))
+def delete_batch(ctx: Ctx, id: str, batch: str) -> None:
+    """Delete a batch and its trials; 409 while its sweep runs."""
+    batches.remove(ctx, id, batch)

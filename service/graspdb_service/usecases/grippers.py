@@ -1,0 +1,123 @@
+"""Grippers: the built-in ones, and the user's own."""
+
+from __future__ import annotations
+
+from graspdb.wire import GripperCreate, GripperInfo, GripperProfile
+from graspdb_geometry.grippers import PANDA, PG70, GripperShape
+from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.storage import grippers
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.grippers import GripperRow
+from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.idempotency import Created, replay_or
+from graspdb_service.usecases.slugs import is_slug
+
+
+def seed(database: Database) -> None:
+    """Store the built-in grippers where they are missing; several replicas may do so at once."""
+    with database.read() as tx:
+        if not grippers.missing(tx, BUILTIN):
+            return
+    with database.write() as tx:
+        for gripper, (name, profile) in sorted(BUILTIN.items()):
+            grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
+
+
+def create(ctx: Context, request: GripperCreate, *, key: str | None, body: bytes) -> Created:
+    """Store the user's gripper."""
+    profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
+    _check_shape(profile)
+
+    def make(tx: Tx) -> Created:
+        if not grippers.create(tx, request.id, request.name, profile.model_dump(mode="json")):
+            raise conflict("already-exists", f"There is a gripper {request.id!r} already: choose another id")
+        return Created(
+            _info(require(tx, request.id)).model_dump(mode="json"), location=f"/grippers/{request.id}"
+        )
+
+    return replay_or(ctx, scope="POST /grippers", key=key, request=body, create=make)
+
+
+def get(ctx: Context, gripper: str) -> GripperInfo:
+    """One gripper."""
+    with ctx.database.read() as tx:
+        return _info(require(tx, gripper))
+
+
+def page(ctx: Context, *, after: str, limit: int) -> tuple[list[GripperInfo], str | None]:
+    """A page of grippers by id, and where the next one starts."""
+    with ctx.database.read() as tx:
+        rows = grippers.page(tx, after=after, limit=limit + 1)
+    return [_info(row) for row in rows[:limit]], rows[limit - 1].id if len(rows) > limit else None
+
+
+def require(tx: Tx, gripper: str) -> GripperRow:
+    """The gripper, or a 404."""
+    row = grippers.find(tx, gripper) if is_slug(gripper) else None
+    if row is None:
+        raise not_found("gripper", gripper[:80], "GET /grippers lists them, POST /grippers makes one")
+    return row
+
+
+def unknown(field: str, names: list[str]) -> ProblemError:
+    """422 for a request's field that names grippers which do not exist."""
+    listed = ", ".join(repr(name) for name in names)
+    return invalid(field, f"there is no gripper {listed}: GET /grippers lists them, POST /grippers makes one")
+
+
+def _check_shape(profile: GripperProfile) -> None:
+    if profile.tip_offset_m > profile.finger.length_m:
+        raise invalid(
+            "tip_offset_m", "the tool origin lies between the finger's base and tip: at most length_m"
+        )
+
+
+def _info(row: GripperRow) -> GripperInfo:
+    return GripperInfo(
+        id=row.id,
+        name=row.name,
+        profile=GripperProfile.model_validate(row.profile),
+        builtin=row.builtin,
+        created_at=row.created_at,
+    )
+
+
+def _profile(shape: GripperShape, base_offset_m: float, **facts: float) -> GripperProfile:
+    return GripperProfile.model_validate(
+        {
+            "max_opening_m": shape.max_opening_m,
+            "finger": {
+                "width_m": shape.finger_width_m,
+                "thickness_m": shape.finger_thickness_m,
+                "length_m": shape.finger_length_m,
+            },
+            "tip_offset_m": shape.tip_offset_m,
+            "palm_size_m": shape.palm_size_m,
+            "base_to_tool": {"position": [0, 0, base_offset_m], "quaternion_xyzw": [0, 0, 0, 1]},
+            "symmetric": True,
+            **facts,
+        }
+    )
+
+
+BUILTIN: dict[str, tuple[str, GripperProfile]] = {
+    # RobWork's public device files: 60 mm/s and 40 N, 0.1 kg a finger, plastic on plastic; the hardware
+    # driver's acceleration limit is 39 mm/s^2.
+    "pg70": (
+        "Schunk PG70",
+        _profile(
+            PG70,
+            0.140,
+            finger_mass_kg=0.1,
+            max_speed_m_s=0.06,
+            max_acceleration_m_s2=0.039,
+            force_n=40.0,
+            friction=0.4,
+        ),
+    ),
+    # Franka's hand: 50 mm/s and 70 N continuous by its data sheet; the tool 103.4 mm from the hand's frame.
+    "panda": (
+        "Franka Panda hand",
+        _profile(PANDA, 0.1034, finger_mass_kg=0.015, max_speed_m_s=0.05, force_n=70.0, friction=0.4),
+    ),
+}
