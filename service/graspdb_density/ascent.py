@@ -7,6 +7,9 @@ mean-shift rotation. So steps of length 1 never descend; longer ones (over-relax
 of steps) are taken back when they do.
 """
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -25,7 +28,7 @@ _RELAXATION = 1.6
 
 
 @exact
-def score_centres(  # type: ignore[no-untyped-def]
+def score_centres(
     positions, quaternions, twins, sums, planes, spheres, cones, sigma, kappa, reach_m, reach, scores, turned
 ):
     """Optimistic log density at the feasible pose nearest to every kernel centre, -inf where that is out of
@@ -64,7 +67,7 @@ def score_centres(  # type: ignore[no-untyped-def]
 
 
 @exact
-def _same(p, q, other_p, other_q, separation_m, cosine, twins):  # type: ignore[no-untyped-def]
+def _same(p, q, other_p, other_q, separation_m, cosine, twins):
     """Whether two grasps are within both separations; ``cosine`` is that of half the angle."""
     squared = (p[0] - other_p[0]) ** 2 + (p[1] - other_p[1]) ** 2 + (p[2] - other_p[2]) ** 2
     if squared > separation_m * separation_m:
@@ -76,7 +79,7 @@ def _same(p, q, other_p, other_q, separation_m, cosine, twins):  # type: ignore[
 
 
 @exact
-def thin(positions, quaternions, first, limit, separation_m, separation, twins, kept):  # type: ignore[no-untyped-def]
+def thin(positions, quaternions, first, limit, separation_m, separation, twins, kept):
     """Greedy choice of mutually distinct poses in the order given, after ``first`` that are chosen already.
 
     ``kept`` (at least ``limit``) holds indices, the first ``first`` of them set; returns how many there are
@@ -100,7 +103,7 @@ def thin(positions, quaternions, first, limit, separation_m, separation, twins, 
 
 
 @exact
-def climb(  # type: ignore[no-untyped-def]
+def climb(
     data, start, table, centre, scale, planes, spheres, cones, kappa, radius, wide, positions, quaternions,
     tolerance, path, lengths,
 ):  # fmt: skip

@@ -16,6 +16,9 @@ wrap around in Python) and without slices, whose reference counts would cost mor
 Accumulation is float32 within a block of at most ``BLOCK`` kernels and float64 across.
 """
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -89,41 +92,65 @@ def _exp(x: Any) -> Any:
 
 
 @fast
-def _run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # type: ignore[no-untyped-def]
-    """Sum of kernels whose antipode's and farther twin's share is negligible; (qx..qw) is kappa times the
-    quaternion.
+def _run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+    """Sums of k and k r^2 where the antipode's and the farther twin's share is negligible.
+
+    (qx..qw) is kappa times the quaternion.
     """
-    total = _ZERO
+    total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
         dy = data[1, i] - py
         dz = data[2, i] - pz
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
         b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        near = max(abs(a), abs(b))
-        total += data[7, i] * _exp(near - kappa - (dx * dx + dy * dy + dz * dz))
-    return total
+        r2 = dx * dx + dy * dy + dz * dz
+        k = data[7, i] * _exp(max(abs(a), abs(b)) - kappa - r2)
+        total += k
+        spread += k * r2
+    return total, spread
 
 
 @fast
-def _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # type: ignore[no-untyped-def]
-    """Sum of kernels with every term: both twins, each with its antipode."""
-    total = _ZERO
+def _run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+    """Sums of k and k r^2 over both twins, each by its nearer end."""
+    total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
         dy = data[1, i] - py
         dz = data[2, i] - pz
-        base = -kappa - (dx * dx + dy * dy + dz * dz)
+        r2 = dx * dx + dy * dy + dz * dz
+        base = -kappa - r2
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        k = data[7, i] * (_exp(base + abs(a)) + twin * _exp(base + abs(b)))
+        total += k
+        spread += k * r2
+    return total, spread
+
+
+@fast
+def _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+    """Sums of k and k r^2 with every term: both twins, each with its antipode."""
+    total, spread = _ZERO, _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        r2 = dx * dx + dy * dy + dz * dz
+        base = -kappa - r2
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
         b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
         own = _exp(base + a) + _exp(base - a)
         other = _exp(base + b) + _exp(base - b)
-        total += data[7, i] * (own + twin * other)
-    return total
+        k = data[7, i] * (own + twin * other)
+        total += k
+        spread += k * r2
+    return total, spread
 
 
 @fast
-def _moments_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, sums):  # type: ignore[no-untyped-def]
+def _moments_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, sums):
     """Add to ``sums`` (9,): k, k (p_i - p), the signed pull k mu_i of the quaternion, and k r^2, scaled
     units.
 
@@ -176,7 +203,7 @@ def _moments_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide
 
 
 @fast
-def _runs(start, table, s, px, py, pz, radius, runs):  # type: ignore[no-untyped-def]
+def _runs(start, table, s, px, py, pz, radius, runs):
     """Ranges of kernels in the cells of segment ``s`` that a ball reaches, into ``runs`` (MAX_RUNS, 2); their
     number.
 
@@ -225,33 +252,42 @@ def _runs(start, table, s, px, py, pz, radius, runs):  # type: ignore[no-untyped
 
 
 @fast
-def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):  # type: ignore[no-untyped-def]
-    """Sum of weights times kernels (1 at a kernel's centre) within ``radius``, position in scaled units."""
+def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
+    """Sum of weights times kernels (1 at a centre) within ``radius``, their k r^2, and how many were visited.
+
+    ``wide`` is 0 where the nearest of twins and antipodes stands for all, 1 where both twins count, 2 where
+    antipodes do too.
+    """
     fx, fy, fz = F32(px), F32(py), F32(pz)
     k = F32(kappa)
     q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
-    total = 0.0
+    total, spread, visited = 0.0, 0.0, 0
     for s in range(table.shape[0]):
         twin = F32(table[s, TWIN])
         for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
             begin, end = runs[r, 0], runs[r, 1]
+            visited += end - begin
             while begin < end:
                 stop = min(begin + BLOCK, end)
-                if wide:
-                    total += _run_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
+                if wide == 2:
+                    part = _run_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
+                elif wide == 1:
+                    part = _run_twins(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
                 else:
-                    total += _run_narrow(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
+                    part = _run_narrow(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
+                total += part[0]
+                spread += part[1]
                 begin = stop
-    return total
+    return total, spread, visited
 
 
 @fast
-def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums):  # type: ignore[no-untyped-def]
+def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums):
     """Fill ``sums`` (9,) with the moments of `_moments_run` over the kernels within ``radius``."""
     fx, fy, fz = F32(px), F32(py), F32(pz)
     k = F32(kappa)
     q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
-    every = F32(1.0) if wide else F32(0.0)
+    every = F32(1.0) if wide > 0 else F32(0.0)
     sums[:] = 0.0
     for s in range(table.shape[0]):
         twin = F32(table[s, TWIN])
@@ -264,7 +300,7 @@ def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sum
 
 
 @fast
-def _top_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # type: ignore[no-untyped-def]
+def _top_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
     """Largest exponent of a run, float64."""
     top = -1e300
     for i in range(np.uint64(begin), np.uint64(end)):
@@ -278,7 +314,7 @@ def _top_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):  # t
 
 
 @fast
-def _sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):  # type: ignore[no-untyped-def]
+def _sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):
     """Sum of every term of a run relative to e^top, exponents in float64."""
     total = _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
@@ -295,7 +331,7 @@ def _sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):
 
 
 @fast
-def exact_log_sum(data, blocks, boxes, px, py, pz, q, kappa, margin):  # type: ignore[no-untyped-def]
+def exact_log_sum(data, blocks, boxes, px, py, pz, q, kappa, margin):
     """Log of the sum over all kernels, without a cut-off; right however far the pose is from data.
 
     Blocks of kernels whose bounding box proves every exponent to lie ``margin`` nats below the largest one
@@ -336,55 +372,49 @@ def exact_log_sum(data, blocks, boxes, px, py, pz, q, kappa, margin):  # type: i
 
 
 @fast
-def log_sums(  # type: ignore[no-untyped-def]
-    data,
-    start,
-    table,
-    blocks,
-    boxes,
-    centre,
-    scale,
-    positions,
-    quaternions,
-    kappa,
-    radius,
-    wide,
-    floor,
-    margin,
-    out,
+def log_sums(
+    data, start, table, blocks, boxes, centre, scale, positions, quaternions, kappa, stages, wide, margin, out
 ):
     """Log of the weighted kernel sum at every pose into ``out`` (M,).
 
-    Sums below ``floor`` are taken again without a cut-off: there what was cut could be all there is. A
-    ``radius`` that is not positive asks for that everywhere.
+    Parameters
+    ----------
+    stages : (T, 3)
+        Radii to try in turn, each with the largest mean exponent of position and the least mean kernel at
+        which what lies outside is too little to matter (see `density.stages`). A pose that passes none, or
+        where there are none, is summed without a cut-off.
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     for j in range(positions.shape[0]):
         px = (positions[j, 0] - centre[0]) * scale
         py = (positions[j, 1] - centre[1]) * scale
         pz = (positions[j, 2] - centre[2]) * scale
-        total = 0.0
-        if radius > 0.0:
-            total = _sum_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs)
-        if total > floor:
-            out[j] = math.log(total)
-        else:
+        done = False
+        for t in range(stages.shape[0]):
+            total, spread, visited = _sum_at(
+                data, start, table, px, py, pz, quaternions[j], kappa, stages[t, 0], wide, runs
+            )
+            if total > 0.0 and spread <= stages[t, 1] * total and total >= stages[t, 2] * visited:
+                out[j] = math.log(total)
+                done = True
+                break
+        if not done:
             out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
 
 
 @fast
-def sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):  # type: ignore[no-untyped-def]
+def sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
     """The weighted kernel sum within ``radius`` at every pose, zero where nothing is in reach."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     for j in range(positions.shape[0]):
         px = (positions[j, 0] - centre[0]) * scale
         py = (positions[j, 1] - centre[1]) * scale
         pz = (positions[j, 2] - centre[2]) * scale
-        out[j] = _sum_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs)
+        out[j] = _sum_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs)[0]
 
 
 @fast
-def moments(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):  # type: ignore[no-untyped-def]
+def moments(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
     """The moments at every pose into ``out`` (M, 9)."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     for j in range(positions.shape[0]):
@@ -395,7 +425,7 @@ def moments(data, start, table, centre, scale, positions, quaternions, kappa, ra
 
 
 @fast
-def _scatter_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, weight, out):  # type: ignore[no-untyped-def]
+def _scatter_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, weight, out):
     """Add one kernel's value at every kernel centre of a run."""
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
@@ -410,12 +440,12 @@ def _scatter_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide
 
 
 @fast
-def scatter_sums(  # type: ignore[no-untyped-def]
+def scatter_sums(
     data, start, table, centre, scale, positions, quaternions, weights, twins, kappa, radius, wide, out
 ):
     """Add the kernels of the given rows to the sums ``out`` (N,) at every sorted kernel's centre."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    every = F32(1.0) if wide else F32(0.0)
+    every = F32(1.0) if wide > 0 else F32(0.0)
     for j in range(positions.shape[0]):
         px = (positions[j, 0] - centre[0]) * scale
         py = (positions[j, 1] - centre[1]) * scale

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import compiled, reference, se3
 from .cells import Cells
-from .kernels import IsotropicKernel
+from .kernels import HAAR_VOLUME, IsotropicKernel
 from .se3 import Floats
 from .threads import for_blocks
 
@@ -28,15 +28,16 @@ if TYPE_CHECKING:
     from .maximum import Maximum
     from .region import Region
 
-__all__ = ["CUTOFF", "WIDE_ROTATION", "GraspDensity"]
+__all__ = ["CUTOFF", "TWIN_ROTATION", "WIDE_ROTATION", "GraspDensity"]
 
 #: Default cut-off in standard deviations of position.
 CUTOFF = 4.0
-#: From this rotation width on, a pose's farther twin and antipode are summed; below, the nearest stands
-#: for all.
-WIDE_ROTATION = math.radians(20.5)
+#: From these rotation widths on, both twins are summed, and their antipodes too; below the first, the nearer
+#: twin stands for both. At the limits what is neglected is below 1e-3 of one kernel's mass.
+TWIN_ROTATION, WIDE_ROTATION = math.radians(20.5), math.radians(36.0)
 _CUTOFF_LIMITS = (2.0, 10.0)
 _QUERY_BLOCK = 1024
+_SORTED_FROM = 256
 
 
 class GraspDensity:
@@ -182,9 +183,10 @@ class GraspDensity:
         return self._cells
 
     @property
-    def wide(self) -> bool:
-        """Whether every twin and antipode is summed."""
-        return self._kernel.sigma_rotation > WIDE_ROTATION
+    def wide(self) -> int:
+        """Which terms of a kernel are summed, as `compiled` counts them."""
+        width = self._kernel.sigma_rotation
+        return int(width > TWIN_ROTATION) + int(width > WIDE_ROTATION)
 
     @property
     def log_unit(self) -> float:
@@ -208,28 +210,42 @@ class GraspDensity:
         ----------
         positions, quaternions_xyzw : (M, 3), (M, 4)
         cutoff
-            Kernels further than this many standard deviations of position are left out, at least; None leaves
-            none out. Where the rest is too little to trust, the pose is evaluated again without a cut-off.
+            Kernels nearer than this many standard deviations of position are summed; those beyond too
+            wherever they might matter (`stages`). None: all.
         threads
             At most this many, of the package's own pool.
+
+        Notes
+        -----
+        Error of the density against the float64 sum over every row, measured on an ellipsoid shell of 2,000
+        to 160,000 rows at poses a kernel's width away from rows: median 3e-5 and at most 1e-3 at the default
+        cut-off, at most 5e-4 at 5. Poses further than any cut-off are summed without one: there the error is
+        2e-5 or 1e-6 of the log density's magnitude, whichever is more, from rounding to float32. At poses
+        turned half way between twins, at rotation widths just below 20.5 degrees, up to 1e-2.
         """
         p, q = se3.as_poses(positions, quaternions_xyzw)
-        radius = 0.0 if cutoff is None else scaled_radius(cutoff)
         cells = self._cells
+        steps = stages(self._kernel, cutoff)
         # The least weight there can be bounds what skipping far blocks may lose.
         margin = 16.0 + math.log(self._total / float(self._weights.min()))
-        floor = self._trusted_sum(cutoff)
+        ordered = len(p) >= _SORTED_FROM
+        if ordered:
+            order = cells.visiting_order(p)
+            p, q = p[order], q[order]
         out = np.empty(len(p))
 
         def work(begin: int, end: int) -> None:
             compiled.log_sums(
                 cells.data, cells.start, cells.table, cells.blocks, cells.boxes, cells.centre, cells.scale,
-                p[begin:end], q[begin:end], self._kernel.kappa, radius, self.wide, floor, margin,
-                out[begin:end],
+                p[begin:end], q[begin:end], self._kernel.kappa, steps, self.wide, margin, out[begin:end],
             )  # fmt: skip
 
         for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
         out += self.log_unit
+        if ordered:
+            result = np.empty(len(p))
+            result[order] = out
+            return result
         return out
 
     def density(
@@ -242,10 +258,6 @@ class GraspDensity:
     ) -> Floats:
         """Density at poses, 1/(m^3 rad^3); underflows to 0 only below 1e-300."""
         return np.exp(self.log_density(positions, quaternions_xyzw, cutoff=cutoff, threads=threads))
-
-    def _trusted_sum(self, cutoff: float | None) -> float:
-        """Kernel sums below this are evaluated again without a cut-off."""
-        return 1e-6 if cutoff is None else math.exp(-0.5 * cutoff * cutoff)
 
     def gradient(
         self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, cutoff: float = 6.0
@@ -263,7 +275,7 @@ class GraspDensity:
         moments = self.moments(p, q, cutoff=cutoff)
         total = moments[:, :1]
         kappa, scale = self._kernel.kappa, self._cells.scale
-        near = total[:, 0] > self._trusted_sum(cutoff)
+        near = total[:, 0] > math.exp(-0.5 * cutoff * cutoff)
         safe = np.where(near[:, None], total, 1.0)
         along = moments[:, 1:4] / safe * (2.0 * scale)
         pull = moments[:, 4:8] / safe * kappa
@@ -387,6 +399,30 @@ class GraspDensity:
             known = self.maximum(None, count=1, threads=threads)[0]
             self._global = known
         return known
+
+
+def stages(kernel: IsotropicKernel, cutoff: float | None) -> Floats:
+    """Radii to try and when to trust them, for `compiled.log_sums`; shape (T, 3).
+
+    What a cut at c standard deviations leaves out weighs at most exp(-c^2 / 2) a kernel. That is too much
+    where the kernels inside are themselves far away: on the fringe of data, which shows in their mean
+    exponent of position (3/2 inside a cloud, 1 on a surface, c^2 / 2 at the cut); and where the pose's
+    rotation is unlike all around, which shows in their mean value (compared with that at a uniformly random
+    rotation). Such poses are taken again with a larger radius and, if that does not help, without one.
+    """
+    if cutoff is None:
+        return np.empty((0, 3))
+    # Mean of the rotation's factor, 1 at its peak, over all rotations.
+    random = math.exp(-1.5 * math.log(2.0 * math.pi * kernel.sigma_position_m**2) - kernel.log_peak)
+    random /= HAAR_VOLUME
+    rows = []
+    for reach in (cutoff, 1.4 * cutoff):
+        mean_exponent = max(0.5 * reach * reach - 5.8, 2.2)
+        # The kernels that one larger ball adds grow as its volume, at worst.
+        least = 0.04 * random * math.exp(8.0 - 0.5 * reach * reach)
+        rows.append((reach / math.sqrt(2.0), mean_exponent, least))
+    scaled_radius(cutoff)
+    return np.array(rows)
 
 
 def scaled_radius(cutoff: float) -> float:

@@ -10,6 +10,9 @@ centres and radii, and ``cones`` (10,): approach axis, its angle, closing axis, 
 axis keeps its sign, unused. A negative angle means no cone.
 """
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -27,7 +30,7 @@ MARGIN = 1e-8
 
 
 @exact
-def position_excess(planes, spheres, p):  # type: ignore[no-untyped-def]
+def position_excess(planes, spheres, p):
     """Distance by which a point misses the constraint it misses most, metres; at most 0 inside."""
     worst = -1e300
     for k in range(planes.shape[0]):
@@ -40,7 +43,7 @@ def position_excess(planes, spheres, p):  # type: ignore[no-untyped-def]
 
 
 @exact
-def _axis(q, which, out):  # type: ignore[no-untyped-def]
+def _axis(q, which, out):
     """Tool axis y (which = 1) or z (2) in the object frame."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     if which == 2:
@@ -50,7 +53,7 @@ def _axis(q, which, out):  # type: ignore[no-untyped-def]
 
 
 @exact
-def _towards(axis, goal, signed, normal):  # type: ignore[no-untyped-def]
+def _towards(axis, goal, signed, normal):
     """Angle from an axis (its nearer end unless ``signed``) to a goal; ``normal`` gets the unit turn that
     closes it.
     """
@@ -77,7 +80,7 @@ def _towards(axis, goal, signed, normal):  # type: ignore[no-untyped-def]
 
 
 @exact
-def cone_excess(cones, q):  # type: ignore[no-untyped-def]
+def cone_excess(cones, q):
     """Angle by which the worse of the two axes leaves its cone, radians; at most 0 inside."""
     axis, normal = np.empty(3), np.empty(3)
     worst = -1e300
@@ -91,7 +94,7 @@ def cone_excess(cones, q):  # type: ignore[no-untyped-def]
 
 
 @exact
-def _turn(q, v):  # type: ignore[no-untyped-def]
+def _turn(q, v):
     """q <- exp(v) q, v a rotation vector in the object frame."""
     angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     s = 0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle
@@ -107,7 +110,7 @@ def _turn(q, v):  # type: ignore[no-untyped-def]
 
 
 @exact
-def _pull_back(v, n, out):  # type: ignore[no-untyped-def]
+def _pull_back(v, n, out):
     """Gradient by the rotation vector v of a function whose gradient by a small further turn is n: J_l(v)^T
     n.
     """
@@ -122,7 +125,7 @@ def _pull_back(v, n, out):  # type: ignore[no-untyped-def]
 
 
 @exact
-def _least(g1, r1, g2, r2, v):  # type: ignore[no-untyped-def]
+def _least(g1, r1, g2, r2, v):
     """Shortest v with g1.v >= r1 and g2.v >= r2 (a plain compromise where they contradict)."""
     a11, a22, a12 = 0.0, 0.0, 0.0
     for i in range(3):
@@ -143,7 +146,7 @@ def _least(g1, r1, g2, r2, v):  # type: ignore[no-untyped-def]
 
 
 @exact
-def project_rotation(cones, q):  # type: ignore[no-untyped-def]
+def project_rotation(cones, q):
     """Turn q (4,) in place to the nearest rotation inside the cones; whether it got there."""
     first, second = cones[3] >= 0.0, cones[7] >= 0.0
     if not (first or second):
@@ -203,7 +206,7 @@ def project_rotation(cones, q):  # type: ignore[no-untyped-def]
 
 
 @exact
-def project_position(planes, spheres, p):  # type: ignore[no-untyped-def]
+def project_position(planes, spheres, p):
     """Move p (3,) in place to the nearest point inside planes and spheres; whether it got there."""
     count = planes.shape[0] + spheres.shape[0]
     if count == 0 or position_excess(planes, spheres, p) <= 0.0:
@@ -242,7 +245,7 @@ def project_position(planes, spheres, p):  # type: ignore[no-untyped-def]
 
 
 @exact
-def project_all(planes, spheres, cones, positions, quaternions, inside):  # type: ignore[no-untyped-def]
+def project_all(planes, spheres, cones, positions, quaternions, inside):
     """Project poses in place; ``inside`` (M,) says which reached the region."""
     for j in range(positions.shape[0]):
         there = project_position(planes, spheres, positions[j])
