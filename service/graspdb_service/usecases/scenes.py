@@ -1,4 +1,4 @@
-"""The exact collision test of the gripper against an object, prepared once per mesh."""
+"""The exact collision test of a gripper against an object, prepared once per geometry."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import GripperProfile
 from graspdb_geometry import meshes
-from graspdb_geometry.collision import Scene
+from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import GripperShape
 from graspdb_service.problems import conflict
 from graspdb_service.storage import assets
@@ -22,14 +22,17 @@ from graspdb_service.usecases.selection import Selected
 
 Floats = NDArray[np.float64]
 
+Solid = Scene | Surface
+"""An object's convex parts once they exist, and its mesh's own triangles before."""
+
 _MAX_BYTES = 256 * 2**20
-#: Hulls, planes and edges of a prepared part take about this many times its bytes as a file.
+#: Hulls, planes, edges and trees take about this many times the bytes of the file.
 _GROWTH = 10
 
 
 @dataclass(frozen=True)
 class _Prepared:
-    scene: Scene
+    solid: Solid
     nbytes: int
 
 
@@ -37,28 +40,30 @@ class _Prepared:
 class CollisionTest:
     """The open gripper of one profile against one object."""
 
-    scene: Scene
+    solid: Solid
     shape: GripperShape
 
     def free(self, positions: Floats, quaternions: Floats, threads: int = 1) -> NDArray[np.bool_]:
         """Which poses (n, 3), (n, 4) the open gripper can take without overlapping the object."""
-        return ~self.scene.collides(positions, quaternions, self.shape, threads=threads)
+        return ~self.solid.collides(positions, quaternions, self.shape, threads=threads)
 
 
 class Scenes:
-    """Prepared objects, by what they are made of: the same parts are the same scene for every object."""
+    """Prepared geometry, by content: the same parts are prepared once, whichever object they belong to."""
 
     def __init__(self, database: Database, compute: Compute) -> None:
         self._database = database
         self._compute = compute
-        self._cache: SingleFlightCache[str, _Prepared] = SingleFlightCache(_MAX_BYTES, lambda p: p.nbytes)
+        self._cache: SingleFlightCache[tuple[str, str], _Prepared] = SingleFlightCache(
+            _MAX_BYTES, lambda p: p.nbytes
+        )
 
     def test(self, row: ObjectRow, selected: Selected) -> CollisionTest | None:
         """The collision test of a selection; None where geometry or gripper is not known."""
         if selected.profile is None:
             return None
-        scene = self._scene(row)
-        return None if scene is None else CollisionTest(scene, shape_of(selected.profile))
+        solid = self._solid(row)
+        return None if solid is None else CollisionTest(solid, shape_of(selected.profile))
 
     def require(self, row: ObjectRow, selected: Selected) -> CollisionTest:
         """As :meth:`test`.
@@ -74,38 +79,38 @@ class Scenes:
         reasons = []
         if row.mesh_sha256 is None and row.parts_sha256 is None:
             reasons.append(f"the object has no mesh (PUT /objects/{row.slug}/mesh)")
-        elif self._scene(row) is None:
-            reasons.append(
-                "the object's convex parts are not known yet: a worker makes them for its first sweep,"
-                f" or PUT /objects/{row.slug}/convex-parts"
-            )
         if selected.profile is None:
             reasons.append("no trial names its gripper (name one: gripper=)")
         raise conflict("collision-unknown", "Collisions can't be tested: " + "; ".join(reasons))
 
-    def _scene(self, row: ObjectRow) -> Scene | None:
+    def _solid(self, row: ObjectRow) -> Solid | None:
         if row.parts_sha256 is not None:
-            return self._prepared(row.parts_sha256, lambda content, _: meshes.parts_from_glb(content))
+            return self._prepared(
+                row.parts_sha256, "parts", lambda content, _: Scene(meshes.parts_from_glb(content))
+            )
         info = row.mesh_info
-        if row.mesh_sha256 is None or info is None or not info["convex"]:
+        if row.mesh_sha256 is None or info is None:
             return None
 
-        def own_part(content: bytes, media_type: str) -> list[meshes.Part]:
+        def own(content: bytes, media_type: str) -> Solid:
+            # Checked in a child process when it came; what is stored is trusted.
             mesh = meshes.load(content, media_type, info["unit"])
-            return [(mesh.vertices, mesh.faces)]
+            if info["convex"]:
+                return Scene([(mesh.vertices, mesh.faces)])
+            return Surface(mesh.vertices, mesh.faces, watertight=info["watertight"])
 
-        return self._prepared(row.mesh_sha256, own_part)
+        # The same file in another unit is another object.
+        return self._prepared(row.mesh_sha256, info["unit"], own)
 
-    def _prepared(self, sha256: str, parts: Callable[[bytes, str], list[meshes.Part]]) -> Scene:
+    def _prepared(self, sha256: str, reading: str, prepare: Callable[[bytes, str], Solid]) -> Solid:
         def make(_: _Prepared | None) -> _Prepared:
             with self._database.read() as tx:
                 found = assets.get(tx, sha256)
             if found is None:
                 raise conflict("object-changed", "The object's geometry was replaced just now: ask again")
-            scene = self._compute.run(lambda: Scene(parts(*found)))
-            return _Prepared(scene, _GROWTH * len(found[0]))
+            return _Prepared(self._compute.run(lambda: prepare(*found)), _GROWTH * len(found[0]))
 
-        return self._cache.get(sha256, lambda _: True, make).scene
+        return self._cache.get((sha256, reading), lambda _: True, make).solid
 
 
 def shape_of(profile: GripperProfile) -> GripperShape:
