@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
-from graspdb_geometry import _convex_kernels
+from graspdb_geometry import _convex_kernels, _surface_kernels
 from graspdb_geometry.grippers import GripperShape
 
 FloatArray = npt.NDArray[np.float64]
@@ -130,6 +130,90 @@ class Scene:
         _in_blocks(run, len(p), threads)
         hits: npt.NDArray[np.bool_] = codes == COLLIDES
         return hits
+
+
+class Surface:
+    """An object as triangles, for queries before it has convex parts; immutable, thread-safe.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float
+        Metres, object frame.
+    faces : (F, 3) int
+        Triangles, counterclockwise seen from outside.
+    watertight : bool
+        The triangles close a solid: then a gripper wholly inside of it collides too.
+
+    Raises
+    ------
+    ValueError
+        Without triangles, for indices out of range or coordinates that are not finite.
+    """
+
+    #: Triangles in a leaf of the tree.
+    _LEAF = 4
+
+    def __init__(self, vertices: npt.ArrayLike, faces: npt.ArrayLike, *, watertight: bool) -> None:
+        points = np.asarray(vertices, dtype=np.float64)
+        index = np.asarray(faces, dtype=np.int64)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
+            raise ValueError("vertices must be (V, 3) and finite")
+        if index.ndim != 2 or index.shape[1] != 3 or not len(index):
+            raise ValueError("faces must be (F, 3) with at least one row")
+        if int(index.min()) < 0 or int(index.max()) >= len(points):
+            raise ValueError("faces must refer to existing vertices")
+        self.watertight = watertight
+        self.triangle_count = len(index)
+        self._tree = self._build(points[index])
+
+    def collides(
+        self,
+        positions: npt.ArrayLike,
+        quaternions: npt.ArrayLike,
+        shape: GripperShape,
+        opening_m: float | None = None,
+        threads: int = 1,
+    ) -> npt.NDArray[np.bool_]:
+        """Whether the gripper overlaps the object in each pose; as :meth:`Scene.collides`."""
+        p, q = _poses(positions, quaternions)
+        boxes = np.ascontiguousarray(_gripper_boxes(shape, opening_m)[:3])
+        hits = np.empty(len(p), dtype=np.bool_)
+
+        def run(block: slice) -> None:
+            _surface_kernels.collides(p[block], q[block], boxes, self._tree, self.watertight, hits[block])
+
+        _in_blocks(run, len(p), threads)
+        return hits
+
+    @classmethod
+    def _build(cls, corners: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
+        """Tree over triangles (F, 3, 3), halved at the median of the longest side of their centres."""
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        middle = (low + high) / 2
+        order = np.arange(len(corners))
+        nodes: list[FloatArray] = []
+        links: list[tuple[int, int]] = []
+        pending = [(0, len(corners), -1, 0)]  # begin, end, parent, which child
+        while pending:
+            begin, end, parent, side = pending.pop()
+            number = len(nodes)
+            if parent >= 0:
+                first, second = links[parent]
+                links[parent] = (number, second) if side == 0 else (first, number)
+            members = order[begin:end]
+            lower, upper = low[members].min(axis=0), high[members].max(axis=0)
+            nodes.append(np.stack([(lower + upper) / 2, (upper - lower) / 2 * (1 + 1e-12) + 1e-15]))
+            if end - begin <= cls._LEAF:
+                links.append((-1 - begin, end))
+                continue
+            links.append((0, 0))
+            centres = middle[members]
+            axis = int(np.argmax(np.ptp(centres, axis=0)))
+            half = (end - begin) // 2
+            order[begin:end] = members[np.argpartition(centres[:, axis], half)]
+            pending.append((begin + half, end, number, 1))
+            pending.append((begin, begin + half, number, 0))
+        return np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
 
 
 class _Solid:

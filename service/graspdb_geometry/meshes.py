@@ -81,8 +81,8 @@ class MeshProperties:
     lower, upper : list of 3 floats
         Bounding box, metres.
     watertight : bool
-        At every edge as many triangles run one way as the other, and the volume is positive: a closed surface,
-        or several, which may touch or overlap.
+        At every edge as many triangles run one way as the other, and the volume is positive: a closed
+        surface, or several, which may touch or overlap.
     convex : bool
         Watertight and equal to its convex hull, so that it is its own convex part.
     volume_m3, centre_of_mass, inertia : float, list, 3x3 list, or None
@@ -334,8 +334,8 @@ def inspect_in_child(
     if done.returncode != 0:
         raise MeshError(
             "mesh",
-            f"reading it failed or needs more than {memory_bytes / 2**20:.0f} MiB of memory or {seconds:g} s of "
-            "processor time: check the file, or simplify it",
+            f"reading it failed or needs more than {memory_bytes / 2**20:.0f} MiB of memory or {seconds:g} s "
+            "of processor time: check the file, or simplify it",
         )
     head, _, rest = done.stdout.partition(b"\n")
     answer: dict[str, Any] = json.loads(head)
