@@ -156,7 +156,8 @@ def project_rotation(cones, q):
     if first and second:
         origin = q.copy()
         v, g1, g2 = np.zeros(3), np.empty(3), np.empty(3)
-        for _ in range(12):
+        damping, last = 1.0, 1e300
+        for _ in range(60):
             _axis(q, 2, axis)
             e1 = _towards(axis, cones[0:3], True, n1) - cones[3] + MARGIN
             _axis(q, 1, axis)
@@ -169,14 +170,20 @@ def project_rotation(cones, q):
                 r2 += g2[i] * v[i]
             moved = v.copy()
             _least(g1, r1, g2, r2, v)
+            change = abs(v[0] - moved[0]) + abs(v[1] - moved[1]) + abs(v[2] - moved[2])
+            if change > 0.6 * last:
+                # Narrow cones curve more than the subproblem knows: full steps overshoot from side to side.
+                damping = max(0.6 * damping, 0.1)
+            last = change
+            for i in range(3):
+                v[i] = moved[i] + damping * (v[i] - moved[i])
             length = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
             if length > 3.0:
                 for i in range(3):
                     v[i] *= 3.0 / length
             q[:] = origin
             _turn(q, v)
-            change = abs(v[0] - moved[0]) + abs(v[1] - moved[1]) + abs(v[2] - moved[2])
-            if change < 1e-9:
+            if change < 1e-8:
                 break
     # Closed form for one cone; for two, this mends what curvature left over.
     for _ in range(200):

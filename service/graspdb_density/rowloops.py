@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from . import compiled as c
-from .compiler import fast, inlined
+from .compiler import exact, fast, inlined
 
 F32 = np.float32
 #: Rows evaluated at a time: the buffers stay in the first-level cache.
@@ -75,9 +75,8 @@ def _isotropic_values(data, begin, n, px, py, pz, qx, qy, qz, qw, kappa, twin, w
             base = -kappa - (dx * dx + dy * dy + dz * dz)
             a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
             b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz)
-            low = min(a, b * twin)
-            # The antipodes of both and the farther twin; the nearest of all is there already. Without a twin
-            # its terms vanish and the row's own antipode stays.
+            low = min(a, b)
+            # The nearest of the four is there already; the others are both antipodes and the farther twin.
             out[k] += c._exp(base - a) + twin * (c._exp(base + low) + c._exp(base - b))
 
 
@@ -88,11 +87,6 @@ def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi
     """
     px, py, pz = F32(p[0]), F32(p[1]), F32(p[2])
     qx, qy, qz, qw = F32(q[0]), F32(q[1]), F32(q[2]), F32(q[3])
-    if turned:
-        # Right multiplication by the jaw's turn on the left operand's inverse: q_i M -> (y, -x, w, -z).
-        sx, sy = -_ONE, -_ONE
-    else:
-        sx, sy = _ONE, _ONE
     flip = F32(-1.0) if (turned and frame_turns) else _ONE
     m = F32(metres)
     for k in range(np.uint64(n)):
@@ -109,7 +103,7 @@ def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi
         vz = aw * qz + ax * qy - ay * qx + az * qw
         w = aw * qw - ax * qx - ay * qy - az * qz
         if turned:
-            # M^-1 (vx, vy, vz, w) with M^-1 = (0, 0, -1, 0).
+            # (q_i M)^-1 q = M^-1 v with M^-1 = (0, 0, -1, 0).
             tx, ty, tz, tw = vy, -vx, -w, vz
             vx, vy, vz, w = tx, ty, tz, tw
         sign = _ONE if w >= _ZERO else -_ONE
@@ -117,8 +111,6 @@ def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi
         xi[3, k] = f * vx
         xi[4, k] = f * vy
         xi[5, k] = f * vz
-    # Only the signs' names differ between the twins; both loops above are the same vector code.
-    return sx + sy
 
 
 @fast
@@ -247,7 +239,7 @@ def mixture_sums(  # type: ignore[no-untyped-def]
     return kept
 
 
-@fast
+@exact
 def _component_exponent(x, lower):  # type: ignore[no-untyped-def]
     """Half the squared Mahalanobis distance of one displacement (6,), in float64."""
     square = 0.0
@@ -261,7 +253,7 @@ def _component_exponent(x, lower):  # type: ignore[no-untyped-def]
     return square
 
 
-@fast
+@exact
 def mixture_log_sum(  # type: ignore[no-untyped-def]
     positions, quaternions, frames, symmetric, frame_turns, log_rows, lowers, log_weights, wraps, p, q
 ):

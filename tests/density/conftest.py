@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+
 from graspdb_density import se3
 from graspdb_density.se3 import Floats
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graspdb_density import HAAR_VOLUME, GraspDensity, IsotropicKernel, reference, se3
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from graspdb_density import HAAR_VOLUME, GraspDensity, IsotropicKernel, reference, se3
 
 Poses = tuple[se3.Floats, se3.Floats]
 Shell = Callable[[int, np.random.Generator], Poses]

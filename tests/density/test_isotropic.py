@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from graspdb_density import HAAR_VOLUME, IsotropicKernel, reference, se3
-from graspdb_density.kernels import sample_von_mises_fisher
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import iv
+
+from graspdb_density import HAAR_VOLUME, IsotropicKernel, reference, se3
+from graspdb_density.kernels import sample_von_mises_fisher
 
 WIDTHS_DEG = [5.0, 15.0, 20.0, 30.0, 60.0]
 

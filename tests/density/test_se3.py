@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from graspdb_density import se3
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+
+from graspdb_density import se3
 
 ANGLES = st.one_of(
     st.floats(0.0, math.pi),
