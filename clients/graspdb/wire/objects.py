@@ -67,6 +67,7 @@ class PartsInfo(Response):
     parts: int
     volume_m3: float
     bounding_box: BoundingBox
+    warnings: list[str] = Field(default_factory=list)
 
 
 class ObjectInfo(Response):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Row, Select, delete, func, insert, select, update
 
+from graspdb_service.storage import sweeps as sweep_rows
 from graspdb_service.storage import trials as trial_rows
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import batches, idempotency_keys, packed_outcomes, sweeps, trials
@@ -125,10 +126,12 @@ def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
 
 def outcome_counts(tx: Tx, batch: BatchRow) -> dict[int, int]:
     """Everything a batch holds by outcome code: rows, and the packed outcomes of its sweep."""
-    if batch.sweep_id is not None:
-        # A sweep's packed outcomes have every pose, those that became rows included.
-        return _packed_codes(tx, batch.sweep_id)
     counts: dict[int, int] = {}
+    if batch.sweep_id is not None:
+        if batch.purpose == "check":
+            return _packed_codes(tx, batch.sweep_id)
+        # Not every code of the packed outcomes: poses that another sweep had stored before count there.
+        _, counts = sweep_rows.packed_counts(tx, batch.sweep_id)
     for (_, outcome), number in row_counts(tx, batch).items():
         counts[outcome] = counts.get(outcome, 0) + number
     return counts
@@ -143,10 +146,8 @@ def remove(tx: Tx, batch: BatchRow) -> None:
     rows = row_counts(tx, batch)
     if batch.sweep_id is not None:
         if batch.purpose == "collect" and batch.provenance_id is not None:
-            packed = _packed_codes(tx, batch.sweep_id)
-            for (_, outcome), number in rows.items():
-                packed[outcome] = packed.get(outcome, 0) - number
-            trial_rows.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items() if n})
+            _, packed = sweep_rows.packed_counts(tx, batch.sweep_id)
+            trial_rows.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items()})
         tx.execute(delete(packed_outcomes).where(packed_outcomes.c.sweep_id == batch.sweep_id))
     if batch.first_seq is not None:
         tx.execute(delete(trials).where(*_rows(batch)))

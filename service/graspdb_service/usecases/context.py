@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
@@ -20,6 +21,7 @@ class Context:
     compute: Compute
     densities: Densities
     scenes: Scenes
+    mesh_children: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:

@@ -1,0 +1,57 @@
+"""An object's mesh and convex parts: raw bodies under ``/objects/{id}``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from fastapi import APIRouter, Request, Response
+
+from graspdb.wire import MeshInfo, PartsInfo
+from graspdb_service.api.routing import Ctx, RawBody, media_type, not_modified, scope
+from graspdb_service.usecases import meshes
+
+router = APIRouter(tags=["objects"])
+
+_BINARY = {"type": "string", "format": "binary"}
+_MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, _BINARY)
+
+
+@router.put("/objects/{id}/mesh", **scope("admin", body=_MESH_BODY))
+def put_mesh(
+    ctx: Ctx, id: str, request: Request, body: RawBody, unit: Literal["m", "mm", "cm", "in"] = "m"
+) -> MeshInfo:
+    """Store the mesh: STL, OBJ, PLY or GLB as the raw body, said by Content-Type."""
+    return meshes.put_mesh(ctx, id, body, media=media_type(request), unit=unit)
+
+
+@router.get(
+    "/objects/{id}/mesh",
+    response_class=Response,
+    responses={200: {"content": {media: {"schema": _BINARY} for media in meshes.MEDIA_TYPES}}},
+    **scope("jobs:work"),
+)
+def get_mesh(ctx: Ctx, id: str, request: Request) -> Response:
+    """The mesh's bytes as they came."""
+    return _bytes(request, *meshes.get_mesh(ctx, id))
+
+
+@router.put("/objects/{id}/convex-parts", **scope("admin", body={meshes.GLB: _BINARY}))
+def put_convex_parts(ctx: Ctx, id: str, request: Request, body: RawBody) -> PartsInfo:
+    """Store the convex parts: a GLB in metres with one geometry a part, object frame."""
+    return meshes.put_parts(ctx, id, body, media=media_type(request))
+
+
+@router.get(
+    "/objects/{id}/convex-parts",
+    response_class=Response,
+    responses={200: {"content": {meshes.GLB: {"schema": _BINARY}}}},
+    **scope("jobs:work"),
+)
+def get_convex_parts(ctx: Ctx, id: str, request: Request) -> Response:
+    """The convex parts' bytes."""
+    return _bytes(request, *meshes.get_parts(ctx, id))
+
+
+def _bytes(request: Request, content: bytes, media: str, sha256: str) -> Response:
+    tag = f'"{sha256}"'
+    return not_modified(request, tag) or Response(content, media_type=media, headers={"ETag": tag})
