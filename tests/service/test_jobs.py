@@ -1,0 +1,657 @@
+"""The lease protocol over HTTP and against a model: every job done once, whatever workers do."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
+from hypothesis.stateful import run_state_machine_as_test as run_machine
+from sqlalchemy import text
+
+from graspdb.wire import (
+    OUTCOME_CODES,
+    ClaimRequest,
+    FailureReport,
+    GridPlan,
+    MeshInfo,
+    PartsInfo,
+    SimulateResult,
+    SweepCreate,
+)
+from graspdb_geometry.grids import PoseGrid
+from graspdb_service.problems import ProblemError
+from graspdb_service.settings import Settings
+from graspdb_service.storage import assets, objects, schema
+from graspdb_service.storage.database import Database
+from graspdb_service.usecases import grippers, jobs, sweeps
+from graspdb_service.usecases.context import Context
+
+BOX = {"lower": [-0.02, -0.02, -0.05], "upper": [0.02, 0.02, 0.05]}
+GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "margin_m": 0.0}
+#: 3 x 3 x 5 positions and half of 72 rotations, for the jaw is symmetric.
+GRID_POSES = 45 * 36
+
+
+def add_box(database: Database, slug: str) -> None:
+    """An object ready for sweeps: a box that is its own convex part. The protocol never opens the files."""
+    with database.write() as tx:
+        objects.create(tx, slug, {"mass_kg": 0.3})
+        row = objects.find(tx, slug)
+        assert row is not None
+        sha256 = assets.put(tx, f"a box for {slug}".encode(), "model/stl")
+        mesh = MeshInfo(
+            sha256=sha256,
+            media_type="model/stl",
+            unit="m",
+            bytes=1,
+            vertices=8,
+            faces=12,
+            bounding_box=BOX,
+            volume_m3=1.6e-4,
+            watertight=True,
+            convex=True,
+            centre_of_mass=(0, 0, 0),
+            inertia_m5=None,
+        )
+        parts = PartsInfo(sha256=sha256, parts=1, volume_m3=1.6e-4, bounding_box=BOX)
+        objects.advance(tx, row.id, append=False)
+        objects.change(
+            tx,
+            row.id,
+            {
+                "mesh_sha256": sha256,
+                "mesh_info": mesh.model_dump(mode="json"),
+                "parts_sha256": sha256,
+                "parts_info": parts.model_dump(mode="json"),
+            },
+        )
+
+
+def simulate(payload: dict[str, Any]) -> dict[str, Any]:
+    """A result as a worker makes it, with outcomes that depend on the pose index only."""
+    grid = PoseGrid(**payload["grid"])
+    index = grid.pose_indices(payload["start"], payload["stop"])
+    codes = outcome_of(index)
+    physics = index[codes != OUTCOME_CODES["collision"]]
+    return {
+        "outcomes": base64.b64encode(codes.tobytes()).decode(),
+        "rows": {
+            "pose_index": physics.tolist(),
+            "width_m": [0.04] * len(physics),
+            "quality": [None] * len(physics),
+        },
+    }
+
+
+def outcome_of(index: np.ndarray) -> np.ndarray:
+    return np.array([1, 2, 2, 2, 4, 6, 2, 2], dtype=np.uint8)[(index * 2_654_435_761 >> 7) % 8]
+
+
+@pytest.fixture
+def box(http: httpx.Client, database_url: str) -> Iterator[Database]:
+    """The database behind ``http``, holding the object ``box``."""
+    database = Database(database_url)
+    add_box(database, "box")
+    yield database
+    database.dispose()
+
+
+def start_sweep(http: httpx.Client, chunk_poses: int = 100, **options: Any) -> dict[str, Any]:
+    answer = http.post("/objects/box/sweeps", json={"grid": GRID, "chunk_poses": chunk_poses, **options})
+    assert answer.status_code == 202, answer.text
+    made: dict[str, Any] = answer.json()
+    return made
+
+
+def claim(http: httpx.Client, worker: str = "w", limit: int = 1) -> list[dict[str, Any]]:
+    answer = http.post("/jobs/claim", json={"worker": worker, "capabilities": ["simulate"], "limit": limit})
+    assert answer.status_code == 200, answer.text
+    found: list[dict[str, Any]] = answer.json()["jobs"]
+    return found
+
+
+def put_result(http: httpx.Client, job: dict[str, Any], body: dict[str, Any] | None = None) -> httpx.Response:
+    return http.put(
+        f"/jobs/{job['id']}/result",
+        params={"lease_id": job["lease_id"]},
+        json=simulate(job["payload"]) if body is None else body,
+    )
+
+
+def let_leases_run_out(database: Database) -> None:
+    with database.write() as tx:
+        tx.execute(text("UPDATE jobs SET lease_expires_at = 0 WHERE state = 'leased'"))
+
+
+def is_lost(answer: httpx.Response) -> bool:
+    return answer.status_code == 409 and bool(answer.json()["type"].endswith(":lease-lost"))
+
+
+def stored_indices(database: Database) -> list[int]:
+    with database.read() as tx:
+        rows = tx.execute(text("SELECT pose_index FROM trials WHERE pose_index IS NOT NULL ORDER BY 1"))
+        return [int(index) for (index,) in rows]
+
+
+def expected_indices(plan: dict[str, Any] | None = None) -> list[int]:
+    grid = PoseGrid(**BOX, **{**GRID, **(plan or {})})
+    index = grid.pose_indices(0, grid.total)
+    return sorted(index[outcome_of(index) != OUTCOME_CODES["collision"]].tolist())
+
+
+def test_workers_finish_a_sweep_and_every_pose_is_stored_once(http: httpx.Client, box: Database) -> None:
+    sweep = start_sweep(http)
+    assert (sweep["state"], sweep["poses"], sweep["chunks"]) == ("queued", GRID_POSES, 17)
+    first = claim(http)[0]
+    assert first["payload"]["grid"] == {
+        **BOX,
+        **GRID,
+        "region": None,
+        "max_poses": None,
+        "seed": 0,
+        "symmetric": True,
+    }
+    assert first["payload"]["gripper"]["max_opening_m"] == 0.07
+    assert (first["payload"]["start"], first["payload"]["stop"]) == (0, 100)
+    assert http.get(f"/sweeps/{sweep['id']}").json()["state"] == "running"
+    before = http.get("/objects/box").json()["revision"]
+    answer = put_result(http, first)
+    assert answer.status_code == 200
+    assert answer.json() == {
+        "job": first["id"],
+        "revision": before + 1,
+        "inserted": answer.json()["inserted"],
+    }
+    while found := claim(http, limit=5):
+        for job in found:
+            assert put_result(http, job).status_code == 200
+    assert stored_indices(box) == expected_indices()
+    done = http.get(f"/sweeps/{sweep['id']}").json()
+    assert (done["state"], done["chunks_done"], done["poses_done"]) == ("done", 17, GRID_POSES)
+    assert sum(done["outcomes"].values()) == GRID_POSES
+    # Rows and packed outcomes together are every pose, and the object counts them.
+    batch = http.get(f"/objects/box/batches/{sweep['batch']}").json()
+    assert batch["inserted"] == len(expected_indices())
+    assert batch["packed"] == GRID_POSES - batch["inserted"]
+    assert http.get("/objects/box").json()["outcomes"] == done["outcomes"] == batch["outcomes"]
+    worker = http.get("/workers").json()["items"][0]
+    assert (worker["worker"], worker["jobs_done"], worker["poses_done"]) == ("w", 17, GRID_POSES)
+    assert worker["jobs_leased"] == 0
+
+
+def test_rows_carry_the_pose_the_service_derived_and_the_grids_density(
+    http: httpx.Client, box: Database
+) -> None:
+    sweep = start_sweep(http, 2_000)
+    assert put_result(http, claim(http)[0]).status_code == 200
+    trials = http.get("/objects/box/trials", params={"limit": 1_000}).json()["items"]
+    index = np.array([trial["pose_index"] for trial in trials])
+    position, quaternion = PoseGrid(**BOX, **GRID).poses(index)
+    np.testing.assert_allclose([trial["position"] for trial in trials], position, atol=1e-15)
+    np.testing.assert_allclose([trial["quaternion_xyzw"] for trial in trials], quaternion, atol=1e-15)
+    # 45 cells of (2 cm)^3 and all of SO(3), whose volume is 8 pi^2.
+    density = 1 / (8 * np.pi**2 * 45 * 0.02**3)
+    for trial in trials:
+        assert trial["proposal_density"] == pytest.approx(density, rel=1e-12)
+        assert (trial["gripper"], trial["source"], trial["protocol"]) == ("pg70", "simulation", "wrench")
+        assert (trial["sweep"], trial["width_m"], trial["quality"]) == (sweep["id"], 0.04, None)
+
+
+def test_eight_claimers_never_get_the_same_job(http: httpx.Client, box: Database) -> None:
+    sweep = start_sweep(http, 10)
+    got: list[str] = []
+
+    def work(name: str) -> None:
+        with httpx.Client(base_url=http.base_url, timeout=60) as client:
+            while found := claim(client, name, limit=3):
+                got.extend(job["id"] for job in found)
+
+    threads = [threading.Thread(target=work, args=(f"w{number}",)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(got) == len(set(got)) == sweep["chunks"] == 162
+
+
+def test_a_late_result_is_refused_once_another_has_the_job(http: httpx.Client, box: Database) -> None:
+    start_sweep(http, 2_000)
+    stalled = claim(http, "stalled")[0]
+    assert claim(http, "other") == []
+    let_leases_run_out(box)
+    taken = claim(http, "other")[0]
+    assert taken["id"] == stalled["id"]
+    assert taken["lease_id"] != stalled["lease_id"]
+    for method, path in (("PUT", "lease"), ("DELETE", "lease")):
+        url = f"/jobs/{stalled['id']}/{path}"
+        assert is_lost(http.request(method, url, params={"lease_id": stalled["lease_id"]}))
+    assert is_lost(put_result(http, stalled))
+    failure = http.put(
+        f"/jobs/{stalled['id']}/failure", params={"lease_id": stalled["lease_id"]}, json={"error": "late"}
+    )
+    assert is_lost(failure)
+    assert stored_indices(box) == []
+    assert put_result(http, taken).status_code == 200
+    assert is_lost(put_result(http, stalled))
+    assert stored_indices(box) == expected_indices()
+
+
+def test_a_result_after_its_lease_ran_out_is_accepted_while_nobody_else_came(
+    http: httpx.Client, box: Database
+) -> None:
+    start_sweep(http, 2_000)
+    job = claim(http)[0]
+    let_leases_run_out(box)
+    assert put_result(http, job).status_code == 200
+    assert stored_indices(box) == expected_indices()
+
+
+def test_renewing_keeps_a_job(http: httpx.Client, box: Database) -> None:
+    start_sweep(http, 2_000)
+    job = claim(http)[0]
+    let_leases_run_out(box)
+    renewed = http.put(f"/jobs/{job['id']}/lease", params={"lease_id": job["lease_id"]})
+    assert renewed.status_code == 200
+    assert renewed.json()["cancel"] is False
+    assert renewed.json()["lease_s"] == 60
+    assert claim(http, "other") == []
+
+
+def test_the_same_result_again_gets_the_same_answer(http: httpx.Client, box: Database) -> None:
+    start_sweep(http)
+    job = claim(http)[0]
+    first = put_result(http, job)
+    put_result(http, claim(http)[0])
+    again = put_result(http, job)
+    assert (again.status_code, again.json()) == (200, first.json())
+    other = simulate(job["payload"])
+    other["rows"]["width_m"][0] = 0.05
+    assert is_lost(put_result(http, job, other))
+    indices = stored_indices(box)
+    assert len(indices) == len(set(indices))
+
+
+def test_a_result_sent_many_times_at_once_is_stored_once(http: httpx.Client, box: Database) -> None:
+    start_sweep(http, 2_000)
+    job = claim(http)[0]
+    answers: list[Any] = []
+
+    def send() -> None:
+        with httpx.Client(base_url=http.base_url, timeout=60) as client:
+            answers.append(put_result(client, job))
+
+    threads = [threading.Thread(target=send) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [answer.status_code for answer in answers] == [200] * 6
+    assert len({answer.text for answer in answers}) == 1
+    assert stored_indices(box) == expected_indices()
+
+
+def test_giving_a_job_back_is_no_attempt(http: httpx.Client, box: Database) -> None:
+    start_sweep(http, 2_000)
+    for _ in range(6):
+        job = claim(http)[0]
+        gone = http.delete(f"/jobs/{job['id']}/lease", params={"lease_id": job["lease_id"]})
+        assert gone.status_code == 204
+    assert put_result(http, claim(http)[0]).status_code == 200
+
+
+def fail(http: httpx.Client, job: dict[str, Any], error: str) -> httpx.Response:
+    return http.put(f"/jobs/{job['id']}/failure", params={"lease_id": job["lease_id"]}, json={"error": error})
+
+
+def test_a_job_that_keeps_failing_ends_and_can_be_retried(http: httpx.Client, box: Database) -> None:
+    sweep = start_sweep(http, 1_000)
+    for attempt in range(4):
+        job = claim(http)[0]
+        answer = fail(http, job, f"boom {attempt}")
+        state = "failed" if attempt == 3 else "queued"
+        assert answer.json() == {"job": job["id"], "state": state, "attempts": attempt + 1}
+        # The report's answer may be lost: the same again changes nothing.
+        assert fail(http, job, f"boom {attempt}").json() == answer.json()
+    assert put_result(http, claim(http)[0]).status_code == 200
+    ended = http.get(f"/sweeps/{sweep['id']}").json()
+    assert ended["state"] == "failed"
+    assert ended["failed_chunks"] == [{"chunk": 0, "attempts": 4, "error": "boom 3"}]
+    assert claim(http) == []
+    assert is_lost(put_result(http, job))
+    retried = http.post(f"/sweeps/{sweep['id']}/retry").json()
+    assert (retried["state"], retried["chunks_failed"]) == ("running", 0)
+    assert put_result(http, claim(http)[0]).status_code == 200
+    assert http.get(f"/sweeps/{sweep['id']}").json()["state"] == "done"
+    assert stored_indices(box) == expected_indices()
+
+
+def test_a_job_that_kills_every_worker_ends(http: httpx.Client, box: Database) -> None:
+    sweep = start_sweep(http, 2_000)
+    for attempt in range(4):
+        assert len(claim(http, f"victim {attempt}")) == 1
+        let_leases_run_out(box)
+    assert claim(http, "survivor") == []
+    ended = http.get(f"/sweeps/{sweep['id']}").json()
+    assert ended["state"] == "failed"
+    assert "the lease ran out 4 times" in ended["failed_chunks"][0]["error"]
+
+
+def test_after_cancelling_nothing_is_stored(http: httpx.Client, box: Database) -> None:
+    sweep = start_sweep(http)
+    done, held = claim(http, limit=2)
+    assert put_result(http, done).status_code == 200
+    before = stored_indices(box)
+    cancelled = http.post(f"/sweeps/{sweep['id']}/cancel").json()
+    assert (cancelled["state"], cancelled["chunks_done"]) == ("cancelled", 1)
+    renewed = http.put(f"/jobs/{held['id']}/lease", params={"lease_id": held["lease_id"]})
+    assert renewed.json()["cancel"] is True
+    assert is_lost(put_result(http, held))
+    assert claim(http) == []
+    assert stored_indices(box) == before
+    assert http.delete("/objects/box").status_code == 204
+
+
+def test_a_sweeps_object_and_batch_stay_while_it_runs(http: httpx.Client, box: Database) -> None:
+    sweep = start_sweep(http, 2_000)
+    assert http.delete("/objects/box").status_code == 409
+    assert http.delete(f"/objects/box/batches/{sweep['batch']}").status_code == 409
+    assert put_result(http, claim(http)[0]).status_code == 200
+    assert http.delete(f"/objects/box/batches/{sweep['batch']}").status_code == 204
+    assert stored_indices(box) == []
+    assert http.get("/objects/box").json()["outcomes"] == {}
+    assert http.post(f"/sweeps/{sweep['id']}/retry").json()["type"].endswith(":batch-deleted")
+
+
+def spoil(result: dict[str, Any], payload: dict[str, Any], how: str) -> dict[str, Any]:
+    codes = np.frombuffer(base64.b64decode(result["outcomes"]), dtype=np.uint8).copy()
+    rows = result["rows"]
+    if how == "short":
+        codes = codes[:-1]
+    elif how == "code":
+        codes[3] = 9
+    elif how == "foreign":
+        rows["pose_index"][-1] = 10_000_000
+    elif how == "huge":
+        rows["pose_index"][-1] = 2**70
+    elif how == "twice":
+        rows["pose_index"][1] = rows["pose_index"][0]
+    elif how == "widths":
+        rows["width_m"].pop()
+    elif how == "collision":
+        codes[:] = OUTCOME_CODES["collision"]
+    elif how == "success":
+        codes[codes == OUTCOME_CODES["collision"]] = OUTCOME_CODES["success"]
+    elif how == "nan":
+        rows["quality"][0] = float("nan")
+    elif how == "unknown":
+        rows["colour"] = []
+    result["outcomes"] = base64.b64encode(codes.tobytes()).decode()
+    return result
+
+
+@pytest.mark.parametrize(
+    ("how", "field"),
+    [
+        ("short", "outcomes"),
+        ("code", "outcomes"),
+        ("foreign", "rows.pose_index"),
+        ("huge", "rows.pose_index"),
+        ("twice", "rows.pose_index"),
+        ("widths", "rows.width_m"),
+        ("collision", "rows.pose_index"),
+        ("success", "rows.pose_index"),
+        ("nan", ""),
+        ("unknown", "rows.colour"),
+    ],
+)
+def test_a_result_that_does_not_fit_is_named_and_not_stored(
+    sqlite_http: httpx.Client, sqlite_url: str, how: str, field: str
+) -> None:
+    database = Database(sqlite_url)
+    add_box(database, "box")
+    start_sweep(sqlite_http, 2_000)
+    job = claim(sqlite_http)[0]
+    body = json.dumps(spoil(simulate(job["payload"]), job["payload"], how))
+    answer = sqlite_http.put(
+        f"/jobs/{job['id']}/result",
+        params={"lease_id": job["lease_id"]},
+        content=body,
+        headers={"Content-Type": "application/json"},
+    )
+    assert answer.status_code == 422, answer.text
+    assert answer.json()["errors"][0]["field"].startswith(field)
+    assert stored_indices(database) == []
+    assert put_result(sqlite_http, job).status_code == 200
+    database.dispose()
+
+
+def test_bad_requests_are_named(sqlite_http: httpx.Client) -> None:
+    missing = sqlite_http.put(
+        "/jobs/none/result",
+        params={"lease_id": "x"},
+        json={"outcomes": "", "rows": {"pose_index": [], "width_m": [], "quality": []}},
+    )
+    assert missing.status_code == 404
+    assert sqlite_http.put("/jobs/none/lease").json()["errors"][0]["field"] == "lease_id"
+    nothing = sqlite_http.post("/jobs/claim", json={"worker": "w", "capabilities": []})
+    assert nothing.json()["errors"][0]["field"] == "capabilities"
+    idle = sqlite_http.post("/jobs/claim", json={"worker": "w"}).json()
+    assert idle["jobs"] == []
+    assert idle["retry_after_s"] > 0
+
+
+def test_a_lift_sweep_waits_for_a_worker_that_can(sqlite_http: httpx.Client, sqlite_url: str) -> None:
+    database = Database(sqlite_url)
+    add_box(database, "box")
+    start_sweep(sqlite_http, 2_000, protocol="lift")
+    assert claim(sqlite_http) == []
+    able = sqlite_http.post("/jobs/claim", json={"worker": "w", "capabilities": ["simulate", "lift"]}).json()
+    assert able["jobs"][0]["payload"]["protocol"] == "lift"
+    database.dispose()
+
+
+# --- against a model ------------------------------------------------------------------------------------
+
+
+class LeaseProtocol(RuleBasedStateMachine):
+    """Workers claim, stall, come back late, give up and repeat themselves; the model says what holds."""
+
+    leases: Bundle[Any] = Bundle("leases")
+    context: Context
+    number = 0
+
+    @initialize()
+    def sweep(self) -> None:
+        LeaseProtocol.number += 1
+        slug = f"box-{LeaseProtocol.number}-{time.time_ns()}"
+        add_box(self.context.database, slug)
+        spec = SweepCreate.model_validate({"grid": GRID, "chunk_poses": 500})
+        made = sweeps.create(self.context, slug, spec, key=None, request=b"")
+        self.slug, self.sweep_id = slug, made.body["id"]
+        self.state = dict.fromkeys(range(4), "queued")
+        self.attempts: Counter[int] = Counter()
+        self.holder: dict[int, str | None] = dict.fromkeys(range(4))
+        self.expired: dict[int, bool] = dict.fromkeys(range(4), False)
+        self.reported: dict[int, str | None] = dict.fromkeys(range(4))
+
+    @rule(target=leases, limit=st.integers(1, 3))
+    def claim(self, limit: int) -> Any:
+        most = self.context.settings.max_attempts
+        for chunk, state in self.state.items():
+            if state == "leased" and self.expired[chunk] and self.attempts[chunk] >= most:
+                self.state[chunk] = "failed"
+        free = [
+            chunk
+            for chunk, state in self.state.items()
+            if state == "queued" or (state == "leased" and self.expired[chunk])
+        ]
+        request = ClaimRequest(worker="w", limit=limit)
+        answer = jobs.claim(self.context, request)
+        claimed = [(job.payload.start // 500, job) for job in answer.jobs]  # type: ignore[union-attr]
+        assert [chunk for chunk, _ in claimed] == free[:limit]
+        for chunk, job in claimed:
+            assert job.lease_id != self.holder[chunk]
+            self.state[chunk] = "leased"
+            self.attempts[chunk] += 1
+            self.holder[chunk], self.expired[chunk], self.reported[chunk] = job.lease_id, False, None
+        return multiple(*claimed)
+
+    @rule(lease=leases)
+    def run_out(self, lease: Any) -> None:
+        chunk, job = lease
+        with self.context.database.write() as tx:
+            tx.execute(
+                text("UPDATE jobs SET lease_expires_at = 0 WHERE lease_id = :lease AND state = 'leased'"),
+                {"lease": job.lease_id},
+            )
+        if self._holds(chunk, job):
+            self.expired[chunk] = True
+
+    @rule(lease=leases)
+    def renew(self, lease: Any) -> None:
+        chunk, job = lease
+        if self._holds(chunk, job):
+            assert not jobs.renew(self.context, job.id, job.lease_id).cancel
+            self.expired[chunk] = False
+        elif self.state[chunk] == "cancelled" and self.holder[chunk] == job.lease_id:
+            assert jobs.renew(self.context, job.id, job.lease_id).cancel
+        else:
+            self._refused(jobs.renew, job.id, job.lease_id)
+
+    @rule(lease=leases)
+    def give_back(self, lease: Any) -> None:
+        chunk, job = lease
+        if not self._holds(chunk, job):
+            self._refused(jobs.release, job.id, job.lease_id)
+            return
+        jobs.release(self.context, job.id, job.lease_id)
+        self.state[chunk], self.holder[chunk] = "queued", None
+        self.attempts[chunk] -= 1
+
+    @rule(lease=leases)
+    def report_failure(self, lease: Any) -> None:
+        chunk, job = lease
+        report = FailureReport(error="boom")
+        if self._holds(chunk, job):
+            last = self.attempts[chunk] >= self.context.settings.max_attempts
+            noted = jobs.fail(self.context, job.id, job.lease_id, report)
+            self.state[chunk] = "failed" if last else "queued"
+            assert noted.state == self.state[chunk]
+        elif self.holder[chunk] == job.lease_id and self.state[chunk] in ("queued", "failed"):
+            assert jobs.fail(self.context, job.id, job.lease_id, report).state == self.state[chunk]
+        else:
+            self._refused(jobs.fail, job.id, job.lease_id, report)
+
+    @rule(lease=leases)
+    def hand_in(self, lease: Any) -> None:
+        chunk, job = lease
+        result = simulate(job.payload.model_dump(mode="json"))
+        model = SimulateResult.model_validate(result)
+        arguments = (job.id, job.lease_id, b"the same bytes", model)
+        if self._holds(chunk, job):
+            answer = jobs.complete(self.context, *arguments)
+            assert answer.inserted == len(result["rows"]["pose_index"])
+            self.state[chunk] = "done"
+            self.reported[chunk] = answer.model_dump_json()
+        elif self.state[chunk] == "done" and self.holder[chunk] == job.lease_id:
+            assert jobs.complete(self.context, *arguments).model_dump_json() == self.reported[chunk]
+        else:
+            self._refused(jobs.complete, *arguments)
+
+    @rule()
+    def cancel(self) -> None:
+        sweeps.cancel(self.context, self.sweep_id)
+        for chunk, state in self.state.items():
+            if state in ("queued", "leased"):
+                self.state[chunk] = "cancelled"
+
+    @rule()
+    def retry(self) -> None:
+        sweeps.retry(self.context, self.sweep_id)
+        for chunk, state in self.state.items():
+            if state in ("failed", "cancelled"):
+                self.state[chunk], self.holder[chunk], self.attempts[chunk] = "queued", None, 0
+
+    @invariant()
+    def done_chunks_are_stored_once(self) -> None:
+        if not hasattr(self, "sweep_id"):
+            return
+        info = sweeps.get(self.context, self.sweep_id)
+        states = Counter(self.state.values())
+        assert (info.chunks_done, info.chunks_failed) == (states["done"], states["failed"])
+        if states["cancelled"]:
+            assert info.state == "cancelled"
+        elif states["queued"] or states["leased"]:
+            assert info.state in ("queued", "running")
+        else:
+            assert info.state == ("failed" if states["failed"] else "done")
+        grid = PoseGrid(**BOX, **GRID)
+        index = [
+            grid.pose_indices(chunk * 500, min(chunk * 500 + 500, GRID_POSES))
+            for chunk, state in self.state.items()
+            if state == "done"
+        ]
+        expected = np.concatenate([np.empty(0, dtype=np.int64), *index])
+        codes = outcome_of(expected)
+        with self.context.database.read() as tx:
+            row = objects.find(tx, self.slug)
+            assert row is not None
+            found = tx.execute(
+                text("SELECT pose_index, outcome FROM trials WHERE object_id = :id ORDER BY pose_index"),
+                {"id": row.id},
+            ).all()
+        physics = codes != OUTCOME_CODES["collision"]
+        assert [(int(a), int(b)) for a, b in found] == list(
+            zip(expected[physics].tolist(), codes[physics].tolist(), strict=True)
+        )
+        assert sum(info.outcomes.values()) == len(expected)
+
+    def teardown(self) -> None:
+        if hasattr(self, "sweep_id"):
+            sweeps.cancel(self.context, self.sweep_id)
+
+    def _holds(self, chunk: int, job: Any) -> bool:
+        return self.state[chunk] == "leased" and self.holder[chunk] == job.lease_id
+
+    def _refused(self, call: Any, *arguments: Any) -> None:
+        with pytest.raises(ProblemError) as caught:
+            call(self.context, *arguments)
+        assert (caught.value.status, caught.value.kind) == (409, "lease-lost")
+
+
+def test_the_lease_protocol_against_a_model(database_url: str) -> None:
+    database = Database(database_url)
+    if database.is_sqlite:
+        schema.upgrade(database)
+    grippers.seed(database)
+    context = Context.create(Settings(database_url=database_url, max_attempts=2), database)
+    machine = type("Machine", (LeaseProtocol,), {"context": context})
+    try:
+        run_machine(
+            machine,
+            settings=settings(
+                max_examples=25,
+                stateful_step_count=20,
+                deadline=None,
+                suppress_health_check=list(HealthCheck),
+            ),
+        )
+    finally:
+        context.close()
+
+
+def test_a_grid_plan_on_the_wire_is_the_grid_of_the_service() -> None:
+    """What a worker makes of a payload must be what the service derives poses from."""
+    fields = set(GridPlan.model_fields)
+    assert fields == {field for field in PoseGrid.__dataclass_fields__ if not field.startswith("_")}
