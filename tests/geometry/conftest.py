@@ -7,12 +7,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 import pytest
-from graspdb_geometry import grippers
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from graspdb_geometry import collision, grippers
+
 FloatArray = npt.NDArray[np.float64]
+
+#: Programmes are solved in millimetres: the solver's feasibility tolerance of 1e-7 then means 0.1 nm.
+MM = 1000.0
 
 
 class Oracle:
@@ -34,9 +38,9 @@ class Oracle:
         """Radius of the greatest ball inside both, negative (if bounded) when they are apart."""
         rows = np.concatenate([a, b])
         matrix = np.column_stack([rows[:, :3], np.ones(len(rows))])
-        answer = linprog([0, 0, 0, -1], A_ub=matrix, b_ub=-rows[:, 3], bounds=[(None, None)] * 4)
+        answer = linprog([0, 0, 0, -1], A_ub=matrix, b_ub=-rows[:, 3] * MM, bounds=[(None, None)] * 4)
         assert answer.status == 0, answer.message
-        return float(answer.x[3])
+        return float(answer.x[3]) / MM
 
     def collision_depth(
         self,
@@ -59,8 +63,13 @@ class Oracle:
     def column_extent(
         self, position: FloatArray, rotation: FloatArray, shape: grippers.GripperShape
     ) -> tuple[float, float, float]:
-        """Least and greatest y (tool frame) of the object between the fingers, and the overlap's depth."""
+        """Least and greatest y (tool frame) of the object between the fingers, and the overlap's depth.
+
+        Like the finger boxes the column is narrower by the touch tolerance: on a sliver that grazes its side
+        the extent is that sensitive.
+        """
         half, centre = shape.column()
+        half = half - np.array([1, 0, 1]) * collision.TOUCH_TOLERANCE_M
         box = self.box(centre, half, position, rotation)
         low, high, deepest = np.inf, -np.inf, -1.0
         axis = rotation[:, 1]
@@ -70,9 +79,11 @@ class Oracle:
             deepest = max(deepest, self.depth(spaces, box))
             rows = np.concatenate([spaces, box])
             for sign in (1.0, -1.0):
-                answer = linprog(sign * axis, A_ub=rows[:, :3], b_ub=-rows[:, 3], bounds=[(None, None)] * 3)
+                answer = linprog(
+                    sign * axis, A_ub=rows[:, :3], b_ub=-rows[:, 3] * MM, bounds=[(None, None)] * 3
+                )
                 if answer.status == 0:
-                    y = float(axis @ (answer.x - position))
+                    y = float(axis @ (answer.x / MM - position))
                     low, high = min(low, y), max(high, y)
         return low, high, deepest
 

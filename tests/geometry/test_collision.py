@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graspdb.examples import EXAMPLES, example
-from graspdb_geometry import collision, grids, grippers
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+
+from graspdb.examples import EXAMPLES, example
+from graspdb_geometry import collision, grids, grippers
 
 PG70 = grippers.PG70
 SEEDS = st.integers(0, 2**32 - 1)

@@ -7,6 +7,7 @@ import io
 import numpy as np
 import pytest
 import trimesh
+
 from graspdb.examples import EXAMPLES, example
 
 #: Part counts and masses (kg) as published with the measurements the objects were made for.

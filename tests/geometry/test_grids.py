@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graspdb_geometry import grids
-from graspdb_geometry.permutation import SeededPermutation
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from graspdb_geometry import grids
+from graspdb_geometry.permutation import SeededPermutation
 
 CONE = ((-0.04, -0.04, -0.2), (0.04, 0.04, 0.2))
 

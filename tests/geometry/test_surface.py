@@ -1,0 +1,111 @@
+"""Collision with a mesh's own triangles: against linear programming, the convex parts, and inside tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+
+from graspdb.examples import EXAMPLES, example
+from graspdb_geometry import _surface_kernels, collision, grids, grippers
+
+PG70 = grippers.PG70
+
+
+def triangle_depth(corners: np.ndarray, box: np.ndarray) -> float:
+    """How far inside the box (half-spaces n.x + d <= 0) the triangle reaches; negative outside."""
+    # Unknowns: three barycentric weights and the margin, to be maximised.
+    matrix = np.column_stack([box[:, :3] @ corners.T, np.ones(len(box))])
+    answer = linprog(
+        [0, 0, 0, -1],
+        A_ub=matrix,
+        b_ub=-box[:, 3],
+        A_eq=[[1, 1, 1, 0]],
+        b_eq=[1],
+        bounds=[(0, None)] * 3 + [(None, None)],
+    )
+    assert answer.status == 0, answer.message
+    return float(answer.x[3])
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_loose_triangles_agree_with_linear_programming(seed: int, oracle: Any, random_poses: Any) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 12))
+    corners = rng.uniform(-0.1, 0.1, size=(count, 1, 3)) + rng.normal(size=(count, 3, 3)) * 0.03
+    surface = collision.Surface(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), watertight=False)
+    positions, quaternions = random_poses(rng, 4, 0.15)
+    hits = surface.collides(positions, quaternions, PG70)
+    half_extents, centres = PG70.boxes()
+    for p, q, hit in zip(positions, quaternions, hits, strict=True):
+        rotation = Rotation.from_quat(q).as_matrix()
+        deepest = max(
+            triangle_depth(t, oracle.box(c, h, p, rotation))
+            for t in corners
+            for c, h in zip(centres, half_extents, strict=True)
+        )
+        if abs(deepest) > 1e-6:
+            assert hit == (deepest > 0)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_closed_surface_collides_like_its_convex_parts(name: str) -> None:
+    thing = example(name)
+    vertices, faces = thing.triangles
+    surface = collision.Surface(vertices, faces, watertight=True)
+    scene = collision.Scene(thing.parts)
+    grid = grids.PoseGrid(*(tuple(b) for b in thing.bounds), max_poses=20_000, seed=2)
+    positions, quaternions = grid.poses(grid.pose_indices(0, grid.total))
+    for opening in (None, 0.02):
+        by_surface = surface.collides(positions, quaternions, PG70, opening, threads=2)
+        assert np.array_equal(by_surface, scene.collides(positions, quaternions, PG70, opening))
+        assert 0 < by_surface.sum() < len(positions)
+
+
+def test_a_gripper_wholly_inside_collides_with_solids_only() -> None:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = [[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)]
+    pose = [[0.1, 0.2, 0.3]], [[0.0, 0.0, 0.0, 1.0]]
+    assert collision.Surface(corners, faces, watertight=True).collides(*pose, PG70).all()
+    assert not collision.Surface(corners, faces, watertight=False).collides(*pose, PG70).any()
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_rays_and_winding_numbers_agree_on_what_is_inside(name: str) -> None:
+    thing = example(name)
+    vertices, faces = thing.triangles
+    tree = collision.Surface(vertices, faces, watertight=True)._tree
+    low, high = thing.bounds
+    points = np.random.default_rng(8).uniform(low - 0.01, high + 0.01, size=(3000, 3))
+    # Straight below vertices along the ray, where a careless crossing count goes wrong.
+    distances = np.random.default_rng(9).uniform(0.0005, 0.05, size=(len(vertices), 1))
+    points = np.concatenate([points, vertices - distances * _surface_kernels._RAY[2]])
+    stack = np.empty(128, dtype=np.int64)
+    winding = np.array([_surface_kernels.winding_number(x, vertices[faces]) for x in points])
+    inside = np.array([_surface_kernels.inside(x, tree, stack) for x in points])
+    clear = np.abs(winding - np.round(winding)) < 1e-6
+    assert clear.mean() > 0.99
+    assert np.array_equal(inside[clear], winding[clear] > 0.5)
+    assert 0 < inside.sum() < len(points)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "message"),
+    [
+        (np.zeros((3, 2)), [[0, 1, 2]], "vertices"),
+        (np.full((3, 3), np.inf), [[0, 1, 2]], "finite"),
+        (np.zeros((3, 3)), np.zeros((0, 3), dtype=int), "at least one"),
+        (np.zeros((3, 3)), [[0, 1, 3]], "existing"),
+        (np.zeros((3, 3)), [[0, 1, -1]], "existing"),
+    ],
+)
+def test_bad_surfaces_are_refused(vertices: Any, faces: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        collision.Surface(vertices, faces, watertight=True)
