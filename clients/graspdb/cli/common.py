@@ -48,23 +48,24 @@ def console() -> Console:
     return Console() if sys.stdout.isatty() or "COLUMNS" in os.environ else Console(width=160)
 
 
+class Vector(tuple[float, ...]):
+    """Numbers from the command line; a class, because typer takes a tuple type for several arguments."""
+
+
 def vector(count: int, names: str) -> Any:
     """A parser for ``count`` comma-separated numbers."""
 
-    def parse(text: str) -> tuple[float, ...]:
+    def parse(text: str) -> Vector:
         try:
-            numbers = tuple(float(part) for part in text.split(","))
+            numbers = Vector(float(part) for part in text.split(","))
         except ValueError:
-            numbers = ()
+            numbers = Vector()
         if len(numbers) != count or not all(np.isfinite(numbers)):
             raise typer.BadParameter(f"{text!r} is not {count} finite numbers {names}")
         return numbers
 
     parse.__name__ = names
     return parse
-
-
-Vector3 = tuple[float, ...]
 
 
 def vector_option(help: str, *names: str, count: int = 3, metavar: str = "x,y,z") -> Any:

@@ -15,7 +15,7 @@ from graspdb.cli.common import (
     SigmaPosition,
     SigmaRotation,
     Source,
-    Vector3,
+    Vector,
     numbers,
     out,
     show_rows,
@@ -69,24 +69,24 @@ def best_grasp(
     context: typer.Context,
     id: ObjectId,
     count: Annotated[int, typer.Option(min=1, max=1_000, help="So many distinct grasps.")] = 1,
-    box_min: Annotated[Vector3 | None, vector_option("Lower corner of the workspace.", "--box-min")] = None,
-    box_max: Annotated[Vector3 | None, vector_option("Upper corner of the workspace.", "--box-max")] = None,
+    box_min: Annotated[Vector | None, vector_option("Lower corner of the workspace.", "--box-min")] = None,
+    box_max: Annotated[Vector | None, vector_option("Upper corner of the workspace.", "--box-max")] = None,
     sphere: Annotated[
-        Vector3 | None, vector_option("Centre and radius.", "--sphere", count=4, metavar="x,y,z,r")
+        Vector | None, vector_option("Centre and radius.", "--sphere", count=4, metavar="x,y,z,r")
     ] = None,
     above_plane: Annotated[
-        Vector3 | None,
+        Vector | None,
         vector_option("Keep n.x >= d.", "--above-plane", count=4, metavar="nx,ny,nz,d"),
     ] = None,
-    approach: Annotated[Vector3 | None, vector_option("Approach direction (tool z).", "--approach")] = None,
+    approach: Annotated[Vector | None, vector_option("Approach direction (tool z).", "--approach")] = None,
     approach_cone_deg: Annotated[float | None, typer.Option(help="Half angle about --approach.")] = None,
-    closing: Annotated[Vector3 | None, vector_option("Closing direction (tool y).", "--closing")] = None,
+    closing: Annotated[Vector | None, vector_option("Closing direction (tool y).", "--closing")] = None,
     closing_cone_deg: Annotated[float | None, typer.Option(help="Half angle about --closing.")] = None,
     collision_free: Annotated[
         bool | None, typer.Option("--collision-free/--any", help="Whether the gripper must clear the object.")
     ] = None,
     object_pose: Annotated[
-        Vector3 | None,
+        Vector | None,
         vector_option("The object in the world.", "--object-pose", count=7, metavar="x,y,z,qx,qy,qz,qw"),
     ] = None,
     frame: Annotated[str | None, typer.Option(help="Frame of the constraints: world or object.")] = None,
@@ -180,7 +180,7 @@ def likelihood(
         str | None, typer.Argument(help="Poses: .csv (x,y,z,qx,qy,qz,qw), .npy, .json, NDJSON.")
     ] = None,
     pose: Annotated[
-        Vector3 | None, vector_option("One pose instead.", "--pose", count=7, metavar="x,y,z,qx,qy,qz,qw")
+        Vector | None, vector_option("One pose instead.", "--pose", count=7, metavar="x,y,z,qx,qy,qz,qw")
     ] = None,
     gripper: Gripper = None,
     protocol: Protocol = None,

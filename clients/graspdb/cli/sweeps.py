@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspdb.cli.common import ObjectId, Vector3, out, show_rows, show_table, state_of, vector_option
+from graspdb.cli.common import ObjectId, Vector, out, show_rows, show_table, state_of, vector_option
 from graspdb.files import read_poses
 from graspdb.sweeps import Sweep
 
@@ -29,8 +29,8 @@ def sweep(
     position_step_m: Annotated[float | None, typer.Option(help="Grid step, metres [0.01].")] = None,
     rotation_step_deg: Annotated[float | None, typer.Option(help="Grid step, degrees [15].")] = None,
     margin_m: Annotated[float | None, typer.Option(help="Margin about the bounding box [0.02].")] = None,
-    region_min: Annotated[Vector3 | None, vector_option("Cut the grid to a box.", "--region-min")] = None,
-    region_max: Annotated[Vector3 | None, vector_option("Its upper corner.", "--region-max")] = None,
+    region_min: Annotated[Vector | None, vector_option("Cut the grid to a box.", "--region-min")] = None,
+    region_max: Annotated[Vector | None, vector_option("Its upper corner.", "--region-max")] = None,
     poses: Annotated[
         str | None, typer.Option(help="Simulate exactly the poses of this file (.csv, .npy, .json).")
     ] = None,
