@@ -5,6 +5,7 @@ from .density import GraspDensity
 from .kernels import HAAR_VOLUME, IsotropicKernel
 from .maximum import Maximum, nearest
 from .region import Region
+from .success import SuccessEstimate, SuccessModel
 from .weights import effective_sample_size, importance_weights, mixture_weights
 
 __all__ = [
@@ -13,6 +14,8 @@ __all__ = [
     "IsotropicKernel",
     "Maximum",
     "Region",
+    "SuccessEstimate",
+    "SuccessModel",
     "effective_sample_size",
     "importance_weights",
     "mixture_weights",

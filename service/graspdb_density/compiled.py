@@ -460,3 +460,64 @@ def scatter_sums(
                     data, runs[r, 0], runs[r, 1], F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin,
                     every, weight, out,
                 )  # fmt: skip
+
+
+@fast
+def _squares_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, cut):
+    """Sums of k and k^2 over kernels whose exponent is above ``-cut``.
+
+    ``wide`` asks for twins and antipodes; without it, the nearest stands for all.
+    """
+    total, squares = _ZERO, _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        base = -kappa - (dx * dx + dy * dy + dz * dz)
+        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
+        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        large, small = max(a, b), min(a, b)
+        k = _exp(base + large)
+        if wide:
+            k += _exp(base - large) + twin * (_exp(base + small) + _exp(base - small))
+        k = data[7, i] * k if base + large >= -cut else _ZERO
+        total += k
+        squares += k * k
+    return total, squares
+
+
+@fast
+def square_sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
+    """Sums of k and k^2 at every pose into ``out`` (M, 2), over kernels with an exponent of at most radius^2.
+
+    ``radius`` is the cut-off over sqrt 2: position and rotation share the allowance. The cut is exact,
+    because far from data it decides between an attempt and none.
+    """
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    k, cut = F32(kappa), F32(radius * radius)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        total, squares = 0.0, 0.0
+        for s in range(table.shape[0]):
+            twin = F32(table[s, TWIN])
+            for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    stop = min(begin + BLOCK, end)
+                    if wide:
+                        part = _squares_run(
+                            data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, k, twin, True, cut
+                        )
+                    else:
+                        part = _squares_run(
+                            data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, k, twin, False, cut
+                        )
+                    total += part[0]
+                    squares += part[1]
+                    begin = stop
+        out[j, 0] = total
+        out[j, 1] = squares
