@@ -179,7 +179,7 @@ class Closing:
     touched : bool
         Both fingers had touched the object at the same time.
     opening_m : float
-        Distance between the fingers.
+        Distance between the fingers; of a stalled jaw, what it holds is this wide.
     normals : (K, 3) float64
         Contact normals in the tool frame, pointing into the object.
     forces : (K,) float64

@@ -14,12 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from graspdb.wire import GripperProfile, ResultRows, SimulatePayload, SimulateResult
 from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import GripperShape
-from numpy.typing import NDArray
-
 from graspdb_simworker.bodies import Gripper, Part, closing_force
 from graspdb_simworker.labels import Label, Outcome, label_of
 from graspdb_simworker.scene import GraspWorld

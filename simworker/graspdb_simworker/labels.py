@@ -138,17 +138,21 @@ def _tangents(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _descend(normals, forces, count, friction, x, y, z):  # type: ignore[no-untyped-def]
+def _descend(normals, forces, count, friction, x, y, z, step):  # type: ignore[no-untyped-def]
     """Pattern search on the sphere: eight compass points in the tangent plane, the step halved where
     none is lower."""
     best = _support(normals, forces, count, friction, x, y, z)
-    step = 0.2
+    turn = 0.0
     while step > 1e-4:
         ax, ay, az, bx, by, bz = _tangents(x, y, z)
+        # Turned every time: a fixed compass is stopped by a kink that runs between its points.
+        turn += 0.6
+        cosine, sine = step * math.cos(turn), step * math.sin(turn)
         moved = False
         nx, ny, nz = x, y, z
         for k in range(8):
-            c, s = _COMPASS[k, 0] * step, _COMPASS[k, 1] * step
+            c = cosine * _COMPASS[k, 0] - sine * _COMPASS[k, 1]
+            s = sine * _COMPASS[k, 0] + cosine * _COMPASS[k, 1]
             tx, ty, tz = x + c * ax + s * bx, y + c * ay + s * by, z + c * az + s * bz
             norm = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz)
             tx, ty, tz = tx * norm, ty * norm, tz * norm
@@ -159,7 +163,7 @@ def _descend(normals, forces, count, friction, x, y, z):  # type: ignore[no-unty
                 moved = True
         x, y, z = nx, ny, nz
         if not moved:
-            step *= 0.5
+            step *= 0.6
     return best, x, y, z
 
 
@@ -241,7 +245,7 @@ def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
                 break
     for slot in range(_STARTS):
         d = _DIRECTIONS[starts[slot]]
-        value, x, y, z = _descend(merged, sums, count, friction, d[0], d[1], d[2])
+        value, x, y, z = _descend(merged, sums, count, friction, d[0], d[1], d[2], 0.2)
         if value < best:
             best = value
             where[0], where[1], where[2] = x, y, z
@@ -271,6 +275,12 @@ def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
                 if value < best:
                     best = value
                     where[0], where[1], where[2] = x, y, z
+
+    # A kink's lowest point need not be a minimum across the kink.
+    value, x, y, z = _descend(merged, sums, count, friction, where[0], where[1], where[2], 0.05)
+    if value < best:
+        best = value
+        where[0], where[1], where[2] = x, y, z
     return best, where
 
 

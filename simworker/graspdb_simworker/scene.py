@@ -343,6 +343,8 @@ class GraspWorld:
                 for c in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
                 if c[9] > 0.0
             ]
+            # Bullet's hulls are inflated by the margin on both sides; the object is not.
+            opening -= 2.0 * COLLISION_MARGIN_M
         # contactNormalOnB points from B, the object, to A: turned round it points into the object.
         normals = np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(
             -1, 3

@@ -6,7 +6,6 @@ import signal
 
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import meshes
-
 from graspdb_simworker import chunks, messages
 from graspdb_simworker.labels import Label
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 
 from graspdb.wire import SimulatePayload, SimulateResult
-
 from graspdb_simworker import messages
 from graspdb_simworker.labels import SIMULATION_ERROR, Label
 

@@ -1,0 +1,387 @@
+"""The pull loop: claim a job, simulate it in a child, hand in the result; renew leases all the while.
+
+A worker holds nothing but leases, so it may be killed at any time: the service gives its jobs to others
+when their leases run out. What it computed is not lost to a service that restarts: results are sent
+until they are accepted or the lease is another's. Threads: one a child (``processes``), and one
+heartbeat for all; if the heartbeat dies the worker stops rather than go on with leases that run out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from graspdb.errors import (
+    Conflict,
+    Forbidden,
+    GraspDBError,
+    InvalidInput,
+    LeaseLost,
+    NotFound,
+    TooLarge,
+    Unauthorized,
+)
+from graspdb.transport import Transport
+from graspdb.wire import (
+    ClaimedJob,
+    ClaimRequest,
+    ClaimResponse,
+    LeaseRenewed,
+    SimulatePayload,
+    SimulateResult,
+)
+from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
+
+log = logging.getLogger("graspdb.simworker")
+
+CAPABILITIES = ("simulate",)
+"""Job kinds, and protocols beyond ``wrench``, that this worker claims."""
+MAX_BACKOFF_S = 15.0
+IDLE_S = 2.0
+_CACHED_PARTS = 16
+
+
+class WorkerFailed(Exception):
+    """The worker can't go on; the message says what to do."""
+
+
+@dataclass
+class Lease:
+    """A claimed job, shared between the thread that works on it and the heartbeat."""
+
+    job: str
+    lease_id: str
+    lease_s: float
+    renewed: float
+    lost: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass
+class Tally:
+    """What a worker has done since it started."""
+
+    jobs: int = 0
+    poses: int = 0
+    grasps: int = 0
+    failures: int = 0
+    lost: int = 0
+
+
+class Worker:
+    """Pulls simulate jobs from one service.
+
+    Parameters
+    ----------
+    transport : Transport
+        Shared by all threads. Give it few retries: this loop has its own.
+    name : str
+        As the service lists it.
+    processes : int
+        Children that simulate, a thread each.
+    exit_when_idle : bool
+        Return once there is nothing left to claim.
+    once : bool
+        Return after one job for each process.
+    make_child
+        Builds the supervised child of one thread.
+    report
+        Called from any thread after every finished job.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        name: str,
+        processes: int = 1,
+        exit_when_idle: bool = False,
+        once: bool = False,
+        make_child: Callable[[], Child] = Child,
+        report: Callable[[Tally], None] = lambda tally: None,
+    ) -> None:
+        if processes < 1:
+            raise ValueError("processes must be at least 1")
+        self._transport = transport
+        self._name = name
+        self._processes = processes
+        self._exit_when_idle = exit_when_idle
+        self._once = once
+        self._make_child = make_child
+        self._report = report
+        self._stop = threading.Event()
+        self._done = threading.Event()
+        self._lock = threading.Lock()
+        self._leases: dict[str, Lease] = {}
+        self._parts: dict[str, bytes] = {}
+        self._fatal: WorkerFailed | None = None
+        self.tally = Tally()
+
+    def stop(self) -> None:
+        """Stop soon: children are killed and leases given back. May be called from a signal handler."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Work until stopped, or idle if so asked.
+
+        Raises
+        ------
+        WorkerFailed
+            If the service refuses this worker, pybullet is missing or the heartbeat died.
+        """
+        heartbeat = threading.Thread(
+            target=self._guard, args=(self._heartbeat,), name="heartbeat", daemon=True
+        )
+        slots = [
+            threading.Thread(target=self._guard, args=(self._slot,), name=f"slot-{number}", daemon=True)
+            for number in range(self._processes)
+        ]
+        heartbeat.start()
+        for slot in slots:
+            slot.start()
+        try:
+            for slot in slots:
+                # In slices: a signal's handler runs in this thread only between them.
+                while slot.is_alive():
+                    slot.join(0.2)
+        finally:
+            self._stop.set()
+            self._done.set()
+            for thread in (*slots, heartbeat):
+                thread.join(10.0)
+        if self._fatal is not None:
+            raise self._fatal
+
+    def _guard(self, body: Callable[[], None]) -> None:
+        try:
+            body()
+        except WorkerFailed as error:
+            self._fail(error)
+        except PybulletMissing as error:
+            self._fail(WorkerFailed(f"pybullet can't be imported: {error}"))
+        except BaseException as error:
+            log.exception("the worker's %s died", threading.current_thread().name)
+            self._fail(WorkerFailed(f"{threading.current_thread().name} died: {error!r}"))
+
+    def _fail(self, error: WorkerFailed) -> None:
+        with self._lock:
+            self._fatal = self._fatal or error
+        self._stop.set()
+
+    # -- heartbeat ----------------------------------------------------------------------------------------
+
+    def _heartbeat(self) -> None:
+        """Renew every lease at a third of its time. Ends only once all slots have ended."""
+        while not self._done.is_set():
+            now = time.monotonic()
+            with self._lock:
+                leases = list(self._leases.values())
+            due = [lease for lease in leases if not lease.lost.is_set()]
+            for lease in due:
+                if now - lease.renewed >= lease.lease_s / 3.0:
+                    self._renew(lease)
+            shortest = min((lease.lease_s for lease in due), default=3.0)
+            self._done.wait(min(1.0, shortest / 10.0))
+
+    def _renew(self, lease: Lease) -> None:
+        try:
+            answer = self._transport.request(
+                "PUT", f"/jobs/{lease.job}/lease", params={"lease_id": lease.lease_id}, retries=0
+            )
+        except (LeaseLost, NotFound) as error:
+            log.warning("job %s: lease lost (%s)", lease.job, error)
+            lease.lost.set()
+        except GraspDBError as error:
+            # Perhaps the service restarts. A lease that ran out may still be ours when it is back.
+            log.warning("job %s: could not renew the lease: %s", lease.job, error)
+            lease.renewed += min(1.0, lease.lease_s / 10.0)
+        else:
+            renewed = LeaseRenewed.model_validate_json(answer.content)
+            lease.renewed, lease.lease_s = time.monotonic(), renewed.lease_s
+            if renewed.cancel:
+                log.info("job %s: cancelled", lease.job)
+                lease.lost.set()
+
+    # -- jobs ---------------------------------------------------------------------------------------------
+
+    def _slot(self) -> None:
+        failures = 0
+        with self._make_child() as child:
+            while not self._stop.is_set():
+                try:
+                    job, wait = self._claim()
+                except (Unauthorized, Forbidden) as error:
+                    raise WorkerFailed(f"the service refuses this worker: {error}") from error
+                except InvalidInput as error:
+                    raise WorkerFailed(f"the service does not understand this worker: {error}") from error
+                except GraspDBError as error:
+                    failures += 1
+                    delay = _backoff(failures)
+                    log.warning("can't claim jobs (again in %.1f s): %s", delay, error)
+                    self._stop.wait(delay)
+                    continue
+                failures = 0
+                if job is None:
+                    if self._exit_when_idle or self._once:
+                        return
+                    self._stop.wait(wait)
+                    continue
+                self._work(child, job)
+                if self._once:
+                    return
+
+    def _claim(self) -> tuple[ClaimedJob | None, float]:
+        request = ClaimRequest(worker=self._name, capabilities=list(CAPABILITIES), limit=1)
+        answer = ClaimResponse.model_validate_json(
+            self._transport.request("POST", "/jobs/claim", body=request, retries=0).content
+        )
+        return (answer.jobs[0] if answer.jobs else None), max(0.1, answer.retry_after_s or IDLE_S)
+
+    def _work(self, child: Child, job: ClaimedJob) -> None:
+        with self._holding(job) as lease:
+            try:
+                payload = job.payload
+                if not isinstance(payload, SimulatePayload):
+                    raise ChunkFailed(f"this worker does not do {job.kind!r} jobs")
+                parts = self._parts_of(payload, lease)
+                result = child.run(payload, parts, wanted=lambda: self._wanted(lease))
+            except Cancelled:
+                self._abandon(lease)
+            except ChunkFailed as error:
+                log.error("job %s failed: %s", job.id, error)
+                self.tally.failures += 1
+                self._hand_in(lease, "failure", {"error": str(error)[:4000]})
+            except PybulletMissing:
+                self._release(lease)
+                raise
+            else:
+                self._submit(lease, payload, result)
+
+    @contextlib.contextmanager
+    def _holding(self, job: ClaimedJob) -> Iterator[Lease]:
+        lease = Lease(job.id, job.lease_id, job.lease_s, time.monotonic())
+        with self._lock:
+            self._leases[lease.lease_id] = lease
+        try:
+            yield lease
+        finally:
+            with self._lock:
+                self._leases.pop(lease.lease_id, None)
+
+    def _wanted(self, lease: Lease) -> bool:
+        return not (self._stop.is_set() or lease.lost.is_set())
+
+    def _abandon(self, lease: Lease) -> None:
+        if lease.lost.is_set():
+            self.tally.lost += 1
+        else:
+            self._release(lease)
+
+    def _release(self, lease: Lease) -> None:
+        """Give a lease back, so that another worker need not wait until it runs out."""
+        try:
+            self._transport.request(
+                "DELETE", f"/jobs/{lease.job}/lease", params={"lease_id": lease.lease_id}, retries=0
+            )
+        except GraspDBError as error:
+            log.warning("job %s: could not release the lease, it will run out: %s", lease.job, error)
+
+    def _parts_of(self, payload: SimulatePayload, lease: Lease) -> bytes:
+        """The object's convex parts as GLB, fetched once for each hash.
+
+        Raises
+        ------
+        Cancelled
+            If the job is not wanted any more before they came.
+        ChunkFailed
+            If the service does not have the parts that the sweep was planned with.
+        """
+        digest = payload.parts_sha256
+        with self._lock:
+            if digest in self._parts:
+                return self._parts[digest]
+        failures = 0
+        while True:
+            if not self._wanted(lease):
+                raise Cancelled
+            try:
+                data = self._transport.request("GET", payload.convex_parts, retries=0).content
+                break
+            except (NotFound, Unauthorized, Forbidden, InvalidInput) as error:
+                raise ChunkFailed(f"can't fetch {payload.convex_parts}: {error}") from error
+            except GraspDBError as error:
+                failures += 1
+                log.warning("can't fetch %s: %s", payload.convex_parts, error)
+                self._stop.wait(_backoff(failures))
+        found = hashlib.sha256(data).hexdigest()
+        if found != digest:
+            raise ChunkFailed(
+                f"{payload.convex_parts} has the SHA-256 {found}, the sweep was planned with {digest}"
+            )
+        with self._lock:
+            while len(self._parts) >= _CACHED_PARTS:
+                self._parts.pop(next(iter(self._parts)))
+            self._parts[digest] = data
+        return data
+
+    def _submit(self, lease: Lease, payload: SimulatePayload, result: SimulateResult) -> None:
+        accepted = self._hand_in(lease, "result", result)
+        if accepted is None:
+            return
+        with self._lock:
+            self.tally.jobs += 1
+            self.tally.poses += payload.stop - payload.start
+            self.tally.grasps += len(result.rows.pose_index)
+            tally = self.tally
+        self._report(tally)
+
+    def _hand_in(self, lease: Lease, what: str, body: SimulateResult | dict[str, str]) -> bytes | None:
+        """Send until the service answers for good; None if it does not want it any more.
+
+        The same body under the same lease is idempotent, so an answer lost on the way does no harm.
+        Once the worker is asked to stop there is one more attempt, then the lease runs out by itself.
+        """
+        failures = 0
+        while True:
+            last = self._stop.is_set()
+            if lease.lost.is_set():
+                self.tally.lost += 1
+                return None
+            try:
+                answer = self._transport.request(
+                    "PUT",
+                    f"/jobs/{lease.job}/{what}",
+                    params={"lease_id": lease.lease_id},
+                    body=body,
+                    retries=0,
+                )
+            except (Conflict, NotFound) as error:
+                log.warning("job %s: %s not wanted: %s", lease.job, what, error)
+                self.tally.lost += 1
+                return None
+            except (InvalidInput, TooLarge, Unauthorized, Forbidden) as error:
+                log.error("job %s: the service refuses the %s: %s", lease.job, what, error)
+                self.tally.failures += 1
+                if what == "result":
+                    message = f"the service refused the result: {error}"
+                    self._hand_in(lease, "failure", {"error": message[:4000]})
+                return None
+            except GraspDBError as error:
+                if last:
+                    log.error("job %s: %s not sent, stopping: %s", lease.job, what, error)
+                    return None
+                failures += 1
+                delay = _backoff(failures)
+                log.warning("job %s: %s not sent (again in %.1f s): %s", lease.job, what, delay, error)
+                self._stop.wait(delay)
+            else:
+                return answer.content
+
+
+def _backoff(failures: int) -> float:
+    return min(MAX_BACKOFF_S, 0.25 * 2.0 ** min(failures, 10)) * random.uniform(0.6, 1.0)

@@ -1,0 +1,156 @@
+"""One closing at a time, in real physics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from graspdb.examples import example
+from graspdb_geometry import collision
+from graspdb_simworker.bodies import Closing, End
+from graspdb_simworker.chunks import Workpiece
+from graspdb_simworker.labels import Outcome, label_of
+from graspdb_simworker.scene import GraspWorld
+
+GetWorkpiece = Callable[..., Workpiece]
+FindPoses = Callable[[str, int], list[tuple[Any, Any]]]
+
+
+def travels(workpiece: Workpiece, poses: list[tuple[Any, Any]]) -> list[float]:
+    positions, quaternions = (np.array([pose[k] for pose in poses]) for k in (0, 1))
+    codes, first = workpiece.scene.classify(positions, quaternions, workpiece.shape)
+    assert (codes == collision.CONTACT).all()
+    return [float(t) for t in np.minimum(first.min(axis=1), 0.5 * workpiece.shape.max_opening_m)]
+
+
+def close_all(world: GraspWorld, poses: list[tuple[Any, Any]], travel: list[float]) -> list[Closing]:
+    return [world.close(p, q, t) for (p, q), t in zip(poses, travel, strict=True)]
+
+
+def same(a: Closing, b: Closing) -> bool:
+    """Equal in every bit."""
+    arrays = all(
+        getattr(a, name).tobytes() == getattr(b, name).tobytes() for name in ("normals", "forces", "fingers")
+    )
+    return arrays and all(
+        getattr(a, name) == getattr(b, name)
+        for name in ("end", "touched", "opening_m", "position", "quaternion_xyzw", "steps")
+    )
+
+
+@pytest.mark.parametrize("fidelity", ["standard", "fine"])
+def test_the_rim_of_a_mug_is_held(
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], fidelity: str
+) -> None:
+    workpiece = workpiece_of("mug", fidelity)
+    held = workpiece.world.close(*grasps["rim"])
+    assert held.end is End.STALLED
+    assert held.touched
+    label = label_of(held, workpiece.gripper, workpiece.mass_kg, workpiece.friction)
+    assert label.outcome is Outcome.SUCCESS
+    # The wall is 4 mm; across a finger's width it bulges by 2 mm.
+    assert 0.0045 < label.width_m < 0.0070
+    # Both fingers press with the closing force, one against the other.
+    for finger, sign in ((0, 1.0), (1, -1.0)):
+        on = held.fingers == finger
+        along = (held.forces[on, None] * held.normals[on])[:, 1].sum()
+        assert sign * along == pytest.approx(workpiece.gripper.closing_force_n, rel=0.15)
+
+
+def test_nothing_to_close_on_is_a_miss(
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]
+) -> None:
+    workpiece = workpiece_of("mug")
+    closing = workpiece.world.close(*grasps["above"])
+    assert closing.end is End.EMPTY
+    assert (
+        label_of(closing, workpiece.gripper, workpiece.mass_kg, workpiece.friction).outcome is Outcome.MISSED
+    )
+
+
+def test_the_cone_is_as_wide_as_it_is(workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]) -> None:
+    workpiece = workpiece_of("cone")
+    position, quaternion = grasps["waist"]
+    for z in (-0.1, 0.0, 0.1):
+        closing = workpiece.world.close((*position[:2], z), quaternion)
+        label = label_of(closing, workpiece.gripper, workpiece.mass_kg, workpiece.friction)
+        assert label.outcome is Outcome.SUCCESS
+        # The diameter there; flat fingers, 20 mm wide, ride on the thicker side of the taper.
+        diameter = 2.0 * (0.025 - 0.075 * z)
+        assert diameter - 2e-4 < label.width_m < diameter + 2.0 * 0.075 * 0.010 + 2e-4
+        # Friction cones of two opposite 40 N contacts hold 2.4 kg at most.
+        assert 2.0 < label.quality < 3.6
+
+
+def test_starting_near_the_contact_changes_nothing_but_the_time(
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]
+) -> None:
+    workpiece = workpiece_of("cone")
+    (travel,) = travels(workpiece, [grasps["waist"]])
+    assert 0.008 < travel < 0.0101
+    slow, quick = (workpiece.world.close(*grasps["waist"], t) for t in (0.0, travel))
+    assert quick.steps < slow.steps
+    assert quick.end is slow.end is End.STALLED
+    assert quick.opening_m == pytest.approx(slow.opening_m, abs=2e-4)
+
+
+def test_an_off_centre_object_is_centred(
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]
+) -> None:
+    workpiece = workpiece_of("cone")
+    position, quaternion = grasps["waist"]
+    closing = workpiece.world.close((position[0], 0.008, position[2]), quaternion)
+    assert closing.end is End.STALLED
+    # Fingers that close alike push it to the middle, nearly: it was 8 mm off.
+    assert abs(closing.position[1]) < 0.0025
+
+
+@pytest.mark.parametrize("name", ["mug", "elongated-d"])
+def test_labels_do_not_depend_on_order_or_world(
+    workpiece_of: GetWorkpiece, physical_poses: FindPoses, name: str
+) -> None:
+    workpiece = workpiece_of(name)
+    poses = physical_poses(name, 60)
+    travel = travels(workpiece, poses)
+    forward = close_all(workpiece.world, poses, travel)
+    order = np.random.default_rng(3).permutation(len(poses)).tolist()
+    shuffled = close_all(workpiece.world, [poses[k] for k in order], [travel[k] for k in order])
+    assert all(same(forward[k], result) for k, result in zip(order, shuffled, strict=True))
+    thing = example(name)
+    with GraspWorld(thing.parts, thing.mass_kg, thing.friction, workpiece.gripper) as other:
+        fresh = [other.close(*poses[k], travel[k]) for k in reversed(range(20))]
+    assert all(same(a, b) for a, b in zip(forward[:20], reversed(fresh), strict=True))
+    assert len({closing.end for closing in forward}) > 1, "the sample must hold more than one kind of end"
+
+
+def outcomes(workpiece: Workpiece, poses: list[tuple[Any, Any]]) -> np.ndarray:
+    travel = travels(workpiece, poses)
+    return np.array(
+        [
+            workpiece.simulate(np.array(p), np.array(q), t).outcome
+            for (p, q), t in zip(poses, travel, strict=True)
+        ]
+    )
+
+
+def test_mirrored_twins_agree(workpiece_of: GetWorkpiece, physical_poses: FindPoses) -> None:
+    workpiece = workpiece_of("mug")
+    poses = physical_poses("mug", 150)
+    half_turn = Rotation.from_quat([0.0, 0.0, 1.0, 0.0])
+    twins = [(p, tuple((Rotation.from_quat(q) * half_turn).as_quat().tolist())) for p, q in poses]
+    agree = outcomes(workpiece, poses) == outcomes(workpiece, twins)
+    # Not a matter of course: Bullet treats the fingers one after the other.
+    assert agree.mean() >= 0.97
+
+
+@pytest.mark.parametrize("name", ["mug", "cone"])
+def test_standard_agrees_with_fine(workpiece_of: GetWorkpiece, physical_poses: FindPoses, name: str) -> None:
+    poses = physical_poses(name, 120)
+    standard = outcomes(workpiece_of(name), poses) == Outcome.SUCCESS
+    fine = outcomes(workpiece_of(name, "fine"), poses) == Outcome.SUCCESS
+    assert 0.05 < fine.mean() < 0.95
+    assert (standard == fine).mean() >= 0.96
