@@ -1,0 +1,386 @@
+"""Best grasps under constraints, in either frame, against search by brute force."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from graspdb_density import GraspDensity, IsotropicKernel, Region, reference, se3
+from graspdb_geometry.collision import Scene
+from graspdb_geometry.grippers import PG70
+
+Floats = NDArray[np.float64]
+Poses = tuple[Floats, Floats]
+Post = Callable[..., dict[str, Any]]
+Make = Callable[..., str]
+
+KERNEL = IsotropicKernel(0.015, np.deg2rad(15))
+BOX = (0.04, 0.06, 0.10)
+
+
+def box_stl(size: tuple[float, float, float]) -> tuple[bytes, Floats, NDArray[np.int64]]:
+    """A binary STL of a box about the origin, and its vertices and faces."""
+    v = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+    f = np.array(
+        [
+            (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
+            (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
+        ]
+    )  # fmt: skip
+    triangles = b"".join(struct.pack("<12fH", 0, 0, 0, *v[t].ravel(), 0) for t in f)
+    return b"\0" * 80 + struct.pack("<I", len(f)) + triangles, v, f
+
+
+def put_box(http: httpx.Client, size: tuple[float, float, float] = BOX) -> Scene:
+    content, vertices, faces = box_stl(size)
+    answer = http.put("/objects/thing/mesh?unit=m", content=content, headers={"Content-Type": "model/stl"})
+    assert answer.status_code in (200, 201), answer.text
+    return Scene([(vertices, faces)])
+
+
+def best(http: httpx.Client, **query: Any) -> dict[str, Any]:
+    """The answer to GET, which must equal the answer to POST."""
+    joined = {
+        name: ",".join(map(repr, map(float, value))) if isinstance(value, (list, tuple, np.ndarray)) else value
+        for name, value in query.items()
+    }
+    answer = http.get("/objects/thing/best-grasp", params=joined)
+    assert answer.status_code == 200, answer.text
+    plain = {
+        name: list(map(float, value)) if isinstance(value, (tuple, np.ndarray)) else value
+        for name, value in query.items()
+    }
+    posted = http.post("/objects/thing/best-grasp", json=plain)
+    assert posted.json() == answer.json()
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def fields(answer: httpx.Response, status: int = 422) -> set[str]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    return {item["field"] for item in answer.json()["errors"]}
+
+
+def exact(trials: Poses, grasp: dict[str, Any]) -> float:
+    pose = np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]])
+    return float(reference.log_density(KERNEL, *trials, *pose)[0])
+
+
+@pytest.fixture
+def thing(http: httpx.Client, make_object: Make, post: Post, two_clusters: Poses) -> httpx.Client:
+    make_object(http)
+    post(http, "thing", two_clusters)
+    return http
+
+
+def test_unconstrained_equals_brute_force(thing: httpx.Client, two_clusters: Poses) -> None:
+    answer = best(thing)
+    assert answer["status"] == "ok"
+    (grasp,) = answer["grasps"]
+    assert grasp["log_density"] == pytest.approx(exact(two_clusters, grasp), abs=2e-3)
+    assert grasp["density"] == pytest.approx(np.exp(grasp["log_density"]))
+    assert grasp["relative"] == pytest.approx(1)
+    assert grasp["active_constraints"] == []
+    assert grasp["collision_free"] is None
+    rng = np.random.default_rng(0)
+    rows = rng.integers(0, 500, 20_000)
+    positions = two_clusters[0][rows] + rng.normal(size=(20_000, 3)) * 0.005
+    turns = se3.from_rotation_vector(rng.normal(size=(20_000, 3)) * 0.1)
+    rivals = GraspDensity.build(*two_clusters, kernel=KERNEL).log_density(
+        positions, se3.multiply(two_clusters[1][rows], turns)
+    )
+    assert grasp["log_density"] >= rivals.max() - 1e-3
+
+
+def test_constraints_hold_and_are_named(thing: httpx.Client, two_clusters: Poses) -> None:
+    """The upper cluster's peak is near (0, 0, 60) mm; each constraint cuts it off."""
+    free = best(thing)["grasps"][0]
+    for query, active, region in (
+        ({"box_min": [-1, -1, 0.07]}, ["box_min"], Region([[0, 0, 1, 0.07]])),
+        (
+            {"box_min": [-1, -1, 0.02], "box_max": [1, 1, 0.05]},
+            ["box_max"],
+            Region([[0, 0, 1, 0.02], [0, 0, -1, -0.05]]),
+        ),
+        ({"above_plane": [2, 0, 0, 0.02]}, ["above_plane"], Region([[1, 0, 0, 0.01]])),
+        ({"sphere": [0, 0, 0.08, 0.01]}, ["sphere"], Region(spheres=[[0, 0, 0.08, 0.01]])),
+        (
+            {"approach": [1, 0, -1], "approach_cone_deg": 30, "sphere": [0, 0, 0.06, 0.05]},
+            ["approach"],
+            Region(spheres=[[0, 0, 0.06, 0.05]], approach=[1, 0, -1], approach_angle=np.deg2rad(30)),
+        ),
+        (
+            {"closing": [1, -1, 0], "closing_cone_deg": 20, "sphere": [0, 0, 0.06, 0.05]},
+            ["closing"],
+            Region(spheres=[[0, 0, 0.06, 0.05]], closing=[1, -1, 0], closing_angle=np.deg2rad(20)),
+        ),
+    ):
+        answer = best(thing, **query)
+        assert answer["status"] == "ok", query
+        (grasp,) = answer["grasps"]
+        position, quaternion = np.array(grasp["position"]), np.array(grasp["quaternion_xyzw"])
+        assert region.contains(position[None], quaternion[None])[0], query
+        assert grasp["active_constraints"] == active, query
+        assert grasp["log_density"] < free["log_density"]
+        assert grasp["relative"] == pytest.approx(
+            np.exp(grasp["log_density"] - free["log_density"]), rel=1e-3
+        )
+        assert grasp["log_density"] == pytest.approx(exact(two_clusters, grasp), abs=5e-3)
+        # No success inside the region is better than what was found.
+        inside = region.contains(*two_clusters)
+        if inside.any():
+            there = two_clusters[0][inside], two_clusters[1][inside]
+            rivals = reference.log_density(KERNEL, *two_clusters, *there)
+            assert grasp["log_density"] >= rivals.max() - 1e-3
+
+
+def test_world_frame_equals_object_frame(thing: httpx.Client) -> None:
+    """A box in the world, of a tilted object, is askew in the object frame."""
+    rng = np.random.default_rng(2)
+    shift, turn = np.array([0.5, -0.3, 0.8]), se3.normalise(rng.normal(size=4))
+    object_pose = [*shift, *turn]
+    top = shift + se3.rotate(turn, np.array([0, 0, 0.06]))
+    lower, upper = top + [-0.1, -0.1, 0.005], top + [0.1, 0.1, 0.1]
+    plane_normal = se3.rotate(turn, np.array([1.0, 0, 0]))
+    query = {
+        "object_pose": object_pose,
+        "box_min": lower,
+        "box_max": upper,
+        "approach": se3.rotate(turn, np.array([0.2, 0, -1.0])),
+        "approach_cone_deg": 10,
+        "above_plane": [*plane_normal, float(plane_normal @ shift) - 0.004],
+        "sphere": [*top, 0.05],
+        "closing": se3.rotate(turn, np.array([0, 1.0, 0])),
+        "closing_cone_deg": 40,
+    }
+    answer = best(thing, **query)
+    assert answer["status"] == "ok"
+    (grasp,) = answer["grasps"]
+    position, quaternion = np.array(grasp["position"]), np.array(grasp["quaternion_xyzw"])
+    world = np.array(grasp["world"]["position"]), np.array(grasp["world"]["quaternion_xyzw"])
+    np.testing.assert_allclose(world[0], shift + se3.rotate(turn, position), atol=1e-12)
+    assert se3.angle_between(world[1], se3.multiply(turn, quaternion)) < 1e-7
+    assert (world[0] >= lower - 1e-6).all()
+    assert (world[0] <= upper + 1e-6).all()
+    assert np.linalg.norm(world[0] - top) <= 0.05 + 1e-6
+    assert plane_normal @ world[0] >= query["above_plane"][3] - 1e-6
+    axis = query["approach"] / np.linalg.norm(query["approach"])
+    assert np.degrees(np.arccos(se3.rotate(world[1], [0, 0, 1.0]) @ axis)) <= 10 + 1e-4
+    assert "box_min" in grasp["active_constraints"]
+
+    # The same in the object frame: the box's faces as its planes, one query a face would be six.
+    in_object = best(
+        thing,
+        object_pose=object_pose,
+        frame="object",
+        approach=[0.2, 0, -1],
+        approach_cone_deg=10,
+        above_plane=[1, 0, 0, -0.004],
+        sphere=[0, 0, 0.06, 0.05],
+    )["grasps"][0]
+    in_world = best(
+        thing,
+        object_pose=object_pose,
+        approach=query["approach"],
+        approach_cone_deg=10,
+        above_plane=query["above_plane"],
+        sphere=query["sphere"],
+    )["grasps"][0]
+    np.testing.assert_allclose(in_object["position"], in_world["position"], atol=1e-4)
+    np.testing.assert_allclose(in_object["log_density"], in_world["log_density"], atol=1e-3)
+    np.testing.assert_allclose(
+        in_object["world"]["position"], shift + se3.rotate(turn, np.array(in_object["position"])), atol=1e-9
+    )
+
+
+def test_several_distinct_grasps(thing: httpx.Client) -> None:
+    answer = best(thing, count=5, min_separation_m=0.01, min_separation_deg=25)
+    grasps = answer["grasps"]
+    assert (answer["status"], len(grasps)) == ("ok", 5)
+    logs = [grasp["log_density"] for grasp in grasps]
+    assert logs == sorted(logs, reverse=True)
+    for i, a in enumerate(grasps):
+        for b in grasps[:i]:
+            qa, qb = np.array(a["quaternion_xyzw"]), np.array(b["quaternion_xyzw"])
+            angle = min(se3.angle_between(qa, qb), se3.angle_between(qa, se3.jaw_twin(qb)))
+            apart = np.linalg.norm(np.subtract(a["position"], b["position"]))
+            assert apart > 0.01 - 1e-9 or angle > np.deg2rad(25) - 1e-7
+    two = best(thing, count=10, min_separation_m=0.12, min_separation_deg=180)
+    assert two["status"] == "fewer"
+    assert 1 <= len(two["grasps"]) < 10
+
+
+def test_nearest_trials_are_the_nearest_successes(
+    http: httpx.Client, make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    make_object(http)
+    post(http, "thing", two_clusters, "dropped")
+    post(http, "thing", two_clusters)
+    (grasp,) = best(http)["grasps"]
+    seqs = grasp["nearest_trials"]
+    assert len(seqs) == 5
+    assert min(seqs) > 500
+    position, quaternion = np.array(grasp["position"]), np.array(grasp["quaternion_xyzw"])
+    angle = np.minimum(
+        se3.angle_between(two_clusters[1], quaternion),
+        se3.angle_between(two_clusters[1], se3.jaw_twin(quaternion)),
+    )
+    squared = (np.linalg.norm(two_clusters[0] - position, axis=1) / 0.015) ** 2
+    measure = 0.5 * squared + KERNEL.kappa * (1 - np.cos(angle / 2))
+    assert seqs == (np.argsort(measure)[:5] + 501).tolist()
+
+
+def test_infeasible_says_the_nearest(thing: httpx.Client) -> None:
+    answer = best(thing, box_min=[1, 1, 1], box_max=[2, 2, 2])
+    assert (answer["status"], answer["grasps"]) == ("infeasible", [])
+    assert answer["nearest"]["position"][2] > 0.05
+    assert answer["nearest"]["nearest_trials"]
+    # A region that is empty is as infeasible as one out of reach.
+    answer = best(thing, box_min=[1, 1, 1], sphere=[0, 0, 0, 0.1])
+    assert answer["status"] == "infeasible"
+    answer = best(thing, approach=[0, 0, 1], approach_cone_deg=5)
+    assert answer["status"] == "infeasible"
+    assert answer["nearest"] is not None
+
+
+def test_no_successes(http: httpx.Client, make_object: Make, post: Post, two_clusters: Poses) -> None:
+    make_object(http)
+    for outcome in (None, "missed"):
+        if outcome:
+            post(http, "thing", two_clusters, outcome)
+        answer = best(http)
+        assert (answer["status"], answer["grasps"], answer["nearest"]) == ("no_successes", [], None)
+
+
+def test_collision_free(
+    http: httpx.Client, make_object: Make, post: Post, clusters: Callable[..., Poses]
+) -> None:
+    """Grasps of a box from above, half of them so deep that the palm is inside it."""
+    make_object(http)
+    scene = put_box(http)
+    centres = [((0, 0, 0.045), (1.0, 0, 0, 0)), ((0, 0, -0.01), (1.0, 0, 0, 0))]
+    shallow, deep = clusters(centres[:1], 100, seed=1), clusters(centres[1:], 300, seed=2)
+    trials = np.concatenate([shallow[0], deep[0]]), np.concatenate([shallow[1], deep[1]])
+    post(http, "thing", trials)
+
+    # Trials without a gripper: nothing is known of collisions, until a gripper is named.
+    assert best(http)["grasps"][0]["collision_free"] is None
+    refused = http.get("/objects/thing/best-grasp?collision_free=true")
+    assert refused.status_code == 409
+    assert "gripper" in refused.json()["title"]
+
+    blind = best(http, gripper="pg70", collision_free=False)["grasps"][0]
+    assert blind["collision_free"] is False
+    free = best(http, gripper="pg70", count=3)
+    assert free["grasps"]
+    for grasp in free["grasps"]:
+        assert grasp["collision_free"] is True
+        assert not scene.collides([grasp["position"]], [grasp["quaternion_xyzw"]], PG70)[0]
+        assert grasp["log_density"] < blind["log_density"]
+    answer = http.post(
+        "/objects/thing/likelihood",
+        json={
+            "poses": {"position": trials[0].tolist(), "quaternion_xyzw": trials[1].tolist()},
+            "gripper": "pg70",
+        },
+    ).json()
+    assert answer["collision_free"] == (~scene.collides(*trials, PG70)).tolist()
+    assert len(set(answer["collision_free"])) == 2
+    # Where everything in reach collides, that is infeasible.
+    inside = best(http, gripper="pg70", box_min=[-0.01, -0.01, -0.03], box_max=[0.01, 0.01, 0.0])
+    assert inside["status"] == "infeasible"
+    assert inside["nearest"]["collision_free"] is True
+
+
+def test_collision_needs_a_mesh(
+    sqlite_http: httpx.Client, make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    make_object(sqlite_http)
+    post(sqlite_http, "thing", two_clusters, gripper="pg70")
+    assert best(sqlite_http)["grasps"][0]["collision_free"] is None
+    refused = sqlite_http.post("/objects/thing/best-grasp", json={"collision_free": True})
+    assert refused.status_code == 409
+    assert refused.json()["type"].endswith("collision-unknown")
+    assert "mesh" in refused.json()["title"]
+
+
+def test_asymmetric_jaw_has_a_signed_closing_direction(
+    sqlite_http: httpx.Client, make_object: Make, post: Post, clusters: Callable[..., Poses]
+) -> None:
+    http = sqlite_http
+    make_object(http)
+    profile = {
+        "max_opening_m": 0.07,
+        "finger": {"width_m": 0.02, "thickness_m": 0.01, "length_m": 0.05},
+        "palm_size_m": [0.05, 0.05, 0.05],
+        "symmetric": False,
+    }
+    assert http.post("/grippers", json={"id": "hook", **profile}).status_code == 201
+    post(http, "thing", clusters([((0, 0, 0.06), (1.0, 0, 0, 0))], 100), gripper="hook")
+    # Turned about x by half a turn, the tool's y points along -y.
+    assert best(http, closing=[0, -1, 0], closing_cone_deg=40)["status"] == "ok"
+    assert best(http, closing=[0, 1, 0], closing_cone_deg=40)["status"] == "infeasible"
+
+
+BAD = [
+    ({"box_min": [0, 0, 1], "box_max": [1, 1, 0]}, {"box_min", "box_max"}),
+    ({"box_min": [0, 0]}, {"box_min.2"}),
+    ({"box_min": [0, 0, 0, 0]}, {"box_min"}),
+    ({"box_max": [0, 0, 5000]}, {"box_max"}),
+    ({"approach": [0, 0, 1]}, {"approach_cone_deg"}),
+    ({"approach_cone_deg": 10}, {"approach"}),
+    ({"closing": [0, 0, 1]}, {"closing_cone_deg"}),
+    ({"closing_cone_deg": 10}, {"closing"}),
+    ({"approach": [0, 0, 0], "approach_cone_deg": 10}, {"approach"}),
+    ({"approach": [0, 0, 1], "approach_cone_deg": 0}, {"approach_cone_deg"}),
+    ({"approach": [0, 0, 1], "approach_cone_deg": 181}, {"approach_cone_deg"}),
+    (
+        {"approach": [0, 0, 1], "approach_cone_deg": 5, "closing": [0, 0, 1], "closing_cone_deg": 5},
+        {"approach_cone_deg", "closing_cone_deg"},
+    ),
+    ({"sphere": [0, 0, 0, 0]}, {"sphere"}),
+    ({"sphere": [0, 0, 0, -1]}, {"sphere"}),
+    ({"above_plane": [0, 0, 0, 1]}, {"above_plane"}),
+    ({"frame": "world"}, {"object_pose"}),
+    ({"frame": "camera"}, {"frame"}),
+    ({"object_pose": [0, 0, 0, 0, 0, 0, 0]}, {"object_pose"}),
+    ({"object_pose": [0, 0, 0, 0, 0, 0, 2]}, {"object_pose"}),
+    ({"count": 0}, {"count"}),
+    ({"count": 10**6}, {"count"}),
+    ({"objective": "luck"}, {"objective"}),
+    ({"min_separation_m": 0}, {"min_separation_m"}),
+    ({"min_separation_deg": 400}, {"min_separation_deg"}),
+    ({"collision_free": "perhaps"}, {"collision_free"}),
+    ({"box_mim": [0, 0, 0]}, {"box_mim"}),
+]
+
+
+def test_bad_requests_name_the_field(
+    sqlite_http: httpx.Client, make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    http = sqlite_http
+    make_object(http)
+    post(http, "thing", two_clusters)
+    path = "/objects/thing/best-grasp"
+    for query, named in BAD:
+        assert fields(http.post(path, json=query)) == named, query
+        joined = {k: ",".join(map(str, v)) if isinstance(v, list) else v for k, v in query.items()}
+        assert fields(http.get(path, params=joined)) == named, query
+    floats = ("box_min", "sphere", "above_plane", "approach", "object_pose")
+    for name in floats:
+        width = {"box_min": 3, "approach": 3, "object_pose": 7}.get(name, 4)
+        for bad in ("nan", "inf", "1e999", "x", ""):
+            value = ",".join(["0"] * (width - 1) + [bad])
+            named = fields(http.get(path, params={name: value, "approach_cone_deg": 10}))
+            assert any(item.split(".")[0] == name for item in named), (name, bad, named)
+        raw = '{"%s": [%s]}' % (name, ",".join(["0"] * (width - 1) + ["1e999"]))
+        answer = http.post(path, content=raw, headers={"Content-Type": "application/json"})
+        assert answer.status_code == 422, raw
+    assert http.get("/objects/none/best-grasp").status_code == 404
