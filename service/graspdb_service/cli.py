@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import logging
 import os
 import sys
+import tempfile
 from typing import Annotated, Any, NoReturn
 
 try:
@@ -61,6 +63,15 @@ def migrate(database_url: DatabaseUrl = None) -> None:
         typer.echo(f"The schema is at {schema.upgrade(database)}.")
     except (schema.StaleSchema, UnsupportedDatabase) as error:
         _fail(str(error))
+
+
+@cli.command()
+def openapi() -> None:
+    """Print the OpenAPI document; docs/openapi.json is this output."""
+    with tempfile.TemporaryDirectory() as folder:
+        app = create_app(Settings(database_url=f"sqlite:///{folder}/empty.sqlite"))
+        typer.echo(json.dumps(app.openapi(), indent=1, ensure_ascii=False))
+        app.state.context.close()
 
 
 def _settings(**given: Any) -> Settings:

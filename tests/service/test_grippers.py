@@ -1,0 +1,113 @@
+"""Grippers: two are built in, users add theirs."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+
+from graspdb_service.storage import grippers
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.schema import upgrade
+from graspdb_service.usecases.grippers import seed
+
+MINE: dict[str, Any] = {
+    "id": "mine",
+    "name": "Printed jaw",
+    "max_opening_m": 0.05,
+    "finger": {"width_m": 0.01, "thickness_m": 0.01, "length_m": 0.05},
+    "tip_offset_m": 0.01,
+    "palm_size_m": [0.05, 0.08, 0.05],
+    "base_to_tool": {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.12], [0, 0, 0, 1]]},
+    "symmetric": False,
+}
+
+
+def test_built_in_grippers_exist_from_the_start(http: httpx.Client) -> None:
+    items = http.get("/grippers").json()["items"]
+    assert [item["id"] for item in items] == ["panda", "pg70"]
+    assert all(item["builtin"] for item in items)
+    pg70 = items[1]["profile"]
+    assert pg70["max_opening_m"] == 0.07
+    assert pg70["finger"] == {"width_m": 0.02, "thickness_m": 0.015, "length_m": 0.07}
+    assert (pg70["tip_offset_m"], pg70["palm_size_m"]) == (0.023, [0.08, 0.112, 0.092])
+    assert (pg70["max_speed_m_s"], pg70["force_n"], pg70["friction"]) == (0.06, 40.0, 0.4)
+    assert pg70["base_to_tool"]["position"] == [0, 0, 0.14]
+
+
+def test_users_gripper_is_read_back(http: httpx.Client) -> None:
+    made = http.post("/grippers", json=MINE)
+    assert made.status_code == 201, made.text
+    assert made.headers["location"] == "/grippers/mine"
+    found = http.get("/grippers/mine")
+    assert found.json() == made.json()
+    profile = found.json()["profile"]
+    assert profile["base_to_tool"] == {"position": [0, 0, 0.12], "quaternion_xyzw": [0, 0, 0, 1]}
+    assert (profile["symmetric"], found.json()["builtin"]) == (False, False)
+    assert http.get("/grippers/mine", headers={"If-None-Match": found.headers["etag"]}).status_code == 304
+    assert http.post("/grippers", json=MINE).status_code == 409
+    assert [g["id"] for g in http.get("/grippers").json()["items"]] == ["mine", "panda", "pg70"]
+
+
+def test_grippers_come_in_pages(sqlite_http: httpx.Client) -> None:
+    first = sqlite_http.get("/grippers?limit=1").json()
+    second = sqlite_http.get("/grippers", params={"limit": 1, "cursor": first["next"]}).json()
+    assert [first["items"][0]["id"], second["items"][0]["id"], second["next"]] == ["panda", "pg70", None]
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"max_opening_m": 0}, "max_opening_m"),
+        ({"max_opening_m": -1}, "max_opening_m"),
+        ({"max_opening_m": 1e9}, "max_opening_m"),
+        ({"finger": {"width_m": 0.01, "thickness_m": 0.01}}, "finger.length_m"),
+        ({"palm_size_m": [0.1, 0.1]}, "palm_size_m.2"),
+        ({"tip_offset_m": 0.06}, "tip_offset_m"),
+        ({"force_n": "strong"}, "force_n"),
+        ({"fingers": 2}, "fingers"),
+        (
+            {"base_to_tool": {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]}},
+            "base_to_tool.quaternion_xyzw",
+        ),
+        ({"id": "no spaces"}, "id"),
+    ],
+)
+def test_bad_profile_names_its_field(sqlite_http: httpx.Client, change: dict[str, Any], field: str) -> None:
+    answer = sqlite_http.post("/grippers", json={**MINE, **change})
+    assert answer.status_code == 422
+    assert [error["field"] for error in answer.json()["errors"]] == [field]
+    assert len(sqlite_http.get("/grippers").json()["items"]) == 2
+
+
+def test_missing_gripper_is_404(http: httpx.Client) -> None:
+    for name in ("nope", "%00", "a%20b"):
+        assert http.get(f"/grippers/{name}").status_code == 404
+
+
+def _seed(url: str, barrier: Any) -> None:
+    database = Database(url)
+    barrier.wait()
+    seed(database)
+    database.dispose()
+
+
+def test_replicas_that_start_at_once_seed_once(database_url: str) -> None:
+    database = Database(database_url)
+    if database.is_sqlite:
+        upgrade(database)
+    spawn = multiprocessing.get_context("spawn")
+    barrier = spawn.Barrier(3)
+    target: Callable[..., None] = _seed
+    replicas = [spawn.Process(target=target, args=(database_url, barrier)) for _ in range(3)]
+    for replica in replicas:
+        replica.start()
+    for replica in replicas:
+        replica.join(60)
+        assert replica.exitcode == 0
+    with database.read() as tx:
+        assert [row.id for row in grippers.page(tx, after="", limit=10)] == ["panda", "pg70"]
+    database.dispose()
