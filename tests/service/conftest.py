@@ -47,7 +47,10 @@ def clusters() -> Callable[..., Poses]:
 @pytest.fixture(scope="session")
 def two_clusters() -> Poses:
     """300 grasps from above around (0, 0, 60) mm and 200 from the side around (-80, 0, 0) mm."""
-    top, side = _clusters([((0, 0, 0.06), DOWN)], 300, seed=1), _clusters([((-0.08, 0, 0), SIDE)], 200, seed=2)
+    top, side = (
+        _clusters([((0, 0, 0.06), DOWN)], 300, seed=1),
+        _clusters([((-0.08, 0, 0), SIDE)], 200, seed=2),
+    )
     return np.concatenate([top[0], side[0]]), np.concatenate([top[1], side[1]])
 
 

@@ -47,7 +47,9 @@ def put_box(http: httpx.Client, size: tuple[float, float, float] = BOX) -> Scene
 def best(http: httpx.Client, **query: Any) -> dict[str, Any]:
     """The answer to GET, which must equal the answer to POST."""
     joined = {
-        name: ",".join(map(repr, map(float, value))) if isinstance(value, (list, tuple, np.ndarray)) else value
+        name: ",".join(map(repr, map(float, value)))
+        if isinstance(value, (list, tuple, np.ndarray))
+        else value
         for name, value in query.items()
     }
     answer = http.get("/objects/thing/best-grasp", params=joined)

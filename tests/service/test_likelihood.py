@@ -249,7 +249,11 @@ def test_bad_options_name_the_field(
     pose = '{"position":[%s,0,0],"quaternion_xyzw":[0,0,0,1]}'
     for number in ("NaN", "Infinity", "1e999"):
         assert 400 <= raw('{"poses":[' + pose % number + "]}").status_code < 500
-        assert 400 <= raw('{"poses":{"position":[[%s,0,0]],"quaternion_xyzw":[[0,0,0,1]]}}' % number).status_code < 500
+        assert (
+            400
+            <= raw('{"poses":{"position":[[%s,0,0]],"quaternion_xyzw":[[0,0,0,1]]}}' % number).status_code
+            < 500
+        )
     for text in ("", "[]", '{"poses":[', "null", '"poses"'):
         assert 400 <= raw(text).status_code < 500
     assert raw('{"poses":[' + pose % "0" + "]}", "text/csv").status_code == 415

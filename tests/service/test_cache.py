@@ -1,0 +1,306 @@
+"""The densities kept by a service: made once, extended, rebuilt, bounded, never stale."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from graspdb_density import GraspDensity, IsotropicKernel, reference
+from graspdb_service.app import create_app
+from graspdb_service.problems import ProblemError
+from graspdb_service.settings import Settings
+from graspdb_service.usecases import densities as densities_module
+from graspdb_service.usecases.cache import SingleFlightCache
+from graspdb_service.usecases.compute import MAX_QUERIES, Compute
+from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.densities import Built, KernelChoice
+from graspdb_service.usecases.selection import Filters
+
+Floats = NDArray[np.float64]
+Poses = tuple[Floats, Floats]
+Post = Callable[..., dict[str, Any]]
+Make = Callable[..., str]
+
+DEFAULT = (Filters(), KernelChoice())
+KERNEL = IsotropicKernel(0.015, np.deg2rad(15))
+
+
+def part(poses: Poses, start: int, stop: int) -> Poses:
+    return poses[0][start:stop], poses[1][start:stop]
+
+
+@pytest.fixture
+def ctx(database_url: str, http: httpx.Client) -> Iterator[Context]:
+    """The parts of a second service process over the database of ``http``."""
+    context = create_app(Settings(database_url=database_url)).state.context
+    yield context
+    context.close()
+
+
+# -- the cache by itself -----------------------------------------------------------------------------------
+
+
+def test_single_flight() -> None:
+    cache = SingleFlightCache[str, bytes](1000, len)
+    made = []
+    gate = threading.Event()
+
+    def make(_: bytes | None) -> bytes:
+        made.append(1)
+        gate.wait(5)
+        return b"value"
+
+    with ThreadPoolExecutor(8) as pool:
+        answers = [pool.submit(cache.get, "key", lambda _: True, make) for _ in range(8)]
+        while not made:
+            time.sleep(0.001)
+        gate.set()
+        assert {answer.result() for answer in answers} == {b"value"}
+    assert len(made) == 1
+
+
+def test_a_failure_is_not_kept() -> None:
+    cache = SingleFlightCache[str, bytes](1000, len)
+
+    def fail(_: bytes | None) -> bytes:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError):
+        cache.get("key", lambda _: True, fail)
+    assert cache.get("key", lambda _: True, lambda before: b"yes" if before is None else b"no") == b"yes"
+    # What was there is kept where the next making fails.
+    with pytest.raises(ValueError):
+        cache.get("key", lambda _: False, fail)
+    assert cache.get("key", lambda _: True, fail) == b"yes"
+
+
+def test_least_recently_used_goes_first() -> None:
+    cache = SingleFlightCache[str, bytes](100, len)
+    made: list[str] = []
+
+    def get(key: str, size: int = 40) -> None:
+        def make(_: bytes | None) -> bytes:
+            made.append(key)
+            return bytes(size)
+
+        cache.get(key, lambda _: True, make)
+
+    get("a"), get("b"), get("a"), get("c")
+    assert cache.nbytes == 80
+    get("a")
+    assert made == ["a", "b", "c"]
+    get("b")
+    assert made == ["a", "b", "c", "b"]
+    # Too large to keep, but answered.
+    get("huge", 500)
+    assert made[-1] == "huge"
+    assert cache.nbytes <= 100
+
+
+def test_more_queries_than_places_are_refused() -> None:
+    compute = Compute(1)
+    places = [compute.admitted() for _ in range(MAX_QUERIES)]
+    for place in places:
+        place.__enter__()
+    with pytest.raises(ProblemError) as caught, compute.admitted():
+        pass
+    assert caught.value.status == 429
+    assert "Retry-After" in caught.value.headers
+    for place in places:
+        place.__exit__(None, None, None)
+    with compute.admitted():
+        pass
+    compute.close()
+
+
+# -- densities over a database -------------------------------------------------------------------------------
+
+
+def test_concurrent_first_requests_build_once(
+    http: httpx.Client,
+    ctx: Context,
+    make_object: Make,
+    post: Post,
+    two_clusters: Poses,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    make_object(http)
+    post(http, "thing", two_clusters)
+    builds = []
+    build = densities_module._build
+
+    def counted(*given: Any) -> Built:
+        builds.append(1)
+        time.sleep(0.05)
+        return build(*given)
+
+    monkeypatch.setattr(densities_module, "_build", counted)
+    with ThreadPoolExecutor(10) as pool:
+        found = list(pool.map(lambda _: ctx.densities.get("thing", *DEFAULT), range(10)))
+    assert len(builds) == 1
+    assert len({id(built) for built in found}) == 1
+    # Named or not, the only gripper there is means the same density.
+    named = ctx.densities.get("thing", Filters(), KernelChoice())
+    assert named is found[0]
+
+
+def test_extension_equals_rebuild_in_any_order_of_batches(
+    http: httpx.Client,
+    ctx: Context,
+    make_object: Make,
+    post: Post,
+    two_clusters: Poses,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Batches with and without proposal densities and grippers, failures between; one reader keeps pace."""
+    make_object(http)
+    reads: list[int] = []
+    read = densities_module.trials.read
+
+    def watched(*given: Any, **more: Any) -> Any:
+        reads.append(more["after_seq"])
+        return read(*given, **more)
+
+    monkeypatch.setattr(densities_module.trials, "read", watched)
+    rng = np.random.default_rng(4)
+    proposals: list[Floats] = []
+    done = 0
+    steps = [(120, None), (60, None), (1, 20.0), (100, 30.0), (80, 5.0), (39, None), (100, 12.0)]
+    last_seq = 0
+    for count, proposal in steps:
+        poses = part(two_clusters, done, done + count)
+        density = np.full(count, np.nan) if proposal is None else proposal * rng.uniform(0.5, 2, count)
+        proposals.append(density)
+        post(http, "thing", poses, proposal_density=density)
+        post(http, "thing", part(two_clusters, 0, 10), "failure")
+        done += count
+        built = ctx.densities.get("thing", *DEFAULT)
+        assert reads[-1] == last_seq  # The tail only.
+        last_seq = built.last_seq
+        assert built.density is not None
+        assert built.density.size == done
+        known = np.concatenate(proposals)
+        weights = np.ones(done)
+        if not np.isnan(known).all():
+            weights = np.where(np.isnan(known), np.nanmean(1 / known), 1 / known)
+        trials = part(two_clusters, 0, done)
+        fresh = GraspDensity.build(*trials, kernel=KERNEL, weights=weights)
+        np.testing.assert_allclose(
+            built.density.log_density(*two_clusters), fresh.log_density(*two_clusters), atol=1e-5
+        )
+        exact = reference.log_density(KERNEL, *trials, *two_clusters, weights=weights)
+        np.testing.assert_allclose(built.density.log_density(*two_clusters, cutoff=None), exact, atol=1e-4)
+        np.testing.assert_allclose(built.density.weights, weights / weights.sum(), rtol=1e-9)
+    assert len(reads) == len(steps)
+    # Nothing new: not even the tail is read.
+    assert ctx.densities.get("thing", *DEFAULT) is built
+    assert len(reads) == len(steps)
+
+
+def test_what_one_process_commits_is_in_the_others_next_answer(
+    database_url: str, serve: Callable[..., str], make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    with (
+        httpx.Client(base_url=serve(database_url), timeout=60) as one,
+        httpx.Client(base_url=serve(database_url), timeout=60) as two,
+    ):
+        make_object(one)
+        batches = []
+        for step in range(5):
+            writer, reader = (one, two) if step % 2 else (two, one)
+            receipt = post(writer, "thing", part(two_clusters, 100 * step, 100 * step + 100))
+            batches.append(receipt["batch"])
+            for client in (reader, writer):
+                info = client.get("/objects/thing/density").json()
+                assert (info["size"], info["revision"]) == (100 * step + 100, receipt["revision"])
+        body = {"poses": {"position": two_clusters[0].tolist(), "quaternion_xyzw": two_clusters[1].tolist()}}
+        answers = [c.post("/objects/thing/likelihood", json=body).json()["log_density"] for c in (one, two)]
+        np.testing.assert_allclose(answers[0], answers[1], atol=1e-5)
+
+        # Deleting a batch through one rebuilds in the other.
+        assert one.delete(f"/objects/thing/batches/{batches[1]}").status_code in (200, 204)
+        left = np.r_[0:100, 200:500]
+        exact = reference.log_density(KERNEL, two_clusters[0][left], two_clusters[1][left], *two_clusters)
+        for client in (two, one):
+            info = client.get("/objects/thing/density").json()
+            assert info["size"] == 400
+            assert info["epoch"] == info["revision"]
+            answer = client.post("/objects/thing/likelihood", json=body).json()
+            np.testing.assert_allclose(answer["log_density"], exact, atol=2e-3)
+
+
+def test_a_new_object_of_the_same_name_has_nothing_of_the_old(
+    http: httpx.Client, ctx: Context, make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    make_object(http)
+    post(http, "thing", two_clusters)
+    old = ctx.densities.get("thing", *DEFAULT)
+    assert http.delete("/objects/thing").status_code == 204
+    with pytest.raises(ProblemError) as caught:
+        ctx.densities.get("thing", *DEFAULT)
+    assert caught.value.status == 404
+    make_object(http)
+    new = ctx.densities.get("thing", *DEFAULT)
+    assert new.density is None
+    assert new.object_row.id != old.object_row.id
+
+
+def test_readers_never_lose_or_double_a_trial_while_others_write(
+    http: httpx.Client, ctx: Context, make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    make_object(http)
+    stop = threading.Event()
+    wrong: list[str] = []
+
+    def read() -> None:
+        size = 0
+        while not stop.is_set():
+            built = ctx.densities.get("thing", *DEFAULT)
+            now = 0 if built.density is None else built.density.size
+            if now < size or now != built.selected.successes or len(np.unique(built.seq)) != now:
+                wrong.append(f"{now} after {size}, {built.selected.successes} counted")
+            size = now
+
+    readers = [threading.Thread(target=read) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    with ThreadPoolExecutor(4) as writers:
+        for answer in [
+            writers.submit(post, http, "thing", part(two_clusters, i, i + 20)) for i in range(0, 500, 20)
+        ]:
+            answer.result()
+    stop.set()
+    for reader in readers:
+        reader.join()
+    assert wrong == []
+    final = ctx.densities.get("thing", *DEFAULT)
+    assert final.density is not None
+    assert final.density.size == 500
+
+
+def test_the_cache_is_bounded_by_bytes(
+    database_url: str, http: httpx.Client, make_object: Make, post: Post, clusters: Callable[..., Poses]
+) -> None:
+    make_object(http)
+    post(http, "thing", clusters([((0, 0, 0), (0, 0, 0, 1.0))], 4000))
+    settings = Settings(database_url=database_url, max_density_cache_bytes=2**21)
+    context = create_app(settings).state.context
+    try:
+        widths = [0.01 + 0.001 * i for i in range(12)]
+        for width in widths:
+            built = context.densities.get("thing", Filters(), KernelChoice(width, 15.0))
+            assert built.density is not None
+            assert context.densities.nbytes <= 2**21
+        assert 1 <= len(context.densities) < len(widths)
+        again = context.densities.get("thing", Filters(), KernelChoice(widths[-1], 15.0))
+        assert again is built
+    finally:
+        context.close()
