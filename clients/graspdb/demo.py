@@ -34,8 +34,8 @@ from graspdb.sweeps import OutcomeArrays, Sweep, SweepBar, duration
 
 __all__ = ["Children", "DemoFailed", "demo", "wilson_interval"]
 
-MAX_POSES = 400_000
-"""A random part of the mug's grid: enough for some thousands of successes, and a few minutes of two cores."""
+MAX_POSES = 600_000
+"""A random part of the mug's grid: enough for thousands of successes in one to five minutes of two cores."""
 DRAWS = 100
 BEST = 10
 LEVEL = 0.90
@@ -96,15 +96,21 @@ class Children:
 
     def stop(self) -> None:
         """Ask the last started first, then kill what is left of each one's session."""
-        for _, process in reversed(self._running):
-            if process.poll() is None:
-                process.terminate()
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(STOP_S)
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        self._running.clear()
+        # Ignored meanwhile: a second Ctrl-C would leave some of them running.
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            for _, process in reversed(self._running):
+                if process.poll() is None:
+                    process.terminate()
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        process.wait(STOP_S)
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+            self._running.clear()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
@@ -143,7 +149,8 @@ def demo(
     ] = None,
 ) -> None:
     """From nothing to a best grasp: service, worker, real physics, density, queries and a check of them."""
-    console = Console(highlight=False)
+    # A log gets whole lines, a terminal lines broken between words.
+    console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     names = [name.strip() for name in objects.split(",") if name.strip()]
     started = time.monotonic()
 
@@ -215,7 +222,7 @@ def _running(
                         raise DemoFailed(f"no answer in {START_S:g} s:\n{children.log('graspdb-server')}")
                     time.sleep(0.1)
         children.start("graspdb-simworker", "run", "--url", url, "--processes", str(processes))
-        console.print(f"The service answers at {url} (docs: {url}/docs), on SQLite in {folder}.")
+        console.print(f"The service answers at {url} (docs: {url}/docs), on SQLite in {escape(str(folder))}.")
         console.print(f"A worker with {processes} simulating process{'es' * (processes > 1)} runs beside it.")
         with Client(url) as db:
             try:
@@ -276,7 +283,10 @@ def _grasp_example(db: Client, children: Children, name: str, max_poses: int, co
     console.print(f"\n[bold]Best grasp overall[/]\n{_grasp(item.best_grasp())}")
     console.print(f"\n{_in_workspace(item)}\n")
     shares = _check(item, children, console)
-    return f"[bold]{item.id}[/]: {successes:,} successes of {info.poses_done:,} poses; {shares}"
+    return (
+        f"[bold]{item.id}[/]: {successes:,} successes of {info.poses_done:,} poses.\n"
+        f"  At the fine time step: {shares}."
+    )
 
 
 def _counts(outcomes: dict[str, int]) -> str:
@@ -286,7 +296,7 @@ def _counts(outcomes: dict[str, int]) -> str:
 
 
 def _grasp(grasp: Grasp) -> str:
-    return "\n".join(f"  {name}: {escape(value)}" for name, value in grasp.summary().items())
+    return "\n".join(f"  {escape(name)}: {escape(value)}" for name, value in grasp.summary().items())
 
 
 def _in_workspace(item: GraspObject) -> str:
@@ -321,7 +331,9 @@ def _check(item: GraspObject, children: Children, console: Console) -> str:
         check = item.sweep(poses=poses, fidelity="fine", purpose="check")
         outcomes = _wait(check, children, f"check {title}").outcomes()
         found[title] = outcomes
-        console.print(f"Of {len(outcomes)} {title}, simulated at the fine time step: {_share(outcomes)}.")
+        console.print(
+            f"Of {len(outcomes)} {title}, simulated at the fine time step, {_share(outcomes)} hold."
+        )
     shares = {title: float(np.mean(outcomes.success)) for title, outcomes in found.items()}
     top = shares["best distinct grasps"]
     if top < 0.8:
@@ -331,14 +343,14 @@ def _check(item: GraspObject, children: Children, console: Console) -> str:
             " More --max-poses may help.[/]"
         )
     return "; ".join(
-        f"{_share(outcomes)} of the {len(outcomes)} {title}" for title, outcomes in found.items()
+        f"{_share(outcomes)} of {len(outcomes)} {title} hold" for title, outcomes in found.items()
     )
 
 
 def _share(outcomes: OutcomeArrays) -> str:
     count, total = int(outcomes.success.sum()), len(outcomes)
     low, high = wilson_interval(count, total)
-    return f"{count / total:.2f} succeed ({100 * LEVEL:.0f} % interval {low:.2f} to {high:.2f})"
+    return f"{count} ({count / total:.2f}; {100 * LEVEL:.0f} % interval {low:.2f} to {high:.2f})"
 
 
 def _hold(db: Client, children: Children, name: str, console: Console) -> None:
@@ -349,6 +361,7 @@ def _hold(db: Client, children: Children, name: str, console: Console) -> None:
         f"  curl '{db.url}/objects/{name}/best-grasp?approach=0,0,-1&approach_cone_deg=45'\n"
         f"and in a browser {db.url}/docs"
     )
-    while True:
-        children.check()
-        time.sleep(0.5)
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            children.check()
+            time.sleep(0.5)

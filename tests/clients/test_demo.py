@@ -1,0 +1,101 @@
+"""The demo: the whole chain as processes, and what it leaves behind when something goes wrong."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from scipy import optimize, stats
+
+from graspdb.demo import Children, DemoFailed, wilson_interval
+
+GRASPDB = str(Path(sys.executable).with_name("graspdb"))
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (3, 10), (10, 10), (80, 100)])
+def test_wilson_interval_inverts_the_score_test(successes: int, trials: int) -> None:
+    low, high = wilson_interval(successes, trials, 0.9)
+    z = stats.norm.ppf(0.95)
+    share = successes / trials
+
+    def score(p: float) -> float:
+        return (share - p) ** 2 - z**2 * p * (1 - p) / trials
+
+    assert low == pytest.approx(0 if successes == 0 else optimize.brentq(score, 0, share - 1e-9))
+    assert high == pytest.approx(1 if successes == trials else optimize.brentq(score, share + 1e-9, 1))
+
+
+def test_no_trials_have_no_interval() -> None:
+    for successes, trials in ((0, 0), (2, 1), (-1, 3)):
+        with pytest.raises(ValueError):
+            wilson_interval(successes, trials)
+
+
+def _alive(text: str) -> list[str]:
+    """Command lines of running processes that contain the text."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            line = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:
+            continue
+        if text in line and str(os.getpid()) != path.parent.name:
+            found.append(line)
+    return found
+
+
+def test_from_nothing_to_checked_grasps(tmp_path: Path) -> None:
+    arguments = ["demo", "--folder", str(tmp_path), "--max-poses", "20000", "--processes", "1"]
+    done = subprocess.run([GRASPDB, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    out = done.stdout
+    assert "Simulated 20,000 poses" in out
+    assert out.index("Best grasp overall") < out.index("Best grasp in a workspace")
+    assert re.search(
+        r"Of 100 draws from the density, .* \d+ \(0\.\d\d; 90 % interval 0\.\d\d to 0\.\d\d\)", out
+    )
+    (best,) = re.findall(r"Of \d+ best distinct grasps, .*?, \d+ \(([01]\.\d\d);", out)
+    assert float(best) >= 0.5
+    assert "/docs" in out
+    assert not _alive(str(tmp_path))
+
+
+def test_stopped_in_the_middle_it_leaves_no_process(tmp_path: Path) -> None:
+    arguments = [GRASPDB, "demo", "--folder", str(tmp_path), "--max-poses", "2000000", "--processes", "1"]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    worker_log = tmp_path / "graspdb-simworker.log"
+    deadline = time.monotonic() + 60
+    while not worker_log.exists():
+        assert time.monotonic() < deadline
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    port = re.findall(r"--port (\d+)", " ".join(_alive(str(tmp_path))))[0]
+    assert _alive(f"--url http://127.0.0.1:{port} --processes")
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Interrupted" in out
+    assert not _alive(str(tmp_path))
+    assert not _alive(f"--url http://127.0.0.1:{port} --processes")
+
+
+def test_a_child_that_fails_is_reported_with_its_last_lines(tmp_path: Path) -> None:
+    children = Children(tmp_path)
+    children.start("graspdb-server", "serve", "--database-url", "mysql://nowhere/x")
+    try:
+        deadline = time.monotonic() + 30
+        while "not supported" not in children.log("graspdb-server") and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(1)
+        with pytest.raises(DemoFailed, match="graspdb-server ended with exit code") as caught:
+            children.check()
+        assert children.log("graspdb-server") in str(caught.value)
+        assert "wrote nothing" not in str(caught.value)
+    finally:
+        children.stop()
