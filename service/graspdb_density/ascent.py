@@ -38,32 +38,46 @@ def score_centres(
     its own kernel loses on the way into the region. ``turned`` says where the jaw's twin is nearer to a
     signed closing cone.
     """
-    twin = np.empty(4)
     signed = cones[8] > 0.5 and cones[7] >= 0.0
-    conic = cones[3] >= 0.0 or cones[7] >= 0.0
     linear = planes.shape[0] + spheres.shape[0] > 0
+    # Most centres are far outside a cone: a cosine tells without an arc cosine.
+    least_approach = math.cos(min(cones[3] + reach, math.pi)) if cones[3] >= 0.0 else -2.0
+    least_closing = math.cos(min(cones[7] + reach, math.pi)) if cones[7] >= 0.0 else -2.0
     for j in range(positions.shape[0]):
         scores[j] = -np.inf
         turned[j] = False
         away, angle = 0.0, 0.0
+        x, y, z, w = quaternions[j, 0], quaternions[j, 1], quaternions[j, 2], quaternions[j, 3]
+        if cones[3] >= 0.0:
+            dot = (
+                cones[0] * 2.0 * (x * z + y * w)
+                + cones[1] * 2.0 * (y * z - x * w)
+                + cones[2] * (1.0 - 2.0 * (x * x + y * y))
+            )
+            if dot < least_approach:
+                continue
+            angle = math.acos(min(max(dot, -1.0), 1.0)) - cones[3]
+        if cones[7] >= 0.0:
+            dot = (
+                cones[4] * 2.0 * (x * y - z * w)
+                + cones[5] * (1.0 - 2.0 * (x * x + z * z))
+                + cones[6] * 2.0 * (y * z + x * w)
+            )
+            if dot < 0.0 and (not signed or twins[j]):
+                # Without a sign, or for a jaw whose fingers may be exchanged, the axis has two ends.
+                dot = -dot
+                turned[j] = signed
+            if dot < least_closing:
+                continue
+            angle = max(angle, math.acos(min(max(dot, -1.0), 1.0)) - cones[7])
         if linear:
             away = max(projection.position_excess(planes, spheres, positions[j]), 0.0)
             if away > reach_m:
                 continue
-        if conic:
-            angle = max(projection.cone_excess(cones, quaternions[j]), 0.0)
-            if signed and angle > 0.0 and twins[j]:
-                q = quaternions[j]
-                twin[0], twin[1], twin[2], twin[3] = q[1], -q[0], q[3], -q[2]
-                other = max(projection.cone_excess(cones, twin), 0.0)
-                if other < angle:
-                    angle = other
-                    turned[j] = True
-            if angle > reach:
-                continue
-        scores[j] = (
-            math.log(max(sums[j], 1e-300)) - 0.5 * (away / sigma) ** 2 - kappa * (1.0 - math.cos(0.5 * angle))
-        )
+        loss = 0.5 * (away / sigma) ** 2
+        if angle > 0.0:
+            loss += kappa * (1.0 - math.cos(0.5 * angle))
+        scores[j] = math.log(max(sums[j], 1e-300)) - loss
 
 
 @exact

@@ -150,11 +150,50 @@ def _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
 
 
 @fast
-def _moments_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, sums):
+def _moments_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sums):
+    """As `_moments_wide` with the nearest of twins and antipodes standing for all."""
+    s = _ZERO
+    sx, sy, sz = _ZERO, _ZERO, _ZERO
+    m0, m1, m2, m3 = _ZERO, _ZERO, _ZERO, _ZERO
+    rr = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        r2 = dx * dx + dy * dy + dz * dz
+        u0, u1, u2, u3 = data[3, i], data[4, i], data[5, i], data[6, i]
+        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
+        b = (u0 * qy - u1 * qx + u2 * qw - u3 * qz) * twin
+        own = abs(a) >= abs(b)
+        near = a if own else b
+        k = data[7, i] * _exp(abs(near) - kappa - r2)
+        g = k if near >= _ZERO else -k
+        ga = g if own else _ZERO
+        gb = _ZERO if own else g
+        s += k
+        sx += k * dx
+        sy += k * dy
+        sz += k * dz
+        m0 += ga * u0 - gb * u1
+        m1 += ga * u1 + gb * u0
+        m2 += ga * u2 - gb * u3
+        m3 += ga * u3 + gb * u2
+        rr += k * r2
+    sums[0] += s
+    sums[1] += sx
+    sums[2] += sy
+    sums[3] += sz
+    sums[4] += m0
+    sums[5] += m1
+    sums[6] += m2
+    sums[7] += m3
+    sums[8] += rr
+
+
+@fast
+def _moments_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sums):
     """Add to ``sums`` (9,): k, k (p_i - p), the signed pull k mu_i of the quaternion, and k r^2, scaled
     units.
-
-    ``wide`` is 1 to sum both twins and antipodes, 0 to take the nearest only.
     """
     s = _ZERO
     sx, sy, sz = _ZERO, _ZERO, _ZERO
@@ -172,9 +211,9 @@ def _moments_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide
         w = data[7, i]
         large, small = max(abs(a), abs(b)), min(abs(a), abs(b))
         k1 = w * _exp(base + large)
-        k2 = w * wide * twin * _exp(base + small)
-        k3 = w * wide * _exp(base - large)
-        k4 = w * wide * twin * _exp(base - small)
+        k2 = w * twin * _exp(base + small)
+        k3 = w * _exp(base - large)
+        k4 = w * twin * _exp(base - small)
         own_near = abs(a) >= abs(b)
         ga = (k1 - k3) if own_near else (k2 - k4)
         gb = (k2 - k4) if own_near else (k1 - k3)
@@ -283,11 +322,10 @@ def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
 
 @fast
 def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums):
-    """Fill ``sums`` (9,) with the moments of `_moments_run` over the kernels within ``radius``."""
+    """Fill ``sums`` (9,) with the moments of `_moments_wide` over the kernels within ``radius``."""
     fx, fy, fz = F32(px), F32(py), F32(pz)
     k = F32(kappa)
     q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
-    every = F32(1.0) if wide > 0 else F32(0.0)
     sums[:] = 0.0
     for s in range(table.shape[0]):
         twin = F32(table[s, TWIN])
@@ -295,7 +333,10 @@ def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sum
             begin, end = runs[r, 0], runs[r, 1]
             while begin < end:
                 stop = min(begin + BLOCK, end)
-                _moments_run(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, every, sums)
+                if wide > 0:
+                    _moments_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, sums)
+                else:
+                    _moments_narrow(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, sums)
                 begin = stop
 
 

@@ -33,9 +33,11 @@ Admissible = Callable[[Floats, Floats], NDArray[np.bool_]]
 #: standard deviations.
 REACH = 4.0
 _STARTS = 24
-_STEPS = 48
+#: All starts climb a few steps; those that then are near the best climb on.
+_FIRST_STEPS, _STEPS = 8, 48
+_PROMISING, _FINALISTS = 0.9, 8
 _TOLERANCE = 2e-3
-_SHORTLIST = 4096
+_SHORTLIST = 1024
 #: Poses shown to ``admissible`` at a time and in all while looking for starts.
 _BATCH = 64
 _MOST_CHECKS = 8192
@@ -142,7 +144,7 @@ class _Search:
         starts = self.starts(max(_STARTS, 3 * count))
         if not len(starts):
             return []
-        pool, ends = self.climbed(starts)
+        pool, ends = self.climbed(starts, max(_FINALISTS, 2 * count))
         pool = starts.joined(pool).sort()
         chosen: list[int] = []
         if self.admissible is not None and len(ends):
@@ -240,27 +242,34 @@ class _Search:
         for_blocks(work, density.size, block=16_384, threads=self.threads)
         return scores, turned
 
-    def climbed(self, starts: _Pool) -> tuple[_Pool, _Pool]:
+    def climbed(self, starts: _Pool, finalists: int) -> tuple[_Pool, _Pool]:
         """Every pose passed while climbing, and the ends."""
+        passed, ends = self.climb(starts, _FIRST_STEPS)
+        if not len(ends):
+            return passed, ends
+        ends = ends.sort()
+        promising = int(np.sum(ends.sums >= _PROMISING * ends.sums[0]))
+        on, last = self.climb(ends.take(np.arange(min(promising, finalists))), _STEPS)
+        return passed.joined(on), last
+
+    def climb(self, starts: _Pool, steps: int) -> tuple[_Pool, _Pool]:
         density, region, cells = self.density, self.region, self.density.cells
-        path = np.empty((len(starts), _STEPS, ascent.PATH))
+        path = np.empty((len(starts), steps, ascent.PATH))
         lengths = np.empty(len(starts), dtype=np.int64)
 
         def work(begin: int, end: int) -> None:
             part = slice(begin, end)
             ascent.climb(
                 cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                region.planes, region.balls, region.cones, density.kernel.kappa, REACH / math.sqrt(2.0),
-                density.wide, starts.positions[part], starts.quaternions[part], _TOLERANCE, path[part],
-                lengths[part],
+                region.planes, region.balls, region.cones,
+                density.kernel.kappa, REACH / math.sqrt(2.0), density.wide,
+                starts.positions[part], starts.quaternions[part], _TOLERANCE, path[part], lengths[part],
             )  # fmt: skip
 
         for_blocks(work, len(starts), block=4, threads=self.threads)
-        steps = np.arange(_STEPS)
-        passed = path[steps[None, :] < lengths[:, None]]
+        passed = path[np.arange(steps)[None, :] < lengths[:, None]]
         moved = np.flatnonzero(lengths)
-        ends = path[moved, lengths[moved] - 1]
-        return _pool_of(passed), _pool_of(ends)
+        return _pool_of(passed), _pool_of(path[moved, lengths[moved] - 1])
 
     def check(self, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
         assert self.admissible is not None

@@ -21,7 +21,14 @@ import numpy as np
 
 from .compiler import exact
 
-__all__ = ["cone_excess", "position_excess", "project_all", "project_position", "project_rotation"]
+__all__ = [
+    "cone_excess",
+    "contains_all",
+    "position_excess",
+    "project_all",
+    "project_position",
+    "project_rotation",
+]
 
 
 #: Projections aim this far inside, so that rounding does not leave them outside. Metres; radians.
@@ -249,6 +256,16 @@ def project_position(planes, spheres, p):
         if moved < 1e-12 or (sweep > 20 and position_excess(planes, spheres, p) <= 0.0 and moved < 1e-7):
             break
     return position_excess(planes, spheres, p) <= 2.0 * MARGIN_M
+
+
+@exact
+def contains_all(planes, spheres, cones, positions, quaternions, tolerance_m, tolerance, inside):
+    """Which poses (M,) are inside, within the tolerances."""
+    for j in range(positions.shape[0]):
+        inside[j] = (
+            position_excess(planes, spheres, positions[j]) <= tolerance_m
+            and cone_excess(cones, quaternions[j]) <= tolerance
+        )
 
 
 @exact

@@ -101,11 +101,7 @@ class Region:
         """Which poses (M,) lie inside, within 2e-9 m and 1e-7 rad."""
         p, q = se3.as_poses(positions, quaternions_xyzw)
         inside = np.empty(len(p), dtype=bool)
-        for j in range(len(p)):
-            inside[j] = (
-                projection.position_excess(self.planes, self.balls, p[j]) <= TOLERANCE_M
-                and projection.cone_excess(self.cones, q[j]) <= TOLERANCE
-            )
+        projection.contains_all(self.planes, self.balls, self.cones, p, q, TOLERANCE_M, TOLERANCE, inside)
         return inside
 
     def project(
