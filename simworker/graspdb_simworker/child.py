@@ -26,11 +26,15 @@ def main() -> int:
     # An interrupt at the terminal is for the worker, who ends its children itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    complaints = os.dup(2)
+    os.dup2(null, 2)  # pybullet greets on the standard error
     try:
         from graspdb_simworker import serving
     except ImportError as error:
         messages.send(sink, messages.MISSING, str(error).encode())
         return 2
+    finally:
+        os.dup2(complaints, 2)
     try:
         serving.serve(source, sink)
     except messages.Closed:

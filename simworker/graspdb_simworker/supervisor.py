@@ -211,6 +211,8 @@ class _Attempt:
                 silence = START_SECONDS if self.simulating is None else self._pose_s + 5.0
                 kind, body = messages.receive(_fd(self._process.stdout), silence_s=silence, check=self._check)
                 self.heard += 1
+                # Here too: a busy child leaves no silence in which to ask.
+                self._check()
                 if kind == messages.BEFORE:
                     self.simulating = messages.unpack_row(body)
                 elif kind == messages.AFTER:

@@ -1,0 +1,167 @@
+"""Children that die, hang or are not wanted any more; real processes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graspdb.examples import example
+from graspdb.wire import SimulatePayload
+from graspdb_simworker import chunks, messages, supervisor
+from graspdb_simworker.labels import Label, Outcome
+from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
+
+MakePayload = Callable[..., SimulatePayload]
+GetWorkpiece = Callable[..., chunks.Workpiece]
+FindPoses = Callable[[str, int], list[tuple[Any, Any]]]
+FAULTY = (sys.executable, str(Path(__file__).with_name("faulty_child.py")))
+
+
+@pytest.fixture(scope="module")
+def mug_glb() -> bytes:
+    return example("mug").parts_glb()
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.02)
+
+
+def alive(pid: int) -> bool:
+    with contextlib.suppress(FileNotFoundError):
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    return False
+
+
+def test_a_child_gives_the_bytes_of_this_process_and_so_does_the_next(
+    payload_of: MakePayload, workpiece_of: GetWorkpiece, mug_glb: bytes
+) -> None:
+    payload = payload_of("mug", stop=2_000)
+    here = chunks.simulate_chunk(payload, workpiece_of("mug"))
+    seen: list[int] = []
+    with Child(recycle_chunks=2) as child:
+        results = []
+        pids = []
+        for _ in range(3):
+            results.append(child.run(payload, mug_glb, progress=seen.append))
+            pids.append(child.pid)
+    # The parts travelled as GLB, in float32: the same labels, and widths within its rounding of a micrometre.
+    assert results[0] == results[1] == results[2]
+    assert pids[0] is not None
+    assert pids[1] is None, "recycled after two chunks"
+    assert pids[2] not in (None, pids[0])
+    assert results[0].rows.pose_index == here.rows.pose_index
+    different = np.frombuffer(results[0].outcomes, np.uint8) != np.frombuffer(here.outcomes, np.uint8)
+    assert different.mean() < 0.002
+    assert seen == list(range(1, len(here.rows.pose_index) + 1)) * 3
+
+
+@pytest.mark.parametrize("how", ["crash", "hang"])
+def test_a_deadly_pose_is_a_simulation_error_and_the_rest_goes_on(
+    payload_of: MakePayload, physical_poses: FindPoses, mug_glb: bytes, how: str
+) -> None:
+    poses = physical_poses("mug", 12)
+    payload = payload_of("mug", poses=poses)
+    with Child() as child:
+        healthy = child.run(payload, mug_glb)
+    deadly = poses[7][0]
+    with Child((*FAULTY, how, *map(repr, deadly)), pose_s=1.0) as child:
+        result = child.run(payload, mug_glb)
+    hit = np.array([np.allclose(p, deadly) for p, _ in poses])
+    found, expected = (np.frombuffer(r.outcomes, np.uint8) for r in (result, healthy))
+    assert hit[7]
+    assert (found[hit] == Outcome.SIMULATION_ERROR).all()
+    np.testing.assert_array_equal(found[~hit], expected[~hit])
+    assert result.rows.pose_index == healthy.rows.pose_index
+    assert result.rows.width_m[7] is None
+    assert [q for q, dead in zip(result.rows.quality, hit, strict=True) if not dead] == [
+        q for q, dead in zip(healthy.rows.quality, hit, strict=True) if not dead
+    ]
+
+
+def test_what_a_chunk_raises_is_its_failure_and_the_child_lives_on(
+    payload_of: MakePayload, physical_poses: FindPoses, mug_glb: bytes
+) -> None:
+    poses = physical_poses("mug", 3)
+    with Child((*FAULTY, "raise", *map(repr, poses[1][0]))) as child:
+        with pytest.raises(ChunkFailed, match="RuntimeError: the parts make no sense"):
+            child.run(payload_of("mug", poses=poses), mug_glb)
+        assert len(child.run(payload_of("mug", poses=poses[:1]), mug_glb).outcomes) == 1
+        with pytest.raises(ChunkFailed, match="GLB"):
+            child.run(payload_of("mug", poses=poses[:1], parts_sha256="other"), b"no GLB at all")
+
+
+def test_a_child_that_dies_at_once_fails_the_chunk(payload_of: MakePayload, mug_glb: bytes) -> None:
+    with Child((*FAULTY, "start")) as child, pytest.raises(ChunkFailed, match="exit code 3"):
+        child.run(payload_of("mug", stop=10), mug_glb)
+
+
+def test_a_missing_pybullet_is_told_apart(payload_of: MakePayload, mug_glb: bytes) -> None:
+    script = "import sys; sys.modules['pybullet'] = None; from graspdb_simworker import child; sys.exit(child.main())"
+    with Child((sys.executable, "-c", script)) as child, pytest.raises(PybulletMissing, match="pybullet"):
+        child.run(payload_of("mug", stop=10), mug_glb)
+
+
+def test_a_chunk_that_is_not_wanted_any_more_kills_its_child(payload_of: MakePayload, mug_glb: bytes) -> None:
+    lost = threading.Event()
+    with Child() as child:
+        pids: list[int | None] = []
+
+        def progress(done: int) -> None:
+            pids.append(child.pid)
+            lost.set()
+
+        with pytest.raises(Cancelled):
+            child.run(
+                payload_of("mug", stop=100_000), mug_glb, wanted=lambda: not lost.is_set(), progress=progress
+            )
+        assert pids[0] is not None
+        assert not alive(pids[0])
+        assert child.pid is None
+        # And the next chunk gets a new one.
+        assert len(child.run(payload_of("mug", stop=50), mug_glb).outcomes) == 50
+
+
+def test_a_child_whose_worker_is_gone_ends_itself(payload_of: MakePayload, mug_glb: bytes) -> None:
+    process = subprocess.Popen(supervisor.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    assert messages.receive(process.stdout.fileno(), silence_s=60.0)[0] == messages.READY
+    chunk = messages.Chunk(payload_of("mug", stop=100_000).model_dump_json(), {}, 10.0, mug_glb)
+    messages.send(process.stdin.fileno(), messages.CHUNK, messages.pack_chunk(chunk))
+    assert messages.receive(process.stdout.fileno(), silence_s=60.0)[0] == messages.BEFORE
+    # In mid-chunk the pipes close, as they do when a worker is killed.
+    process.stdin.close()
+    process.stdout.close()
+    wait_for(lambda: process.poll() is not None)
+
+
+def test_messages_survive_the_pipe_and_broken_pipes_are_noticed() -> None:
+    reader, writer = os.pipe()
+    big = os.urandom(3 << 20)
+    thread = threading.Thread(target=messages.send, args=(writer, messages.RESULT, big))
+    thread.start()
+    assert messages.receive(reader, silence_s=10.0) == (messages.RESULT, big)
+    thread.join()
+    with pytest.raises(messages.Silent):
+        messages.receive(reader, silence_s=0.1, poll_s=0.02)
+    os.close(writer)
+    with pytest.raises(messages.Closed):
+        messages.receive(reader)
+    os.close(reader)
+    label = Label(Outcome.SLIPPED, 0.0125, 0.0)
+    assert messages.unpack_label(messages.pack_label(2**40, label)) == (2**40, label)
+    chunk = messages.Chunk("{}", {3: label}, 2.5, b"glb")
+    assert messages.unpack_chunk(messages.pack_chunk(chunk)) == chunk
