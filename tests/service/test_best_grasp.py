@@ -149,7 +149,7 @@ def test_world_frame_equals_object_frame(thing: httpx.Client) -> None:
     shift, turn = np.array([0.5, -0.3, 0.8]), se3.normalise(rng.normal(size=4))
     object_pose = [*shift, *turn]
     top = shift + se3.rotate(turn, np.array([0, 0, 0.06]))
-    lower, upper = top + [-0.1, -0.1, 0.005], top + [0.1, 0.1, 0.1]
+    lower, upper = top + np.array([-0.1, -0.1, 0.005]), top + np.array([0.1, 0.1, 0.1])
     plane_normal = se3.rotate(turn, np.array([1.0, 0, 0]))
     query = {
         "object_pose": object_pose,
@@ -382,7 +382,7 @@ def test_bad_requests_name_the_field(
             value = ",".join(["0"] * (width - 1) + [bad])
             named = fields(http.get(path, params={name: value, "approach_cone_deg": 10}))
             assert any(item.split(".")[0] == name for item in named), (name, bad, named)
-        raw = '{"%s": [%s]}' % (name, ",".join(["0"] * (width - 1) + ["1e999"]))
+        raw = f'{{"{name}": [{",".join(["0"] * (width - 1) + ["1e999"])}]}}'
         answer = http.post(path, content=raw, headers={"Content-Type": "application/json"})
         assert answer.status_code == 422, raw
     assert http.get("/objects/none/best-grasp").status_code == 404

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import httpx
@@ -17,7 +18,7 @@ Make = Callable[..., str]
 
 def split(poses: Poses, *sizes: int) -> list[Poses]:
     edges = np.cumsum([0, *sizes])
-    return [(poses[0][a:b], poses[1][a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(poses[0][a:b], poses[1][a:b]) for a, b in pairwise(edges)]
 
 
 def problem(answer: httpx.Response, status: int) -> dict[str, Any]:

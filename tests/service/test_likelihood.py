@@ -246,17 +246,15 @@ def test_bad_options_name_the_field(
     def raw(text: str, media: str = "application/json") -> httpx.Response:
         return http.post(path, content=text.encode(), headers={"Content-Type": media})
 
-    pose = '{"position":[%s,0,0],"quaternion_xyzw":[0,0,0,1]}'
     for number in ("NaN", "Infinity", "1e999"):
-        assert 400 <= raw('{"poses":[' + pose % number + "]}").status_code < 500
-        assert (
-            400
-            <= raw('{"poses":{"position":[[%s,0,0]],"quaternion_xyzw":[[0,0,0,1]]}}' % number).status_code
-            < 500
-        )
+        position = f"[{number},0,0]"
+        row = '{"position":' + position + ',"quaternion_xyzw":[0,0,0,1]}'
+        assert 400 <= raw('{"poses":[' + row + "]}").status_code < 500
+        held = '{"position":[' + position + '],"quaternion_xyzw":[[0,0,0,1]]}'
+        assert 400 <= raw('{"poses":' + held + "}").status_code < 500
     for text in ("", "[]", '{"poses":[', "null", '"poses"'):
         assert 400 <= raw(text).status_code < 500
-    assert raw('{"poses":[' + pose % "0" + "]}", "text/csv").status_code == 415
+    assert raw(json.dumps({"poses": poses}), "text/csv").status_code == 415
     assert fields(http.get(f"{path}?position=0,0&quaternion_xyzw=0,0,0,1"))
     assert fields(http.get(f"{path}?position=0,0,nan&quaternion_xyzw=0,0,0,1"))
     assert fields(http.get(f"{path}?position=0,0,0")) == {"quaternion_xyzw"}
@@ -282,7 +280,7 @@ def test_livez_answers_while_a_heavy_query_runs(
     centres = [(tuple(c), (1.0, 0.0, 0.0, 0.0)) for c in rng.normal(size=(40, 3)) * 0.02]
     poses = clusters(centres, 250)
     post(sqlite_http, "thing", poses)
-    rows = np.resize(np.arange(len(poses[0])), 200_000)
+    rows = np.resize(np.arange(len(poses[0])), 60_000)
     body = json.dumps({"poses": columns((poses[0][rows], poses[1][rows])), "include": ["relative"]}).encode()
     done = threading.Event()
     statuses: list[int] = []
