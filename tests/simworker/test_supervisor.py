@@ -109,7 +109,10 @@ def test_a_child_that_dies_at_once_fails_the_chunk(payload_of: MakePayload, mug_
 
 
 def test_a_missing_pybullet_is_told_apart(payload_of: MakePayload, mug_glb: bytes) -> None:
-    script = "import sys; sys.modules['pybullet'] = None; from graspdb_simworker import child; sys.exit(child.main())"
+    script = (
+        "import sys; sys.modules['pybullet'] = None;"
+        " from graspdb_simworker import child; sys.exit(child.main())"
+    )
     with Child((sys.executable, "-c", script)) as child, pytest.raises(PybulletMissing, match="pybullet"):
         child.run(payload_of("mug", stop=10), mug_glb)
 
