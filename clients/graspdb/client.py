@@ -71,9 +71,7 @@ class Client:
 
     def workers(self) -> list[wire.WorkerInfo]:
         """The simulation workers that have asked for jobs."""
-        answer = self._transport.json("GET", "/workers")
-        items = answer["items"] if isinstance(answer, dict) else answer
-        return [wire.WorkerInfo.model_validate(item) for item in items]
+        return list(Listing(self._transport, "/workers", wire.WorkerInfo))
 
     def add_example(self, name: str) -> GraspObject:
         """Create one of the paper's objects: ``cone``, ``elongated-d``, ``screwdriver`` or ``mug``.

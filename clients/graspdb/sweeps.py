@@ -32,6 +32,7 @@ __all__ = ["OutcomeArrays", "Sweep", "SweepBar", "Sweeps", "create_sweep", "dura
 ProgressCallback = Callable[[wire.SweepInfo], None]
 FINISHED = frozenset({"done", "failed", "cancelled"})
 _WORKER_SILENT_S = 30.0
+_OUTCOMES_PAGE = 50_000
 _FIRST_POLL_S, _LAST_POLL_S = 0.2, 2.0
 
 
@@ -158,32 +159,30 @@ class Sweep:
         """Why nothing happens, if that is for want of a worker."""
         if self.info.state != "queued":
             return None
-        answer = self._transport.json("GET", "/workers")
-        items = answer["items"] if isinstance(answer, dict) else answer
-        if items:
+        if Listing(self._transport, "/workers", wire.WorkerInfo).first(1):
             return None
         return f"no worker has come yet: graspdb-simworker run --url {self._transport.url}"
 
     def outcomes(self) -> OutcomeArrays:
         """Every pose of the finished chunks with its outcome, as arrays."""
-        cursor: str | None = None
-        pages: list[wire.SweepOutcomes] = []
+        # Straight into arrays: a model of millions of rows would take longer than their simulation's answer.
+        pages: list[dict[str, NDArray[Any]]] = []
+        params: dict[str, Any] = {"limit": _OUTCOMES_PAGE, "cursor": None}
         while True:
-            answer = self._transport.json("GET", f"{self._path}/outcomes", params={"cursor": cursor})
-            page = wire.SweepOutcomes.model_validate(answer)
-            pages.append(page)
-            cursor = page.next
-            if cursor is None:
+            answer = self._transport.json("GET", f"{self._path}/outcomes", params=params)
+            pages.append(
+                {
+                    "pose_index": np.array(answer["pose_index"], dtype=np.int64),
+                    "position": np.array(answer["position"], dtype=np.float64).reshape(-1, 3),
+                    "quaternion_xyzw": np.array(answer["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
+                    "outcome": np.array(answer["outcome"], dtype=np.str_),
+                }
+            )
+            params["cursor"] = answer["next"]
+            if params["cursor"] is None:
                 break
-        return OutcomeArrays(
-            sweep=self.id,
-            pose_index=np.concatenate([np.array(p.pose_index, dtype=np.int64) for p in pages]),
-            position=np.concatenate([np.array(p.position, dtype=np.float64).reshape(-1, 3) for p in pages]),
-            quaternion_xyzw=np.concatenate(
-                [np.array(p.quaternion_xyzw, dtype=np.float64).reshape(-1, 4) for p in pages]
-            ),
-            outcome=np.concatenate([np.array(p.outcome, dtype=np.str_) for p in pages]),
-        )
+        columns = {name: np.concatenate([page[name] for page in pages]) for name in pages[0]}
+        return OutcomeArrays(sweep=self.id, **columns)
 
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
@@ -230,10 +229,10 @@ class Sweeps:
         return Sweep(self._transport, wire.SweepInfo.model_validate(answer))
 
     def list(self, *, object: str | None = None, state: str | None = None) -> Iterator[Sweep]:
-        """The sweeps, of one object and in one state if said."""
-        for info in Listing(self._transport, "/sweeps", wire.SweepInfo):
-            if object in (None, info.object) and state in (None, info.state):
-                yield Sweep(self._transport, info)
+        """The sweeps, the newest first; of one object and in one state if said."""
+        params = {"object": object, "state": state}
+        for info in Listing(self._transport, "/sweeps", wire.SweepInfo, params):
+            yield Sweep(self._transport, info)
 
 
 def create_sweep(
