@@ -82,11 +82,13 @@ def test_the_commands_it_names_exist() -> None:
         assert done.returncode == 0, (program, words, done.stderr)
 
 
-def test_its_links_lead_somewhere() -> None:
-    links = re.findall(r"\]\(([^)#\s]+)(?:#([^)\s]+))?\)", README)
+@pytest.mark.parametrize("page", ["README.md", "docs/user-guide.md"])
+def test_links_lead_somewhere(page: str) -> None:
+    here = ROOT / page
+    links = re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", here.read_text(encoding="utf-8"))
     assert links
     for target, anchor in links:
-        path = ROOT / target
+        path = here.parent / target if target else here
         assert path.exists(), target
         if anchor:
             headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
