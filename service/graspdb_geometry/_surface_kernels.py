@@ -251,3 +251,45 @@ def collides(
                     hit = True
                     break
         hits[i] = hit
+
+
+@nb.njit(cache=True, nogil=True)
+def points_collide(
+    positions: FloatArray,
+    quaternions: FloatArray,
+    boxes: FloatArray,
+    points: FloatArray,
+    radius: float,
+    hits: npt.NDArray[np.bool_],
+) -> None:
+    """Fill hits: whether a ball about one of the points overlaps a box (B, 2, 3: centre, half extents)."""
+    r = np.empty((3, 3))
+    x = np.empty(3)
+    reach = 0.0
+    for b in range(boxes.shape[0]):
+        far = 0.0
+        for a in range(3):
+            far += (abs(boxes[b, 0, a]) + boxes[b, 1, a]) ** 2
+        reach = max(reach, np.sqrt(far) + radius)
+    for i in range(positions.shape[0]):
+        p = positions[i]
+        _rotation(quaternions[i], r)
+        hits[i] = False
+        for k in range(points.shape[0]):
+            dx = points[k, 0] - p[0]
+            dy = points[k, 1] - p[1]
+            dz = points[k, 2] - p[2]
+            if dx * dx + dy * dy + dz * dz > reach * reach:
+                continue
+            _to_tool(points[k], p, r, x)
+            for b in range(boxes.shape[0]):
+                d2 = 0.0
+                for a in range(3):
+                    d = abs(x[a] - boxes[b, 0, a]) - boxes[b, 1, a]
+                    if d > 0.0:
+                        d2 += d * d
+                if d2 <= radius * radius:
+                    hits[i] = True
+                    break
+            if hits[i]:
+                break

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 from graspdb_geometry import _convex_kernels, _surface_kernels
 from graspdb_geometry.grippers import GripperShape
@@ -31,6 +32,8 @@ CONTACT = 2
 #: Overlaps shallower than this count as touching, which is no collision.  Far above the rounding of meshes
 #: stored as float32 (4e-9 m at 7 cm), far below what a simulator resolves.
 TOUCH_TOLERANCE_M = 1e-7
+
+MAX_RETREAT_M = 2.0
 
 #: Poses handed to a thread at once: long enough to hide the hand-over, short enough to balance the load.
 _BLOCK = 8192
@@ -91,7 +94,7 @@ class Scene:
             before it meets the object; beyond the stroke if the object lies on one side only.  Otherwise NaN.
         """
         p, q = _poses(positions, quaternions)
-        boxes = _gripper_boxes(shape, None)
+        boxes = _gripper_boxes(shape, None, 0.0)
         codes = np.empty(len(p), dtype=np.uint8)
         extents = np.empty((len(p), 2))
 
@@ -112,13 +115,26 @@ class Scene:
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
+        retreat_m: float = 0.0,
     ) -> npt.NDArray[np.bool_]:
-        """Whether the gripper, at an opening (its widest by default), overlaps the object in each pose.
+        """Whether the gripper overlaps the object in each pose, or on its way there.
 
-        Parameters and conventions as in :meth:`classify`; returns (n,) bool.
+        Parameters
+        ----------
+        positions, quaternions, shape, threads
+            As in :meth:`classify`.
+        opening_m : float, optional
+            Gap between the fingers, its widest by default.
+        retreat_m : float
+            Test the whole straight approach along z that starts this far back; exact, as a box swept along
+            one of its own axes is a box.
+
+        Returns
+        -------
+        (n,) bool
         """
         p, q = _poses(positions, quaternions)
-        boxes = _gripper_boxes(shape, opening_m)
+        boxes = _gripper_boxes(shape, opening_m, retreat_m)
         codes = np.empty(len(p), dtype=np.uint8)
         extents = np.empty((len(p), 2))
 
@@ -173,10 +189,11 @@ class Surface:
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
+        retreat_m: float = 0.0,
     ) -> npt.NDArray[np.bool_]:
         """Whether the gripper overlaps the object in each pose; as :meth:`Scene.collides`."""
         p, q = _poses(positions, quaternions)
-        boxes = np.ascontiguousarray(_gripper_boxes(shape, opening_m)[:3])
+        boxes = np.ascontiguousarray(_gripper_boxes(shape, opening_m, retreat_m)[:3])
         hits = np.empty(len(p), dtype=np.bool_)
 
         def run(block: slice) -> None:
@@ -214,6 +231,71 @@ class Surface:
             pending.append((begin + half, end, number, 1))
             pending.append((begin, begin + half, number, 0))
         return np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
+
+
+class PointCloud:
+    """Obstacles as points of a sensor, each a ball; immutable, thread-safe.
+
+    Parameters
+    ----------
+    points : (K, 3) float
+        Metres, in the frame of the poses that will be asked for.
+    radius_m : float
+        How much room around each point counts as occupied.
+    """
+
+    def __init__(self, points: npt.ArrayLike, radius_m: float = 0.0) -> None:
+        self.points = np.ascontiguousarray(points, dtype=np.float64)
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or not np.all(np.isfinite(self.points)):
+            raise ValueError("points must be (K, 3) and finite")
+        if not (np.isfinite(radius_m) and 0.0 <= radius_m <= 1.0):
+            raise ValueError("radius_m must lie between 0 and 1 m")
+        self.radius_m = float(radius_m)
+
+    def collides(
+        self,
+        positions: npt.ArrayLike,
+        quaternions: npt.ArrayLike,
+        shape: GripperShape,
+        opening_m: float | None = None,
+        threads: int = 1,
+        retreat_m: float = 0.0,
+    ) -> npt.NDArray[np.bool_]:
+        """Whether the gripper overlaps a ball in each pose; as :meth:`Scene.collides`."""
+        p, q = _poses(positions, quaternions)
+        boxes = np.ascontiguousarray(_gripper_boxes(shape, opening_m, retreat_m)[:3])
+        hits = np.empty(len(p), dtype=np.bool_)
+
+        def run(block: slice) -> None:
+            _surface_kernels.points_collide(
+                p[block], q[block], boxes, self.points, self.radius_m, hits[block]
+            )
+
+        _in_blocks(run, len(p), threads)
+        return hits
+
+
+def box_part(half_extents: npt.ArrayLike, position: npt.ArrayLike, quaternion: npt.ArrayLike) -> Part:
+    """A box as a convex part, for obstacles.
+
+    Parameters
+    ----------
+    half_extents, position : (3,) float
+        Metres.
+    quaternion : (4,) float
+        Orientation xyzw.
+    """
+    half = np.asarray(half_extents, dtype=np.float64)
+    if half.shape != (3,) or not np.all(half > 0) or not np.all(np.isfinite(half)):
+        raise ValueError("half_extents must be three positive numbers")
+    signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    p, q = _poses(
+        np.reshape(np.asarray(position, dtype=np.float64), (1, -1)), np.reshape(quaternion, (1, -1))
+    )
+    vertices: FloatArray = Rotation.from_quat(q[0]).apply(signs * half) + p[0]
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([(a, b, c) for quad in quads for a, b, c in (quad[:3], (quad[0], *quad[2:]))])
+    return vertices, faces
 
 
 class _Solid:
@@ -272,9 +354,13 @@ def _starts(counts: list[int]) -> npt.NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
-def _gripper_boxes(shape: GripperShape, opening_m: float | None) -> FloatArray:
+def _gripper_boxes(shape: GripperShape, opening_m: float | None, retreat_m: float) -> FloatArray:
     """Centres and half extents, less the touch tolerance, of both fingers, palm and column: (4, 2, 3)."""
+    if not 0.0 <= retreat_m <= MAX_RETREAT_M:
+        raise ValueError(f"retreat_m must lie between 0 and {MAX_RETREAT_M:g} m")
     half_extents, centres = shape.boxes(opening_m)
+    half_extents[:, 2] += retreat_m / 2
+    centres[:, 2] -= retreat_m / 2
     column_half, column_centre = shape.column(opening_m)
     shrunk = np.maximum(half_extents - TOUCH_TOLERANCE_M, 0.0)
     # The column keeps its full height in y, so that contact starts at the fingers' faces.
