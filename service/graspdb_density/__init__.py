@@ -7,8 +7,10 @@ from .maximum import Maximum, nearest
 from .region import Region
 from .success import SuccessEstimate, SuccessModel
 from .weights import effective_sample_size, importance_weights, mixture_weights
+from .widths import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
 
 __all__ = [
+    "DEFAULT_KERNEL",
     "HAAR_VOLUME",
     "GraspDensity",
     "IsotropicKernel",
@@ -16,10 +18,13 @@ __all__ = [
     "Region",
     "SuccessEstimate",
     "SuccessModel",
+    "WidthChoice",
+    "choose_widths",
     "effective_sample_size",
     "importance_weights",
     "mixture_weights",
     "nearest",
     "reference",
     "se3",
+    "widths_prefix",
 ]

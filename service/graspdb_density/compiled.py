@@ -562,3 +562,57 @@ def square_sums(data, start, table, centre, scale, positions, quaternions, kappa
                     begin = stop
         out[j, 0] = total
         out[j, 1] = squares
+
+
+@fast
+def _other_blocks_run(data, block, own, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+    """Sum of both twins' kernels over a run, those of block ``own`` left out."""
+    total = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        base = -kappa - (dx * dx + dy * dy + dz * dz)
+        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
+        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz)
+        k = _exp(base + a) + twin * _exp(base + b)
+        total += data[7, i] * k if block[i] != own else _ZERO
+    return total
+
+
+@fast
+def other_blocks_sums(
+    data, block, start, table, centre, scale, positions, quaternions, own, kappa, radius, out
+):
+    """Kernel sums at poses (M,) over the sorted kernels whose ``block`` (N,) int32 differs from ``own``
+    (M,).
+    """
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    k = F32(kappa)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        total = 0.0
+        for s in range(table.shape[0]):
+            twin = F32(table[s, TWIN])
+            for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+                total += _other_blocks_run(
+                    data,
+                    block,
+                    own[j],
+                    runs[r, 0],
+                    runs[r, 1],
+                    F32(px),
+                    F32(py),
+                    F32(pz),
+                    q0,
+                    q1,
+                    q2,
+                    q3,
+                    k,
+                    twin,
+                )
+        out[j] = total

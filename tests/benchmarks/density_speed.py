@@ -1,9 +1,9 @@
 """Speed of densities beside scikit-learn's, NumPy's exponential and bare loops, on the ellipsoid shell.
 
 Every figure is a median of interleaved rounds in one process on one core, unless a column says otherwise.
-The peer is ``sklearn.neighbors.KernelDensity`` on the 7-D embedding ``(p / sigma, sqrt(kappa) q)``, where a Gaussian
-of bandwidth 1 is the kernel itself; rows are doubled for the jaw's twins but not for the sign of quaternions,
-which saves the peer half its rows and makes its answers wrong wherever signs differ.
+The peer is ``sklearn.neighbors.KernelDensity`` on the 7-D embedding ``(p / sigma, sqrt(kappa) q)``, where a
+Gaussian of bandwidth 1 is the kernel itself; rows are doubled for the jaw's twins but not for the sign of
+quaternions, which saves the peer half its rows and makes its answers wrong wherever signs differ.
 
 ``python tests/benchmarks/density_speed.py --plot FILE`` also draws time against the number of kernels.
 """
