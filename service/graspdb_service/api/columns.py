@@ -1,12 +1,12 @@
 """Long columns of poses and numbers in JSON, in and out, without a model a row.
 
 orjson keeps the interpreter to itself while it works, so that even ``/livez`` would wait: long columns
-become text in pieces.
+become text, and arrays, in pieces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from graspdb.wire import Pose
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 from graspdb_density import se3
+from graspdb_service.api.jsonpieces import LongArray, loads
 from graspdb_service.problems import ProblemError, invalid
 
 Floats = NDArray[np.float64]
@@ -69,18 +70,37 @@ def read_object(body: bytes) -> dict[str, Any]:
         400 where the body is no JSON, 422 where it is no object.
     """
     try:
-        value = orjson.loads(body)
+        value = loads(body)
     except orjson.JSONDecodeError as error:
-        raise ProblemError(
-            400,
-            "invalid-json",
-            "The body is not valid JSON (NaN and Infinity are none)",
-            detail=str(error)[:200],
-            errors=[("body", "not valid JSON")],
-        ) from None
+        raise _no_json(error) from None
     if not isinstance(value, dict):
         raise invalid("body", "must be a JSON object")
     return value
+
+
+def _no_json(error: ValueError) -> ProblemError:
+    return ProblemError(
+        400,
+        "invalid-json",
+        "The body is not valid JSON (NaN and Infinity are none)",
+        detail=str(error)[:200],
+        errors=[("body", "not valid JSON")],
+    )
+
+
+def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:
+    """A list, or a long array of a body, as consecutive lists, each with the index of its first item."""
+    if isinstance(value, list):
+        for start in range(0, len(value), _ROWS):
+            yield start, value[start : start + _ROWS]
+        return
+    start = 0
+    try:
+        for items in value:
+            yield start, items
+            start += len(items)
+    except orjson.JSONDecodeError as error:
+        raise _no_json(error) from None
 
 
 def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
@@ -100,10 +120,11 @@ def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
                 f"{field}.quaternion_xyzw", f"has {len(quaternion)} rows and position {len(position)}"
             )
         names = (f"{field}.position.{{}}", f"{field}.quaternion_xyzw.{{}}")
-    elif isinstance(value, list):
-        if not value:
+    elif isinstance(value, list | LongArray):
+        rows = [_rows(items, field, first) for first, items in _pieces(value)]
+        if not rows:
             raise invalid(field, "at least one pose")
-        position, quaternion = _rows(value, field)
+        position, quaternion = (np.concatenate(part) for part in zip(*rows, strict=True))
         names = (f"{field}.{{}}.position", f"{field}.{{}}.quaternion_xyzw")
     else:
         raise invalid(field, "a list of poses, or columns {position, quaternion_xyzw}")
@@ -133,7 +154,7 @@ def _check_keys(value: dict[str, Any], wanted: set[str], field: str) -> None:
         raise ProblemError(422, "invalid-request", "The request is not valid", errors=errors[:20])
 
 
-def _rows(items: list[Any], field: str) -> tuple[Floats, Floats]:
+def _rows(items: list[Any], field: str, first: int) -> tuple[Floats, Floats]:
     """Poses as rows: the fast way where all have the plain form, else each by its model."""
     plain = {"position", "quaternion_xyzw"}
     try:
@@ -152,7 +173,7 @@ def _rows(items: list[Any], field: str) -> tuple[Floats, Floats]:
             pose = Pose.model_validate(item)
         except ValidationError as error:
             raise RequestValidationError(
-                [{**e, "loc": (field, i, *e["loc"])} for e in error.errors(include_input=False)]
+                [{**e, "loc": (field, first + i, *e["loc"])} for e in error.errors(include_input=False)]
             ) from None
         position[i], quaternion[i] = pose.position, pose.quaternion_xyzw
     return position, quaternion
@@ -168,28 +189,28 @@ def _from_matrices(values: list[Any]) -> tuple[Floats, Floats]:
 
 
 def _matrix(value: Any, width: int, field: str) -> Floats:
-    if not isinstance(value, list):
+    if not isinstance(value, list | LongArray):
         raise invalid(field, f"a list of rows of {width} numbers")
-    try:
-        return _numbers(value, width)
-    except (TypeError, ValueError):
-        for i, row in enumerate(value):
-            try:
-                _numbers([row], width)
-            except (TypeError, ValueError):
-                raise invalid(f"{field}.{i}", f"must be {width} finite numbers") from None
-        raise invalid(field, f"a list of rows of {width} numbers") from None
+    parts = [np.empty((0, width))]
+    for first, items in _pieces(value):
+        try:
+            parts.append(_numbers(items, width))
+        except (TypeError, ValueError):
+            for i, row in enumerate(items):
+                try:
+                    _numbers([row], width)
+                except (TypeError, ValueError):
+                    raise invalid(f"{field}.{first + i}", f"must be {width} finite numbers") from None
+            raise invalid(field, f"a list of rows of {width} numbers") from None
+    return np.concatenate(parts)
 
 
 def _numbers(rows: list[Any], width: int) -> Floats:
-    """Rows of numbers as an array, in pieces; ValueError or TypeError where they are none."""
-    out = np.empty((len(rows), width))
-    for start in range(0, len(rows), _ROWS):
-        piece = np.array(rows[start : start + _ROWS])
-        # Not "O" (null, ragged rows), "U" (text), "b" (true).
-        if piece.dtype.kind not in "iuf" or piece.shape[1:] != (width,):
-            raise ValueError("not numbers")
-        if not np.isfinite(piece).all():
-            raise ValueError("not finite")
-        out[start : start + _ROWS] = piece
-    return out
+    """Rows of numbers as an array; ValueError or TypeError where they are none."""
+    values = np.array(rows)
+    # Not "O" (null, ragged rows), "U" (text), "b" (true).
+    if values.dtype.kind not in "iuf" or values.shape[1:] != (width,):
+        raise ValueError("not numbers")
+    if not np.isfinite(values).all():
+        raise ValueError("not finite")
+    return values.astype(np.float64)
