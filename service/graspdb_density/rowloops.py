@@ -18,6 +18,8 @@ from .compiler import exact, fast, inlined
 F32 = np.float32
 #: Rows evaluated at a time: the buffers stay in the first-level cache.
 BLOCK = 256
+#: Columns of weightings come in multiples of this.
+LANES = 32
 _ONE, _ZERO = F32(1.0), F32(0.0)
 
 
@@ -35,6 +37,8 @@ def _angle_coefficients() -> tuple[np.float32, ...]:
 
 (_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10) = _angle_coefficients()
 _TURN = F32(2.0 * math.pi)
+#: Keeps the wrap of a rotation by nothing finite; far below float32 where the wrap matters.
+_TINY = F32(1e-6)
 
 
 @inlined
@@ -130,8 +134,8 @@ def _add_component(xi, n, lower, log_weight, far, out):  # type: ignore[no-untyp
     other = _ONE if far else _ZERO
     for k in range(np.uint64(n)):
         x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
-        angle = math.sqrt(x3 * x3 + x4 * x4 + x5 * x5)
-        wrap = _ONE - other * _TURN / max(angle, F32(1e-3))
+        angle = math.sqrt(x3 * x3 + x4 * x4 + x5 * x5 + _TINY)
+        wrap = _ONE - other * _TURN / angle
         x3, x4, x5 = x3 * wrap, x4 * wrap, x5 * wrap
         z0 = l00 * x0 - b0
         z1 = l10 * x0 + l11 * x1 - b1
@@ -161,17 +165,36 @@ def _mixture_values(  # type: ignore[no-untyped-def]
 
 
 @fast
-def _accumulate(values, n, begin, least, weights, out):  # type: ignore[no-untyped-def]
-    """Add ``value * weights[row]`` for every value above ``least``; how many there were."""
+def _accumulate(values, n, begin, least, weights, index, kept_values, out):  # type: ignore[no-untyped-def]
+    """Add ``value * weights[row]`` for every value above ``least``; how many there were.
+
+    First a branch-free compaction, since which values count is hardly predictable, then four rows at a time
+    over columns in chunks of constant width, which stay in vector registers.
+    """
     kept = 0
-    width = np.uint64(weights.shape[1])
-    for k in range(n):
+    for k in range(np.uint64(n)):
         v = values[k]
-        if v > least:
-            kept += 1
-            i = np.uint64(begin + k)
-            for b in range(width):
-                out[b] += v * weights[i, b]
+        index[kept] = begin + k
+        kept_values[kept] = v
+        kept += 1 if v > least else 0
+    full = kept - kept % 4
+    for first in range(0, weights.shape[1], LANES):
+        f = np.uint64(first)
+        for e in range(0, full, 4):
+            i0, i1 = np.uint64(index[e]), np.uint64(index[e + 1])
+            i2, i3 = np.uint64(index[e + 2]), np.uint64(index[e + 3])
+            v0, v1, v2, v3 = kept_values[e], kept_values[e + 1], kept_values[e + 2], kept_values[e + 3]
+            for b in range(np.uint64(LANES)):
+                out[f + b] += (
+                    v0 * weights[i0, f + b]
+                    + v1 * weights[i1, f + b]
+                    + v2 * weights[i2, f + b]
+                    + v3 * weights[i3, f + b]
+                )
+        for e in range(full, kept):
+            i0, v0 = np.uint64(index[e]), kept_values[e]
+            for b in range(np.uint64(LANES)):
+                out[f + b] += v0 * weights[i0, f + b]
     return kept
 
 
@@ -185,6 +208,8 @@ def isotropic_sums(  # type: ignore[no-untyped-def]
     """
     runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
     values = np.empty(BLOCK, dtype=np.float32)
+    kept_values = np.empty(BLOCK + 1, dtype=np.float32)
+    index = np.empty(BLOCK + 1, dtype=np.int64)
     kept = 0
     for j in range(positions.shape[0]):
         px = (positions[j, 0] - centre[0]) * scale
@@ -203,19 +228,21 @@ def isotropic_sums(  # type: ignore[no-untyped-def]
                         data, begin, n, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, wide,
                         values,
                     )  # fmt: skip
-                    kept += _accumulate(values, n, begin, F32(least), weights, out[j])
+                    kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
                     begin += n
     return kept
 
 
 @fast
 def mixture_sums(  # type: ignore[no-untyped-def]
-    data, start, table, centre, scale, frames, frame_turns, positions, quaternions, lowers, log_weights, wraps,
-    radius, least, weights, out,
+    data, start, table, centre, scale, frames, frame_turns, positions, quaternions, lowers, log_weights,
+    wraps, radius, least, weights, out,
 ):  # fmt: skip
     """As `isotropic_sums`, for a mixture of Gaussians over the displacement from each row."""
     runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
     values = np.empty(BLOCK, dtype=np.float32)
+    kept_values = np.empty(BLOCK + 1, dtype=np.float32)
+    index = np.empty(BLOCK + 1, dtype=np.int64)
     xi = np.empty((6, BLOCK), dtype=np.float32)
     p = np.empty(3)
     metres = 1.0 / scale
@@ -234,7 +261,7 @@ def mixture_sums(  # type: ignore[no-untyped-def]
                         data, frames, begin, n, p, quaternions[j], metres, twin, frame_turns, lowers,
                         log_weights, wraps, xi, values,
                     )  # fmt: skip
-                    kept += _accumulate(values, n, begin, F32(least), weights, out[j])
+                    kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
                     begin += n
     return kept
 

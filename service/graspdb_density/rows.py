@@ -13,6 +13,7 @@ dropped: a similarity by eq 9 rises by about 1e-4 for it. Values are float32, wi
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import rowloops, se3
 from .cells import Cells
-from .density import WIDE_ROTATION, GraspDensity
+from .density import GraspDensity
 from .kernels import IsotropicKernel
 from .se3 import Floats
 from .threads import for_blocks
@@ -32,9 +33,11 @@ __all__ = ["CUTOFF", "Kernel", "KernelRows", "MixtureKernel", "Progress", "rotat
 CUTOFF = 5.0
 #: Kernel values not above this share of the largest are dropped.
 LEAST = 1e-6
+#: Mixture sums below this many smallest weights are taken again without a cut-off.
+_TRUSTED_SUM = 1e-2
 _POSE_BLOCK = 512
-#: Weightings are padded to whole vectors of float32.
-_LANES = 16
+#: Wider than this, a row's farther twin and its antipodes add more than 1e-4 of a kernel.
+_WIDE_ROTATION = math.radians(20.0)
 
 #: Called with the share done, in [0, 1]; an exception it raises cancels the work and reaches the caller.
 Progress = Callable[[float], None]
@@ -197,6 +200,7 @@ class KernelRows:
         quaternions_xyzw: ArrayLike,
         weightings: NDArray[np.floating],
         *,
+        least: float = LEAST,
         threads: int = 1,
         progress: Progress | None = None,
     ) -> NDArray[np.float32]:
@@ -207,6 +211,10 @@ class KernelRows:
         positions, quaternions_xyzw : (M, 3), (M, 4)
         weightings : (N, B)
             V, one column a weighting of the rows.
+        least : float
+            Kernel values not above this share of the largest are dropped.
+        progress
+            May be called from several threads, one at a time.
 
         Returns
         -------
@@ -218,33 +226,40 @@ class KernelRows:
             raise ValueError(f"weightings have shape ({self.size}, B), not {weightings.shape}")
         cells = self._cells
         share = np.where(self.symmetric, 0.5, 1.0)[cells.rows]
-        width = -(-weightings.shape[1] // _LANES) * _LANES
+        width = -(-weightings.shape[1] // rowloops.LANES) * rowloops.LANES
         padded = np.zeros((self.size, width), dtype=np.float32)
-        padded[:, : weightings.shape[1]] = weightings[cells.rows] * share[:, None]
+        padded[:, : weightings.shape[1]] = weightings[cells.rows] * share[:, None].astype(np.float32)
         out = np.empty((len(p), width), dtype=np.float32)
+        # Neighbours one after the other find their rows' weights in the cache.
+        order = np.lexsort(np.floor(p.T / self._reach))
+        p, q = p[order], q[order]
         radius = self._reach * cells.scale
         done = 0
+        guard = threading.Lock()
 
         def work(begin: int, end: int) -> None:
             nonlocal done
             if isinstance(self.kernel, IsotropicKernel):
                 rowloops.isotropic_sums(
-                    cells.data, cells.start, cells.table, cells.centre, cells.scale, p[begin:end], q[begin:end],
-                    self.kernel.kappa, radius, self.kernel.sigma_rotation > WIDE_ROTATION, LEAST, padded,
-                    out[begin:end],
+                    cells.data, cells.start, cells.table, cells.centre, cells.scale, p[begin:end],
+                    q[begin:end], self.kernel.kappa, radius, self.kernel.sigma_rotation > _WIDE_ROTATION,
+                    least, padded, out[begin:end],
                 )  # fmt: skip
             else:
                 rowloops.mixture_sums(
                     cells.data, cells.start, cells.table, cells.centre, cells.scale, self._sorted_frames,
                     self._own_frames, p[begin:end], q[begin:end], self._lowers.astype(np.float32),
-                    self._log_weights.astype(np.float32), self._wraps, radius, LEAST, padded, out[begin:end],
+                    self._log_weights.astype(np.float32), self._wraps, radius, least, padded, out[begin:end],
                 )  # fmt: skip
-            done += end - begin
             if progress is not None:
-                progress(done / len(p))
+                with guard:
+                    done += end - begin
+                    progress(done / len(p))
 
         for_blocks(work, len(p), block=_POSE_BLOCK, threads=threads)
-        return out[:, : weightings.shape[1]]
+        result = np.empty((len(p), weightings.shape[1]), dtype=np.float32)
+        result[order] = out[:, : weightings.shape[1]]
+        return result
 
     def log_density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row."""
@@ -258,10 +273,10 @@ class KernelRows:
                 symmetric=self.symmetric,
             )
             return density.log_density(p, q, cutoff=CUTOFF, threads=threads)
-        raw = self.weights / self.weights.mean()
-        sums = self.sums(p, q, raw[:, None].astype(np.float32), threads=threads)[:, 0].astype(np.float64)
-        # Sums of about the threshold may owe as much to what was dropped; those poses are taken again exactly.
-        near = sums > 1e3 * LEAST * float(raw.min())
+        raw = (self.weights / self.weights.mean()).astype(np.float32)[:, None]
+        sums = self.sums(p, q, raw, least=0.0, threads=threads)[:, 0].astype(np.float64)
+        # Where little is left, what lies beyond the cut-off may count as much: those poses are taken again.
+        near = sums > _TRUSTED_SUM * float(raw.min())
         out = np.empty(len(p))
         out[near] = np.log(sums[near]) - math.log(self.size)
         if not near.all():

@@ -1,0 +1,456 @@
+"""Have we tried enough? How much a density would change if its grasps were drawn again (eq 9).
+
+``s = mean over b of BC(m, d_b)``: the Bhattacharyya coefficient between the density m of all grasps and the
+density d_b of a bootstrap replicate; 1 means that the replicates agree with it entirely. Equation 9 of
+Bodenhagen, Detry, Piater and Krueger takes the mean density of the replicates; the density of all grasps is
+what that mean tends to. Estimated with points drawn from m: ``BC_b = E_m sqrt(d_b / m)``.
+
+s measures variance, not truth: a wider kernel raises it while the likelihood of held-out grasps falls. So
+every point of a curve carries both. N counts successes; a grasp and its twin under the jaw's turn are one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from . import se3
+from .rows import Kernel, KernelRows, Progress
+from .se3 import Floats
+
+__all__ = [
+    "LEAST_GRASPS",
+    "TARGET",
+    "ConvergenceCurve",
+    "CurvePoint",
+    "Needed",
+    "Similarity",
+    "Verdict",
+    "bootstrap_similarity",
+    "convergence_curve",
+    "curve_sizes",
+    "grasps_needed",
+    "needed_ratio",
+    "verdict",
+]
+
+#: The similarity from which a density counts as converged.
+TARGET = 0.95
+#: Smallest subset of a curve and the fewest sizes that make one.
+LEAST_SUBSET, LEAST_SIZES = 25, 4
+#: Fewest grasps for a curve: sizes are halved from the whole down.
+LEAST_GRASPS = LEAST_SUBSET * 2 ** (LEAST_SIZES - 1)
+#: Grasps held out for the likelihood: this share of all, but no more than.
+_HELD_OUT_SHARE, _HELD_OUT_MOST = 0.1, 2_000
+#: Resamples behind intervals.
+_RESAMPLES = 400
+#: Extrapolations beyond this many times the present number say nothing.
+_HORIZON = 1_000.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Similarity:
+    """Eq 9 for one set of grasps.
+
+    Attributes
+    ----------
+    value : float
+        s in [0, 1]: the mean of ``replicates``.
+    deviation : float
+        Standard deviation over the replicates: the bar of figure 14.
+    replicates : (B,)
+        BC of every bootstrap replicate with the whole.
+    """
+
+    value: float
+    deviation: float
+    replicates: Floats
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CurvePoint:
+    """Similarity and likelihood at one number of grasps.
+
+    Attributes
+    ----------
+    grasps : int
+    similarity : float
+        Mean over the subsets of their s.
+    deviation : float
+        Standard deviation over bootstrap replicates within a subset (root mean square over subsets).
+    replicates : (S, B)
+        BC of every replicate of every subset.
+    log_likelihood : float
+        Mean log density at the held-out grasps, nats of 1/(m^3 rad^3), averaged over subsets.
+    log_likelihood_error : float
+        Standard error of that mean from the held-out grasps.
+    """
+
+    grasps: int
+    similarity: float
+    deviation: float
+    replicates: Floats
+    log_likelihood: float
+    log_likelihood_error: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ConvergenceCurve:
+    """Points by rising number of grasps; ``held_out`` grasps judged the likelihood."""
+
+    points: tuple[CurvePoint, ...]
+    held_out: int
+
+
+@dataclass(frozen=True, slots=True)
+class Needed:
+    """Number of grasps at which a similarity is reached, with an interval.
+
+    ``math.inf`` where the curve does not rise enough to say. ``extrapolated`` is false where the curve itself
+    crosses the target.
+    """
+
+    target: float
+    grasps: float
+    low: float
+    high: float
+    level: float
+    extrapolated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether there are enough grasps.
+
+    Attributes
+    ----------
+    state : str
+        ``enough``, ``more``, or ``borderline`` where the interval of s holds the target.
+    similarity, low, high : float
+        s of all grasps and its interval.
+    needed : Needed
+        Grasps in total.
+    more : (float, float, float)
+        Further grasps: least, best guess and most; 0 where reached, ``math.inf`` where nothing can be said.
+    exponent : float
+        a of ``1 - s ~ N^-a`` through the last three points.
+    """
+
+    state: str
+    grasps: int
+    similarity: float
+    low: float
+    high: float
+    needed: Needed
+    more: tuple[float, float, float]
+    exponent: float
+
+
+def bootstrap_similarity(
+    rows: KernelRows,
+    rng: np.random.Generator,
+    *,
+    replicates: int = 50,
+    points: int = 20_000,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> Similarity:
+    """s of eq 9 for all grasps of ``rows``.
+
+    A replicate resamples the grasps with their weights uniformly with replacement and renormalises.
+
+    Parameters
+    ----------
+    points : int
+        Draws from the whole density, systematic over kernels: 1,000 leave a Monte Carlo spread of about
+        1.6e-3, 20,000 of 3e-4.
+
+    Raises
+    ------
+    ValueError
+        For fewer than 2 grasps, 2 replicates or 2 points.
+    """
+    if rows.size < 2 or replicates < 2 or points < 2:
+        raise ValueError("a bootstrap needs at least 2 grasps, 2 replicates and 2 points")
+    p, q = rows.sample(points, rng)
+    weightings = np.empty((replicates + 1, rows.size), dtype=np.float32)
+    weightings[0] = rows.weights * rows.size
+    for b in range(1, replicates + 1):
+        counts = np.bincount(rng.integers(rows.size, size=rows.size), minlength=rows.size)
+        again = rows.weights * counts
+        weightings[b] = again * (rows.size / again.sum())
+    sums = rows.sums(p, q, weightings.T, threads=threads, progress=progress)
+    whole = sums[:, 0]
+    # A point all of whose kernels fell below the threshold says nothing.
+    seen = whole > 0.0
+    if not seen.any():
+        raise ValueError("no drawn pose is within reach of any grasp")
+    ratio = sums[seen, 1:] / whole[seen, None]
+    values = np.sqrt(ratio, out=ratio).mean(axis=0, dtype=np.float64)
+    return Similarity(float(values.mean()), float(values.std(ddof=1)), values)
+
+
+def curve_sizes(count: int) -> list[int]:
+    """Numbers of grasps of a curve: the whole, halved down to about `LEAST_SUBSET`, rising.
+
+    Raises
+    ------
+    ValueError
+        For fewer than `LEAST_GRASPS`, saying how many more are needed.
+    """
+    if count < LEAST_GRASPS:
+        raise ValueError(
+            f"a convergence curve needs at least {LEAST_GRASPS} successful grasps (a grasp and its twin "
+            f"under the jaw's turn are one); there are {count}, so {LEAST_GRASPS - count} more are needed"
+        )
+    sizes = [count]
+    while sizes[-1] // 2 >= LEAST_SUBSET:
+        sizes.append(sizes[-1] // 2)
+    return sizes[::-1]
+
+
+def convergence_curve(
+    positions: ArrayLike,
+    quaternions_xyzw: ArrayLike,
+    kernel: Kernel,
+    *,
+    weights: ArrayLike | None = None,
+    symmetric: ArrayLike | bool = True,
+    frames: ArrayLike | None = None,
+    held_out: tuple[ArrayLike, ArrayLike] | None = None,
+    sizes: Sequence[int] | None = None,
+    subsets: int = 5,
+    replicates: int = 50,
+    points: int = 20_000,
+    seed: int = 0,
+    threads: int = 1,
+    progress: Progress | None = None,
+) -> ConvergenceCurve:
+    """s and the held-out likelihood against the number of grasps (figures 6 and 14).
+
+    Parameters
+    ----------
+    positions, quaternions_xyzw : (N, 3) metres, (N, 4)
+        Successful grasps, one row a physical grasp.
+    kernel, weights, symmetric, frames
+        As `KernelRows` takes them.
+    held_out : poses or None
+        Grasps to judge the likelihood on. None: a tenth of the rows (2,000 at most), the same for every point
+        and kernel of a seed; they take part in s and are left out of the density whose likelihood is taken.
+        They count with their weights, given ones equally.
+    sizes : rising numbers of grasps, at least 4, or None for `curve_sizes`
+    subsets : int
+        Subsets drawn without replacement at each size, at least 5. At the whole number they are the same
+        grasps with other draws.
+    points : int
+        Draws from the density at each size, over its subsets together.
+
+    Raises
+    ------
+    ValueError
+        Where there are too few grasps (saying how many are needed) or an argument is out of range.
+    """
+    p, q = se3.as_poses(positions, quaternions_xyzw)
+    count = len(p)
+    wanted = curve_sizes(count)
+    if sizes is not None:
+        wanted = [int(n) for n in sizes]
+        if len(wanted) < LEAST_SIZES or wanted != sorted(set(wanted)):
+            raise ValueError(f"a curve needs at least {LEAST_SIZES} different sizes, rising")
+        if wanted[0] < LEAST_SUBSET or wanted[-1] > count:
+            raise ValueError(f"sizes of a curve lie between {LEAST_SUBSET} and the {count} grasps there are")
+    if subsets < 5:
+        raise ValueError("a point of a curve is the mean over at least 5 subsets")
+    # Children of one seed: the split and the subsets do not depend on how many numbers a kernel's draws take.
+    split, *children = np.random.default_rng(seed).spawn(1 + len(wanted) * subsets)
+    everything = KernelRows(p, q, kernel, weights=weights, symmetric=symmetric, frames=frames)
+    judged = np.zeros(count, dtype=bool)
+    if held_out is None:
+        share = min(_HELD_OUT_MOST, max(1, round(_HELD_OUT_SHARE * count)))
+        judged[split.permutation(count)[:share]] = True
+        test = p[judged], q[judged]
+        shares = everything.weights[judged]
+    else:
+        test = se3.as_poses(*held_out)
+        if not len(test[0]):
+            raise ValueError("the held-out grasps must not be empty")
+        shares = np.ones(len(test[0]))
+    work = sum(wanted) * subsets
+    finished = 0
+    result = []
+    for index, n in enumerate(wanted):
+        values: list[Floats] = []
+        likelihoods: list[Floats] = []
+        for turn in range(subsets):
+            picker, draws = children[index * subsets + turn].spawn(2)
+            chosen = np.arange(count) if n == count else np.sort(picker.permutation(count)[:n])
+            subset = everything if n == count else everything.subset(chosen)
+            values.append(
+                bootstrap_similarity(
+                    subset,
+                    draws,
+                    replicates=replicates,
+                    points=max(2, points // subsets),
+                    threads=threads,
+                    progress=_part(progress, finished / work, 0.9 * n / work),
+                ).replicates
+            )
+            # All subsets of the whole are the same grasps, so their likelihood is too.
+            if n < count or not likelihoods:
+                training = chosen[~judged[chosen]]
+                likelihoods.append(everything.subset(training).log_density(*test, threads=threads))
+            finished += n
+            if progress is not None:
+                progress(finished / work)
+        result.append(_curve_point(n, np.array(values), np.mean(likelihoods, axis=0), shares))
+    return ConvergenceCurve(tuple(result), len(test[0]))
+
+
+def _part(progress: Progress | None, begin: float, share: float) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda done: progress(begin + share * done)
+
+
+def _curve_point(grasps: int, values: Floats, log_density: Floats, shares: Floats) -> CurvePoint:
+    share = shares / shares.sum()
+    mean = float(share @ log_density)
+    return CurvePoint(
+        grasps=grasps,
+        similarity=float(values.mean()),
+        deviation=float(np.sqrt(values.var(axis=1, ddof=1).mean())),
+        replicates=values,
+        log_likelihood=mean,
+        log_likelihood_error=float(np.linalg.norm(share * (log_density - mean))),
+    )
+
+
+# -- how many more
+
+
+def _resampled(curve: ConvergenceCurve, rng: np.random.Generator) -> Floats:
+    """s of every point, resampled over subsets and over replicates within them: (resamples, points)."""
+    columns = []
+    for point in curve.points:
+        subsets, count = point.replicates.shape
+        which = rng.integers(subsets, size=(_RESAMPLES, subsets, 1))
+        again = rng.integers(count, size=(_RESAMPLES, subsets, count))
+        columns.append(point.replicates[which, again].mean(axis=(1, 2)))
+    return np.stack(columns, axis=1)
+
+
+def _fit(sizes: Floats, similarity: Floats) -> tuple[Floats, Floats]:
+    """Exponent a and log c of ``1 - s = c N^-a`` through the last three points, rows independent."""
+    x = np.log(sizes[-3:])
+    y = np.log(np.maximum(1.0 - similarity[..., -3:], 1e-12))
+    x0 = x.mean()
+    slope = ((x - x0) * y).sum(axis=-1) / ((x - x0) ** 2).sum()
+    return -slope, y.mean(axis=-1) - slope * x0
+
+
+def _needed(sizes: Floats, similarity: Floats, target: float) -> tuple[Floats, NDArray[np.bool_]]:
+    """Grasps at which each row (R, P) reaches the target, and whether it lies beyond the curve."""
+    gap = math.log(1.0 - target)
+    log_sizes = np.log(sizes)
+    y = np.log(np.maximum(1.0 - similarity, 1e-12))
+    exponent, constant = _fit(sizes, similarity)
+    rising = exponent > 1e-3
+    beyond = np.where(rising, (constant - gap) / np.where(rising, exponent, 1.0), np.inf)
+    beyond = np.exp(np.minimum(beyond, log_sizes[-1] + math.log(_HORIZON)))
+    beyond = np.where(beyond >= sizes[-1] * _HORIZON * (1.0 - 1e-9), np.inf, beyond)
+    out = np.empty(len(similarity))
+    outside = np.zeros(len(similarity), dtype=bool)
+    for r, row in enumerate(y):
+        # The last crossing: noise may touch the target earlier.
+        above = np.flatnonzero(row > gap)
+        if not above.size:
+            out[r] = sizes[0]
+        elif above[-1] == len(sizes) - 1:
+            out[r], outside[r] = max(beyond[r], sizes[-1]), True
+        else:
+            i = above[-1]
+            share = (row[i] - gap) / (row[i] - row[i + 1])
+            out[r] = math.exp(log_sizes[i] + share * (log_sizes[i + 1] - log_sizes[i]))
+    return out, outside
+
+
+def _checked_target(target: float, level: float) -> None:
+    if not 0.0 < target < 1.0 or not 0.0 < level < 1.0:
+        raise ValueError("target similarity and level lie between 0 and 1")
+
+
+def grasps_needed(
+    curve: ConvergenceCurve, *, target: float = TARGET, level: float = 0.9, seed: int = 0
+) -> Needed:
+    """Grasps at which a curve reaches a similarity: interpolated (log 1 - s over log N), else by the fit
+    ``1 - s ~ N^-a`` to the last three points; the interval by resampling subsets and replicates.
+
+    A curve that is above the target from its first point on gives that point's number: an upper bound.
+    """
+    _checked_target(target, level)
+    sizes = np.array([point.grasps for point in curve.points], dtype=np.float64)
+    best, outside = _needed(sizes, np.array([[point.similarity for point in curve.points]]), target)
+    spread, _ = _needed(sizes, _resampled(curve, np.random.default_rng(seed)), target)
+    low, high = _interval(spread, level)
+    return Needed(target, float(best[0]), low, high, level, bool(outside[0]))
+
+
+def needed_ratio(
+    curve: ConvergenceCurve,
+    reference: ConvergenceCurve,
+    *,
+    target: float = TARGET,
+    level: float = 0.9,
+    seed: int = 0,
+) -> tuple[float, float, float]:
+    """Grasps one kernel needs over those the reference needs: value and interval; nan where neither can be
+    told.
+    """
+    _checked_target(target, level)
+    values = []
+    for number, one in enumerate((curve, reference)):
+        sizes = np.array([point.grasps for point in one.points], dtype=np.float64)
+        spread, _ = _needed(sizes, _resampled(one, np.random.default_rng((seed, number))), target)
+        values.append((grasps_needed(one, target=target, level=level, seed=seed).grasps, spread))
+    (best, spread), (base, base_spread) = values
+    with np.errstate(invalid="ignore"):
+        ratio = np.float64(best) / np.float64(base)
+        ratios = spread / base_spread
+    if np.isnan(ratios).any():
+        return float(ratio), math.nan, math.nan
+    low, high = _interval(ratios, level)
+    return float(ratio), low, high
+
+
+def verdict(curve: ConvergenceCurve, *, target: float = TARGET, level: float = 0.9, seed: int = 0) -> Verdict:
+    """Whether the whole of a curve's grasps suffice, and how many more are needed otherwise."""
+    needed = grasps_needed(curve, target=target, level=level, seed=seed)
+    resampled = _resampled(curve, np.random.default_rng(seed))
+    last = curve.points[-1]
+    low, high = _interval(resampled[:, -1], level)
+    state = "enough" if low >= target else "more" if high < target else "borderline"
+    sizes = np.array([point.grasps for point in curve.points], dtype=np.float64)
+    exponent, _ = _fit(sizes, np.array([point.similarity for point in curve.points]))
+    least, best, most = (max(0.0, n - last.grasps) for n in (needed.low, needed.grasps, needed.high))
+    return Verdict(
+        state=state,
+        grasps=last.grasps,
+        similarity=last.similarity,
+        low=low,
+        high=high,
+        needed=needed,
+        more=(least, best, most),
+        exponent=float(exponent),
+    )
+
+
+def _interval(values: Floats, level: float) -> tuple[float, float]:
+    """Quantiles by order statistics: infinities stay what they are instead of spoiling an interpolation."""
+    tail = 0.5 * (1.0 - level)
+    low = np.quantile(values, tail, method="lower")
+    high = np.quantile(values, 1.0 - tail, method="higher")
+    return float(low), float(high)

@@ -1,0 +1,437 @@
+"""Eq 9 against brute force and theory, curves, verdicts and the kernels behind them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp
+
+from graspdb_density import IsotropicKernel, matching, reference, se3
+from graspdb_density import convergence as cv
+from graspdb_density.rows import KernelRows, rotation_normaliser
+from graspdb_density.se3 import Floats
+
+Poses = tuple[Floats, Floats]
+Shell = Callable[[int, np.random.Generator], Poses]
+KERNEL = IsotropicKernel(0.015, math.radians(15.0))
+MIRROR = np.diag([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Mixture:
+    weights: Floats
+    means: Floats
+    covariances: Floats
+
+
+def _gaussian(*deviations: float) -> Mixture:
+    return Mixture(np.ones(1), np.zeros((1, 6)), np.diag(np.square(deviations))[None])
+
+
+def _random_mixture(rng: np.random.Generator, scale: float = 1.0) -> Mixture:
+    """Two pairs of components, each a mirror image of the other."""
+    widths = np.array([0.02, 0.01, 0.015, 0.3, 0.5, 0.2]) * scale
+    means, covariances = [], []
+    for _ in range(2):
+        root = rng.standard_normal((6, 6)) * 0.3 + np.eye(6)
+        cov = widths[:, None] * (root @ root.T) * widths
+        mean = rng.standard_normal(6) * widths
+        means += [mean, MIRROR @ mean]
+        covariances += [cov, MIRROR @ cov @ MIRROR]
+    return Mixture(np.array([0.3, 0.3, 0.2, 0.2]), np.array(means), np.array(covariances))
+
+
+def _brute_log_density(kernel: Mixture, rows: Poses, frames: Floats | None, at: Poses) -> Floats:
+    """Sum over rows, twins, components and both wraps in float64 with general-purpose pieces only."""
+    lists: list[Floats] = []
+    normaliser = rotation_normaliser(kernel.means[:, 3:], kernel.covariances[:, 3:, 3:])
+    for turned in (False, True):
+        q = se3.jaw_twin(rows[1]) if turned else rows[1]
+        axes = se3.to_matrix(q) if frames is None else frames
+        move = np.einsum("nij,mni->mnj", axes, at[0][:, None] - rows[0])
+        vector = se3.to_rotation_vector(se3.multiply(se3.conjugate(q)[None], at[1][:, None]))
+        angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+        for wrapped in (vector, vector * (1.0 - 2.0 * math.pi / np.maximum(angle, 1e-9))):
+            xi = np.concatenate([move, wrapped], axis=-1)
+            for w, mean, cov, z in zip(
+                kernel.weights, kernel.means, kernel.covariances, normaliser, strict=True
+            ):
+                d = xi - mean
+                square = np.einsum("mni,ij,mnj->mn", d, np.linalg.inv(cov), d)
+                log_norm = 0.5 * np.linalg.slogdet(cov)[1] + 3.0 * math.log(2.0 * math.pi) + math.log(z)
+                lists.append(math.log(w) - log_norm - 0.5 * square)
+    result: Floats = logsumexp(np.concatenate(lists, axis=1), axis=1) - math.log(2.0 * len(rows[0]))
+    return result
+
+
+# -- kernels evaluated row by row
+
+
+@pytest.mark.parametrize("degrees", [10.0, 15.0, 25.0, 50.0])
+def test_isotropic_sums_equal_the_reference_under_every_weighting(shell: Shell, degrees: float) -> None:
+    rng = np.random.default_rng(1)
+    p, q = shell(400, rng)
+    kernel = IsotropicKernel(0.03, math.radians(degrees))
+    symmetric = rng.random(400) < 0.7
+    rows = KernelRows(p, q, kernel, symmetric=symmetric)
+    at = rows.sample(60, rng)
+    weightings = rng.random((400, 37))
+    sums = rows.sums(*at, weightings, least=0.0)
+    for column in (0, 31, 36):
+        w = weightings[:, column]
+        expected = reference.log_density(kernel, p, q, *at, weights=w, symmetric=symmetric)
+        got = np.log(sums[:, column] / w.sum()) + rows.log_unit
+        assert np.max(np.abs(got - expected)) < 2e-3
+        assert np.median(np.abs(got - expected)) < 1e-4
+
+
+@pytest.mark.parametrize("framed", [False, True])
+def test_mixture_density_equals_brute_force(shell: Shell, framed: bool) -> None:
+    rng = np.random.default_rng(2)
+    rows = shell(150, rng)
+    frames = se3.to_matrix(se3.random_quaternions(150, rng)) if framed else None
+    kernel = _random_mixture(rng)
+    density = KernelRows(*rows, kernel, frames=frames)
+    near = density.sample(80, rng)
+    far = near[0] + rng.standard_normal((80, 3)) * 0.3, se3.random_quaternions(80, rng)
+    for at in (near, far):
+        got = density.log_density(*at)
+        assert np.max(np.abs(got - _brute_log_density(kernel, rows, frames, at))) < 2e-3
+
+
+def test_a_round_gaussian_agrees_with_the_isotropic_kernel(shell: Shell) -> None:
+    """The two families differ by how they curve on SO(3), of the order of the squared width."""
+    rng = np.random.default_rng(3)
+    p, q = shell(2_000, rng)
+    narrow = IsotropicKernel(0.02, math.radians(6.0))
+    density = KernelRows(p, q, narrow)
+    round_one = KernelRows(p, q, _gaussian(*[0.02] * 3, *[math.radians(6.0)] * 3))
+    at = density.sample(500, rng)
+    assert np.max(np.abs(density.log_density(*at) - round_one.log_density(*at))) < 0.05
+
+
+@given(st.lists(st.floats(2.0, 40.0), min_size=3, max_size=3))
+@settings(max_examples=25, deadline=None)
+def test_rotation_normaliser_agrees_with_its_series(degrees: list[float]) -> None:
+    cov = np.diag(np.radians(degrees) ** 2)
+    trace = np.trace(cov)
+    fourth = trace**2 + 2.0 * np.trace(cov @ cov)
+    got = rotation_normaliser(np.zeros((1, 3)), cov[None])[0]
+    assert got == pytest.approx(1.0 - trace / 12.0 + fourth / 360.0, abs=3e-3)
+    if max(degrees) <= 20.0:
+        assert got == pytest.approx(1.0 - trace / 12.0 + fourth / 360.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("kernel", [KERNEL, _gaussian(0.03, 0.01, 0.02, 0.5, 0.9, 0.3)])
+def test_draws_follow_the_density(kernel: IsotropicKernel | Mixture) -> None:
+    """Importance sampling: uniform poses weighted by the density have the moments of the draws."""
+    rng = np.random.default_rng(4)
+    rows = KernelRows(np.zeros((1, 3)), se3.random_quaternions(1, rng), kernel)
+    p, q = rows.sample(40_000, rng)
+    if isinstance(kernel, IsotropicKernel):
+        spread = np.full(3, kernel.sigma_position_m)
+    else:
+        spread = np.sqrt(np.diag(kernel.covariances[0]))[:3]
+    wide_p = rng.standard_normal((200_000, 3)) * 1.3 * spread.max()
+    wide_q = se3.random_quaternions(200_000, rng)
+    log_proposal = -0.5 * np.sum((wide_p / (1.3 * spread.max())) ** 2, axis=1)
+    log_proposal -= 1.5 * math.log(2.0 * math.pi) + 3.0 * math.log(1.3 * spread.max())
+    log_proposal -= math.log(8.0 * math.pi**2)
+    ratio = np.exp(rows.log_density(wide_p, wide_q) - log_proposal)
+    # The density integrates to one over positions and rotations.
+    assert ratio.mean() == pytest.approx(1.0, abs=6.0 * ratio.std() / math.sqrt(len(ratio)))
+    for axis in range(3):
+        square = wide_p[:, axis] ** 2
+        expected = np.average(square, weights=ratio)
+        error = math.sqrt(np.sum((ratio * (square - expected)) ** 2)) / ratio.sum()
+        assert np.mean(p[:, axis] ** 2) == pytest.approx(expected, abs=5.0 * error + 0.02 * expected)
+    turn = np.abs(np.sum(q * rows.quaternions_xyzw[0], axis=1))
+    other = np.abs(np.sum(wide_q * rows.quaternions_xyzw[0], axis=1))
+    expected = np.average(other, weights=ratio)
+    error = math.sqrt(np.sum((ratio * (other - expected)) ** 2)) / ratio.sum()
+    assert turn.mean() == pytest.approx(expected, abs=5.0 * error)
+
+
+def test_a_mixture_is_checked(shell: Shell) -> None:
+    p, q = shell(10, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="positive definite"):
+        KernelRows(p, q, Mixture(np.ones(1), np.zeros((1, 6)), -np.eye(6)[None]))
+    with pytest.raises(ValueError, match="weights"):
+        KernelRows(p, q, Mixture(np.ones(2), np.zeros((1, 6)), np.eye(6)[None]))
+    with pytest.raises(ValueError, match="orthonormal"):
+        KernelRows(p, q, _gaussian(*[0.1] * 6), frames=2.0 * np.eye(3))
+    with pytest.raises(ValueError, match="at least one"):
+        KernelRows(p[:0], q[:0], KERNEL)
+
+
+# -- similarity
+
+
+def _exact_similarity(rows: KernelRows, counts: Floats, points: int, rng: np.random.Generator) -> float:
+    """BC(m, d_b) with densities from the float64 reference, no truncation."""
+    assert isinstance(rows.kernel, IsotropicKernel)
+    at = rows.sample(points, rng)
+    own = rows.positions, rows.quaternions_xyzw
+    whole = reference.log_density(rows.kernel, *own, *at, weights=rows.weights)
+    chosen = counts > 0
+    again = reference.log_density(
+        rows.kernel, own[0][chosen], own[1][chosen], *at, weights=(rows.weights * counts)[chosen]
+    )
+    return float(np.exp(0.5 * (again - whole)).mean())
+
+
+def test_similarity_equals_the_reference(shell: Shell) -> None:
+    rng = np.random.default_rng(5)
+    p, q = shell(300, rng)
+    rows = KernelRows(p, q, IsotropicKernel(0.03, 0.4), weights=rng.uniform(0.2, 1.0, 300))
+    got = cv.bootstrap_similarity(rows, rng, replicates=200, points=4_000)
+    exact = [
+        _exact_similarity(rows, np.bincount(rng.integers(300, size=300), minlength=300), 2_000, rng)
+        for _ in range(12)
+    ]
+    error = np.std(exact, ddof=1) / math.sqrt(len(exact)) + got.deviation / math.sqrt(200)
+    assert got.value == pytest.approx(np.mean(exact), abs=4.0 * error + 1e-3)
+    assert got.replicates.shape == (200,)
+    assert got.value == pytest.approx(got.replicates.mean())
+    assert got.deviation == pytest.approx(got.replicates.std(ddof=1))
+
+
+def test_far_apart_grasps_follow_the_multinomial() -> None:
+    """Kernels that share nothing: BC_b = mean of sqrt(c_i), and E sqrt(Poisson(1)) is .773."""
+    rng = np.random.default_rng(6)
+    p = np.arange(4_000)[:, None] * np.array([1.0, 0.0, 0.0])
+    rows = KernelRows(p, se3.random_quaternions(4_000, rng), KERNEL)
+    k = np.arange(60)
+    poisson = np.exp(-1.0 - np.cumsum(np.log(np.maximum(k, 1))))
+    expected = float(np.sum(np.sqrt(k) * poisson))
+    got = cv.bootstrap_similarity(rows, rng, replicates=60, points=8_000)
+    assert got.value == pytest.approx(expected, abs=3e-3)
+
+
+def test_one_place_has_converged() -> None:
+    rows = KernelRows(np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1)), KERNEL)
+    got = cv.bootstrap_similarity(rows, np.random.default_rng(0), points=200)
+    assert got.value == pytest.approx(1.0, abs=1e-6)
+    assert got.deviation < 1e-6
+
+
+@given(st.integers(0, 1_000), st.floats(0.005, 0.05), st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_similarity_is_a_share_and_does_not_know_units_of_weight(
+    seed: int, sigma: float, twins: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    p, q = rng.uniform(-0.1, 0.1, (60, 3)), se3.random_quaternions(60, rng)
+    w = rng.uniform(0.1, 1.0, 60)
+    values = []
+    for scale in (1.0, 1e6):
+        rows = KernelRows(p, q, IsotropicKernel(sigma, 0.3), weights=w * scale, symmetric=twins)
+        values.append(
+            cv.bootstrap_similarity(rows, np.random.default_rng(seed), points=300, replicates=8).replicates
+        )
+    assert np.all(values[0] <= 1.0 + 1e-3)
+    assert np.all(values[0] > 0.0)
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-4)
+
+
+def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
+    rng = np.random.default_rng(7)
+    rows = KernelRows(*shell(3_000, rng), KERNEL)
+    one = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10)
+    two = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10, threads=2)
+    np.testing.assert_array_equal(one.replicates, two.replicates)
+
+    class StopError(Exception):
+        pass
+
+    seen: list[float] = []
+
+    def progress(share: float) -> None:
+        seen.append(share)
+        if share > 0.4:
+            raise StopError
+
+    with pytest.raises(StopError):
+        cv.bootstrap_similarity(rows, rng, points=2_000, replicates=10, progress=progress)
+    assert seen == sorted(seen)
+    assert seen[-1] < 1.0
+
+
+# -- curves
+
+
+@pytest.fixture(scope="module")
+def curve(shell: Shell) -> cv.ConvergenceCurve:
+    p, q = shell(1_600, np.random.default_rng(8))
+    return cv.convergence_curve(p, q, IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3)
+
+
+def test_curve_rises_and_shows_its_parts(curve: cv.ConvergenceCurve) -> None:
+    assert [point.grasps for point in curve.points] == [25, 50, 100, 200, 400, 800, 1_600]
+    s = np.array([point.similarity for point in curve.points])
+    assert np.all(np.diff(s) > 0.0)
+    assert all(point.replicates.shape == (5, 20) for point in curve.points)
+    assert curve.held_out == 160
+    likelihood = [point.log_likelihood for point in curve.points]
+    assert likelihood[-1] > likelihood[0]
+    assert all(0.0 < point.log_likelihood_error < 5.0 for point in curve.points)
+
+
+def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: cv.ConvergenceCurve) -> None:
+    p, q = shell(1_600, np.random.default_rng(8))
+    wide = cv.convergence_curve(p, q, IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3)
+    assert all(w.similarity > n.similarity for w, n in zip(wide.points, curve.points, strict=True))
+    assert wide.points[-1].log_likelihood < curve.points[-1].log_likelihood
+    value, low, high = cv.needed_ratio(wide, curve, target=0.9)
+    assert low <= value <= high < 0.6
+
+
+def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
+    p, q = shell(200, np.random.default_rng(9))
+    one, two, other = (
+        cv.convergence_curve(p, q, KERNEL, points=200, replicates=5, seed=seed) for seed in (1, 1, 2)
+    )
+    assert [a.similarity for a in one.points] == [a.similarity for a in two.points]
+    assert [a.log_likelihood for a in one.points] == [a.log_likelihood for a in two.points]
+    assert [a.similarity for a in one.points] != [a.similarity for a in other.points]
+
+
+def test_too_few_grasps_say_how_many_are_needed(shell: Shell) -> None:
+    p, q = shell(37, np.random.default_rng(0))
+    with pytest.raises(ValueError, match=r"at least 200 .* there are 37, so 163 more"):
+        cv.convergence_curve(p, q, KERNEL)
+    with pytest.raises(ValueError, match="at least 200"):
+        cv.convergence_curve(p[:0], q[:0], KERNEL)
+    p, q = shell(200, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="4 different sizes"):
+        cv.convergence_curve(p, q, KERNEL, sizes=[50, 100, 200])
+    with pytest.raises(ValueError, match="between 25 and the 200"):
+        cv.convergence_curve(p, q, KERNEL, sizes=[50, 100, 200, 400])
+    with pytest.raises(ValueError, match="5 subsets"):
+        cv.convergence_curve(p, q, KERNEL, subsets=4)
+
+
+def _synthetic(exponent: float, scale: float, noise: float, seed: int = 0) -> cv.ConvergenceCurve:
+    rng = np.random.default_rng(seed)
+    points = []
+    for n in (100, 200, 400, 800):
+        values = 1.0 - scale * n**-exponent + noise * rng.standard_normal((5, 50))
+        points.append(cv.CurvePoint(n, float(values.mean()), noise, values, 0.0, 1.0))
+    return cv.ConvergenceCurve(tuple(points), 10)
+
+
+@given(st.floats(0.3, 1.0), st.floats(1.0, 6.0))
+@settings(max_examples=40, deadline=None)
+def test_a_power_law_is_extrapolated_exactly(exponent: float, scale: float) -> None:
+    curve = _synthetic(exponent, min(scale, 0.9 * 100.0**exponent), 0.0)
+    scale = min(scale, 0.9 * 100.0**exponent)
+    truth = (scale / 0.05) ** (1.0 / exponent)
+    needed = cv.grasps_needed(curve)
+    if truth > 100.0:
+        expected = truth if truth < 800.0 * 1_000.0 else math.inf
+        assert needed.grasps == pytest.approx(expected, rel=1e-6)
+        assert needed.extrapolated == (truth > 800.0)
+    assert cv.verdict(curve).exponent == pytest.approx(exponent, abs=1e-6)
+
+
+def test_the_interval_of_what_is_needed_covers_the_truth() -> None:
+    truth = (2.0 / 0.05) ** (1.0 / 0.5)
+    hits = 0
+    for seed in range(40):
+        needed = cv.grasps_needed(_synthetic(0.5, 2.0, 0.01, seed), seed=seed)
+        assert needed.low <= needed.grasps <= needed.high
+        hits += needed.low <= truth <= needed.high
+    assert hits >= 30
+
+
+def test_verdicts() -> None:
+    enough = cv.verdict(_synthetic(0.5, 0.8, 1e-4))
+    assert enough.state == "enough"
+    assert enough.more == (0.0, 0.0, 0.0)
+    more = cv.verdict(_synthetic(0.5, 2.5, 1e-4))
+    assert more.state == "more"
+    assert more.more[1] == pytest.approx(2_500 - 800, rel=0.02)
+    flat = cv.verdict(_synthetic(0.0, 0.3, 1e-4))
+    assert flat.state == "more"
+    assert flat.needed.grasps > 100_000
+    assert flat.more[2] == math.inf
+    borderline = cv.verdict(_synthetic(0.5, 0.05 * 800**0.5, 0.02))
+    assert borderline.state == "borderline"
+
+
+# -- matching
+
+
+def test_determinants_of_the_blocks_are_matched() -> None:
+    kernel = _random_mixture(np.random.default_rng(0))
+    cov = matching.overall_covariance(kernel)
+    match = matching.match_determinants(kernel)
+    assert match.reached
+    assert match.kernel.sigma_position_m**6 == pytest.approx(np.linalg.det(cov[:3, :3]))
+    assert match.kernel.sigma_rotation**6 == pytest.approx(np.linalg.det(cov[3:, 3:]))
+    again = matching.match_determinants(KERNEL)
+    assert again.kernel.sigma_position_m == pytest.approx(KERNEL.sigma_position_m)
+
+
+def test_overall_covariance_is_that_of_draws() -> None:
+    rng = np.random.default_rng(1)
+    kernel = _random_mixture(rng)
+    which = rng.choice(4, 200_000, p=kernel.weights)
+    draws = kernel.means[which] + np.einsum(
+        "nij,nj->ni", np.linalg.cholesky(kernel.covariances)[which], rng.standard_normal((200_000, 6))
+    )
+    got, expected = matching.overall_covariance(kernel), np.cov(draws.T)
+    scale = np.sqrt(np.outer(np.diag(got), np.diag(got)))
+    assert np.max(np.abs(got - expected) / scale) < 0.02
+
+
+@given(st.floats(-2.0, 1.9))
+@settings(max_examples=40, deadline=None)
+def test_likelihood_match_takes_the_wider_of_two(target: float) -> None:
+    def likelihood(kernel: IsotropicKernel) -> float:
+        x = math.log(kernel.sigma_position_m / KERNEL.sigma_position_m)
+        return 2.0 - 5.0 * x * x
+
+    match = matching.match_likelihood(target, KERNEL, likelihood)
+    assert match.reached
+    assert match.achieved == pytest.approx(target, abs=0.011)
+    assert likelihood(match.kernel) == pytest.approx(match.achieved)
+    assert match.kernel.sigma_position_m >= KERNEL.sigma_position_m * 0.95
+
+
+def test_unreachable_likelihood_gives_the_best_there_is() -> None:
+    match = matching.match_likelihood(9.0, KERNEL, lambda k: -((k.sigma_position_m - 0.015) ** 2))
+    assert not match.reached
+    assert match.kernel.sigma_position_m == pytest.approx(0.015, rel=0.01)
+
+
+def test_success_is_matched_by_arrays_and_by_calls() -> None:
+    def rate(kernel: IsotropicKernel) -> float:
+        return float(math.exp(-kernel.sigma_position_m / 0.02))
+
+    factors = np.geomspace(0.5, 2.0, 9)
+    rates = [rate(matching.scaled(KERNEL, float(f))) for f in factors]
+    by_array = matching.match_success(0.4, KERNEL, rates, factors=list(factors))
+    by_call = matching.match_success(0.4, KERNEL, rate, factors=list(factors))
+    assert by_array == by_call
+    assert by_array.reached
+    assert rate(by_array.kernel) == pytest.approx(0.4, abs=0.01)
+    none = matching.match_success(0.9, KERNEL, rates, factors=list(factors))
+    assert not none.reached
+    assert none.achieved == pytest.approx(max(rates))
+    with pytest.raises(ValueError, match="rates"):
+        matching.match_success(0.4, KERNEL, [1.2, 0.3], factors=[1.0, 2.0])
+
+
+def test_noisy_rates_are_made_monotone() -> None:
+    match = matching.match_success(
+        0.25, KERNEL, [0.3, 0.2, 0.3, 0.1], factors=[0.5, 1.0, 1.5, 2.0], draws=[10, 100, 100, 10]
+    )
+    assert match.reached
+    assert match.achieved == pytest.approx(0.25)
