@@ -33,7 +33,7 @@ def triangle_depth(corners: np.ndarray, box: np.ndarray) -> float:
     return float(answer.x[3])
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_loose_triangles_agree_with_linear_programming(seed: int, oracle: Any, random_poses: Any) -> None:
     rng = np.random.default_rng(seed)
