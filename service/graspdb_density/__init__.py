@@ -5,6 +5,7 @@ from .density import GraspDensity
 from .kernels import HAAR_VOLUME, IsotropicKernel
 from .maximum import Maximum, nearest
 from .region import Region
+from .scored import PoseNoise, expected, search_scored
 from .success import SuccessEstimate, SuccessModel
 from .weights import effective_sample_size, importance_weights, mixture_weights
 from .widths import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
@@ -15,16 +16,19 @@ __all__ = [
     "GraspDensity",
     "IsotropicKernel",
     "Maximum",
+    "PoseNoise",
     "Region",
     "SuccessEstimate",
     "SuccessModel",
     "WidthChoice",
     "choose_widths",
     "effective_sample_size",
+    "expected",
     "importance_weights",
     "mixture_weights",
     "nearest",
     "reference",
     "se3",
+    "search_scored",
     "widths_prefix",
 ]

@@ -24,7 +24,7 @@ from .threads import for_blocks
 if TYPE_CHECKING:
     from .density import GraspDensity
 
-__all__ = ["Maximum", "nearest", "search"]
+__all__ = ["Admissible", "Maximum", "Pool", "Search", "nearest", "search"]
 
 #: Whether poses (K, 3), (K, 4) are free of what a region can't express, collisions for one: (K,) bool.
 Admissible = Callable[[Floats, Floats], NDArray[np.bool_]]
@@ -54,31 +54,34 @@ class Maximum:
     log_density : nats of 1/(m^3 rad^3)
     active_constraints
         Names of the region's limits that hold it, see `Region.active`.
+    score
+        What it was chosen by: the log density, unless another score was asked for.
     """
 
     position: Floats
     quaternion_xyzw: Floats
     log_density: float
     active_constraints: tuple[str, ...] = ()
+    score: float = math.nan
 
 
 @dataclass(slots=True)
-class _Pool:
+class Pool:
     """Feasible poses with their kernel sums, best first after `sort`."""
 
     positions: Floats
     quaternions: Floats
     sums: Floats
 
-    def sort(self) -> _Pool:
+    def sort(self) -> Pool:
         order = np.argsort(-self.sums, kind="stable")
-        return _Pool(self.positions[order], self.quaternions[order], self.sums[order])
+        return Pool(self.positions[order], self.quaternions[order], self.sums[order])
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> _Pool:
-        return _Pool(self.positions[index], self.quaternions[index], self.sums[index])
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Pool:
+        return Pool(self.positions[index], self.quaternions[index], self.sums[index])
 
-    def joined(self, other: _Pool) -> _Pool:
-        return _Pool(
+    def joined(self, other: Pool) -> Pool:
+        return Pool(
             np.concatenate([self.positions, other.positions]),
             np.concatenate([self.quaternions, other.quaternions]),
             np.concatenate([self.sums, other.sums]),
@@ -122,11 +125,14 @@ def search(
     if not (min_separation_m >= 0.0 and min_separation >= 0.0):
         raise ValueError("separations must not be negative")
     region = region or Region()
-    search_ = _Search(density, region, admissible, threads)
-    return search_.run(count, min_separation_m, min_separation)
+    return Search(density, region, admissible, threads).run(count, min_separation_m, min_separation)
 
 
-class _Search:
+class Search:
+    """One search; `sums` ranks poses and `climbed` refines them."""
+
+    starts_wanted = _STARTS
+
     def __init__(
         self, density: GraspDensity, region: Region, admissible: Admissible | None, threads: int
     ) -> None:
@@ -141,7 +147,7 @@ class _Search:
     # ------------------------------------------------------------------------------------------------------
 
     def run(self, count: int, separation_m: float, separation: float) -> list[Maximum]:
-        starts = self.starts(max(_STARTS, 3 * count))
+        starts = self.starts(max(self.starts_wanted, 3 * count))
         if not len(starts):
             return []
         pool, ends = self.climbed(starts, max(_FINALISTS, 2 * count))
@@ -158,20 +164,25 @@ class _Search:
         if not chosen:
             return []
         found = pool.take(np.array(chosen))
-        values = self.density.log_density(found.positions, found.quaternions)
+        logs = self.density.log_density(found.positions, found.quaternions)
+        scores = self.values(found.positions, found.quaternions)
         maxima = [
-            Maximum(p, se3.canonical(q), float(v), self.region.active(p, q))
-            for p, q, v in zip(found.positions, found.quaternions, values, strict=True)
+            Maximum(p, se3.canonical(q), float(log), self.region.active(p, q), float(score))
+            for p, q, log, score in zip(found.positions, found.quaternions, logs, scores, strict=True)
         ]
-        return sorted(maxima, key=lambda m: -m.log_density)
+        return sorted(maxima, key=lambda m: -m.score)
 
-    def starts(self, wanted: int) -> _Pool:
+    def values(self, positions: Floats, quaternions: Floats) -> Floats:
+        """The scores to report."""
+        return self.density.log_density(positions, quaternions)
+
+    def starts(self, wanted: int) -> Pool:
         """Separated feasible poses to climb from, admissible ones only."""
         density = self.density
         kernel = density.kernel
         scores, turned = self.scores()
         pending = np.flatnonzero(scores > -np.inf)
-        found = _Pool(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
+        found = Pool(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
         size = _SHORTLIST
         while pending.size and len(found) < wanted and self.checks < _MOST_CHECKS:
             if pending.size > size:
@@ -194,7 +205,7 @@ class _Search:
             found = self.add_distinct(found, near_p, near_q, wanted)
         return found
 
-    def add_distinct(self, found: _Pool, positions: Floats, quaternions: Floats, wanted: int) -> _Pool:
+    def add_distinct(self, found: Pool, positions: Floats, quaternions: Floats, wanted: int) -> Pool:
         """Join to ``found`` the poses distinct by one kernel width, in order, until there are ``wanted``."""
         kernel = self.density.kernel
         joined_p = np.concatenate([found.positions, positions])
@@ -221,7 +232,7 @@ class _Search:
                 break
         if not picked.size:
             return found
-        fresh = _Pool(joined_p[picked], joined_q[picked], np.empty(len(picked)))
+        fresh = Pool(joined_p[picked], joined_q[picked], np.empty(len(picked)))
         fresh.sums = self.sums(fresh.positions, fresh.quaternions)
         return found.joined(fresh)
 
@@ -242,7 +253,7 @@ class _Search:
         for_blocks(work, density.size, block=16_384, threads=self.threads)
         return scores, turned
 
-    def climbed(self, starts: _Pool, finalists: int) -> tuple[_Pool, _Pool]:
+    def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
         """Every pose passed while climbing, and the ends."""
         passed, ends = self.climb(starts, _FIRST_STEPS)
         if not len(ends):
@@ -252,7 +263,7 @@ class _Search:
         on, last = self.climb(ends.take(np.arange(min(promising, finalists))), _STEPS)
         return passed.joined(on), last
 
-    def climb(self, starts: _Pool, steps: int) -> tuple[_Pool, _Pool]:
+    def climb(self, starts: Pool, steps: int) -> tuple[Pool, Pool]:
         density, region, cells = self.density, self.region, self.density.cells
         path = np.empty((len(starts), steps, ascent.PATH))
         lengths = np.empty(len(starts), dtype=np.int64)
@@ -269,7 +280,7 @@ class _Search:
         for_blocks(work, len(starts), block=4, threads=self.threads)
         passed = path[np.arange(steps)[None, :] < lengths[:, None]]
         moved = np.flatnonzero(lengths)
-        return _pool_of(passed), _pool_of(path[moved, lengths[moved] - 1])
+        return pool_of(passed), pool_of(path[moved, lengths[moved] - 1])
 
     def check(self, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
         assert self.admissible is not None
@@ -282,7 +293,7 @@ class _Search:
     def sums(self, positions: Floats, quaternions: Floats) -> Floats:
         return np.asarray(self.density.moments(positions, quaternions, cutoff=REACH)[:, 0], dtype=np.float64)
 
-    def choose(self, pool: _Pool, count: int, separation_m: float, separation: float) -> list[int]:
+    def choose(self, pool: Pool, count: int, separation_m: float, separation: float) -> list[int]:
         """Indices of the best distinct admissible poses of a sorted pool."""
         usable = (
             self.region.contains(pool.positions, pool.quaternions) if len(pool) else np.empty(0, dtype=bool)
@@ -311,7 +322,7 @@ class _Search:
             confirmed[batch[allowed]] = True
             usable[batch[~allowed]] = False
 
-    def explore(self, best: _Pool) -> _Pool:
+    def explore(self, best: Pool) -> Pool:
         """Random search around an admissible pose whose climb is blocked, in steps that shrink as they
         fail.
         """
@@ -334,15 +345,15 @@ class _Search:
                 better = better[self.check(p[better], q[better])]
             if better.size:
                 top = better[np.argmax(sums[better])]
-                best = _Pool(p[top : top + 1], q[top : top + 1], sums[top : top + 1])
+                best = Pool(p[top : top + 1], q[top : top + 1], sums[top : top + 1])
                 passed = passed.joined(best)
             else:
                 step *= 0.5
         return passed
 
 
-def _pool_of(rows: Floats) -> _Pool:
-    return _Pool(rows[:, 0:3].copy(), rows[:, 3:7].copy(), rows[:, 7].copy())
+def pool_of(rows: Floats) -> Pool:
+    return Pool(rows[:, 0:3].copy(), rows[:, 3:7].copy(), rows[:, 7].copy())
 
 
 def nearest(
@@ -376,4 +387,5 @@ def nearest(
         return None
     values = density.log_density(p, q)
     top = int(np.argmax(values))
-    return Maximum(p[top], se3.canonical(q[top]), float(values[top]), region.active(p[top], q[top]))
+    value = float(values[top])
+    return Maximum(p[top], se3.canonical(q[top]), value, region.active(p[top], q[top]), value)

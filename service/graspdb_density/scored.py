@@ -1,0 +1,166 @@
+"""The best grasps by any score of a pose, and scores averaged over pose noise.
+
+A density has its own climb (`maximum`). A success probability's lower end, an expectation under noise or a
+mixture kernel's density have none; here they are searched by values alone, from where an isotropic density is
+high.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from . import se3
+from .maximum import Admissible, Maximum, Pool, Search
+from .region import Region
+from .se3 import Floats
+
+if TYPE_CHECKING:
+    from .density import GraspDensity
+
+__all__ = ["PoseNoise", "Score", "expected", "search_scored"]
+
+#: Scores poses (K, 3), (K, 4): (K,), higher is better.
+Score = Callable[[Floats, Floats], Floats]
+
+_CANDIDATES = 192
+_CLIMBERS = 16
+_TRIES, _ROUNDS = 12, 24
+
+
+def search_scored(
+    density: GraspDensity,
+    score: Score,
+    region: Region | None = None,
+    *,
+    count: int = 1,
+    min_separation_m: float = 0.01,
+    min_separation: float = math.radians(20.0),
+    admissible: Admissible | None = None,
+    threads: int = 1,
+) -> list[Maximum]:
+    """The ``count`` best distinct grasps by ``score``, best first; arguments as in `maximum.search`.
+
+    Candidates are well separated centres of the density, projected into the region; the best climb by random
+    steps, drawn from a fixed seed, that shrink as they fail. ``Maximum.score`` is the score.
+    """
+    found = _ScoredSearch(density, region or Region(), admissible, threads, score)
+    return found.run(count, min_separation_m, min_separation)
+
+
+class _ScoredSearch(Search):
+    starts_wanted = _CANDIDATES
+
+    def __init__(
+        self,
+        density: GraspDensity,
+        region: Region,
+        admissible: Admissible | None,
+        threads: int,
+        score: Score,
+    ) -> None:
+        super().__init__(density, region, admissible, threads)
+        self.score = score
+
+    def sums(self, positions: Floats, quaternions: Floats) -> Floats:
+        values = np.asarray(self.score(positions, quaternions), dtype=np.float64)
+        if values.shape != (len(positions),):
+            raise ValueError(f"the score answered shape {values.shape} for {len(positions)} poses")
+        return values
+
+    def values(self, positions: Floats, quaternions: Floats) -> Floats:
+        return self.sums(positions, quaternions)
+
+    def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
+        kernel = self.density.kernel
+        rng = np.random.default_rng(0)
+        best = starts.sort().take(np.arange(min(len(starts), max(_CLIMBERS, finalists))))
+        step = np.full(len(best), 0.6)
+        passed = best
+        for _ in range(_ROUNDS):
+            scale = np.repeat(step, _TRIES)[:, None]
+            at, to = np.repeat(best.positions, _TRIES, axis=0), np.repeat(best.quaternions, _TRIES, axis=0)
+            moved = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
+            turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
+            p, q, inside = self.region.project(moved, se3.multiply(to, turns))
+            scores = np.full(len(p), -np.inf)
+            scores[inside] = self.sums(p[inside], q[inside])
+            better = scores > np.repeat(best.sums, _TRIES)
+            if self.admissible is not None and better.any():
+                better[better] = self.check(p[better], q[better])
+            scores[~better] = -np.inf
+            table = scores.reshape(len(best), _TRIES)
+            winner = table.argmax(axis=1) + np.arange(len(best)) * _TRIES
+            moved_on = scores[winner] > -np.inf
+            step = np.where(moved_on, np.minimum(1.1 * step, 1.0), 0.6 * step)
+            if moved_on.any():
+                index = winner[moved_on]
+                best.positions[moved_on], best.quaternions[moved_on] = p[index], q[index]
+                best.sums[moved_on] = scores[index]
+                passed = passed.joined(best.take(moved_on))
+            if step.max() < 5e-3:
+                break
+        return passed, best
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """Gaussian noise of a pose, deviations per axis in metres and radians.
+
+    As noise of the object's pose it acts on the left, about ``pivot`` (object frame, metres): 5 degrees at a
+    lever of 100 mm move a grasp by 9 mm. As tool noise it acts on the right and the pivot is the tool's
+    origin.
+    """
+
+    sigma_position_m: float
+    sigma_rotation: float
+    pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        values = (self.sigma_position_m, self.sigma_rotation, *self.pivot)
+        if not all(math.isfinite(v) for v in values) or min(values[:2]) < 0.0:
+            raise ValueError("noise must be finite and not negative")
+
+
+def expected(
+    value: Score,
+    *,
+    object_noise: PoseNoise | None = None,
+    tool_noise: PoseNoise | None = None,
+    samples: int = 64,
+) -> Score:
+    """The mean of ``value`` (a density or a probability, not a logarithm) under pose noise, itself a score.
+
+    The noise is a fixed scrambled Sobol set of ``samples`` draws, so that the mean is a smooth function of
+    the pose; its error falls nearly as 1 / samples.
+    """
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1, not {samples}")
+    normal = ndtri(
+        qmc.Sobol(12, rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(samples)))[:samples]
+    )
+    left_p, left_q = _draws(object_noise, normal[:, :6])
+    right_p, right_q = _draws(tool_noise, normal[:, 6:])
+    pivot = np.zeros(3) if object_noise is None else np.array(object_noise.pivot)
+
+    def mean(positions: ArrayLike, quaternions: ArrayLike) -> Floats:
+        p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+        seen_p = pivot + se3.rotate(left_q[:, None], p[None] - pivot) + left_p[:, None]
+        seen_q = se3.multiply(left_q[:, None], q[None])
+        at, to = se3.compose(seen_p, seen_q, right_p[:, None], right_q[:, None])
+        values = value(at.reshape(-1, 3), se3.normalise(to.reshape(-1, 4)))
+        return np.asarray(values.reshape(samples, len(p)).mean(axis=0), dtype=np.float64)
+
+    return mean
+
+
+def _draws(noise: PoseNoise | None, normal: Floats) -> tuple[Floats, Floats]:
+    scale = (0.0, 0.0) if noise is None else (noise.sigma_position_m, noise.sigma_rotation)
+    return normal[:, :3] * scale[0], se3.from_rotation_vector(normal[:, 3:] * scale[1])
