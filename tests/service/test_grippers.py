@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
-import pytest
 
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database
@@ -58,28 +57,25 @@ def test_grippers_come_in_pages(sqlite_http: httpx.Client) -> None:
     assert [first["items"][0]["id"], second["items"][0]["id"], second["next"]] == ["panda", "pg70", None]
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"max_opening_m": 0}, "max_opening_m"),
-        ({"max_opening_m": -1}, "max_opening_m"),
-        ({"max_opening_m": 1e9}, "max_opening_m"),
-        ({"finger": {"width_m": 0.01, "thickness_m": 0.01}}, "finger.length_m"),
-        ({"palm_size_m": [0.1, 0.1]}, "palm_size_m.2"),
-        ({"tip_offset_m": 0.06}, "tip_offset_m"),
-        ({"force_n": "strong"}, "force_n"),
-        ({"fingers": 2}, "fingers"),
-        (
-            {"base_to_tool": {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]}},
-            "base_to_tool.quaternion_xyzw",
-        ),
-        ({"id": "no spaces"}, "id"),
-    ],
-)
-def test_bad_profile_names_its_field(sqlite_http: httpx.Client, change: dict[str, Any], field: str) -> None:
-    answer = sqlite_http.post("/grippers", json={**MINE, **change})
-    assert answer.status_code == 422
-    assert [error["field"] for error in answer.json()["errors"]] == [field]
+BAD_PROFILES: list[tuple[dict[str, Any], str]] = [
+    ({"max_opening_m": 0}, "max_opening_m"),
+    ({"max_opening_m": -1}, "max_opening_m"),
+    ({"max_opening_m": 1e9}, "max_opening_m"),
+    ({"finger": {"width_m": 0.01, "thickness_m": 0.01}}, "finger.length_m"),
+    ({"palm_size_m": [0.1, 0.1]}, "palm_size_m.2"),
+    ({"tip_offset_m": 0.06}, "tip_offset_m"),
+    ({"force_n": "strong"}, "force_n"),
+    ({"fingers": 2}, "fingers"),
+    ({"base_to_tool": {"position": [0, 0, 0], "quaternion_xyzw": [0] * 4}}, "base_to_tool.quaternion_xyzw"),
+    ({"id": "no spaces"}, "id"),
+]
+
+
+def test_bad_profile_names_its_field(sqlite_http: httpx.Client) -> None:
+    for change, field in BAD_PROFILES:
+        answer = sqlite_http.post("/grippers", json={**MINE, **change})
+        assert answer.status_code == 422, change
+        assert [error["field"] for error in answer.json()["errors"]] == [field]
     assert len(sqlite_http.get("/grippers").json()["items"]) == 2
 
 
@@ -88,26 +84,19 @@ def test_missing_gripper_is_404(http: httpx.Client) -> None:
         assert http.get(f"/grippers/{name}").status_code == 404
 
 
-def _seed(url: str, barrier: Any) -> None:
-    database = Database(url)
-    barrier.wait()
-    seed(database)
-    database.dispose()
-
-
 def test_replicas_that_start_at_once_seed_once(database_url: str) -> None:
-    database = Database(database_url)
-    if database.is_sqlite:
-        upgrade(database)
-    spawn = multiprocessing.get_context("spawn")
-    barrier = spawn.Barrier(3)
-    target: Callable[..., None] = _seed
-    replicas = [spawn.Process(target=target, args=(database_url, barrier)) for _ in range(3)]
-    for replica in replicas:
-        replica.start()
-    for replica in replicas:
-        replica.join(60)
-        assert replica.exitcode == 0
-    with database.read() as tx:
+    replicas = [Database(database_url) for _ in range(6)]
+    if replicas[0].is_sqlite:
+        upgrade(replicas[0])
+    barrier = threading.Barrier(len(replicas))
+
+    def start(database: Database) -> None:
+        barrier.wait()
+        seed(database)
+
+    with ThreadPoolExecutor(len(replicas)) as pool:
+        list(pool.map(start, replicas))
+    with replicas[0].read() as tx:
         assert [row.id for row in grippers.page(tx, after="", limit=10)] == ["panda", "pg70"]
-    database.dispose()
+    for database in replicas:
+        database.dispose()

@@ -174,35 +174,33 @@ HUGE_STL = bytearray(BOX)
 HUGE_STL[96:100] = struct.pack("<f", 3e38)
 
 
-@pytest.mark.parametrize(
-    ("content", "media", "unit", "status", "field"),
-    [
-        (b"", "model/stl", "m", 422, "mesh"),
-        (BOX[:-20], "model/stl", "m", 422, "mesh"),
-        (bytes(NAN_STL), "model/stl", "m", 422, "mesh"),
-        (bytes(HUGE_STL), "model/stl", "m", 422, "mesh"),
-        (b"\0" * 80 + struct.pack("<I", 2**32 - 1), "model/stl", "m", 422, "mesh"),
-        (BOX, "model/obj", "m", 422, "mesh"),
-        (BOX, "model/gltf-binary", "m", 422, "mesh"),
-        (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "model/obj", "m", 422, "mesh"),
-        (b"v 0 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "model/obj", "m", 422, "mesh"),
-        (b"PK\x03\x04", "model/3mf", "m", 415, None),
-        (BOX, "", "m", 415, None),
-        (BOX, "application/json", "m", 415, None),
-        (BOX, "model/stl", "ft", 422, "unit"),
-        (_stl(_box((40, 60, 100))), "model/stl", "m", 422, "mesh"),
-    ],
-)  # fmt: skip
-def test_unusable_mesh_is_refused(
-    sqlite_http: httpx.Client, content: bytes, media: str, unit: str, status: int, field: str | None
-) -> None:
+UNUSABLE: list[tuple[bytes, str, str, int, str | None]] = [
+    (b"", "model/stl", "m", 422, "mesh"),
+    (BOX[:-20], "model/stl", "m", 422, "mesh"),
+    (bytes(NAN_STL), "model/stl", "m", 422, "mesh"),
+    (bytes(HUGE_STL), "model/stl", "m", 422, "mesh"),
+    (b"\0" * 80 + struct.pack("<I", 2**32 - 1), "model/stl", "m", 422, "mesh"),
+    (BOX, "model/obj", "m", 422, "mesh"),
+    (BOX, "model/gltf-binary", "m", 422, "mesh"),
+    (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "model/obj", "m", 422, "mesh"),
+    (b"v 0 0 0\nv 1e308 0 0\nv 0 1 0\nf 1 2 3\n", "model/obj", "m", 422, "mesh"),
+    (b"PK\x03\x04", "model/3mf", "m", 415, None),
+    (BOX, "", "m", 415, None),
+    (BOX, "application/json", "m", 415, None),
+    (BOX, "model/stl", "ft", 422, "unit"),
+    (_stl(_box((40, 60, 100))), "model/stl", "m", 422, "mesh"),
+]
+
+
+def test_unusable_mesh_is_refused(sqlite_http: httpx.Client) -> None:
     sqlite_http.post("/objects", json={"id": "box"})
-    headers = {"Content-Type": media} if media else {}
-    answer = sqlite_http.put(f"/objects/box/mesh?unit={unit}", content=content, headers=headers)
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    if field:
-        assert [error["field"] for error in answer.json()["errors"]] == [field]
+    for content, media, unit, status, field in UNUSABLE:
+        headers = {"Content-Type": media} if media else {}
+        answer = sqlite_http.put(f"/objects/box/mesh?unit={unit}", content=content, headers=headers)
+        assert answer.status_code == status, (media, unit, content[:80], answer.text)
+        assert answer.headers["content-type"] == "application/problem+json"
+        if field:
+            assert [error["field"] for error in answer.json()["errors"]] == [field]
     after = sqlite_http.get("/objects/box").json()
     assert (after["mesh"], after["revision"]) == (None, 0)
 

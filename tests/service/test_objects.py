@@ -5,7 +5,6 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
-import pytest
 from sqlalchemy import text
 
 from graspdb_service.storage import objects
@@ -41,11 +40,12 @@ def test_second_object_of_the_same_id_conflicts(http: httpx.Client) -> None:
     assert http.get("/objects/mug").json()["mass_kg"] is None
 
 
-@pytest.mark.parametrize("slug", ["", "-a", "a/b", "a b", "a\x00b", "ä", "x" * 65, 5, None])
-def test_bad_id_names_its_field(sqlite_http: httpx.Client, slug: object) -> None:
-    answer = sqlite_http.post("/objects", json={"id": slug})
-    assert answer.status_code == 422
-    assert [error["field"] for error in answer.json()["errors"]] == ["id"]
+def test_bad_id_names_its_field(sqlite_http: httpx.Client) -> None:
+    for slug in ("", "-a", "a/b", "a b", "a\x00b", "ä", "x" * 65, "a\n", 5, None):
+        answer = sqlite_http.post("/objects", json={"id": slug})
+        assert answer.status_code == 422, slug
+        assert [error["field"] for error in answer.json()["errors"]] == ["id"]
+    assert sqlite_http.get("/objects").json() == {"items": [], "next": None}
 
 
 def test_unknown_field_is_refused(sqlite_http: httpx.Client) -> None:
@@ -72,25 +72,19 @@ def test_pages_cover_every_object_once(http: httpx.Client) -> None:
     assert len(seen) == len(set(seen))
 
 
-@pytest.mark.parametrize(
-    ("query", "field"),
-    [
-        ("limit=0", "limit"),
-        ("limit=1001", "limit"),
-        ("limit=ten", "limit"),
-        ("limit=99999999999999999999", "limit"),
-        ("cursor=%00", "cursor"),
-        ("cursor=nonsense", "cursor"),
-        ("cursor=" + "W" * 499, "cursor"),
-        ("cursor=" + "W" * 501, "cursor"),
-        ("cursor=NTA", "cursor"),
-        ("after=mug", "after"),
-    ],
-)
-def test_bad_page_query_names_its_parameter(http: httpx.Client, query: str, field: str) -> None:
-    answer = http.get(f"/objects?{query}")
-    assert answer.status_code == 422
-    assert [error["field"] for error in answer.json()["errors"]] == [field]
+BAD_QUERIES = {
+    "limit": ("limit=0", "limit=1001", "limit=ten", "limit=99999999999999999999", "limit=NaN"),
+    "cursor": ("cursor=%00", "cursor=nonsense", "cursor=" + "W" * 499, "cursor=" + "W" * 501, "cursor=NTA"),
+    "after": ("after=mug",),
+}
+
+
+def test_bad_page_query_names_its_parameter(http: httpx.Client) -> None:
+    for field, queries in BAD_QUERIES.items():
+        for query in queries:
+            answer = http.get(f"/objects?{query}")
+            assert answer.status_code == 422, query
+            assert [error["field"] for error in answer.json()["errors"]] == [field]
 
 
 def test_patch_sets_what_is_given_and_null_clears(http: httpx.Client) -> None:
@@ -175,11 +169,11 @@ def _tetrahedron_obj() -> bytes:
     return "\n".join(lines).encode()
 
 
-@pytest.mark.parametrize("name", ["nope", "%00", "..%2f..", "a%20b", "%ff", "x" * 300])
-def test_missing_object_is_404_whatever_its_name(http: httpx.Client, name: str) -> None:
-    answer = http.get(f"/objects/{name}")
-    assert answer.status_code == 404
-    assert answer.headers["content-type"] == "application/problem+json"
+def test_missing_object_is_404_whatever_its_name(http: httpx.Client) -> None:
+    for name in ("nope", "%00", "..%2f..", "a%20b", "%ff", "x" * 300, "%ed%a0%80"):
+        answer = http.get(f"/objects/{name}")
+        assert answer.status_code == 404, name
+        assert answer.headers["content-type"] == "application/problem+json"
 
 
 def test_read_modify_writes_of_many_threads_lose_none(database_url: str) -> None:

@@ -283,7 +283,8 @@ def _check(fields: _Fields, defaults: TrialDefaults, faults: _Faults) -> TrialBa
                 " is the unit right?",
             )
     if quaternion is not None:
-        norm = np.sqrt((quaternion**2).sum(axis=1))
+        with np.errstate(over="ignore"):  # an infinite norm is far enough from 1
+            norm = np.sqrt((quaternion**2).sum(axis=1))
         for i in np.flatnonzero(~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)):
             faults.add(
                 fields.place(int(i), "quaternion_xyzw"),
