@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import GripperProfile, ResultRows, SimulatePayload, SimulateResult
+from graspdb.wire import GridPlan, GripperProfile, ResultRows, SimulatePayload, SimulateResult
 from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import GripperShape
@@ -118,6 +118,21 @@ def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:
     )
 
 
+def grid_of(plan: GridPlan) -> PoseGrid:
+    """The grid that a payload describes."""
+    return PoseGrid(
+        lower=plan.lower,
+        upper=plan.upper,
+        position_step_m=plan.position_step_m,
+        rotation_step_deg=plan.rotation_step_deg,
+        margin_m=plan.margin_m,
+        symmetric=plan.symmetric,
+        max_poses=plan.max_poses,
+        seed=plan.seed,
+        region=plan.region,
+    )
+
+
 def poses_of(
     payload: SimulatePayload,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
@@ -129,18 +144,7 @@ def poses_of(
         If the payload has neither grid nor poses, or as many poses as it does not say.
     """
     if payload.grid is not None:
-        plan = payload.grid
-        grid = PoseGrid(
-            lower=plan.lower,
-            upper=plan.upper,
-            position_step_m=plan.position_step_m,
-            rotation_step_deg=plan.rotation_step_deg,
-            margin_m=plan.margin_m,
-            symmetric=plan.symmetric,
-            max_poses=plan.max_poses,
-            seed=plan.seed,
-            region=plan.region,
-        )
+        grid = grid_of(payload.grid)
         indices = grid.pose_indices(payload.start, payload.stop)
         positions, quaternions = grid.poses(indices)
         return indices, positions, quaternions

@@ -8,13 +8,19 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import Progress
 
+from graspdb.errors import GraspDBError
 from graspdb.transport import Transport
+from graspdb.wire import Pose
 
 app = typer.Typer(
     add_completion=False,
@@ -108,6 +114,92 @@ def run(
         f" {tally.failures} failed, {tally.lost} not wanted any more",
         err=True,
     )
+
+
+ObjectName = Annotated[
+    str, typer.Argument(help="An object of the service, or without --url an example: cone, mug, ...")
+]
+ServiceUrl = Annotated[str | None, typer.Option(help="Take object and gripper from this service.")]
+GripperName = Annotated[str, typer.Option(help="A gripper of the service; without --url pg70 or panda.")]
+ApiKey = Annotated[str | None, typer.Option(envvar="GRASPDB_API_KEY")]
+Numbers = Annotated[str, typer.Option(help="Comma-separated, object frame.")]
+
+
+@app.command()
+def verify(
+    object_name: ObjectName,
+    count: Annotated[int, typer.Option(min=10, help="Grasps to simulate again.")] = 1000,
+    gripper: GripperName = "pg70",
+    seed: Annotated[int, typer.Option(help="Of the sample.")] = 0,
+    url: ServiceUrl = None,
+    api_key: ApiKey = None,
+) -> None:
+    """Simulate a sample of the grid's physics poses at 1/2000 s and 200 iterations; print the agreement."""
+    _require_pybullet()
+    from graspdb_simworker import sources, verification
+
+    with _explained():
+        payload, parts = sources.load(object_name, gripper, url=url, api_key=api_key, seed=seed)
+        payload = verification.enough_poses(payload, parts, count)
+        with _progress("grasps") as progress:
+            found = verification.verify(payload, parts, count=count, seed=seed, progress=progress)
+    typer.echo(f"{'outcome':20} {'found':>7} {'checked':>8} {'agree':>7} {'same name':>10}")
+    for s in found.strata:
+        name = s.outcome.name.lower()
+        typer.echo(
+            f"{name:20} {s.available:7} {s.checked:8} {s.agree / s.checked:7.4f} {s.same / s.checked:10.4f}"
+        )
+    typer.echo(
+        f"{object_name}: success or failure agrees in {found.agreement:.4f} of the poses that met physics"
+        f" (at least {found.lower:.4f} at {verification.LEVEL:.0%}; {found.checked} checked);"
+        f" the same outcome in {found.same:.4f}"
+    )
+
+
+@app.command()
+def show(
+    object_name: ObjectName,
+    position: Numbers = "0,0,0",
+    quaternion: Annotated[str, typer.Option(help="x,y,z,w of the tool in the object frame.")] = "0,0,0,1",
+    out: Annotated[Path, typer.Option(help="The PNG to write.")] = Path("grasp.png"),
+    gripper: GripperName = "pg70",
+    fine: Annotated[bool, typer.Option(help="1/2000 s and 200 iterations.")] = False,
+    url: ServiceUrl = None,
+    api_key: ApiKey = None,
+) -> None:
+    """Simulate one grasp and draw how it ends, from two sides."""
+    _require_pybullet()
+    from graspdb_simworker import png, sources
+
+    with _explained():
+        pose = Pose.model_validate({"position": position, "quaternion_xyzw": quaternion})
+        payload, parts = sources.load(object_name, gripper, url=url, api_key=api_key)
+        shown = sources.simulate_one(payload, parts, pose, "fine" if fine else "standard")
+    if shown.picture is not None:
+        out.write_bytes(png.encode(shown.picture))
+    width, quality = (f"{v:.4g}" if v == v else "unknown" for v in (shown.label.width_m, shown.label.quality))
+    typer.echo(
+        f"{shown.label.outcome.name.lower()}: fingers {width} m apart, holds {quality} times the weight"
+        f" in the worst direction; {out if shown.picture is not None else 'no picture'}"
+    )
+
+
+@contextmanager
+def _explained() -> Iterator[None]:
+    """One line for what a user can mend."""
+    try:
+        yield
+    except (ValueError, GraspDBError) as error:
+        typer.echo(f"graspdb-simworker: {error}", err=True)
+        raise typer.Exit(1) from None
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on the standard error."""
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _stop_on_signals(stop: Callable[[], None]) -> None:

@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pybullet
+from numpy.typing import NDArray
 
 from graspdb_simworker.bodies import (
     Closing,
@@ -80,6 +81,8 @@ class GraspWorld:
         Coulomb friction coefficient between object and gripper.
     gripper : Gripper
     fidelity : {'standard', 'fine'}
+    visible : bool
+        Build what can be seen, for :meth:`picture`.
     """
 
     def __init__(
@@ -89,10 +92,14 @@ class GraspWorld:
         friction: float,
         gripper: Gripper,
         fidelity: Fidelity = "standard",
+        *,
+        visible: bool = False,
     ) -> None:
         self.gripper = gripper
         self.stepping = STEPPING[fidelity]
         self.mass = mass_properties(parts, mass_kg)
+        self._visible = visible
+        self._picture: NDArray[np.uint8] | None = None
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("pybullet could not open a DIRECT world")
@@ -138,8 +145,9 @@ class GraspWorld:
     def _build_gripper(self) -> int:
         gripper = self.gripper
         finger_half, palm_half = gripper.finger_half_extents, gripper.palm_half_extents
-        finger = self._box(finger_half)
-        palm = self._box(palm_half)
+        finger, palm = self._box(finger_half), self._box(palm_half)
+        finger_look = self._look(halfExtents=finger_half, rgbaColor=(0.25, 0.30, 0.38, 1.0))
+        palm_look = self._look(halfExtents=palm_half, rgbaColor=(0.55, 0.58, 0.62, 1.0))
         closed = gripper.tip_offset_m - finger_half[2]
         frames = [(0.0, side * finger_half[1], closed) for side in (-1.0, 1.0)]
         return int(
@@ -148,10 +156,11 @@ class GraspWorld:
                 # The base frame is the tool frame; the palm hangs behind it, so that links count from
                 # the tool.
                 baseCollisionShapeIndex=palm,
+                baseVisualShapeIndex=palm_look,
                 basePosition=(0.0, 0.0, gripper.palm_centre_z),
                 linkMasses=[gripper.finger_mass_kg] * 2,
                 linkCollisionShapeIndices=[finger, finger],
-                linkVisualShapeIndices=[-1, -1],
+                linkVisualShapeIndices=[finger_look, finger_look],
                 linkPositions=[(x, y, z - gripper.palm_centre_z) for x, y, z in frames],
                 linkOrientations=[_IDENTITY] * 2,
                 linkInertialFramePositions=[(0.0, 0.0, 0.0)] * 2,
@@ -170,6 +179,13 @@ class GraspWorld:
             )
         )
 
+    def _look(self, **shape: Any) -> int:
+        """A visual shape; none unless the world is to be seen."""
+        if not self._visible:
+            return -1
+        kind = pybullet.GEOM_MESH if "fileName" in shape else pybullet.GEOM_BOX
+        return int(pybullet.createVisualShape(kind, physicsClientId=self._client, **shape))
+
     def _build_object(self, parts: Sequence[Part], mass: MassProperties) -> int:
         # pybullet takes several hulls in one body only from an OBJ file, a group a part. In it the body
         # frame is the principal frame of inertia, so that no inertial offset is left to go wrong.
@@ -183,6 +199,9 @@ class GraspWorld:
                 pybullet.createMultiBody(
                     baseMass=mass.mass_kg,
                     baseCollisionShapeIndex=shape,
+                    baseVisualShapeIndex=self._look(
+                        fileName=os.fspath(path), rgbaColor=(0.93, 0.62, 0.25, 1.0)
+                    ),
                     basePosition=_PARKED,
                     physicsClientId=self._client,
                 )
@@ -244,9 +263,50 @@ class GraspWorld:
             geometry.
         """
         try:
-            return self._close(position, quaternion_xyzw, travel_m)
+            closing = self._close(position, quaternion_xyzw, travel_m)
+            if self._visible:
+                self._picture = self._render()
+            return closing
         finally:
             self._park()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """The end of the last closing from two sides, (480, 1280, 3), drawn by pybullet's CPU renderer.
+
+        Raises
+        ------
+        RuntimeError
+            In a world that is not visible, or before the first closing.
+        """
+        if self._picture is None:
+            raise RuntimeError("only a visible world has a picture, and only after a closing")
+        return self._picture
+
+    def _render(self) -> NDArray[np.uint8]:
+        width, height = 640, 480
+        # The ghost column would be drawn: out of sight meanwhile.
+        column = pybullet.getBasePositionAndOrientation(self._column, physicsClientId=self._client)
+        pybullet.resetBasePositionAndOrientation(
+            self._column, _PARKED, _IDENTITY, physicsClientId=self._client
+        )
+        lens = pybullet.computeProjectionMatrixFOV(fov=32.0, aspect=width / height, nearVal=0.02, farVal=4.0)
+        views = []
+        # Along the fingers' width, and obliquely from the tips; the approach points down.
+        for eye in ((0.45, 0.0, 0.05), (0.28, -0.30, 0.25)):
+            view = pybullet.computeViewMatrix(eye, (0.0, 0.0, -0.02), (0.0, 0.0, -1.0))
+            _, _, pixels, _, _ = pybullet.getCameraImage(
+                width,
+                height,
+                view,
+                lens,
+                lightDirection=(0.6, -0.4, -0.8),
+                shadow=0,
+                renderer=pybullet.ER_TINY_RENDERER,
+                physicsClientId=self._client,
+            )
+            views.append(np.asarray(pixels, dtype=np.uint8).reshape(height, width, 4)[:, :, :3])
+        pybullet.resetBasePositionAndOrientation(self._column, *column, physicsClientId=self._client)
+        return np.concatenate(views, axis=1)
 
     def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
         client, jaw, body = self._client, self._jaw, self._object

@@ -1,0 +1,171 @@
+"""Do the labels hold at a far finer time step? A sample of poses that met physics, simulated again.
+
+The sample is stratified by the outcome at the ordinary fidelity, so that rare outcomes are checked too;
+the agreement over all poses weighs each stratum by its share. The lower bound is the 5 % quantile of
+that weighted sum when each stratum's agreement follows its posterior under Jeffreys' prior, Beta(agree
++ 1/2, disagree + 1/2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import SimulatePayload
+from graspdb_geometry import collision
+from graspdb_simworker import chunks
+from graspdb_simworker.bodies import Part
+from graspdb_simworker.labels import Outcome
+
+LEVEL = 0.95
+_DRAWS = 200_000
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """Poses of one outcome at the ordinary fidelity.
+
+    ``available`` of them were found, ``checked`` were simulated again, ``agree`` on success or failure,
+    ``same`` on the outcome's very name.
+    """
+
+    outcome: Outcome
+    available: int
+    checked: int
+    agree: int
+    same: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement on success or failure between two fidelities, over all poses that met physics."""
+
+    strata: tuple[Stratum, ...]
+    agreement: float
+    lower: float
+    same: float
+
+    @property
+    def checked(self) -> int:
+        return sum(stratum.checked for stratum in self.strata)
+
+
+def enough_poses(payload: SimulatePayload, parts: Sequence[Part], count: int) -> SimulatePayload:
+    """The payload with so many random poses of its grid that about three times ``count`` meet physics."""
+    assert payload.grid is not None
+    scene, shape = collision.Scene(parts), chunks.shape_of(payload.gripper)
+    poses = 20_000
+    while True:
+        grid = payload.grid.model_copy(update={"max_poses": poses})
+        total = min(poses, chunks.grid_of(grid).candidate_total)
+        larger = payload.model_copy(update={"grid": grid, "start": 0, "stop": total})
+        _, positions, quaternions = chunks.poses_of(larger)
+        codes, _ = scene.classify(positions, quaternions, shape)
+        if total < poses or int((codes == collision.CONTACT).sum()) >= 3 * count:
+            return larger
+        poses *= 2
+
+
+def verify(
+    payload: SimulatePayload,
+    parts: Sequence[Part],
+    *,
+    count: int,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Agreement:
+    """Simulate a chunk, then a stratified sample of its physics poses at fine fidelity.
+
+    Parameters
+    ----------
+    payload : SimulatePayload
+        The poses to sample from; its own fidelity is what is verified.
+    parts : sequence of (vertices, faces)
+    count : int
+        Poses to simulate again, as many as there are at most.
+    seed : int
+    progress
+        Told how many of how many closings are done.
+
+    Raises
+    ------
+    ValueError
+        If no pose of the chunk meets physics.
+    """
+    _, positions, quaternions = chunks.poses_of(payload)
+    coarse = chunks.prepare(payload, parts)
+    fine = chunks.prepare(payload.model_copy(update={"fidelity": "fine"}), parts)
+    try:
+        codes, first = coarse.scene.classify(positions, quaternions, coarse.shape)
+        rows = np.flatnonzero(codes == collision.CONTACT)
+        if len(rows) == 0:
+            raise ValueError("no pose of this sample needs physics: take more poses")
+        rng = np.random.default_rng(seed)
+        rows = np.sort(rng.permutation(rows)[: 3 * count])
+        travel = np.minimum(first.min(axis=1), 0.5 * coarse.shape.max_opening_m)
+        total = len(rows) + min(count, len(rows))
+
+        def outcomes(workpiece: chunks.Workpiece, chosen: NDArray[np.int64], done: int) -> NDArray[np.uint8]:
+            found = np.empty(len(chosen), dtype=np.uint8)
+            for k, row in enumerate(chosen.tolist()):
+                label = workpiece.simulate(positions[row], quaternions[row], float(travel[row]))
+                found[k] = label.outcome
+                progress(done + k + 1, total)
+            return found
+
+        labels = outcomes(coarse, rows, 0)
+        picked = _stratified(labels, count, rng)
+        again = outcomes(fine, rows[picked], len(rows))
+    finally:
+        coarse.close()
+        fine.close()
+    return _agreement(labels, labels[picked], again, rng)
+
+
+def _stratified(labels: NDArray[np.uint8], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of about ``count`` labels: at least a tenth of them from each stratum that has as many."""
+    kinds, available = np.unique(labels, return_counts=True)
+    wanted = np.maximum(np.round(count * available / len(labels)).astype(int), count // 10)
+    wanted = np.minimum(wanted, available)
+    # What the small strata got more comes from the largest one.
+    wanted[np.argmax(wanted)] -= max(0, int(wanted.sum()) - count)
+    picked = [
+        rng.permutation(np.flatnonzero(labels == kind))[:take]
+        for kind, take in zip(kinds, np.maximum(wanted, 1), strict=True)
+    ]
+    return np.sort(np.concatenate(picked))
+
+
+def _agreement(
+    labels: NDArray[np.uint8],
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    rng: np.random.Generator,
+) -> Agreement:
+    strata = []
+    for kind in np.unique(before):
+        chosen = before == kind
+        success = after[chosen] == Outcome.SUCCESS
+        strata.append(
+            Stratum(
+                outcome=Outcome(int(kind)),
+                available=int((labels == kind).sum()),
+                checked=int(chosen.sum()),
+                agree=int((success == (kind == Outcome.SUCCESS)).sum()),
+                same=int((after[chosen] == kind).sum()),
+            )
+        )
+    weights = np.array([s.available for s in strata], dtype=np.float64)
+    weights /= weights.sum()
+    shares = np.array([s.agree / s.checked for s in strata])
+    same = np.array([s.same / s.checked for s in strata])
+    draws = np.column_stack([rng.beta(s.agree + 0.5, s.checked - s.agree + 0.5, _DRAWS) for s in strata])
+    return Agreement(
+        tuple(strata),
+        float(weights @ shares),
+        float(np.quantile(draws @ weights, 1.0 - LEVEL)),
+        float(weights @ same),
+    )
