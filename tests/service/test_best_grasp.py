@@ -45,7 +45,8 @@ def put_box(http: httpx.Client, size: tuple[float, float, float] = BOX) -> Scene
 
 
 def best(http: httpx.Client, **query: Any) -> dict[str, Any]:
-    """The answer to GET, which must equal the answer to POST."""
+    """The answer to GET, which must equal the answer to POST; at 15 mm / 15 degrees."""
+    query |= {"sigma_position_m": 0.015, "sigma_rotation_deg": 15}
     joined = {
         name: ",".join(map(repr, map(float, value)))
         if isinstance(value, (list, tuple, np.ndarray))

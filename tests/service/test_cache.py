@@ -29,7 +29,7 @@ Poses = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 
-DEFAULT = (Filters(), KernelChoice())
+PLAIN = (Filters(), KernelChoice(0.015, 15.0))
 KERNEL = IsotropicKernel(0.015, np.deg2rad(15))
 
 
@@ -144,11 +144,11 @@ def test_concurrent_first_requests_build_once(
 
     monkeypatch.setattr(densities_module, "_build", counted)
     with ThreadPoolExecutor(10) as pool:
-        found = list(pool.map(lambda _: ctx.densities.get("thing", *DEFAULT), range(10)))
+        found = list(pool.map(lambda _: ctx.densities.get("thing", *PLAIN), range(10)))
     assert len(builds) == 1
     assert len({id(built) for built in found}) == 1
     # Named or not, the only gripper there is means the same density.
-    named = ctx.densities.get("thing", Filters(), KernelChoice())
+    named = ctx.densities.get("thing", Filters(), KernelChoice(0.015, 15.0))
     assert named is found[0]
 
 
@@ -182,7 +182,7 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
         post(http, "thing", poses, proposal_density=density)
         post(http, "thing", part(two_clusters, 0, 10), "failure")
         done += count
-        built = ctx.densities.get("thing", *DEFAULT)
+        built = ctx.densities.get("thing", *PLAIN)
         assert reads[-1] == last_seq  # The tail only.
         last_seq = built.last_seq
         assert built.density is not None
@@ -201,8 +201,44 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
         np.testing.assert_allclose(built.density.weights, weights / weights.sum(), rtol=1e-9)
     assert len(reads) == len(steps)
     # Nothing new: not even the tail is read.
-    assert ctx.densities.get("thing", *DEFAULT) is built
+    assert ctx.densities.get("thing", *PLAIN) is built
     assert len(reads) == len(steps)
+
+
+def test_default_widths_are_chosen_anew_only_when_successes_double(
+    http: httpx.Client,
+    ctx: Context,
+    database_url: str,
+    make_object: Make,
+    post: Post,
+    clusters: Callable[..., Poses],
+) -> None:
+    """A density that grew and one built at once agree on the widths, too."""
+    make_object(http)
+    rng = np.random.default_rng(6)
+    centres = [(tuple(c), (1.0, 0.0, 0.0, 0.0)) for c in rng.uniform(-0.1, 0.1, (50, 3))]
+    poses = clusters(centres, 20, sigma_m=0.004, sigma_rad=0.05)
+    order = rng.permutation(1000)
+    poses = poses[0][order], poses[1][order]
+    seen = {}
+    for start, stop in ((0, 150), (150, 199), (199, 260), (260, 399), (399, 401), (401, 700), (700, 1000)):
+        post(http, "thing", part(poses, start, stop), proposal_density=rng.uniform(1, 3, stop - start))
+        seen[stop] = ctx.densities.get("thing", Filters(), KernelChoice()).kernel
+        fresh = create_app(Settings(database_url=database_url)).state.context
+        try:
+            assert fresh.densities.get("thing", Filters(), KernelChoice()).kernel == seen[stop]
+        finally:
+            fresh.close()
+    assert (seen[150].sigma_position_m, seen[150].sigma_rotation_deg) == (0.015, 15)
+    assert seen[150] == seen[199]
+    assert "first 200" in seen[260].rule
+    assert seen[260] == seen[399]
+    assert "first 400" in seen[401].rule
+    assert seen[401] == seen[700]
+    assert "first 800" in seen[1000].rule
+    # Clusters of 4 mm and 3 degrees: narrower than the first default.
+    assert seen[1000].sigma_position_m < 0.015
+    assert seen[1000].sigma_rotation_deg < 15
 
 
 def test_what_one_process_commits_is_in_the_others_next_answer(
@@ -221,7 +257,10 @@ def test_what_one_process_commits_is_in_the_others_next_answer(
             for client in (reader, writer):
                 info = client.get("/objects/thing/density").json()
                 assert (info["size"], info["revision"]) == (100 * step + 100, receipt["revision"])
-        body = {"poses": {"position": two_clusters[0].tolist(), "quaternion_xyzw": two_clusters[1].tolist()}}
+        body = {
+            "poses": {"position": two_clusters[0].tolist(), "quaternion_xyzw": two_clusters[1].tolist()},
+            "kernel": {"sigma_position_m": 0.015, "sigma_rotation_deg": 15},
+        }
         answers = [c.post("/objects/thing/likelihood", json=body).json()["log_density"] for c in (one, two)]
         np.testing.assert_allclose(answers[0], answers[1], atol=1e-5)
 
@@ -242,13 +281,13 @@ def test_a_new_object_of_the_same_name_has_nothing_of_the_old(
 ) -> None:
     make_object(http)
     post(http, "thing", two_clusters)
-    old = ctx.densities.get("thing", *DEFAULT)
+    old = ctx.densities.get("thing", *PLAIN)
     assert http.delete("/objects/thing").status_code == 204
     with pytest.raises(ProblemError) as caught:
-        ctx.densities.get("thing", *DEFAULT)
+        ctx.densities.get("thing", *PLAIN)
     assert caught.value.status == 404
     make_object(http)
-    new = ctx.densities.get("thing", *DEFAULT)
+    new = ctx.densities.get("thing", *PLAIN)
     assert new.density is None
     assert new.object_row.id != old.object_row.id
 
@@ -263,7 +302,7 @@ def test_readers_never_lose_or_double_a_trial_while_others_write(
     def read() -> None:
         size = 0
         while not stop.is_set():
-            built = ctx.densities.get("thing", *DEFAULT)
+            built = ctx.densities.get("thing", *PLAIN)
             now = 0 if built.density is None else built.density.size
             if now < size or now != built.selected.successes or len(np.unique(built.seq)) != now:
                 wrong.append(f"{now} after {size}, {built.selected.successes} counted")
@@ -281,7 +320,7 @@ def test_readers_never_lose_or_double_a_trial_while_others_write(
     for reader in readers:
         reader.join()
     assert wrong == []
-    final = ctx.densities.get("thing", *DEFAULT)
+    final = ctx.densities.get("thing", *PLAIN)
     assert final.density is not None
     assert final.density.size == 500
 

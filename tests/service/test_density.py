@@ -44,9 +44,7 @@ def test_counts_kernel_and_revision(
     assert info["revision"] == receipt["revision"]
     assert info["effective_sample_size"] == pytest.approx(500)
     assert info["kernel"]["kind"] == "isotropic"
-    assert info["kernel"]["sigma_position_m"] == 0.015
-    assert info["kernel"]["sigma_rotation_deg"] == 15
-    assert "default" in info["kernel"]["rule"]
+    assert "leave-one-block-out" in info["kernel"]["rule"]
     assert info["unit"] == "1/(m^3 rad^3)"
     asked = http.get("/objects/thing/density?kernel=isotropic&sigma_position_m=0.03").json()["kernel"]
     assert asked["sigma_position_m"] == 0.03
@@ -58,6 +56,8 @@ def test_no_success_is_an_answer_too(http: httpx.Client, make_object: Make, post
     make_object(http)
     info = http.get("/objects/thing/density").json()
     assert (info["size"], info["outcomes"], info["effective_sample_size"]) == (0, {}, 0)
+    assert (info["kernel"]["sigma_position_m"], info["kernel"]["sigma_rotation_deg"]) == (0.015, 15)
+    assert "default" in info["kernel"]["rule"]
     post(http, "thing", (np.zeros((3, 3)), np.array([[0, 0, 0, 1.0]] * 3)), "dropped")
     info = http.get("/objects/thing/density").json()
     assert (info["size"], info["outcomes"]) == (0, {"dropped": 3})

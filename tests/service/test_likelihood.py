@@ -22,6 +22,7 @@ Make = Callable[..., str]
 
 #: The density's stated error with its default cut-off.
 RELATIVE_ERROR = 2e-3
+WIDTHS = {"sigma_position_m": 0.015, "sigma_rotation_deg": 15}
 
 
 def listed(poses: Poses) -> list[dict[str, Any]]:
@@ -36,6 +37,7 @@ def columns(poses: Poses) -> dict[str, Any]:
 
 
 def ask(http: httpx.Client, poses: object, **more: Any) -> dict[str, Any]:
+    more = more if "kernel" in more else {**more, **WIDTHS}
     answer = http.post("/objects/thing/likelihood", json={"poses": poses, **more})
     assert answer.status_code == 200, answer.text
     body: dict[str, Any] = answer.json()

@@ -20,6 +20,8 @@ Poses = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 
+WIDTHS = {"sigma_position_m": 0.015, "sigma_rotation_deg": 15}
+
 
 def fields(answer: httpx.Response, status: int = 422) -> set[str]:
     assert answer.status_code == status, answer.text
@@ -32,10 +34,10 @@ def test_repeatable_and_with_their_density(
     make_object(http)
     post(http, "thing", two_clusters)
     path = "/objects/thing/samples"
-    first = http.post(path, json={"count": 2000, "seed": 7}).json()
+    first = http.post(path, json={"count": 2000, "seed": 7, **WIDTHS}).json()
     assert first["seed"] == 7
-    assert http.post(path, json={"count": 2000, "seed": 7}).json() == first
-    assert http.post(path, json={"count": 2000, "seed": 8}).json()["position"] != first["position"]
+    assert http.post(path, json={"count": 2000, "seed": 7, **WIDTHS}).json() == first
+    assert http.post(path, json={"count": 2000, "seed": 8, **WIDTHS}).json()["position"] != first["position"]
     made_up = http.post(path, json={"count": 5}).json()
     assert http.post(path, json={"count": 5, "seed": made_up["seed"]}).json() == made_up
 
@@ -74,7 +76,7 @@ def test_weights_shape_the_draws(
     make_object(sqlite_http)
     proposal = np.where(np.arange(500) < 300, 30.0, 10.0)
     post(sqlite_http, "thing", two_clusters, proposal_density=proposal)
-    answer = sqlite_http.post("/objects/thing/samples", json={"count": 10_000, "seed": 2}).json()
+    answer = sqlite_http.post("/objects/thing/samples", json={"count": 10_000, "seed": 2, **WIDTHS}).json()
     top = np.array(answer["position"])[:, 2] > 0.03
     assert abs(top.mean() - 300 / 900) < 4 * np.sqrt(0.22 / 10_000)
 

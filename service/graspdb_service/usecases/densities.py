@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, KernelSpec, Selection
-from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
+from graspdb_density import (
+    DEFAULT_KERNEL,
+    GraspDensity,
+    IsotropicKernel,
+    choose_widths,
+    importance_weights,
+    widths_prefix,
+)
 from graspdb_density.density import CUTOFF
 from graspdb_density.kernels import POSITION_LIMITS_M, ROTATION_LIMITS
+from graspdb_density.widths import FIRST_CHOICE
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import objects, trials
 from graspdb_service.storage.database import Database, Tx
@@ -25,8 +33,8 @@ from graspdb_service.usecases.slugs import is_slug
 
 Floats = NDArray[np.float64]
 
-DEFAULT_SIGMA_POSITION_M = 0.015
-DEFAULT_SIGMA_ROTATION_DEG = 15.0
+_DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
+_DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
 #: Weights are told apart in float32: a row that counts less than this share of the heaviest gets this share.
@@ -114,6 +122,8 @@ class Built:
         (N,) NaN where unknown; None where none is known.
     weight_unit
         Weight times proposal density, the same for every row that has one.
+    chosen_from
+        How many of the first rows the widths were chosen from.
     """
 
     revision: int
@@ -126,6 +136,7 @@ class Built:
     seq: NDArray[np.int64]
     proposal_density: Floats | None
     weight_unit: float | None
+    chosen_from: int = 0
 
     @property
     def nbytes(self) -> int:
@@ -219,7 +230,9 @@ class Densities:
             return replace(
                 before, revision=row.revision, last_seq=row.last_seq, object_row=row, selected=selected
             )
-        return self._compute.run(lambda: _build(key.kernel, row, selected, rows, before))
+        return self._compute.run(
+            lambda: _build(key.kernel, row, selected, rows, before, self._compute.threads)
+        )
 
 
 def _require(tx: Tx, slug: str) -> ObjectRow:
@@ -231,16 +244,22 @@ def _require(tx: Tx, slug: str) -> ObjectRow:
 
 
 def _build(
-    choice: KernelChoice, row: ObjectRow, selected: Selected, rows: trials.Columns, before: Built | None
+    choice: KernelChoice,
+    row: ObjectRow,
+    selected: Selected,
+    rows: trials.Columns,
+    before: Built | None,
+    threads: int,
 ) -> Built:
     """Extend the density there was, or build it from all rows where that is not possible."""
     symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
     proposal = None if np.isnan(rows.proposal_density).all() else rows.proposal_density
-    old = None if before is None else before.density
     position, quaternion, seq = rows.position, rows.quaternion_xyzw, rows.seq
+    old = None if before is None else before.density
     if before is not None and old is not None:
-        seq = np.concatenate([before.seq, rows.seq])
+        seq = np.concatenate([before.seq, seq])
         proposal = _joined(before.proposal_density, len(before.seq), proposal, len(rows))
+    chosen_from = widths_prefix(len(seq)) if choice.by_default else 0
     built = Built(
         revision=row.revision,
         epoch=row.epoch,
@@ -252,22 +271,34 @@ def _build(
         seq=seq,
         proposal_density=proposal,
         weight_unit=None,
+        chosen_from=chosen_from,
     )
     if not len(seq):
         return built
     if before is not None and old is not None:
-        if before.kernel == built.kernel:
+        if before.chosen_from == chosen_from:
+            built = replace(built, kernel=before.kernel)
             extended = _extended(before, old, rows, symmetric, proposal)
             if extended is not None:
                 return replace(built, density=extended, weight_unit=before.weight_unit)
         position = np.concatenate([old.positions, position])
         quaternion = np.concatenate([old.quaternions_xyzw, quaternion])
         symmetric = np.concatenate([old.symmetric, symmetric])
-    weights = None if proposal is None else _weights(proposal)
+    if chosen_from and (before is None or before.chosen_from != chosen_from):
+        first = slice(0, chosen_from)
+        widths = choose_widths(
+            position[first],
+            quaternion[first],
+            weights=_weights(None if proposal is None else proposal[first]),
+            symmetric=symmetric[first],
+            threads=threads,
+        )
+        built = replace(built, kernel=_chosen(widths.kernel, widths.rule, widths.rows))
+    weights = _weights(proposal)
     unit = None
     if weights is not None and proposal is not None:
-        first = int(np.flatnonzero(~np.isnan(proposal))[0])
-        unit = float(weights[first] * proposal[first])
+        known = int(np.flatnonzero(~np.isnan(proposal))[0])
+        unit = float(weights[known] * proposal[known])
     density = GraspDensity.build(
         position,
         quaternion,
@@ -298,8 +329,10 @@ def _extended(
     return old.extend(rows.position, rows.quaternion_xyzw, weights=weights, symmetric=symmetric)
 
 
-def _weights(proposal: Floats) -> Floats:
-    """Weights of eq 1, no row lost to rounding."""
+def _weights(proposal: Floats | None) -> Floats | None:
+    """Weights of eq 1, no row lost to rounding; None where all are equal."""
+    if proposal is None or np.isnan(proposal).all():
+        return None
     weights = importance_weights(proposal)
     return np.asarray(np.maximum(weights, weights.max() * _LEAST_SHARE), dtype=np.float64)
 
@@ -319,16 +352,25 @@ def _joined(
 
 def _info(choice: KernelChoice) -> KernelInfo:
     position, rotation = choice.sigma_position_m, choice.sigma_rotation_deg
-    default = f"{DEFAULT_SIGMA_POSITION_M * 1000:g} mm and {DEFAULT_SIGMA_ROTATION_DEG:g} degrees"
+    default = f"{_DEFAULT_POSITION_M * 1000:g} mm and {_DEFAULT_ROTATION_DEG:g} degrees"
     if choice.by_default:
-        rule = f"default: {default}"
+        rule = f"default: {default} until there are {FIRST_CHOICE} successes"
     elif position is None or rotation is None:
         rule = f"as asked; the width not named by default ({default})"
     else:
         rule = "as asked"
     return KernelInfo(
         kind="isotropic",
-        sigma_position_m=DEFAULT_SIGMA_POSITION_M if position is None else position,
-        sigma_rotation_deg=DEFAULT_SIGMA_ROTATION_DEG if rotation is None else rotation,
+        sigma_position_m=_DEFAULT_POSITION_M if position is None else position,
+        sigma_rotation_deg=_DEFAULT_ROTATION_DEG if rotation is None else rotation,
         rule=rule,
+    )
+
+
+def _chosen(kernel: IsotropicKernel, rule: str, rows: int) -> KernelInfo:
+    return KernelInfo(
+        kind="isotropic",
+        sigma_position_m=kernel.sigma_position_m,
+        sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
+        rule=f"default: {rule} likelihood of the first {rows} successes",
     )
