@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import NormalDist
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -42,6 +42,7 @@ LEVEL = 0.90
 LOG_LINES = 15
 START_S = 120.0
 STOP_S = 10.0
+_STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 # The workspace: the mug stands on a table half a metre in front of the robot, turned by 30 degrees, and
 # the gripper comes from above into a box around it.
@@ -56,11 +57,40 @@ class DemoFailed(GraspDBError):
 
 
 class Children:
-    """The processes of the demo: started in sessions of their own and stopped, whatever happens."""
+    """The processes of the demo: started in sessions of their own and stopped, whatever happens.
+
+    A context: within it Ctrl-C and SIGTERM raise, and are remembered, because an exception raised in the
+    midst of somebody's import may be swallowed there; :meth:`check` raises it again.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._running: list[tuple[str, subprocess.Popen[bytes]]] = []
+        self._before: dict[signal.Signals, Any] = {}
+        self._signal: int | None = None
+
+    def __enter__(self) -> Children:
+        self._before = {number: signal.signal(number, self._interrupt) for number in _STOPPING}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number in _STOPPING:
+            signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C would leave some of them running
+        try:
+            self._stop()
+        finally:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+
+    def _interrupt(self, number: int, _frame: FrameType | None) -> None:
+        self._signal = number
+        self._raise_interrupt()
+
+    def _raise_interrupt(self) -> None:
+        if self._signal == signal.SIGINT:
+            raise KeyboardInterrupt
+        if self._signal is not None:
+            raise SystemExit(128 + self._signal)
 
     def start(self, program: str, *arguments: str) -> None:
         """Start a command of this installation; its output goes to ``<program>.log`` in the folder."""
@@ -82,7 +112,8 @@ class Children:
         self._running.append((program, process))
 
     def check(self) -> None:
-        """Raise :class:`DemoFailed` if one has ended."""
+        """Raise :class:`DemoFailed` if one has ended, or the interruption there was."""
+        self._raise_interrupt()
         for program, process in self._running:
             code = process.poll()
             if code is not None:
@@ -94,23 +125,17 @@ class Children:
         lines = (self._folder / f"{program}.log").read_text(errors="replace").splitlines()
         return "\n".join(f"  {line}" for line in lines[-LOG_LINES:]) or "  (it wrote nothing)"
 
-    def stop(self) -> None:
+    def _stop(self) -> None:
         """Ask the last started first, then kill what is left of each one's session."""
-        # Ignored meanwhile: a second Ctrl-C would leave some of them running.
-        before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            for _, process in reversed(self._running):
-                if process.poll() is None:
-                    process.terminate()
-                    with contextlib.suppress(subprocess.TimeoutExpired):
-                        process.wait(STOP_S)
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-            self._running.clear()
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        for _, process in reversed(self._running):
+            if process.poll() is None:
+                process.terminate()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(STOP_S)
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        self._running.clear()
 
 
 def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
@@ -153,11 +178,6 @@ def demo(
     console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     names = [name.strip() for name in objects.split(",") if name.strip()]
     started = time.monotonic()
-
-    def interrupted(_signal: int, _frame: FrameType | None) -> NoReturn:
-        raise SystemExit(143)
-
-    before = signal.signal(signal.SIGTERM, interrupted)
     try:
         with (
             _folder(folder) as place,
@@ -167,16 +187,14 @@ def demo(
             console.rule("Summary")
             for line in lines:
                 console.print(line)
-            console.print(
-                f"Took {duration(time.monotonic() - started)}. API docs: {db.url}/docs while it runs."
-            )
+            stays = "" if keep else " (while it runs: --keep, or make demo KEEP=1, leaves it running)"
+            console.print(f"API docs: {db.url}/docs{stays}")
+            console.print(f"Took {duration(time.monotonic() - started)}.")
             if keep:
                 _hold(db, children, names[0], console)
     except KeyboardInterrupt:
         console.print("\nInterrupted; everything is stopped.")
         raise typer.Exit(130) from None
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _cores() -> int:
@@ -198,10 +216,9 @@ def _running(
     folder: Path, port: int | None, processes: int, console: Console
 ) -> Iterator[tuple[Client, Children]]:
     """Service and worker, ready to be asked; stopped at the end."""
-    children = Children(folder)
     port = _port(port)
     url = f"http://127.0.0.1:{port}"
-    try:
+    with Children(folder) as children:
         with console.status("Starting the service ..."):
             database = f"sqlite:///{folder / 'graspdb.sqlite'}"
             children.start(
@@ -221,6 +238,7 @@ def _running(
                     if time.monotonic() > deadline:
                         raise DemoFailed(f"no answer in {START_S:g} s:\n{children.log('graspdb-server')}")
                     time.sleep(0.1)
+        children.check()  # who answered might be another's service on that port
         children.start("graspdb-simworker", "run", "--url", url, "--processes", str(processes))
         console.print(f"The service answers at {url} (docs: {url}/docs), on SQLite in {escape(str(folder))}.")
         console.print(f"A worker with {processes} simulating process{'es' * (processes > 1)} runs beside it.")
@@ -230,8 +248,6 @@ def _running(
             except GraspDBError:
                 children.check()  # a dead child is the cause, and says more than its consequence
                 raise
-    finally:
-        children.stop()
 
 
 def _port(wanted: int | None) -> int:
@@ -261,6 +277,7 @@ def _grasp_example(db: Client, children: Children, name: str, max_poses: int, co
     """Sweep, density, queries and check of one object; the line for the summary."""
     console.rule(name)
     item = db.add_example(name)
+    children.check()
     console.print(f"Registered: {escape(repr(item))}")
     began = time.monotonic()
     sweep = _wait(item.sweep(max_poses=max_poses), children, f"sweep {item.id}")

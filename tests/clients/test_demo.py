@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 from scipy import optimize, stats
 
+from graspdb import Client
 from graspdb.demo import Children, DemoFailed, wilson_interval
 
 GRASPDB = str(Path(sys.executable).with_name("graspdb"))
@@ -66,11 +68,18 @@ def _alive(*texts: str) -> list[str]:
     return found
 
 
-def test_from_nothing_to_checked_grasps(tmp_path: Path) -> None:
-    arguments = ["demo", "--folder", str(tmp_path), "--max-poses", "20000", "--processes", "1"]
-    done = subprocess.run([GRASPDB, *arguments], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    out = done.stdout
+def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(tmp_path: Path) -> None:
+    arguments = ["demo", "--keep", "--folder", str(tmp_path), "--max-poses", "20000"]
+    process = subprocess.Popen(
+        [GRASPDB, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdout is not None
+    out = ""
+    for line in process.stdout:
+        out += line
+        if line.startswith("and in a browser"):
+            break
+    assert process.poll() is None, out
     assert "Simulated 20,000 poses" in out
     assert out.index("Best grasp overall") < out.index("Best grasp in a workspace")
     assert re.search(
@@ -78,7 +87,14 @@ def test_from_nothing_to_checked_grasps(tmp_path: Path) -> None:
     )
     (best,) = re.findall(r"Of \d+ best distinct grasps, .*?, \d+ \(([01]\.\d\d);", out)
     assert float(best) >= 0.5
-    assert "/docs" in out
+    (url,) = re.findall(r"export GRASPDB_URL=(\S+)", out)
+    assert f"API docs: {url}/docs" in out
+    with Client(url) as db:
+        assert db.objects.get("mug").info.trials == 20_000  # those of the checks are not among them
+        assert len(db.objects.get("mug").best_grasps(count=3)) == 3
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 0
     assert not _alive(str(tmp_path))
 
 
@@ -98,13 +114,22 @@ def test_stopped_in_the_middle_it_leaves_no_process(tmp_path: Path) -> None:
 
 
 def test_a_child_that_fails_is_reported_with_its_last_lines(tmp_path: Path) -> None:
-    children = Children(tmp_path)
-    children.start("graspdb-server", "serve", "--database-url", "mysql://nowhere/x")
-    try:
+    with Children(tmp_path) as children:
+        children.start("graspdb-server", "serve", "--database-url", "mysql://nowhere/x")
         _until(lambda: _failure(children) is not None)
         failure = _failure(children)
         assert failure is not None
         assert "graspdb-server ended with exit code 1" in failure
         assert "mysql is not supported" in failure
-    finally:
-        children.stop()
+
+
+def test_an_interruption_that_somebody_swallowed_is_raised_again(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    for number, expected in ((signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)):
+        with Children(tmp_path) as children:
+            with contextlib.suppress(BaseException):  # as an import may do that guards another
+                os.kill(os.getpid(), number)
+                time.sleep(5)
+            with pytest.raises(expected):
+                children.check()
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
