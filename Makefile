@@ -51,8 +51,8 @@ openapi: install  ## Write docs/openapi.json anew
 PIP_COMPILE = $(BIN)/python -m piptools compile --quiet --generate-hashes --allow-unsafe --strip-extras \
   --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
 
-requirements:  ## Pin anew what pyproject.toml allows: for development, and for the two images
-	$(PIP_COMPILE) --upgrade --all-extras --output-file requirements.txt pyproject.toml
+requirements:  ## Pin what pyproject.toml allows, for development and for the two images (UPGRADE=--upgrade: the newest)
+	$(PIP_COMPILE) $(UPGRADE) --all-extras --output-file requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra service --extra postgres --build-deps-for wheel \
 	  --output-file service/requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra sim --build-deps-for wheel \
