@@ -167,7 +167,9 @@ def database_url(request: pytest.FixtureRequest) -> str:
 def serving(settings: Settings) -> Iterator[str]:
     """The application on a real uvicorn in a thread; yields its address once it answers."""
     server = uvicorn.Server(
-        uvicorn.Config(create_app(settings), host="127.0.0.1", port=0, log_level="warning", lifespan="on")
+        uvicorn.Config(
+            create_app(settings), host="127.0.0.1", port=0, http="h11", log_level="warning", lifespan="on"
+        )
     )
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -90,7 +90,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         dependencies=[Depends(refuse_unknown_parameters)],
-        max_body_size=settings.max_body_bytes,
     )
     app.state.context = ctx
     for router in ROUTERS:
@@ -99,15 +98,29 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.parameters = declared_parameters(app)
     _add_docs(app)
     _add_problems(app)
-    app.add_middleware(RequestTrace)
+    app.add_middleware(RequestTrace, max_body_bytes=settings.max_body_bytes)
     return app
 
 
-class RequestTrace:
-    """Gives every request an id, answers it as ``X-Request-ID``, and counts and times the request."""
+def problem_response(problem: ProblemError, request_id: str) -> Response:
+    """The problem as ``application/problem+json``."""
+    # A field's name may be anything the client sent, half a surrogate pair included.
+    body = json.dumps(problem.document(request_id), ensure_ascii=False).encode("utf-8", "replace")
+    return Response(
+        body, status_code=problem.status, headers=problem.headers, media_type="application/problem+json"
+    )
 
-    def __init__(self, app: ASGIApp) -> None:
+
+class RequestTrace:
+    """Gives every request an id, answers it as ``X-Request-ID``, and counts and times the request.
+
+    What no handler caught ends here as a problem, with its traceback in the log under that id. A body over
+    the limit is refused before any of it is read where its length is told, else as soon as it grows past it.
+    """
+
+    def __init__(self, app: ASGIApp, max_body_bytes: int) -> None:
         self.app = app
+        self.max_body_bytes = max_body_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -116,17 +129,39 @@ class RequestTrace:
         request_id = uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
         started = time.perf_counter()
-        status = 500
+        status, begun = 500, False
 
         async def traced(message: Message) -> None:
-            nonlocal status
+            nonlocal status, begun
             if message["type"] == "http.response.start":
-                status = message["status"]
+                status, begun = message["status"], True
                 message.setdefault("headers", []).append((b"x-request-id", request_id.encode()))
             await send(message)
 
+        size = 0
+
+        async def limited() -> Message:
+            nonlocal size
+            message = await receive()
+            size += len(message.get("body", b""))
+            if size > self.max_body_bytes:
+                raise HTTPException(413)
+            return message
+
         try:
-            await self.app(scope, receive, traced)
+            length = dict(scope["headers"]).get(b"content-length", b"0")
+            if length.isdigit() and int(length) > self.max_body_bytes:
+                await problem_response(body_too_large(), request_id)(scope, receive, traced)
+            else:
+                await self.app(scope, limited, traced)
+        except Exception:
+            log.exception("request %s failed", request_id)
+            if begun:
+                raise
+            problem = ProblemError(
+                500, "internal-error", "The service failed; the log has more under the request's id"
+            )
+            await problem_response(problem, request_id)(scope, receive, traced)
         finally:
             route = getattr(scope.get("route"), "path", "unmatched")
             REQUESTS.labels(scope["method"], route, status).inc()
@@ -150,15 +185,7 @@ def _add_docs(app: FastAPI) -> None:
 
 def _add_problems(app: FastAPI) -> None:
     def answer(request: Request, problem: ProblemError) -> Response:
-        request_id = getattr(request.state, "request_id", "")
-        # A field's name may be anything the client sent, half a surrogate pair included.
-        body = json.dumps(problem.document(request_id), ensure_ascii=False).encode("utf-8", "replace")
-        return Response(
-            body,
-            status_code=problem.status,
-            headers=problem.headers,
-            media_type="application/problem+json",
-        )
+        return problem_response(problem, getattr(request.state, "request_id", ""))
 
     @app.exception_handler(ProblemError)
     def on_problem(request: Request, error: ProblemError) -> Response:
@@ -181,27 +208,23 @@ def _add_problems(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
-        kind = {404: "not-found", 405: "method-not-allowed", 413: "body-too-large"}.get(
+        if error.status_code == 413:
+            return answer(request, body_too_large())
+        kind = {404: "not-found", 405: "method-not-allowed"}.get(
             error.status_code, phrase(error.status_code).lower().replace(" ", "-")
         )
         title = {
             404: f"There is nothing at {request.url.path}",
             405: f"{request.method} is not for {request.url.path}",
-            413: "The body is over the limit (see /info): send it in several requests",
         }.get(error.status_code, str(error.detail))
-        problem = ProblemError(error.status_code, kind, title, headers=error.headers)
-        return answer(request, problem)
+        return answer(request, ProblemError(error.status_code, kind, title, headers=error.headers))
 
-    @app.exception_handler(Exception)
-    def on_bug(request: Request, error: Exception) -> Response:
-        request_id = getattr(request.state, "request_id", "")
-        log.exception("request %s failed", request_id, exc_info=error)
-        return answer(
-            request,
-            ProblemError(
-                500, "internal-error", "The service failed; the log has more under the request's id"
-            ),
-        )
+
+def body_too_large() -> ProblemError:
+    """413, before or while a body is read."""
+    return ProblemError(
+        413, "body-too-large", "The body is over the limit (see /info): send it in several requests"
+    )
 
 
 def problem_of_validation(errors: Any, title: str = "The request is not valid") -> ProblemError:

@@ -51,7 +51,13 @@ def serve(
     except (schema.StaleSchema, UnsupportedDatabase) as error:
         _fail(str(error))
     uvicorn.run(
-        app, host=settings.host, port=settings.port, log_level=log_level, timeout_graceful_shutdown=10
+        app,
+        host=settings.host,
+        port=settings.port,
+        # h11 refuses headers over 64 KiB; httptools would collect them without end.
+        http="h11",
+        log_level=log_level,
+        timeout_graceful_shutdown=10,
     )
 
 
@@ -98,3 +104,7 @@ def _fail(message: str) -> NoReturn:
 def main() -> None:
     """Entry point."""
     cli()
+
+
+if __name__ == "__main__":
+    main()

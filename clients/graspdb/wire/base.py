@@ -35,6 +35,10 @@ UNIT_TOLERANCE = 1e-3
 """A quaternion or rotation matrix this near to exact is normalised; farther off it is refused."""
 
 
+MAX_NESTING = 32
+"""How deep a user's metadata may nest: every JSON library on its way can still read and write that."""
+
+
 class Request(BaseModel):
     """Base of what clients send: unknown fields and non-finite numbers are errors."""
 
@@ -110,7 +114,22 @@ def _no_nul(text: str) -> str:
     return text
 
 
+def _is_deeper(value: Any, depth: int) -> bool:
+    """Whether lists and objects nest more than ``depth`` deep; level by level, so it can't overflow."""
+    level = [value]
+    for _ in range(depth):
+        level = [
+            inner
+            for item in level
+            if isinstance(item, (dict, list, tuple))
+            for inner in (item.values() if isinstance(item, dict) else item)
+        ]
+    return any(isinstance(item, (dict, list, tuple)) for item in level)
+
+
 def _storable(value: dict[str, Any]) -> dict[str, Any]:
+    if _is_deeper(value, MAX_NESTING):
+        raise ValueError(f"metadata nests at most {MAX_NESTING} lists and objects")
     try:
         text = json.dumps(value, allow_nan=False, ensure_ascii=False)
     except (ValueError, RecursionError):

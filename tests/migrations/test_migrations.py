@@ -1,0 +1,184 @@
+"""One Alembic history for both databases: from a checkout, from a wheel, from several processes at once."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import inspect, text
+
+from graspdb_service.storage import schema
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.tables import metadata
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def empty_url(request: pytest.FixtureRequest) -> str:
+    """A database without a schema, of either kind."""
+    name = "sqlite_url" if request.param == "sqlite" else "empty_postgres_url"
+    url: str = request.getfixturevalue(name)
+    return url
+
+
+def _head() -> str | None:
+    return ScriptDirectory(str(schema.migrations_directory())).get_current_head()
+
+
+def _tables(database: Database) -> set[str]:
+    with database.read() as tx:
+        return set(inspect(tx).get_table_names())
+
+
+def test_history_has_one_head_and_starts_from_nothing() -> None:
+    script = ScriptDirectory(str(schema.migrations_directory()))
+    assert len(script.get_heads()) == 1
+    assert schema.migrations_directory() == ROOT / "db" / "migrations"
+
+
+def test_migrations_make_exactly_the_tables_of_the_code(empty_url: str) -> None:
+    database = Database(empty_url)
+    with pytest.raises(schema.StaleSchema, match=r"no schema yet.*graspdb-server migrate"):
+        schema.check(database)
+    assert schema.upgrade(database) == _head()
+    schema.check(database)
+    with database.write() as tx:
+        difference = compare_metadata(
+            MigrationContext.configure(tx, opts={"compare_type": True, "render_as_batch": True}), metadata
+        )
+        # Raises where `alembic check` would fail.
+        command.check(schema.alembic_config(tx))
+    assert difference == []
+    assert _tables(database) == {*metadata.tables, "alembic_version"}
+    assert schema.upgrade(database) == _head()
+    database.dispose()
+
+
+def test_downgrade_leaves_nothing_and_upgrade_comes_back(empty_url: str) -> None:
+    database = Database(empty_url)
+    schema.upgrade(database)
+    with database.write() as tx:
+        command.downgrade(schema.alembic_config(tx), "base")
+    assert _tables(database) == {"alembic_version"}
+    schema.upgrade(database)
+    schema.check(database)
+    database.dispose()
+
+
+def test_several_processes_migrate_at_once(empty_url: str) -> None:
+    replicas = [_server("migrate", "--database-url", empty_url) for _ in range(4)]
+    for replica in replicas:
+        output, _ = replica.communicate(timeout=120)
+        assert replica.returncode == 0, output
+        assert f"The schema is at {_head()}." in output
+    database = Database(empty_url)
+    schema.check(database)
+    database.dispose()
+
+
+def test_migration_from_a_wheel(empty_url: str, wheel: Path) -> None:
+    """The installed package brings its history along: no checkout is needed."""
+    script = (
+        "import sys; from graspdb_service.storage import schema;"
+        "from graspdb_service.storage.database import Database;"
+        "print(schema.migrations_directory()); print(schema.upgrade(Database(sys.argv[1])))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", script, empty_url],
+        env={**os.environ, "PYTHONPATH": str(wheel)},
+        cwd=wheel,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    where, revision = done.stdout.split()
+    assert Path(where) == wheel / "graspdb_service" / "migrations"
+    assert revision == _head()
+    database = Database(empty_url)
+    schema.check(database)
+    database.dispose()
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An unpacked wheel of this checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
+    name = subprocess.run(
+        [sys.executable, "-c", build, str(folder)], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()[-1]
+    with zipfile.ZipFile(folder / name) as archive:
+        archive.extractall(folder / "installed")
+    return folder / "installed"
+
+
+def test_stale_postgres_is_refused_by_name_of_the_command(empty_postgres_url: str) -> None:
+    process = _server("serve", "--port", "0", "--database-url", empty_postgres_url)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "graspdb-server migrate" in output
+    assert "Traceback" not in output
+    database = Database(empty_postgres_url)
+    assert _tables(database) <= {"alembic_version"}
+    database.dispose()
+
+
+def test_newer_schema_is_refused(empty_url: str) -> None:
+    database = Database(empty_url)
+    schema.upgrade(database)
+    with database.write() as tx:
+        tx.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    for use in (schema.check, schema.upgrade):
+        with pytest.raises(schema.StaleSchema, match=r"9999.*newer"):
+            use(database)
+    database.dispose()
+    for order in (["serve", "--port", "0"], ["migrate"]):
+        process = _server(*order, "--database-url", empty_url)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert "newer" in output
+        assert "Traceback" not in output
+
+
+def test_failed_migration_leaves_the_schema_as_it_was(empty_url: str) -> None:
+    """DDL and the version table are in one transaction on both databases."""
+    database = Database(empty_url)
+
+    def interrupted() -> None:
+        with database.write() as tx:
+            command.upgrade(schema.alembic_config(tx), "head")
+            assert inspect(tx).has_table("trials")
+            raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError, match="power cut"):
+        interrupted()
+    assert _tables(database) == set()
+    database.dispose()
+
+
+def test_unsupported_databases_are_named(capfd: pytest.CaptureFixture[str]) -> None:
+    for url, word in (("mysql://x/y", "mysql"), ("sqlite://", "file"), ("nonsense", "no database URL")):
+        process = _server("migrate", "--database-url", url)
+        output, _ = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert word in output
+        assert "Traceback" not in output
+
+
+def _server(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "graspdb_service.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )

@@ -1,0 +1,58 @@
+"""Every route declares the scope it needs, as the contract gives them, or the service does not start."""
+
+from __future__ import annotations
+
+import pytest
+from fastapi import FastAPI
+
+from graspdb_service.api.routing import SCOPE_FIELD, declared_parameters, scope
+from graspdb_service.app import create_app
+from graspdb_service.settings import Settings
+
+PUBLIC = {"/livez", "/readyz", "/metrics", "/info"}
+FOR_WORKERS = {("get", "/objects/{id}/mesh"), ("get", "/objects/{id}/convex-parts")}
+COMPUTING = ("/likelihood", "/best-grasp", "/samples")
+
+
+def _expected(method: str, path: str) -> str:
+    if path in PUBLIC:
+        return "public"
+    if path.startswith("/jobs") or (method, path) in FOR_WORKERS:
+        return "jobs:work"
+    if method == "get" or path.endswith(COMPUTING):
+        return "read"
+    if "/trials" in path or "/batches" in path:
+        return "trials:write"
+    return "admin"
+
+
+def test_scopes_are_those_of_the_contract(sqlite_url: str) -> None:
+    app = create_app(Settings(database_url=sqlite_url))
+    found = {
+        (method, path): operation[SCOPE_FIELD]
+        for path, operations in app.openapi()["paths"].items()
+        for method, operation in operations.items()
+    }
+    app.state.context.close()
+    assert len(found) > 30
+    assert found == {place: _expected(*place) for place in found}
+
+
+def test_route_without_a_scope_is_refused() -> None:
+    app = FastAPI()
+
+    @app.get("/open")
+    def open_to_all() -> None: ...
+
+    with pytest.raises(RuntimeError, match="GET /open declares no scope"):
+        declared_parameters(app)
+
+
+def test_route_with_an_unknown_scope_is_refused() -> None:
+    app = FastAPI()
+
+    @app.get("/odd", **scope("everyone"))  # type: ignore[arg-type]
+    def odd() -> None: ...
+
+    with pytest.raises(RuntimeError, match="GET /odd declares no scope"):
+        declared_parameters(app)
