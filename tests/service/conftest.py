@@ -56,7 +56,7 @@ def two_clusters() -> Poses:
 
 @pytest.fixture(scope="session")
 def post() -> Callable[..., dict[str, Any]]:
-    """``post(http, slug, (positions, quaternions), outcome, **beside)`` stores trials; returns the receipt."""
+    """``post(http, slug, (positions, quaternions), outcome, **beside)`` stores trials: the receipt."""
 
     def post(
         http: httpx.Client, slug: str, poses: Poses, outcome: str | list[str] = "success", **more: Any

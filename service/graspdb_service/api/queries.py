@@ -29,6 +29,7 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.usecases import queries
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.success import LEVEL
 
 router = APIRouter(tags=["queries"])
 
@@ -148,11 +149,21 @@ def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
 
 
 def _likelihoods(answer: queries.LikelihoodAnswer, headers: dict[str, str] | None = None) -> Response:
-    columns = {
+    columns: dict[str, Any] = {
         name: getattr(answer, name)
-        for name in ("density", "log_density", "relative", "collision_free")
+        for name in (
+            "density",
+            "log_density",
+            "relative",
+            "success_probability",
+            "effective_trials",
+            "collision_free",
+        )
         if getattr(answer, name) is not None
     }
+    if answer.interval is not None:
+        low, high = answer.interval
+        columns["interval"] = {"level": LEVEL, "low": low, "high": high}
     return columns_json({"revision": answer.revision, "kernel": answer.kernel.model_dump()}, columns, headers)
 
 

@@ -201,9 +201,19 @@ def read(
     provenance_ids: Sequence[int] | None,
     successes_only: bool,
     after_seq: int = 0,
+    swept: bool = True,
+    without: Sequence[int] = (),
 ) -> Columns:
-    """An object's trials as arrays, ascending ``seq``, those after ``after_seq``."""
+    """An object's trials as arrays, ascending ``seq``, those after ``after_seq``.
+
+    ``swept=False`` leaves out those that a sweep stored, ``without`` those with these outcome codes.
+    """
     where = f"object_id = {int(object_id)} AND seq > {int(after_seq)}"
+    if not swept:
+        # Only a sweep's trials have a place in a plan.
+        where += " AND pose_index IS NULL"
+    if without:
+        where += f" AND outcome NOT IN ({', '.join(str(int(code)) for code in without)})"
     if successes_only:
         # Said literally, as the partial index has it.
         where += f" AND outcome = {SUCCESS}"

@@ -10,6 +10,7 @@ from graspdb_service.storage.database import Database
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.densities import Densities
 from graspdb_service.usecases.scenes import Scenes
+from graspdb_service.usecases.success import Successes
 
 
 @dataclass
@@ -21,6 +22,7 @@ class Context:
     compute: Compute
     densities: Densities
     scenes: Scenes
+    successes: Successes
     mesh_children: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
 
     @classmethod
@@ -32,6 +34,7 @@ class Context:
             compute=compute,
             densities=Densities(database, compute, settings.max_density_cache_bytes),
             scenes=Scenes(database, compute),
+            successes=Successes(database, compute, settings.max_density_cache_bytes),
         )
 
     def close(self) -> None:

@@ -175,7 +175,7 @@ class Densities:
             404 for the object or gripper, 409 for an ambiguous selection.
         """
         with self._database.read() as tx:
-            row = _require(tx, slug)
+            row = require_object(tx, slug)
             with self._lock:
                 known = self._resolved.get((row.id, filters))
             if known is not None and known[0] == row.revision:
@@ -213,9 +213,7 @@ class Densities:
 
     def _refresh(self, key: _Key, slug: str, before: Built | None) -> Built:
         with self._database.read() as tx:
-            row = _require(tx, slug)
-            if row.id != key.object_id:
-                raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
+            row = require_object(tx, slug, key.object_id)
             selected = resolve(tx, row.id, key.filters)
             if before is not None and before.epoch != row.epoch:
                 before = None
@@ -235,11 +233,19 @@ class Densities:
         )
 
 
-def _require(tx: Tx, slug: str) -> ObjectRow:
-    # The use cases of objects need the context, which needs this module.
+def require_object(tx: Tx, slug: str, object_id: int | None = None) -> ObjectRow:
+    """The object with this slug, and with this internal id where one is given.
+
+    Raises
+    ------
+    ProblemError
+        404 without such an object, 409 where it is another one by now.
+    """
     row = objects.find(tx, slug) if is_slug(slug) else None
     if row is None:
         raise not_found("object", slug[:80], "GET /objects lists those there are")
+    if object_id is not None and row.id != object_id:
+        raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
     return row
 
 

@@ -11,9 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import BestGraspRequest, BestGrasps, DensityInfo, Grasp, KernelInfo, Selection, WorldPose
+from graspdb.wire import (
+    BestGraspRequest,
+    BestGrasps,
+    DensityInfo,
+    Grasp,
+    Interval,
+    KernelInfo,
+    Selection,
+    WorldPose,
+)
 from graspdb.wire.queries import LikelihoodColumn
-from graspdb_density import GraspDensity, Region, se3
+from graspdb_density import GraspDensity, Maximum, Region, se3
+from graspdb_density.maximum import Admissible
 from graspdb_density.weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.constraints import Constraints, constraints
@@ -21,6 +31,7 @@ from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.densities import Built, kernel_of
 from graspdb_service.usecases.scenes import CollisionTest
 from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.success import LEVEL
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +40,8 @@ _BLOCK = 16_384
 _SEPARATION_M = 0.01
 _SEPARATION_DEG = 20.0
 _NEAREST_TRIALS = 5
+#: Successes shown to the collision test at a time while looking for the nearest admissible one.
+_CANDIDATES = 1_024
 #: Ratios and draws see more of the kernels' tails than a plain question.
 _PRECISE_CUTOFF = 5.0
 
@@ -79,7 +92,7 @@ def density_info(ctx: Context, slug: str, request: Selection) -> tuple[DensityIn
 class LikelihoodAnswer:
     """Columns (n,) in the poses' order, None where not asked for or not known.
 
-    ``log_density`` is minus infinity where the density is exactly zero.
+    ``log_density`` is minus infinity where the density is exactly zero; NaN stands for not known.
     """
 
     object_id: int
@@ -89,6 +102,9 @@ class LikelihoodAnswer:
     log_density: Floats | None = None
     relative: Floats | None = None
     collision_free: NDArray[np.bool_] | None = None
+    success_probability: Floats | None = None
+    interval: tuple[Floats, Floats] | None = None
+    effective_trials: Floats | None = None
 
 
 def likelihood(
@@ -125,10 +141,12 @@ def likelihood(
                 if asked("relative"):
                     # Rounding may lift a pose at the very maximum above it.
                     relative = np.minimum(np.exp(logs - _global_maximum(ctx, density)), 1.0)
-        if asked("collision_free"):
+        chances = asked("success_probability", "interval", "effective_trials")
+        if chances or asked("collision_free"):
             test = ctx.scenes.test(built.object_row, built.selected)
             if test is not None:
                 free = _free(ctx, test, positions, quaternions)
+        estimates = ctx.successes.estimate(slug, built, positions, quaternions, free) if chances else None
     return LikelihoodAnswer(
         object_id=built.object_row.id,
         revision=built.revision,
@@ -136,7 +154,10 @@ def likelihood(
         density=np.exp(logs) if logs is not None and asked("density") else None,
         log_density=logs if asked("log_density") else None,
         relative=relative if asked("relative") else None,
-        collision_free=free,
+        collision_free=free if asked("collision_free") else None,
+        success_probability=estimates.probability if estimates and asked("success_probability") else None,
+        interval=(estimates.low, estimates.high) if estimates and asked("interval") else None,
+        effective_trials=estimates.effective_trials if estimates and asked("effective_trials") else None,
     )
 
 
@@ -198,29 +219,13 @@ def best_grasps(ctx: Context, slug: str, request: BestGraspRequest) -> tuple[Bes
                 threads=threads,
             )
         )
-        top = _global_maximum(ctx, density)
-
-        def describe(position: Floats, quaternion: Floats, log: float, active: tuple[str, ...]) -> Grasp:
-            return _grasp(built, density, limits, test, position, quaternion, log, top, active)
-
         if found:
-            grasps = ctx.compute.run(
-                lambda: [
-                    describe(m.position, m.quaternion_xyzw, m.log_density, m.active_constraints)
-                    for m in found
-                ]
-            )
+            grasps = _described(ctx, slug, built, density, limits, test, found)
             status = "ok" if len(grasps) >= request.count else "fewer"
             return _answer(built, status, grasps), built.object_row.id
-
-        def closest() -> Grasp | None:
-            row = _closest_row(density, limits.region, admissible)
-            if row is None:
-                return None
-            p, q = density.positions[row], density.quaternions_xyzw[row]
-            return describe(p, q, float(density.log_density(p[None], q[None])[0]), ())
-
-        return _answer(built, "infeasible", [], ctx.compute.run(closest)), built.object_row.id
+        closest = ctx.compute.run(lambda: _closest(density, limits.region, admissible))
+        nearest = _described(ctx, slug, built, density, limits, test, closest)
+        return _answer(built, "infeasible", [], *nearest), built.object_row.id
 
 
 def _answer(built: Built, status: str, grasps: list[Grasp], nearest: Grasp | None = None) -> BestGrasps:
@@ -235,31 +240,52 @@ def _answer(built: Built, status: str, grasps: list[Grasp], nearest: Grasp | Non
     )
 
 
-def _grasp(
+def _described(
+    ctx: Context,
+    slug: str,
     built: Built,
     density: GraspDensity,
     limits: Constraints,
     test: CollisionTest | None,
-    position: Floats,
-    quaternion: Floats,
-    log: float,
-    top: float,
-    active: tuple[str, ...],
-) -> Grasp:
-    world = limits.to_world(position, quaternion)
-    return Grasp(
-        position=_numbers(position),
-        quaternion_xyzw=_numbers(quaternion),
-        world=None
-        if world is None
-        else WorldPose(position=_numbers(world[0]), quaternion_xyzw=_numbers(world[1])),
-        density=math.exp(log),
-        log_density=log,
-        relative=min(math.exp(log - top), 1.0),
-        collision_free=None if test is None else bool(test.free(position[None], quaternion[None])[0]),
-        nearest_trials=_nearest_trials(built, density, position, quaternion),
-        active_constraints=limits.named(active),
+    found: list[Maximum],
+) -> list[Grasp]:
+    """What is known of grasps that a search found."""
+    if not found:
+        return []
+    positions = np.array([item.position for item in found])
+    quaternions = np.array([item.quaternion_xyzw for item in found])
+    free = None if test is None else _free(ctx, test, positions, quaternions)
+    estimates = ctx.successes.estimate(slug, built, positions, quaternions, free)
+    top = _global_maximum(ctx, density)
+    nearest = ctx.compute.run(
+        lambda: [_nearest_trials(built, density, p, q) for p, q in zip(positions, quaternions, strict=True)]
     )
+    grasps = []
+    for i, item in enumerate(found):
+        world = limits.to_world(item.position, item.quaternion_xyzw)
+        probability, low, high = (
+            float(column[i]) for column in (estimates.probability, estimates.low, estimates.high)
+        )
+        known = math.isfinite(probability)
+        grasps.append(
+            Grasp(
+                position=_numbers(item.position),
+                quaternion_xyzw=_numbers(item.quaternion_xyzw),
+                world=None
+                if world is None
+                else WorldPose(position=_numbers(world[0]), quaternion_xyzw=_numbers(world[1])),
+                density=math.exp(item.log_density),
+                log_density=item.log_density,
+                relative=min(math.exp(item.log_density - top), 1.0),
+                success_probability=probability if known else None,
+                interval=Interval(level=LEVEL, low=low, high=high) if known else None,
+                effective_trials=float(estimates.effective_trials[i]),
+                collision_free=None if free is None else bool(free[i]),
+                nearest_trials=nearest[i],
+                active_constraints=limits.named(item.active_constraints),
+            )
+        )
+    return grasps
 
 
 def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quaternion: Floats) -> list[int]:
@@ -277,21 +303,21 @@ def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quate
     return [int(seq) for seq in built.seq[best]]
 
 
-def _closest_row(density: GraspDensity, region: Region, admissible: object) -> int | None:
-    """The success that violates the region least, in widths of the kernel, and is admissible."""
+def _closest(density: GraspDensity, region: Region, admissible: Admissible | None) -> list[Maximum]:
+    """The success that violates the region least, in widths of the kernel, and is admissible; or none."""
     kernel = density.kernel
     p, q, _ = region.project(density.positions, density.quaternions_xyzw)
     shift = np.sum((p - density.positions) ** 2, axis=1) / kernel.sigma_position_m**2
     turn = se3.angle_between(q, density.quaternions_xyzw) ** 2 / kernel.sigma_rotation**2
     order = np.argsort(shift + turn, kind="stable")
-    if admissible is None:
-        return int(order[0])
-    for start in range(0, len(order), 4_096):
-        rows = order[start : start + 4_096]
-        free = np.flatnonzero(admissible(density.positions[rows], density.quaternions_xyzw[rows]))  # type: ignore[operator]
+    for start in range(0, len(order), _CANDIDATES):
+        rows = order[start : start + _CANDIDATES]
+        p, q = density.positions[rows], density.quaternions_xyzw[rows]
+        free = np.arange(len(rows)) if admissible is None else np.flatnonzero(admissible(p, q))
         if free.size:
-            return int(rows[free[0]])
-    return None
+            at = slice(int(free[0]), int(free[0]) + 1)
+            return [Maximum(p[at][0], se3.canonical(q[at][0]), float(density.log_density(p[at], q[at])[0]))]
+    return []
 
 
 def _or(value: float | None, default: float) -> float:

@@ -38,6 +38,8 @@ class Selected:
         Internal ids of the selected trials' provenances, each with whether its jaw is mirror-symmetric.
     outcomes
         Selected trials by outcome, packed ones included.
+    tried
+        The provenances of sources that post failures, too: only they tell how likely a success is.
     """
 
     gripper: str | None
@@ -46,6 +48,7 @@ class Selected:
     profile: GripperProfile | None
     provenances: Mapping[int, bool]
     outcomes: Mapping[str, int]
+    tried: frozenset[int]
 
     @property
     def filters(self) -> Filters:
@@ -107,6 +110,7 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
     for item in candidates:
         for outcome, number in counts[item.id].items():
             outcomes[outcome] = outcomes.get(outcome, 0) + number
+    failing = {item.source for item in candidates if counts[item.id].keys() - {"success", "simulation_error"}}
     return Selected(
         gripper=chosen["gripper"],
         protocol=chosen["protocol"],
@@ -116,6 +120,7 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
             item.id: item.gripper is None or profiles[item.gripper].symmetric for item in candidates
         },
         outcomes={name: outcomes[name] for name in OUTCOMES if name in outcomes},
+        tried=frozenset(item.id for item in candidates if item.source in failing),
     )
 
 
