@@ -8,18 +8,22 @@ import logging
 import os
 import sys
 import tempfile
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+NEEDS = "graspdb-server needs {}: pip install 'graspdb[service]'"
 
 try:
     import typer
     import uvicorn
 
-    from graspdb_service.app import create_app
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
     from graspdb_service.storage.database import Database, UnsupportedDatabase
 except ModuleNotFoundError as error:
-    sys.exit(f"graspdb-server needs {error.name}: pip install 'graspdb[service]'")
+    sys.exit(NEEDS.format(error.name))
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 cli = typer.Typer(add_completion=False, no_args_is_help=True, help="The GraspDB service.")
 
@@ -43,11 +47,11 @@ def serve(
             f"Serving on {settings.host} without keys would open the database to the network."
             " Listen on 127.0.0.1, or say so explicitly: --auth off (GRASPDB_AUTH=off)."
         )
-    # NumPy's BLAS would otherwise start a thread a core inside each compute thread.
+    # Before NumPy is imported: its BLAS would start a thread a core inside each compute thread.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s")
     try:
-        app = create_app(settings)
+        app = _application(settings)
     except (schema.StaleSchema, UnsupportedDatabase) as error:
         _fail(str(error))
     uvicorn.run(
@@ -75,9 +79,18 @@ def migrate(database_url: DatabaseUrl = None) -> None:
 def openapi() -> None:
     """Print the OpenAPI document; docs/openapi.json is this output."""
     with tempfile.TemporaryDirectory() as folder:
-        app = create_app(Settings(database_url=f"sqlite:///{folder}/empty.sqlite"))
+        app = _application(Settings(database_url=f"sqlite:///{folder}/empty.sqlite"))
         typer.echo(json.dumps(app.openapi(), indent=1, ensure_ascii=False))
         app.state.context.close()
+
+
+def _application(settings: Settings) -> FastAPI:
+    # Imported here: migrating needs none of the numerics, which take a second to load.
+    try:
+        from graspdb_service.app import create_app
+    except ModuleNotFoundError as error:
+        _fail(NEEDS.format(error.name))
+    return create_app(settings)
 
 
 def _settings(**given: Any) -> Settings:
