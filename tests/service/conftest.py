@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb_density import se3
+from graspdb_geometry.collision import Scene
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -91,3 +93,27 @@ def make_object() -> Callable[..., str]:
         return slug
 
     return make
+
+
+@pytest.fixture(scope="session")
+def put_box() -> Callable[..., Scene]:
+    """``put_box(http, slug, size)`` gives an object a box about its origin as its mesh: its geometry."""
+
+    def put(http: httpx.Client, slug: str, size: tuple[float, float, float] = (0.04, 0.06, 0.1)) -> Scene:
+        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+        faces = np.array(
+            [
+                (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
+                (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
+            ]
+        )  # fmt: skip
+        triangles = b"".join(struct.pack("<12fH", 0, 0, 0, *corners[f].ravel(), 0) for f in faces)
+        answer = http.put(
+            f"/objects/{slug}/mesh?unit=m",
+            content=b"\0" * 80 + struct.pack("<I", len(faces)) + triangles,
+            headers={"Content-Type": "model/stl"},
+        )
+        assert answer.status_code in (200, 201), answer.text
+        return Scene([(corners, faces)])
+
+    return put

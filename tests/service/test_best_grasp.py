@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -21,27 +20,6 @@ Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 
 KERNEL = IsotropicKernel(0.015, np.deg2rad(15))
-BOX = (0.04, 0.06, 0.10)
-
-
-def box_stl(size: tuple[float, float, float]) -> tuple[bytes, Floats, NDArray[np.int64]]:
-    """A binary STL of a box about the origin, and its vertices and faces."""
-    v = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
-    f = np.array(
-        [
-            (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-            (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
-        ]
-    )  # fmt: skip
-    triangles = b"".join(struct.pack("<12fH", 0, 0, 0, *v[t].ravel(), 0) for t in f)
-    return b"\0" * 80 + struct.pack("<I", len(f)) + triangles, v, f
-
-
-def put_box(http: httpx.Client, size: tuple[float, float, float] = BOX) -> Scene:
-    content, vertices, faces = box_stl(size)
-    answer = http.put("/objects/thing/mesh?unit=m", content=content, headers={"Content-Type": "model/stl"})
-    assert answer.status_code in (200, 201), answer.text
-    return Scene([(vertices, faces)])
 
 
 def best(http: httpx.Client, **query: Any) -> dict[str, Any]:
@@ -263,11 +241,15 @@ def test_no_successes(http: httpx.Client, make_object: Make, post: Post, two_clu
 
 
 def test_collision_free(
-    http: httpx.Client, make_object: Make, post: Post, clusters: Callable[..., Poses]
+    http: httpx.Client,
+    make_object: Make,
+    put_box: Callable[..., Scene],
+    post: Post,
+    clusters: Callable[..., Poses],
 ) -> None:
     """Grasps of a box from above, half of them so deep that the palm is inside it."""
     make_object(http)
-    scene = put_box(http)
+    scene = put_box(http, "thing")
     centres = [((0, 0, 0.045), (1.0, 0, 0, 0)), ((0, 0, -0.01), (1.0, 0, 0, 0))]
     shallow, deep = clusters(centres[:1], 100, seed=1), clusters(centres[1:], 300, seed=2)
     trials = np.concatenate([shallow[0], deep[0]]), np.concatenate([shallow[1], deep[1]])
