@@ -387,6 +387,20 @@ class GraspWorld:
                 physicsClientId=self._client,
             )
 
+    def _contacts(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Normals into the object (K, 3), normal forces (K,) and which body presses (K,)."""
+        contacts = [
+            contact
+            for contact in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
+            if contact[9] > 0.0
+        ]
+        # contactNormalOnB points from B, the object, to A: turned round it points into the object.
+        return (
+            np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
+            np.array([contact[9] for contact in contacts], dtype=np.float64),
+            np.array([contact[3] for contact in contacts], dtype=np.int64),
+        )
+
     def _between(self) -> bool:
         return bool(pybullet.getClosestPoints(self._object, self._column, 0.0, physicsClientId=self._client))
 
@@ -394,23 +408,14 @@ class GraspWorld:
         where, orientation = pybullet.getBasePositionAndOrientation(
             self._object, physicsClientId=self._client
         )
-        contacts: Sequence[Any] = ()
+        normals, forces = np.empty((0, 3)), np.empty(0)
+        fingers = np.empty(0, dtype=np.int64)
         if not all(map(math.isfinite, (*where, *orientation))):
             end = End.UNSTABLE
         elif end is End.STALLED:
-            contacts = [
-                c
-                for c in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
-                if c[9] > 0.0
-            ]
+            normals, forces, fingers = self._contacts()
             # Bullet's hulls are inflated by the margin on both sides; the object is not.
             opening -= 2.0 * COLLISION_MARGIN_M
-        # contactNormalOnB points from B, the object, to A: turned round it points into the object.
-        normals = np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(
-            -1, 3
-        )
-        forces = np.array([contact[9] for contact in contacts], dtype=np.float64)
-        fingers = np.array([contact[3] for contact in contacts], dtype=np.int64)
         quaternion = _multiply(orientation, self._to_body)
         shift = _rotate(quaternion, self.mass.centre)
         position = (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2])
