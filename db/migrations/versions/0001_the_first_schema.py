@@ -107,6 +107,48 @@ def upgrade() -> None:
         batch_op.create_index(batch_op.f("ix_provenances_object_id"), ["object_id"], unique=False)
 
     op.create_table(
+        "trials",
+        sa.Column(
+            "object_id",
+            sa.BigInteger().with_variant(sa.Integer(), "sqlite"),
+            autoincrement=False,
+            nullable=False,
+        ),
+        sa.Column("seq", sa.BigInteger(), autoincrement=False, nullable=False),
+        sa.Column("revision", sa.BigInteger(), nullable=False),
+        sa.Column("batch_id", sa.BigInteger(), nullable=False),
+        sa.Column("provenance_id", sa.BigInteger(), nullable=False),
+        sa.Column("outcome", sa.SmallInteger(), nullable=False),
+        sa.Column("px", sa.Double(), nullable=False),
+        sa.Column("py", sa.Double(), nullable=False),
+        sa.Column("pz", sa.Double(), nullable=False),
+        sa.Column("qx", sa.Double(), nullable=False),
+        sa.Column("qy", sa.Double(), nullable=False),
+        sa.Column("qz", sa.Double(), nullable=False),
+        sa.Column("qw", sa.Double(), nullable=False),
+        sa.Column("proposal_density", sa.Double(), nullable=True),
+        sa.Column("quality", sa.Double(), nullable=True),
+        sa.Column("width_m", sa.Double(), nullable=True),
+        sa.Column("pose_index", sa.BigInteger(), nullable=True),
+        sa.Column("measured_at", sa.DateTime(timezone=True), nullable=True),
+        sa.Column("pose_covariance", sa.JSON(none_as_null=True), nullable=True),
+        sa.Column("metadata", sa.JSON(none_as_null=True), nullable=True),
+        sa.ForeignKeyConstraint(
+            ["object_id"], ["objects.id"], name=op.f("fk_trials_object_id_objects"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("object_id", "seq", name=op.f("pk_trials")),
+        sqlite_with_rowid=False,
+    )
+    with op.batch_alter_table("trials", schema=None) as batch_op:
+        batch_op.create_index(
+            "ix_trials_successes",
+            ["object_id", "seq"],
+            unique=False,
+            sqlite_where=sa.text("outcome = 1"),
+            postgresql_where=sa.text("outcome = 1"),
+        )
+
+    op.create_table(
         "sweeps",
         sa.Column("id", sa.String(length=36), nullable=False),
         sa.Column("object_id", sa.BigInteger().with_variant(sa.Integer(), "sqlite"), nullable=False),
@@ -202,10 +244,12 @@ def upgrade() -> None:
         sa.Column("result_sha256", sa.String(length=64), nullable=True),
         sa.Column("answer", sa.JSON(none_as_null=True), nullable=True),
         sa.Column("counts", sa.JSON(none_as_null=True), nullable=True),
+        sa.Column("progress", sa.String(length=200), nullable=True),
         sa.Column("error", sa.Text(), nullable=True),
         sa.Column("completed_at", sa.Double(), nullable=True),
         sa.CheckConstraint(
-            "state IN ('queued', 'leased', 'done', 'failed', 'cancelled')", name=op.f("ck_jobs_state")
+            "state IN ('waiting', 'queued', 'leased', 'done', 'failed', 'cancelled')",
+            name=op.f("ck_jobs_state"),
         ),
         sa.ForeignKeyConstraint(
             ["object_id"], ["objects.id"], name=op.f("fk_jobs_object_id_objects"), ondelete="CASCADE"
@@ -220,6 +264,13 @@ def upgrade() -> None:
         batch_op.create_index("ix_jobs_claim", ["state", "capability", "id"], unique=False)
         batch_op.create_index(batch_op.f("ix_jobs_object_id"), ["object_id"], unique=False)
         batch_op.create_index(batch_op.f("ix_jobs_sweep_id"), ["sweep_id"], unique=False)
+        batch_op.create_index(
+            "uq_jobs_decompose",
+            ["object_id"],
+            unique=True,
+            sqlite_where=sa.text("kind = 'decompose'"),
+            postgresql_where=sa.text("kind = 'decompose'"),
+        )
 
     op.create_table(
         "packed_outcomes",
@@ -239,63 +290,18 @@ def upgrade() -> None:
     with op.batch_alter_table("packed_outcomes", schema=None) as batch_op:
         batch_op.create_index(batch_op.f("ix_packed_outcomes_sweep_id"), ["sweep_id"], unique=False)
 
-    op.create_table(
-        "trials",
-        sa.Column(
-            "object_id",
-            sa.BigInteger().with_variant(sa.Integer(), "sqlite"),
-            autoincrement=False,
-            nullable=False,
-        ),
-        sa.Column("seq", sa.BigInteger(), autoincrement=False, nullable=False),
-        sa.Column("revision", sa.BigInteger(), nullable=False),
-        sa.Column("batch_id", sa.BigInteger(), nullable=False),
-        sa.Column("provenance_id", sa.BigInteger(), nullable=False),
-        sa.Column("outcome", sa.SmallInteger(), nullable=False),
-        sa.Column("px", sa.Double(), nullable=False),
-        sa.Column("py", sa.Double(), nullable=False),
-        sa.Column("pz", sa.Double(), nullable=False),
-        sa.Column("qx", sa.Double(), nullable=False),
-        sa.Column("qy", sa.Double(), nullable=False),
-        sa.Column("qz", sa.Double(), nullable=False),
-        sa.Column("qw", sa.Double(), nullable=False),
-        sa.Column("proposal_density", sa.Double(), nullable=True),
-        sa.Column("quality", sa.Double(), nullable=True),
-        sa.Column("width_m", sa.Double(), nullable=True),
-        sa.Column("pose_index", sa.BigInteger(), nullable=True),
-        sa.Column("measured_at", sa.DateTime(timezone=True), nullable=True),
-        sa.Column("pose_covariance", sa.JSON(none_as_null=True), nullable=True),
-        sa.Column("metadata", sa.JSON(none_as_null=True), nullable=True),
-        sa.ForeignKeyConstraint(
-            ["object_id"], ["objects.id"], name=op.f("fk_trials_object_id_objects"), ondelete="CASCADE"
-        ),
-        sa.PrimaryKeyConstraint("object_id", "seq", name=op.f("pk_trials")),
-        sqlite_with_rowid=False,
-    )
-    with op.batch_alter_table("trials", schema=None) as batch_op:
-        batch_op.create_index(
-            "ix_trials_successes",
-            ["object_id", "seq"],
-            unique=False,
-            sqlite_where=sa.text("outcome = 1"),
-            postgresql_where=sa.text("outcome = 1"),
-        )
-
 
 def downgrade() -> None:
-    with op.batch_alter_table("trials", schema=None) as batch_op:
-        batch_op.drop_index(
-            "ix_trials_successes",
-            sqlite_where=sa.text("outcome = 1"),
-            postgresql_where=sa.text("outcome = 1"),
-        )
-
-    op.drop_table("trials")
     with op.batch_alter_table("packed_outcomes", schema=None) as batch_op:
         batch_op.drop_index(batch_op.f("ix_packed_outcomes_sweep_id"))
 
     op.drop_table("packed_outcomes")
     with op.batch_alter_table("jobs", schema=None) as batch_op:
+        batch_op.drop_index(
+            "uq_jobs_decompose",
+            sqlite_where=sa.text("kind = 'decompose'"),
+            postgresql_where=sa.text("kind = 'decompose'"),
+        )
         batch_op.drop_index(batch_op.f("ix_jobs_sweep_id"))
         batch_op.drop_index(batch_op.f("ix_jobs_object_id"))
         batch_op.drop_index("ix_jobs_claim")
@@ -310,6 +316,14 @@ def downgrade() -> None:
         batch_op.drop_index(batch_op.f("ix_sweeps_object_id"))
 
     op.drop_table("sweeps")
+    with op.batch_alter_table("trials", schema=None) as batch_op:
+        batch_op.drop_index(
+            "ix_trials_successes",
+            sqlite_where=sa.text("outcome = 1"),
+            postgresql_where=sa.text("outcome = 1"),
+        )
+
+    op.drop_table("trials")
     with op.batch_alter_table("provenances", schema=None) as batch_op:
         batch_op.drop_index(batch_op.f("ix_provenances_object_id"))
 

@@ -64,6 +64,7 @@ class JobRow:
     worker: str | None
     result_sha256: str | None
     answer: dict[str, Any] | None
+    progress: str | None
     error: str | None
 
 
@@ -154,12 +155,13 @@ def claim(
     return sorted((_job(row) for row in tx.execute(statement)), key=lambda job: job.id)
 
 
-def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float) -> float | None:
+def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str | None = None) -> float | None:
     """Extend a lease that is still its job's, even one that has run out; when it then ends, or None."""
+    news = {} if progress is None else {"progress": progress}
     statement = (
         update(jobs)
         .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == "leased")
-        .values(lease_expires_at=unix_now() + lease_s)
+        .values(lease_expires_at=unix_now() + lease_s, **news)
         .returning(jobs.c.lease_expires_at)
     )
     ends: float | None = tx.scalar(statement)

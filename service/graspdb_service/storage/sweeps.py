@@ -19,7 +19,7 @@ from graspdb_service.storage.tables import batches, jobs, objects, packed_outcom
 POSE_COLUMNS = 8
 _POSE_BYTES = 8 * POSE_COLUMNS
 _JOBS_PER_INSERT = 10_000
-_OPEN = ("queued", "leased")
+_OPEN = ("waiting", "queued", "leased")
 
 
 @dataclass(frozen=True)
@@ -128,11 +128,14 @@ def create(
     chunk_poses: int,
     capability: str,
     job_ids: Sequence[str],
+    waiting: bool = False,
 ) -> None:
     """Store a sweep and queue its jobs, one for every ``chunk_poses`` poses of the plan.
 
     Parameters
     ----------
+    waiting
+        The jobs wait for the object's convex parts before they can be claimed.
     poses : (pose_count, 8) float64 or None
         Position, quaternion xyzw and proposal density (NaN: none) of a plan that is no grid.
     """
@@ -169,7 +172,7 @@ def create(
                     "number": number,
                     "start": number * chunk_poses,
                     "stop": min((number + 1) * chunk_poses, pose_count),
-                    "state": "queued",
+                    "state": "waiting" if waiting else "queued",
                     "attempts": 0,
                 }
                 for number, job_id in enumerate(job_ids[first : first + _JOBS_PER_INSERT], first)
@@ -323,13 +326,13 @@ def cancel(tx: Tx, sweep_id: str) -> bool:
     return True
 
 
-def retry(tx: Tx, sweep_id: str) -> int:
+def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
     """Queue failed and cancelled chunks again, with all their attempts; under the object's lock."""
     again = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(["failed", "cancelled"]))
         .values(
-            state="queued",
+            state="waiting" if waiting else "queued",
             attempts=0,
             lease_id=None,
             lease_expires_at=None,

@@ -231,11 +231,22 @@ jobs = Table(
     Column("result_sha256", String(64)),
     Column("answer", JSON(none_as_null=True)),
     Column("counts", JSON(none_as_null=True)),
+    # What its worker says of how far it is, where poses can't tell.
+    Column("progress", String(200)),
     Column("error", Text),
     Column("completed_at", Double),
     UniqueConstraint("sweep_id", "number"),
-    CheckConstraint("state IN ('queued', 'leased', 'done', 'failed', 'cancelled')", name="state"),
+    # Waiting: for the convex parts of its object, which a job of the kind decompose makes.
+    CheckConstraint("state IN ('waiting', 'queued', 'leased', 'done', 'failed', 'cancelled')", name="state"),
     Index("ix_jobs_claim", "state", "capability", "id"),
+    # One decomposition an object, whichever sweeps wait for it.
+    Index(
+        "uq_jobs_decompose",
+        "object_id",
+        unique=True,
+        sqlite_where=text("kind = 'decompose'"),
+        postgresql_where=text("kind = 'decompose'"),
+    ),
 )
 
 # One uint8 for every pose of a finished chunk, in the plan's order, and what physics measured for the
