@@ -18,6 +18,8 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import Counter, Histogram
+from sqlalchemy.exc import OperationalError as DatabaseUnavailable
+from sqlalchemy.exc import TimeoutError as PoolExhausted
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -205,6 +207,18 @@ def _add_problems(app: FastAPI) -> None:
     @app.exception_handler(ObjectGone)
     def on_gone(request: Request, _: ObjectGone) -> Response:
         return answer(request, ProblemError(404, "not-found", "The object has just been deleted"))
+
+    @app.exception_handler(DatabaseUnavailable)
+    @app.exception_handler(PoolExhausted)
+    def on_database(request: Request, error: Exception) -> Response:
+        log.error("request %s: %s", getattr(request.state, "request_id", ""), error)
+        problem = ProblemError(
+            503,
+            "database-unavailable",
+            "The database does not answer or is busy; nothing was stored: try again",
+            headers={"Retry-After": "2"},
+        )
+        return answer(request, problem)
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:

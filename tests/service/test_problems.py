@@ -12,6 +12,7 @@ import httpx
 import pytest
 
 from graspdb_service.settings import Settings
+from graspdb_service.storage import database
 
 Serve = Callable[..., str]
 JSON = {"Content-Type": "application/json"}
@@ -173,3 +174,20 @@ def test_bug_is_a_500_without_its_details(
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.json()["request_id"] == answer.headers["x-request-id"]
     assert "swordfish" not in answer.text
+
+
+def test_busy_database_is_503_and_stores_nothing(
+    sqlite_url: str, serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database, "SQLITE_BUSY_MS", 50)
+    with httpx.Client(base_url=serve(sqlite_url)) as http:
+        http.post("/objects", json={"id": "mug"})
+        other = database.Database(sqlite_url)
+        with other.write():
+            answer = http.post("/objects", json={"id": "cup"}, headers={"Idempotency-Key": "k"})
+            assert http.get("/objects/mug").status_code == 200
+        other.dispose()
+        assert answer.status_code == 503
+        assert answer.headers["retry-after"]
+        assert answer.json()["type"].endswith(":database-unavailable")
+        assert http.post("/objects", json={"id": "cup"}, headers={"Idempotency-Key": "k"}).status_code == 201
