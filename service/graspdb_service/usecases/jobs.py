@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +27,7 @@ from graspdb.wire import (
 from graspdb.wire.jobs import FailureNoted
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import batches, jobs, objects, sweeps, trials
+from graspdb_service.storage.database import Tx
 from graspdb_service.storage.jobs import JobRow
 from graspdb_service.storage.sweeps import SweepRow
 from graspdb_service.usecases import plans
@@ -244,7 +244,7 @@ class _Chunk:
     counts: dict[str, dict[str, int]]
 
 
-def _twins(tx: Any, sweep: SweepRow) -> dict[str, SweepRow]:
+def _twins(tx: Tx, sweep: SweepRow) -> dict[str, SweepRow]:
     key = sweep.snapshot["repeat_key"]
     return {other.id: other for other in sweeps.siblings(tx, sweep) if other.snapshot["repeat_key"] == key}
 
