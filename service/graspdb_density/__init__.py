@@ -1,9 +1,11 @@
 """Grasp densities: kernel density estimation on R^3 x SO(3). Arrays in, arrays out; no IO."""
 
 from . import reference, se3
+from .anisotropic import AnisotropicKernel
 from .density import GraspDensity
 from .kernels import HAAR_VOLUME, IsotropicKernel
 from .maximum import Maximum, nearest
+from .mixture import MixtureDensity
 from .region import Region
 from .scored import PoseNoise, expected, search_scored
 from .success import SuccessEstimate, SuccessModel
@@ -13,9 +15,11 @@ from .widths import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
 __all__ = [
     "DEFAULT_KERNEL",
     "HAAR_VOLUME",
+    "AnisotropicKernel",
     "GraspDensity",
     "IsotropicKernel",
     "Maximum",
+    "MixtureDensity",
     "PoseNoise",
     "Region",
     "SuccessEstimate",
