@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 import tempfile
+import threading
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 NEEDS = "graspdb-server needs {}: pip install 'graspdb[service]'"
@@ -54,6 +55,7 @@ def serve(
         app = _application(settings)
     except (schema.StaleSchema, UnsupportedDatabase) as error:
         _fail(str(error))
+    _warm_up(app)
     uvicorn.run(
         app,
         host=settings.host,
@@ -63,6 +65,13 @@ def serve(
         log_level=log_level,
         timeout_graceful_shutdown=10,
     )
+
+
+def _warm_up(app: Any) -> None:
+    """Load what queries need while the server already answers."""
+    from graspdb_service.usecases.warmup import warm_up
+
+    threading.Thread(target=warm_up, args=(app.state.context.compute,), daemon=True).start()
 
 
 @cli.command()
