@@ -59,6 +59,7 @@ class Lease:
     lease_id: str
     lease_s: float
     renewed: float
+    unheard: bool = False
     lost: threading.Event = field(default_factory=threading.Event)
 
 
@@ -198,11 +199,17 @@ class Worker:
             lease.lost.set()
         except GraspDBError as error:
             # Perhaps the service restarts. A lease that ran out may still be ours when it is back.
-            log.warning("job %s: could not renew the lease: %s", lease.job, error)
+            log.log(
+                logging.DEBUG if lease.unheard else logging.WARNING,
+                "job %s: could not renew the lease, trying on: %s",
+                lease.job,
+                error,
+            )
+            lease.unheard = True
             lease.renewed += min(1.0, lease.lease_s / 10.0)
         else:
             renewed = LeaseRenewed.model_validate_json(answer.content)
-            lease.renewed, lease.lease_s = time.monotonic(), renewed.lease_s
+            lease.renewed, lease.lease_s, lease.unheard = time.monotonic(), renewed.lease_s, False
             if renewed.cancel:
                 log.info("job %s: cancelled", lease.job)
                 lease.lost.set()

@@ -1,8 +1,8 @@
 """How fast grasps are simulated: prefilter, physics, force test and the whole chain, by object.
 
 Random chunks of the 10 mm x 15 degree grid with 20 mm margin, one of each jaw-symmetric pair; medians
-over chunks, each chunk in one process on one core. The last line compares two children at once with
-one.
+over chunks, per second of CPU time on one core. The last line, by the wall clock, compares two children
+at once with one.
 """
 
 from __future__ import annotations
