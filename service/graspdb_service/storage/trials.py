@@ -11,17 +11,16 @@ import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Row, and_, func, literal_column, select
+from sqlalchemy import and_, func, select
 from sqlalchemy import insert as plain_insert
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import provenances as provenance_table
 from graspdb_service.storage.tables import tallies as tally_table
-from graspdb_service.storage.tables import trials as trial_table
 from graspdb_service.storage.upsert import insert as upsert
 
 FloatArray = npt.NDArray[np.float64]
@@ -445,6 +444,30 @@ def _postgres_time(value: datetime | None) -> int | None:
 # --- reading rows ---------------------------------------------------------------------------------------
 
 
+class TrialRow(NamedTuple):
+    """One stored trial, column by column."""
+
+    seq: int
+    revision: int
+    batch_id: int
+    provenance_id: int
+    outcome: int
+    px: float
+    py: float
+    pz: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+    proposal_density: float | None
+    quality: float | None
+    width_m: float | None
+    pose_index: int | None
+    measured_at: datetime | None
+    pose_covariance: list[list[float]] | None
+    metadata: dict[str, Any] | None
+
+
 def page(
     tx: Tx,
     object_id: int,
@@ -456,28 +479,45 @@ def page(
     provenance_ids: Sequence[int] | None = None,
     batch_id: int | None = None,
     since_revision: int | None = None,
-) -> list[Row[Any]]:
-    """Up to ``limit`` trials after a sequence number, as rows with the table's column names.
-
-    ``since_revision`` keeps what was stored after that revision.
-    """
-    query = (
-        select(trial_table)
-        .where(trial_table.c.object_id == object_id, trial_table.c.seq > after_seq)
-        .order_by(trial_table.c.seq)
-        .limit(limit)
-    )
+) -> list[TrialRow]:
+    """Up to ``limit`` trials after a sequence number; ``since_revision`` keeps what was stored after it."""
+    where = [f"object_id = {int(object_id)}", f"seq > {int(after_seq)}"]
     if up_to_seq is not None:
-        query = query.where(trial_table.c.seq <= up_to_seq)
-    if outcome == SUCCESS:
+        where.append(f"seq <= {int(up_to_seq)}")
+    if outcome is not None:
         # Said literally, as the partial index has it.
-        query = query.where(literal_column("outcome") == literal_column(str(SUCCESS)))
-    elif outcome is not None:
-        query = query.where(trial_table.c.outcome == outcome)
+        where.append(f"outcome = {int(outcome)}")
     if provenance_ids is not None:
-        query = query.where(trial_table.c.provenance_id.in_(provenance_ids))
+        where.append(f"provenance_id IN ({', '.join(str(int(p)) for p in provenance_ids) or 'NULL'})")
     if batch_id is not None:
-        query = query.where(trial_table.c.batch_id == batch_id)
+        where.append(f"batch_id = {int(batch_id)}")
     if since_revision is not None:
-        query = query.where(trial_table.c.revision > since_revision)
-    return list(tx.execute(query))
+        where.append(f"revision > {int(since_revision)}")
+    query = (
+        f"SELECT {', '.join(TrialRow._fields)} FROM trials WHERE {' AND '.join(where)}"
+        f" ORDER BY seq LIMIT {int(limit)}"
+    )
+    cursor = tx.connection.cursor()
+    try:
+        cursor.execute(query)
+        rows = [TrialRow._make(row) for row in cursor.fetchall()]
+    finally:
+        cursor.close()
+    return [row if row[-3:] == _NOTHING else _decoded(row) for row in rows]
+
+
+_NOTHING = (None, None, None)
+
+
+def _decoded(row: TrialRow) -> TrialRow:
+    """With times and documents as Python's own: PostgreSQL's driver has done that, SQLite keeps text."""
+    time, covariance, metadata = row[-3:]
+    if isinstance(time, str):
+        time = datetime.fromisoformat(time).replace(tzinfo=UTC)
+    elif time is not None:
+        time = time.astimezone(UTC)
+    return row._replace(
+        measured_at=time,
+        pose_covariance=json.loads(covariance) if isinstance(covariance, str) else covariance,
+        metadata=json.loads(metadata) if isinstance(metadata, str) else metadata,
+    )
