@@ -66,9 +66,17 @@ class SimulatePayload(Response):
 
 
 class DecomposePayload(Response):
+    """A mesh to split into convex parts: ``mesh`` is the path to fetch it from.
+
+    The result is a GLB in metres with one geometry a part, sent as ``model/gltf-binary``.
+    """
+
     object: str
     mesh: str
     mesh_sha256: str
+    media_type: str = "model/stl"
+    unit: str = "m"
+    max_parts: int = 1024
 
 
 class ClaimedJob(Response):
@@ -114,7 +122,10 @@ class ResultAccepted(Response):
 
 
 class FailureReport(Request):
+    """``permanent``: another attempt would end the same way, so none is made."""
+
     error: Text
+    permanent: bool = False
 
 
 class FailureNoted(Response):

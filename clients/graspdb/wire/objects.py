@@ -63,10 +63,14 @@ class MeshInfo(Response):
 
 
 class PartsInfo(Response):
+    """``volume_m3`` is the sum over the parts. ``deviation_m``: how far, in metres, the parts' surface and
+    the mesh's lie apart at most, over points sampled on both; null without a mesh."""
+
     sha256: str
     parts: int
     volume_m3: float
     bounding_box: BoundingBox
+    deviation_m: float | None = None
     warnings: list[str] = Field(default_factory=list)
 
 

@@ -74,6 +74,21 @@ class SweepCreate(Request):
         return self
 
 
+class WaitingFor(Response):
+    """The job that a sweep's chunks wait for: ``decompose`` makes the object's convex parts.
+
+    ``progress`` is what its worker says of it, ``error`` why it or its last attempt failed.
+    """
+
+    kind: Literal["decompose"]
+    job: str
+    state: Literal["queued", "running", "done", "failed", "cancelled"]
+    attempts: int
+    worker: str | None = None
+    progress: str | None = None
+    error: str | None = None
+
+
 class SweepInfo(Response):
     """``poses`` counts what is simulated (one of each jaw-symmetric pair); ``rate_poses_s`` over the last
     minutes; ``time_left_s`` by that rate."""
@@ -95,6 +110,7 @@ class SweepInfo(Response):
     poses: int
     poses_done: int
     full_grid_poses: int | None = None
+    waiting_for: WaitingFor | None = None
     outcomes: dict[str, int] = Field(default_factory=dict)
     rate_poses_s: float | None = None
     time_left_s: float | None = None

@@ -1,0 +1,92 @@
+"""Decompositions: the one job of an object that makes its convex parts, and the chunks that wait for it.
+
+All of them are called under the object's lock, :func:`find` and :func:`source_of` excepted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import and_, insert, select, update
+
+from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.jobs import JobRow
+from graspdb_service.storage.tables import jobs, objects
+
+_COLUMNS = [jobs.c[name] for name in JobRow.__dataclass_fields__]
+
+
+@dataclass(frozen=True)
+class Source:
+    """The object of a decomposition, and its mesh as :class:`graspdb.wire.MeshInfo` has it."""
+
+    slug: str
+    mesh_info: dict[str, Any] | None
+
+
+def find(tx: Tx, object_id: int) -> JobRow | None:
+    """The object's decomposition, whatever became of it."""
+    query = select(*_COLUMNS).where(jobs.c.object_id == object_id, jobs.c.kind == "decompose")
+    row = tx.execute(query).first()
+    return None if row is None else JobRow(**row._mapping)
+
+
+def source_of(tx: Tx, object_id: int) -> Source | None:
+    """What a decomposition is made from."""
+    row = tx.execute(select(objects.c.slug, objects.c.mesh_info).where(objects.c.id == object_id)).first()
+    return None if row is None else Source(row.slug, row.mesh_info)
+
+
+def ask(tx: Tx, object_id: int, job_id: str) -> None:
+    """Queue the object's decomposition, anew where it failed or was cancelled; an open one is left alone."""
+    found = find(tx, object_id)
+    fresh = {
+        "state": "queued",
+        "attempts": 0,
+        "lease_id": None,
+        "lease_expires_at": None,
+        "worker": None,
+        "progress": None,
+        "error": None,
+        "completed_at": None,
+    }
+    if found is None:
+        fixed = {"kind": "decompose", "capability": "decompose", "number": 0, "start": 0, "stop": 0}
+        tx.execute(insert(jobs).values(id=job_id, object_id=object_id, **fixed, **fresh))
+    elif found.state in ("failed", "cancelled"):
+        tx.execute(update(jobs).where(jobs.c.id == found.id).values(**fresh))
+
+
+def waiting_sweeps(tx: Tx, object_id: int) -> list[str]:
+    """Sweeps with chunks that wait for the object's parts."""
+    query = select(jobs.c.sweep_id).where(jobs.c.object_id == object_id, jobs.c.state == "waiting").distinct()
+    return sorted(tx.scalars(query))
+
+
+def release(tx: Tx, object_id: int) -> None:
+    """Let workers claim the chunks that have waited."""
+    tx.execute(_waiting(object_id).values(state="queued"))
+
+
+def fail_waiting(tx: Tx, object_id: int, error: str) -> None:
+    """Fail the chunks that have waited."""
+    tx.execute(_waiting(object_id).values(state="failed", error=error, completed_at=unix_now()))
+
+
+def _waiting(object_id: int) -> Any:
+    return update(jobs).where(and_(jobs.c.object_id == object_id, jobs.c.state == "waiting"))
+
+
+def cancel(tx: Tx, object_id: int) -> None:
+    """End the object's decomposition if it is open."""
+    # The lease stays, so that its holder is told to stop rather than that the lease is lost.
+    tx.execute(
+        update(jobs)
+        .where(
+            jobs.c.object_id == object_id,
+            jobs.c.kind == "decompose",
+            jobs.c.state.in_(("queued", "leased")),
+        )
+        .values(state="cancelled", completed_at=unix_now())
+    )
