@@ -251,6 +251,7 @@ def problem_of_validation(errors: Any, title: str = "The request is not valid") 
         place = [str(part) for part in item["loc"] if part not in ("body", "query", "path", "header")]
         # pydantic names the branch of a union it tried; that is no part of the user's document.
         place = [part for part in place if "[" not in part and not part[:1].isupper()]
+        place = [part for part in place if part != "constrained-str"]
         listed.append((".".join(place) or "body", str(item["msg"]).removeprefix("Value error, ")))
     unique = list(dict.fromkeys(listed))
     return ProblemError(422, "invalid-request", title, errors=unique)
