@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from graspdb_simworker.labels import Label, Outcome
 
-READY, CHUNK, BEFORE, AFTER, RESULT, ERROR, MISSING = b"R", b"C", b"B", b"A", b"D", b"E", b"M"
+READY, CHUNK, BEFORE, AFTER, RESULT, ERROR, MISSING, NOTE = (b"R", b"C", b"B", b"A", b"D", b"E", b"M", b"N")
 MAX_BYTES = 1 << 30
 
 _HEADER = struct.Struct("<cQ")

@@ -30,7 +30,7 @@ from graspdb_service.api.routing import (
     scope,
 )
 from graspdb_service.problems import ProblemError
-from graspdb_service.usecases import jobs
+from graspdb_service.usecases import jobs, meshes
 
 router = APIRouter(tags=["jobs"])
 
@@ -38,6 +38,11 @@ LeaseId = Annotated[
     str, Query(min_length=1, max_length=64, pattern=r"^[\x21-\x7e]+$", description="As the claim gave it.")
 ]
 JobId = str
+_RESULTS = {"application/json": SimulateResult, meshes.GLB: {"type": "string", "format": "binary"}}
+ProgressText = Annotated[
+    str | None,
+    Query(max_length=200, pattern=r"^[^\x00-\x1f]+$", description="How far the work is, for a person."),
+]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -67,9 +72,9 @@ def claim_jobs(ctx: Ctx, request: ClaimRequest) -> ClaimResponse:
 
 
 @router.put("/jobs/{id}/lease", **scope("jobs:work"))
-def renew_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> LeaseRenewed:
+def renew_lease(ctx: Ctx, id: JobId, lease_id: LeaseId, progress: ProgressText = None) -> LeaseRenewed:
     """Keep a job; ``cancel`` says that it is no longer wanted. 409 ``lease-lost`` if another has it."""
-    return jobs.renew(ctx, id, lease_id)
+    return jobs.renew(ctx, id, lease_id, progress)
 
 
 @router.delete("/jobs/{id}/lease", status_code=204, **scope("jobs:work"))
@@ -78,12 +83,14 @@ def release_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> None:
     jobs.release(ctx, id, lease_id)
 
 
-@router.put("/jobs/{id}/result", **scope("jobs:work", body={"application/json": SimulateResult}))
+@router.put("/jobs/{id}/result", **scope("jobs:work", body=_RESULTS))
 def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: RawBody) -> ResultAccepted:
-    """Store a chunk's outcomes and complete its job, in one transaction.
+    """Store a chunk's outcomes, or an object's convex parts, and complete the job, in one transaction.
 
     The same body under the same lease again is answered the same again.
     """
+    if media_type(request) == meshes.GLB:
+        return jobs.complete_parts(ctx, id, lease_id, body)
     return jobs.complete(ctx, id, lease_id, body, parse(SimulateResult, request, body))
 
 

@@ -129,9 +129,9 @@ def fail_waiting(tx: Tx, job: JobRow, reason: str) -> None:
 def drop_unwanted(tx: Tx, object_id: int) -> None:
     """Stop a decomposition that no sweep waits for any more."""
     job = decompositions.find(tx, object_id)
-    if job is not None and job.state in ("queued", "leased"):
-        if not decompositions.waiting_sweeps(tx, object_id):
-            decompositions.cancel(tx, object_id)
+    is_open = job is not None and job.state in ("queued", "leased")
+    if is_open and not decompositions.waiting_sweeps(tx, object_id):
+        decompositions.cancel(tx, object_id)
 
 
 def waiting_for(tx: Tx, sweep: SweepRow) -> WaitingFor | None:
@@ -152,6 +152,12 @@ def waiting_for(tx: Tx, sweep: SweepRow) -> WaitingFor | None:
             "error": job.error,
         }
     )
+
+
+def source(tx: Tx, job: JobRow) -> str | None:
+    """The id of the object that a decomposition is for; None once it is gone."""
+    found = decompositions.source_of(tx, job.object_id)
+    return None if found is None else found.slug
 
 
 def payload(tx: Tx, job: JobRow) -> DecomposePayload | None:

@@ -15,6 +15,7 @@ from graspdb.wire import (
     ClaimedJob,
     ClaimRequest,
     ClaimResponse,
+    DecomposePayload,
     FailureReport,
     GridPlan,
     LeaseRenewed,
@@ -30,8 +31,9 @@ from graspdb_service.storage import batches, jobs, objects, sweeps, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.jobs import JobRow
 from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.usecases import plans
+from graspdb_service.usecases import decompositions, meshes, plans
 from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.plans import ChunkPoses
 
 #: An idle worker that asks again and again is noted this often, so that asking takes no write lock.
@@ -90,18 +92,24 @@ def claim(ctx: Context, request: ClaimRequest) -> ClaimResponse:
             for job in claimed
             if job.sweep_id is not None
         }
-    answers = [
-        ClaimedJob(
-            id=job.id,
-            kind="simulate",
-            lease_id=job.lease_id or "",
-            lease_expires_at=_time(job.lease_expires_at),
-            lease_s=settings.lease_s,
-            payload=_payload(rows[job.sweep_id], job, stored[job.id]),
-        )
-        for job in claimed
-        if job.sweep_id is not None
-    ]
+        payloads = {job.id: decompositions.payload(tx, job) for job in claimed if job.kind == "decompose"}
+    answers = []
+    for job in claimed:
+        payload: SimulatePayload | DecomposePayload | None
+        if job.sweep_id is None:
+            payload = payloads[job.id]
+        else:
+            payload = _payload(rows[job.sweep_id], job, stored[job.id])
+        if payload is not None:
+            answer = ClaimedJob(
+                id=job.id,
+                kind="decompose" if job.sweep_id is None else "simulate",
+                lease_id=job.lease_id or "",
+                lease_expires_at=_time(job.lease_expires_at),
+                lease_s=settings.lease_s,
+                payload=payload,
+            )
+            answers.append(answer)
     return ClaimResponse(jobs=answers, retry_after_s=0.0 if answers else settings.retry_after_s)
 
 
@@ -134,14 +142,22 @@ def _end(ctx: Context, job: JobRow) -> None:
     """Fail a job whose last attempt has run out."""
     with ctx.database.write() as tx:
         sweeps.lock_object(tx, job.object_id)
-        if jobs.end_exhausted(tx, job) and job.sweep_id is not None:
-            sweeps.note_finished(tx, job.sweep_id)
+        if jobs.end_exhausted(tx, job):
+            _failed(tx, _found(jobs.find(tx, job.id), job.id))
 
 
-def renew(ctx: Context, job_id: str, lease_id: str) -> LeaseRenewed:
+def _failed(tx: Tx, job: JobRow) -> None:
+    """What follows from a job that has failed for good."""
+    if job.sweep_id is not None:
+        sweeps.note_finished(tx, job.sweep_id)
+    else:
+        decompositions.fail_waiting(tx, job, job.error or "no reason given")
+
+
+def renew(ctx: Context, job_id: str, lease_id: str, progress: str | None = None) -> LeaseRenewed:
     """Extend a lease, or tell its holder that the job is no longer wanted."""
     with ctx.database.write() as tx:
-        ends = jobs.renew(tx, job_id, lease_id, ctx.settings.lease_s)
+        ends = jobs.renew(tx, job_id, lease_id, ctx.settings.lease_s, progress=progress)
         job = None if ends is not None else jobs.find(tx, job_id)
     if ends is not None:
         return LeaseRenewed(lease_expires_at=_time(ends), lease_s=ctx.settings.lease_s)
@@ -166,10 +182,11 @@ def fail(ctx: Context, job_id: str, lease_id: str, report: FailureReport) -> Fai
         job = _found(jobs.find(tx, job_id), job_id)
     with ctx.database.write() as tx:
         sweeps.lock_object(tx, job.object_id)
-        state = jobs.fail(tx, job_id, lease_id, error=report.error, max_attempts=ctx.settings.max_attempts)
-        if state == "failed" and job.sweep_id is not None:
-            sweeps.note_finished(tx, job.sweep_id)
+        attempts = 0 if report.permanent else ctx.settings.max_attempts
+        state = jobs.fail(tx, job_id, lease_id, error=report.error, max_attempts=attempts)
         job = _found(jobs.find(tx, job_id), job_id)
+        if state == "failed":
+            _failed(tx, job)
     # The same report once more, its answer having been lost.
     repeated = state is None and job.lease_id == lease_id and job.state in ("queued", "failed")
     if state is None and not repeated:
@@ -198,6 +215,8 @@ def complete(ctx: Context, job_id: str, lease_id: str, body: bytes, result: Simu
                 return earlier
             if job.state != "leased" or job.lease_id != lease_id:
                 raise _lost(job)
+            if job.kind != "simulate":
+                raise _wrong_kind(job)
             sweep = sweeps.find(tx, job.sweep_id or "")
             if sweep is None:
                 raise _lost(job)
@@ -232,6 +251,52 @@ def complete(ctx: Context, job_id: str, lease_id: str, body: bytes, result: Simu
         "Sweeps over the same grid keep overtaking this result; send it again",
         headers={"Retry-After": "1"},
     )
+
+
+def complete_parts(ctx: Context, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
+    """Store the convex parts that a worker made, in the transaction that completes its job.
+
+    Raises
+    ------
+    ProblemError
+        409 ``lease-lost``; 413 and 422 as for parts that a user sends. Nothing is stored then.
+    """
+    sha256 = hashlib.sha256(body).hexdigest()
+    with ctx.database.read() as tx:
+        job = _found(jobs.find(tx, job_id), job_id)
+        if (earlier := _replay(job, lease_id, sha256)) is not None:
+            return earlier
+        if job.kind != "decompose":
+            raise _wrong_kind(job)
+        if job.state != "leased" or job.lease_id != lease_id:
+            raise _lost(job)
+        source = decompositions.source(tx, job)
+        row = None if source is None else require(tx, source)
+    if row is None:
+        raise _lost(job)
+    info = meshes.check_parts(ctx, row, body)
+    try:
+        with ctx.database.write() as tx:
+            try:
+                revision, _ = objects.advance(tx, row.id, append=False)
+            except objects.ObjectGone:
+                raise _LostLease from None
+            locked = require(tx, row.slug)
+            accepted = ResultAccepted(job=job.id, revision=revision, inserted=0)
+            # The mesh can't have changed: it has sweeps.
+            if locked.parts_sha256 is not None or not jobs.complete(
+                tx, job.id, lease_id, sha256=sha256, answer=accepted.model_dump(), counts={}
+            ):
+                raise _LostLease
+            meshes.store_parts(tx, locked, body, info)
+            jobs.credit_worker(tx, job.worker, 0)
+    except _LostLease:
+        with ctx.database.read() as tx:
+            job = _found(jobs.find(tx, job_id), job_id)
+        if (earlier := _replay(job, lease_id, sha256)) is not None:
+            return earlier
+        raise _lost(job) from None
+    return accepted
 
 
 @dataclass(frozen=True)
@@ -375,6 +440,11 @@ def _store(
     return accepted
 
 
+def _wrong_kind(job: JobRow) -> ProblemError:
+    wanted = {"simulate": "JSON, as application/json", "decompose": f"a GLB, as {meshes.GLB}"}[job.kind]
+    return ProblemError(415, "unsupported-media-type", f"The result of a {job.kind} job is {wanted}")
+
+
 def _found(job: JobRow | None, job_id: str) -> JobRow:
     if job is None:
         raise not_found("job", job_id[:80], "its object may have been deleted")
@@ -392,6 +462,7 @@ def _lost(job: JobRow) -> ProblemError:
         "done": "it is done",
         "cancelled": "its sweep was cancelled",
         "failed": "it has failed for good",
+        "waiting": "it waits for convex parts",
         "queued": "it was given back or failed, and waits for another claim",
         "leased": "another claim has it",
     }[job.state]

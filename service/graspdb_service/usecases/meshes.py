@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from graspdb.wire import BoundingBox, MeshInfo, PartsInfo
 from graspdb_geometry import meshes
+from graspdb_geometry.deviation import deviation
 from graspdb_geometry.meshes import Inspection, Mesh, MeshError, Part
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.storage import assets, objects, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases import decompositions
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.objects import require
 
@@ -23,6 +26,8 @@ MEDIA_TYPES = meshes.MEDIA_TYPES
 # Parts come from the mesh, rounded or slightly inflated: within this they describe the same object.
 _FIT_M = 1e-3
 _FIT_SHARE = 0.02
+# Surfaces farther apart than this are worth a warning: a decomposition is always a little off.
+_NEAR_SHARE = 0.01
 
 
 def put_mesh(ctx: Context, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
@@ -79,23 +84,66 @@ def put_parts(ctx: Context, slug: str, content: bytes, *, media: str) -> PartsIn
         if row.parts_sha256 == sha256:
             return PartsInfo.model_validate(row.parts_info)
         _refuse_other_parts(tx, row)
+    info = check_parts(ctx, row, content)
+    with ctx.database.write() as tx:
+        locked = require(tx, slug, lock=True)
+        if locked.parts_sha256 == sha256:
+            return PartsInfo.model_validate(locked.parts_info)
+        if (locked.id, locked.mesh_sha256, locked.mesh_info) != (row.id, row.mesh_sha256, row.mesh_info):
+            raise conflict(
+                "object-changed", f"The mesh of {slug!r} was changed at the same moment: try again"
+            )
+        _refuse_other_parts(tx, locked)
+        objects.advance(tx, locked.id, append=False)
+        store_parts(tx, locked, content, info)
+    _drop_unused(ctx, locked)
+    return info
+
+
+def check_parts(ctx: Context, row: ObjectRow, content: bytes) -> PartsInfo:
+    """Check convex parts, wherever they come from, and measure them against their object's mesh.
+
+    Raises
+    ------
+    ProblemError
+        413 and 422 for what can't be used.
+    """
     # The child's limits first: what passed them is safe to read here.
     _inspect(ctx, content, GLB, "m", field="parts")
     try:
         parts = meshes.parts_from_glb(content)
     except MeshError as error:
         raise _refused(error) from None
-    with ctx.database.write() as tx:
-        row = require(tx, slug, lock=True)
-        if row.parts_sha256 == sha256:
-            return PartsInfo.model_validate(row.parts_info)
-        _refuse_other_parts(tx, row)
-        mesh = None if row.mesh_info is None else MeshInfo.model_validate(row.mesh_info)
-        info = _parts_info(content, parts, mesh)
-        objects.advance(tx, row.id, append=False)
-        objects.change(tx, row.id, _parts_values(tx, content, info))
-    _drop_unused(ctx, row)
-    return info
+    mesh = None if row.mesh_info is None else MeshInfo.model_validate(row.mesh_info)
+    info = _parts_info(content, parts, mesh)
+    if mesh is None:
+        return info
+    with ctx.database.read() as tx:
+        found = assets.get(tx, mesh.sha256)
+    if found is None:
+        raise conflict(
+            "object-changed", f"The mesh of {row.slug!r} was changed at the same moment: try again"
+        )
+    own = meshes.load(found[0], mesh.media_type, mesh.unit)
+    apart = ctx.compute.run(lambda: deviation(own, parts)).largest_m
+    longest = max(np.subtract(mesh.bounding_box.upper, mesh.bounding_box.lower))
+    warnings = list(info.warnings)
+    if not warnings and apart > _FIT_M + _NEAR_SHARE * longest:
+        share = (
+            ""
+            if mesh.volume_m3 is None
+            else f", their volume is {info.volume_m3 / mesh.volume_m3:.1%} of its"
+        )
+        warnings.append(f"the parts' surface is up to {1000 * apart:.3g} mm off the mesh's{share}")
+    return info.model_copy(update={"deviation_m": apart, "warnings": warnings})
+
+
+def store_parts(tx: Tx, row: ObjectRow, content: bytes, info: PartsInfo) -> None:
+    """Keep checked parts, for the sweeps that waited for them too; under the object's lock, its revision
+    advanced."""
+    values = _parts_values(tx, content, info)
+    objects.change(tx, row.id, values)
+    decompositions.settle(tx, replace(row, **values))
 
 
 def get_mesh(ctx: Context, slug: str) -> tuple[bytes, str, str]:

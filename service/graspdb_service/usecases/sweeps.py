@@ -30,7 +30,7 @@ from graspdb_service.storage import batches, grippers, jobs, sweeps, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
-from graspdb_service.usecases import plans, queries
+from graspdb_service.usecases import decompositions, plans, queries
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.idempotency import Created, replay_or
 from graspdb_service.usecases.objects import require
@@ -84,11 +84,13 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
     Raises
     ------
     ProblemError
-        404 without the object, 409 while it lacks its mesh or parts, 422 for what can't be simulated.
+        404 without the object, 409 while it lacks its mesh, 422 for what can't be simulated.
     """
     with ctx.database.read() as tx:
         row = require(tx, slug)
         gripper = grippers.find(tx, spec.gripper)
+        if row.mesh_info is not None and row.parts_sha256 is None:
+            decompositions.check(tx, row)
     if gripper is None:
         raise invalid("gripper", f"there is no gripper {spec.gripper!r}: GET /grippers lists them")
     world = _world(row, GripperProfile.model_validate(gripper.profile))
@@ -109,6 +111,9 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
         locked = require(tx, slug, lock=True)
         if not world.still_holds(locked):
             raise conflict("object-changed", f"Object {slug!r} was changed at the same moment: send it again")
+        waiting = locked.parts_sha256 is None
+        if waiting:
+            decompositions.ask(tx, locked, created_ms)
         sweep_id = _new_id(created_ms)
         provenance_id = trials.provenance(tx, locked.id, spec.gripper, "simulation", spec.protocol)
         sweeps.create(
@@ -128,7 +133,11 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
             chunk_poses=chunk,
             capability="simulate" if spec.protocol == "wrench" else spec.protocol,
             job_ids=numbers,
+            waiting=waiting,
         )
+        if waiting:
+            # Until there are parts, it repeats no other's poses.
+            snapshot["repeat_key"] = sweep_id
         _, batch = batches.create(tx, locked.id, revision=locked.revision, sweep_id=sweep_id)
         sweeps.keep_snapshot(tx, sweep_id, {**snapshot, "batch": batch})
         info = _info(tx, _require(tx, sweep_id))
@@ -151,12 +160,6 @@ def _new_id(created_ms: int) -> str:
 def _world(row: ObjectRow, profile: GripperProfile) -> _World:
     if row.mesh_info is None or row.mesh_sha256 is None:
         raise conflict("mesh-missing", f"Object {row.slug!r} has no mesh: PUT /objects/{row.slug}/mesh first")
-    if row.parts_sha256 is None or row.parts_info is None:
-        raise conflict(
-            "convex-parts-missing",
-            f"The mesh of {row.slug!r} is not convex, and physics and collision test need convex parts:"
-            f" PUT /objects/{row.slug}/convex-parts (a GLB with one geometry a part)",
-        )
     try:
         shape_of(profile)
     except ValueError as error:
@@ -170,19 +173,18 @@ def _world(row: ObjectRow, profile: GripperProfile) -> _World:
     box = row.mesh_info["bounding_box"]
     lower, upper = np.array(box["lower"]), np.array(box["upper"])
     _check_size(row, float(np.max(upper - lower)), profile)
-    return _World(
-        row,
-        {
-            "mesh_sha256": row.mesh_sha256,
-            "parts_sha256": row.parts_sha256,
-            "mass_kg": _mass(row),
-            "friction": row.friction if row.friction is not None else profile.friction,
-            "gripper": profile.model_dump(mode="json"),
-            "lower": lower.tolist(),
-            "upper": upper.tolist(),
-        },
-        profile,
-    )
+    snapshot = {
+        "mesh_sha256": row.mesh_sha256,
+        "parts_sha256": row.parts_sha256,
+        "mass_kg": _mass(row),
+        "friction": row.friction if row.friction is not None else profile.friction,
+        "gripper": profile.model_dump(mode="json"),
+        "lower": lower.tolist(),
+        "upper": upper.tolist(),
+    }
+    if snapshot["mass_kg"] is None:
+        snapshot["density_kg_m3"] = row.density_kg_m3
+    return _World(row, snapshot, profile)
 
 
 def _check_size(row: ObjectRow, longest: float, profile: GripperProfile) -> None:
@@ -201,12 +203,14 @@ def _check_size(row: ObjectRow, longest: float, profile: GripperProfile) -> None
     )
 
 
-def _mass(row: ObjectRow) -> float:
+def _mass(row: ObjectRow) -> float | None:
+    """The mass, by density where it is not given; None where that has to wait for the parts' volume."""
     if row.mass_kg is not None:
         return row.mass_kg
-    volume = float((row.parts_info or {}).get("volume_m3") or 0.0)
-    if row.density_kg_m3 is not None and volume > 0.0:
-        return row.density_kg_m3 * volume
+    if row.density_kg_m3 is not None:
+        # The mesh's own volume where it has one: parts may overlap, and differ from decomposer to decomposer.
+        volume = (row.mesh_info or {}).get("volume_m3") or (row.parts_info or {}).get("volume_m3")
+        return row.density_kg_m3 * volume if volume else None
     raise invalid(
         "mass_kg",
         f"unknown: PATCH /objects/{row.slug} with mass_kg, or with density_kg_m3",
@@ -332,6 +336,7 @@ def cancel(ctx: Context, sweep_id: str) -> SweepInfo:
     with ctx.database.write() as tx:
         sweeps.lock_object(tx, row.object_id)
         sweeps.cancel(tx, sweep_id)
+        decompositions.drop_unwanted(tx, row.object_id)
         return _info(tx, _require(tx, sweep_id))
 
 
@@ -347,9 +352,13 @@ def retry(ctx: Context, sweep_id: str) -> SweepInfo:
         row = _require(tx, sweep_id)
     with ctx.database.write() as tx:
         sweeps.lock_object(tx, row.object_id)
-        if _require(tx, sweep_id).batch is None:
+        row = _require(tx, sweep_id)
+        if row.batch is None:
             raise conflict("batch-deleted", "This sweep's batch was deleted: make a new sweep")
-        sweeps.retry(tx, sweep_id)
+        waiting = False
+        if row.finished_at is not None and decompositions.lacks_parts(row):
+            waiting = decompositions.again(tx, require(tx, row.object), row, time.time_ns() // 1_000_000)
+        sweeps.retry(tx, sweep_id, waiting=waiting)
         return _info(tx, _require(tx, sweep_id))
 
 
@@ -378,6 +387,7 @@ def _info(tx: Tx, row: SweepRow) -> SweepInfo:
         poses=row.pose_count,
         poses_done=done.poses_done,
         full_grid_poses=row.snapshot.get("full_count"),
+        waiting_for=decompositions.waiting_for(tx, row),
         outcomes={name: done.counts[name] for name in OUTCOMES if name in done.counts},
         rate_poses_s=rate,
         time_left_s=left / rate if rate and state == "running" else None,

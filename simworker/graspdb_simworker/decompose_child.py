@@ -1,0 +1,85 @@
+"""The process that decomposes a mesh into convex parts: an order and a mesh in, candidates out, best last.
+
+Run as ``python -m graspdb_simworker.decompose_child`` by :mod:`graspdb_simworker.decomposition`. CoACD lives
+here, because it takes memory and time that only a process of its own can bound, and can't be interrupted.
+
+Reads one ``CHUNK`` (a line of JSON, then the mesh as it was uploaded); writes ``NOTE`` (how far it is, for a
+person), ``RESULT`` (a candidate as GLB, each finer than the one before) and ``ERROR``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+from graspdb_simworker import messages
+
+
+def main() -> int:
+    """Decompose one mesh."""
+    source, sink = os.dup(0), os.dup(1)
+    # CoACD prints its log on the standard output: out of the way of the messages.
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(null, stream)
+    # An interrupt at the terminal is for the worker, who ends its children itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        _, body = messages.receive(source, poll_s=60.0)
+        head, _, content = body.partition(b"\n")
+        order = json.loads(head)
+        seconds = max(1, round(order["seconds"]))
+        for kind, limit in (
+            (resource.RLIMIT_AS, int(order["memory_bytes"])),
+            # A worker that dies leaves no child that runs for ever.
+            (resource.RLIMIT_CPU, seconds + 60),
+            (resource.RLIMIT_CORE, 0),
+        ):
+            with suppress(ValueError, OSError):  # an inherited limit may be tighter already
+                resource.setrlimit(kind, (limit, limit))
+        _serve(order, content, sink)
+    except messages.Closed:
+        pass
+    return 0
+
+
+def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
+    try:
+        # Imported under the limits, so that the libraries count as well.
+        from graspdb_simworker import convexity
+    except ImportError as error:
+        messages.send(sink, messages.MISSING, str(error).encode())
+        return
+    try:
+        for kind, body in _steps(convexity, order, content):
+            messages.send(sink, kind, body)
+    except convexity.Undecomposable as error:
+        messages.send(sink, messages.ERROR, str(error).encode())
+    except MemoryError:
+        messages.send(sink, messages.ERROR, b"it needs more memory than allowed")
+
+
+def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    began = time.monotonic()
+    mesh = convexity.read(content, order["media_type"], order["unit"])
+    target = convexity.target_m(mesh)
+    for threshold in convexity.THRESHOLDS:
+        yield messages.NOTE, f"CoACD at threshold {threshold:g}".encode()
+        found = convexity.decompose(mesh, threshold, max_parts=order["max_parts"], seed=order["seed"])
+        yield messages.RESULT, found.glb
+        note = f"{found.parts} parts at threshold {threshold:g}, {1000 * found.deviation_m:.2g} mm off"
+        yield messages.NOTE, note.encode()
+        # A finer one takes longer; what there is by now is worth more than nothing at the end.
+        if found.deviation_m <= target or time.monotonic() - began > order["seconds"] / 3:
+            return
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,144 @@
+"""One decomposition into convex parts, in a child process that is bounded in time and memory."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from graspdb.wire import DecomposePayload
+from graspdb_simworker import messages
+from graspdb_simworker.supervisor import Cancelled, ChunkFailed
+
+COMMAND = (sys.executable, "-m", "graspdb_simworker.decompose_child")
+SEED = 0
+"""CoACD searches at random; with one seed the same mesh gets the same parts."""
+
+_WAY_OUT = "Simplify the mesh, or give its convex parts"
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one decomposition may take.
+
+    Attributes
+    ----------
+    seconds
+        After which the best candidate so far is taken, or without one the job fails.
+    memory_bytes
+        Address space of the child, libraries (about 1 GB) included.
+    """
+
+    seconds: float = 900.0
+    memory_bytes: int = 4 * 2**30
+
+
+class DecompositionFailed(ChunkFailed):
+    """No parts were found; trying again would end the same way."""
+
+
+class _Late(Exception):
+    """The time is over."""
+
+
+def available() -> bool:
+    """Whether this environment has CoACD."""
+    return importlib.util.find_spec("coacd") is not None
+
+
+def decompose(
+    payload: DecomposePayload,
+    mesh: bytes,
+    *,
+    limits: Limits,
+    wanted: Callable[[], bool] = lambda: True,
+    progress: Callable[[str], None] = lambda note: None,
+    command: Sequence[str] = COMMAND,
+) -> bytes:
+    """The mesh's convex parts as GLB.
+
+    Parameters
+    ----------
+    payload : DecomposePayload
+    mesh : bytes
+        As it was uploaded.
+    limits : Limits
+    wanted
+        Asked several times a second; the child is killed as soon as it says no.
+    progress
+        Told in words how far it is.
+    command
+        Starts the process that speaks as :mod:`graspdb_simworker.decompose_child` does.
+
+    Raises
+    ------
+    Cancelled
+        If it was not wanted any more.
+    DecompositionFailed
+        With the reason.
+    """
+    deadline = time.monotonic() + limits.seconds
+
+    def check() -> None:
+        if not wanted():
+            raise Cancelled
+        if time.monotonic() > deadline:
+            raise _Late
+
+    order = {
+        "media_type": payload.media_type,
+        "unit": payload.unit,
+        "max_parts": payload.max_parts,
+        "seed": SEED,
+        "seconds": limits.seconds,
+        "memory_bytes": limits.memory_bytes,
+    }
+    process = subprocess.Popen(
+        tuple(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **_ONE_THREAD}
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    best: bytes | None = None
+    try:
+        with contextlib.suppress(messages.Closed):
+            messages.send(process.stdin.fileno(), messages.CHUNK, json.dumps(order).encode() + b"\n" + mesh)
+        while True:
+            kind, body = messages.receive(process.stdout.fileno(), check=check)
+            if kind == messages.NOTE:
+                progress(body.decode(errors="replace"))
+            elif kind == messages.RESULT:
+                best = body
+            elif kind == messages.MISSING:
+                raise ChunkFailed(f"CoACD can't be imported: {body.decode(errors='replace')}")
+            elif kind == messages.ERROR and best is None:
+                raise DecompositionFailed(f"{body.decode(errors='replace')}. {_WAY_OUT}")
+    except _Late:
+        if best is None:
+            raise DecompositionFailed(
+                f"it takes more than {limits.seconds:g} s (the worker's --decompose-seconds). {_WAY_OUT}"
+            ) from None
+    except messages.Closed:
+        if best is None:
+            raise DecompositionFailed(
+                f"{_cause(process)}: perhaps it needs more than {limits.memory_bytes / 2**20:.0f} MiB"
+                f" (the worker's --decompose-memory-mib). {_WAY_OUT}"
+            ) from None
+    finally:
+        process.kill()
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+    return best
+
+
+def _cause(process: subprocess.Popen[bytes]) -> str:
+    code = process.wait()
+    return f"CoACD died of {signal.Signals(-code).name}" if code < 0 else f"CoACD ended with code {code}"
