@@ -61,6 +61,8 @@ BAD_PROFILES: list[tuple[dict[str, Any], str]] = [
     ({"max_opening_m": 0}, "max_opening_m"),
     ({"max_opening_m": -1}, "max_opening_m"),
     ({"max_opening_m": 1e9}, "max_opening_m"),
+    ({"palm_size_m": [0.1, 0.1, 3]}, "palm_size_m.2"),
+    ({"finger": {"width_m": 5e-5, "thickness_m": 0.01, "length_m": 0.05}}, "finger.width_m"),
     ({"finger": {"width_m": 0.01, "thickness_m": 0.01}}, "finger.length_m"),
     ({"palm_size_m": [0.1, 0.1]}, "palm_size_m.2"),
     ({"tip_offset_m": 0.06}, "tip_offset_m"),

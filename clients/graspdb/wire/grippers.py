@@ -9,7 +9,7 @@ from pydantic import Field
 
 from graspdb.wire.base import Pose, Request, Response, Slug, Text
 
-Length = Annotated[float, Field(gt=1e-5, le=10.0)]
+Length = Annotated[float, Field(ge=1e-4, le=2.0)]
 
 
 class Finger(Request):
@@ -29,7 +29,7 @@ class GripperProfile(Request):
 
     max_opening_m: Length
     finger: Finger
-    tip_offset_m: Annotated[float, Field(ge=0, le=10.0)] = 0.0
+    tip_offset_m: Annotated[float, Field(ge=0, le=2.0)] = 0.0
     palm_size_m: tuple[Length, Length, Length]
     finger_mass_kg: Annotated[float, Field(gt=0, le=100)] = 0.1
     max_speed_m_s: Annotated[float, Field(gt=0, le=10)] = 0.06

@@ -11,13 +11,14 @@ from graspdb.wire.base import Position, Quadruple, Request, Response, Text, Trip
 from graspdb.wire.grippers import GripperProfile
 
 WorkerName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
+Capability = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f]+$")]
 JobKind = Literal["simulate", "decompose"]
 
 
 class ClaimRequest(Request):
     worker: WorkerName
-    capabilities: list[Annotated[str, Field(min_length=1, max_length=64)]] = Field(
-        default_factory=lambda: ["simulate"], max_length=32
+    capabilities: Annotated[list[Capability], Field(max_length=32)] = Field(
+        default_factory=lambda: ["simulate"]
     )
     """Job kinds the worker can do, and ``lift`` where it has that protocol."""
     limit: Annotated[int, Field(ge=1, le=64)] = 1

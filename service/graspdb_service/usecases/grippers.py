@@ -10,6 +10,7 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.idempotency import Created, replay_or
+from graspdb_service.usecases.scenes import shape_of
 from graspdb_service.usecases.slugs import is_slug
 
 
@@ -66,10 +67,12 @@ def unknown(field: str, names: list[str]) -> ProblemError:
 
 
 def _check_shape(profile: GripperProfile) -> None:
-    if profile.tip_offset_m > profile.finger.length_m:
-        raise invalid(
-            "tip_offset_m", "the tool origin lies between the finger's base and tip: at most length_m"
-        )
+    try:
+        shape_of(profile)
+    except ValueError as error:
+        # What can't be tested for collisions must not be stored: every later query would fail on it.
+        field = str(error).partition(" ")[0].replace("finger_", "finger.", 1)
+        raise invalid(field, str(error)) from None
 
 
 def _info(row: GripperRow) -> GripperInfo:
