@@ -71,6 +71,20 @@ def run(
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
     ] = False,
     once: Annotated[bool, typer.Option(help="Stop after one job for each process.")] = False,
+    decompose_seconds: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            envvar="GRASPDB_DECOMPOSE_SECONDS",
+            help="Longest decomposition of a mesh into convex parts; 0 leaves them to other workers.",
+        ),
+    ] = 900.0,
+    decompose_memory_mib: Annotated[
+        int,
+        typer.Option(
+            min=1024, envvar="GRASPDB_DECOMPOSE_MEMORY_MIB", help="Address space of a decomposition."
+        ),
+    ] = 4096,
     api_key: Annotated[
         str | None, typer.Option(envvar="GRASPDB_API_KEY", help="With the scope jobs:work.")
     ] = None,
@@ -78,6 +92,7 @@ def run(
 ) -> None:
     """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked."""
     _require_pybullet()
+    from graspdb_simworker import decomposition
     from graspdb_simworker.loop import Tally, Worker, WorkerFailed
 
     logging.basicConfig(
@@ -91,6 +106,13 @@ def run(
     def report(tally: Tally) -> None:
         log.info("%d jobs, %d poses, %d grasps in physics", tally.jobs, tally.poses, tally.grasps)
 
+    limits = None
+    if decompose_seconds > 0:
+        if decomposition.available():
+            limits = decomposition.Limits(decompose_seconds, decompose_memory_mib * 2**20)
+        else:
+            log.warning("coacd is missing: meshes that are not convex are left to other workers")
+
     with Transport(
         url, api_key=api_key, user_agent="graspdb-simworker", retries=0, timeout_s=30.0
     ) as transport:
@@ -101,6 +123,7 @@ def run(
             exit_when_idle=exit_when_idle,
             once=once,
             report=report,
+            decompositions=limits,
         )
         _stop_on_signals(worker.stop)
         try:

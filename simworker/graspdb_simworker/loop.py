@@ -32,16 +32,20 @@ from graspdb.wire import (
     ClaimedJob,
     ClaimRequest,
     ClaimResponse,
+    DecomposePayload,
     LeaseRenewed,
     SimulatePayload,
     SimulateResult,
 )
+from graspdb_simworker import decomposition
+from graspdb_simworker.decomposition import DecompositionFailed, Limits
 from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
 
 log = logging.getLogger("graspdb.simworker")
 
 CAPABILITIES = ("simulate",)
 """Job kinds, and protocols beyond ``wrench``, that this worker claims."""
+GLB = "model/gltf-binary"
 MAX_BACKOFF_S = 15.0
 IDLE_S = 2.0
 _CACHED_PARTS = 16
@@ -61,6 +65,12 @@ class Lease:
     renewed: float
     unheard: bool = False
     lost: threading.Event = field(default_factory=threading.Event)
+    progress: str | None = None
+
+    def note(self, progress: str) -> None:
+        """Say how far the work is, with the next renewal, which comes soon."""
+        self.progress = progress[:200]
+        self.renewed = -float("inf")
 
 
 @dataclass
@@ -93,6 +103,8 @@ class Worker:
         Builds the supervised child of one thread.
     report
         Called from any thread after every finished job.
+    decompositions : Limits, optional
+        What the decomposition of one mesh may take; None leaves them to other workers.
     """
 
     def __init__(
@@ -105,6 +117,7 @@ class Worker:
         once: bool = False,
         make_child: Callable[[], Child] = Child,
         report: Callable[[Tally], None] = lambda tally: None,
+        decompositions: Limits | None = None,
     ) -> None:
         if processes < 1:
             raise ValueError("processes must be at least 1")
@@ -115,6 +128,7 @@ class Worker:
         self._once = once
         self._make_child = make_child
         self._report = report
+        self._decompositions = decompositions
         self._stop = threading.Event()
         self._done = threading.Event()
         self._lock = threading.Lock()
@@ -192,7 +206,10 @@ class Worker:
     def _renew(self, lease: Lease) -> None:
         try:
             answer = self._transport.request(
-                "PUT", f"/jobs/{lease.job}/lease", params={"lease_id": lease.lease_id}, retries=0
+                "PUT",
+                f"/jobs/{lease.job}/lease",
+                params={"lease_id": lease.lease_id, "progress": lease.progress},
+                retries=0,
             )
         except (LeaseLost, NotFound) as error:
             log.warning("job %s: lease lost (%s)", lease.job, error)
@@ -243,7 +260,8 @@ class Worker:
                     return
 
     def _claim(self) -> tuple[ClaimedJob | None, float]:
-        request = ClaimRequest(worker=self._name, capabilities=list(CAPABILITIES), limit=1)
+        capabilities = [*CAPABILITIES, *(["decompose"] if self._decompositions else [])]
+        request = ClaimRequest(worker=self._name, capabilities=capabilities, limit=1)
         answer = ClaimResponse.model_validate_json(
             self._transport.request("POST", "/jobs/claim", body=request, retries=0).content
         )
@@ -253,8 +271,9 @@ class Worker:
         with self._holding(job) as lease:
             try:
                 payload = job.payload
-                if not isinstance(payload, SimulatePayload):
-                    raise ChunkFailed(f"this worker does not do {job.kind!r} jobs")
+                if isinstance(payload, DecomposePayload):
+                    self._decompose(payload, lease)
+                    return
                 parts = self._parts_of(payload, lease)
                 result = child.run(payload, parts, wanted=lambda: self._wanted(lease))
             except Cancelled:
@@ -262,12 +281,31 @@ class Worker:
             except ChunkFailed as error:
                 log.error("job %s failed: %s", job.id, error)
                 self.tally.failures += 1
-                self._hand_in(lease, "failure", {"error": str(error)[:4000]})
+                permanent = isinstance(error, DecompositionFailed)
+                self._hand_in(lease, "failure", {"error": str(error)[:4000], "permanent": permanent})
             except PybulletMissing:
                 self._release(lease)
                 raise
             else:
                 self._submit(lease, payload, result)
+
+    def _decompose(self, payload: DecomposePayload, lease: Lease) -> None:
+        """Make an object's convex parts and hand them in."""
+        if self._decompositions is None:
+            raise ChunkFailed("this worker does not do 'decompose' jobs")
+        mesh = self._fetched(payload.mesh, payload.mesh_sha256, lease)
+        parts = decomposition.decompose(
+            payload,
+            mesh,
+            limits=self._decompositions,
+            wanted=lambda: self._wanted(lease),
+            progress=lease.note,
+        )
+        if self._hand_in(lease, "result", parts) is not None:
+            with self._lock:
+                self.tally.jobs += 1
+                tally = self.tally
+            self._report(tally)
 
     @contextlib.contextmanager
     def _holding(self, job: ClaimedJob) -> Iterator[Lease]:
@@ -312,28 +350,31 @@ class Worker:
         with self._lock:
             if digest in self._parts:
                 return self._parts[digest]
+        data = self._fetched(payload.convex_parts, digest, lease)
+        with self._lock:
+            while len(self._parts) >= _CACHED_PARTS:
+                self._parts.pop(next(iter(self._parts)))
+            self._parts[digest] = data
+        return data
+
+    def _fetched(self, path: str, digest: str, lease: Lease) -> bytes:
+        """Bytes with this SHA-256 from the service; raises as :meth:`_parts_of`."""
         failures = 0
         while True:
             if not self._wanted(lease):
                 raise Cancelled
             try:
-                data = self._transport.request("GET", payload.convex_parts, retries=0).content
+                data = self._transport.request("GET", path, retries=0).content
                 break
             except (NotFound, Unauthorized, Forbidden, InvalidInput) as error:
-                raise ChunkFailed(f"can't fetch {payload.convex_parts}: {error}") from error
+                raise ChunkFailed(f"can't fetch {path}: {error}") from error
             except GraspDBError as error:
                 failures += 1
-                log.warning("can't fetch %s: %s", payload.convex_parts, error)
+                log.warning("can't fetch %s: %s", path, error)
                 self._stop.wait(_backoff(failures))
         found = hashlib.sha256(data).hexdigest()
         if found != digest:
-            raise ChunkFailed(
-                f"{payload.convex_parts} has the SHA-256 {found}, the sweep was planned with {digest}"
-            )
-        with self._lock:
-            while len(self._parts) >= _CACHED_PARTS:
-                self._parts.pop(next(iter(self._parts)))
-            self._parts[digest] = data
+            raise ChunkFailed(f"{path} has the SHA-256 {found}, the job was planned with {digest}")
         return data
 
     def _submit(self, lease: Lease, payload: SimulatePayload, result: SimulateResult) -> None:
@@ -347,7 +388,9 @@ class Worker:
             tally = self.tally
         self._report(tally)
 
-    def _hand_in(self, lease: Lease, what: str, body: SimulateResult | dict[str, str]) -> bytes | None:
+    def _hand_in(
+        self, lease: Lease, what: str, body: SimulateResult | dict[str, str | bool] | bytes
+    ) -> bytes | None:
         """Send until the service answers for good; None if it does not want it any more.
 
         The same body under the same lease is idempotent, so an answer lost on the way does no harm.
@@ -364,7 +407,9 @@ class Worker:
                     "PUT",
                     f"/jobs/{lease.job}/{what}",
                     params={"lease_id": lease.lease_id},
-                    body=body,
+                    body=None if isinstance(body, bytes) else body,
+                    content=body if isinstance(body, bytes) else None,
+                    headers={"Content-Type": GLB} if isinstance(body, bytes) else None,
                     retries=0,
                 )
             except (Conflict, NotFound) as error:
@@ -376,7 +421,8 @@ class Worker:
                 self.tally.failures += 1
                 if what == "result":
                     message = f"the service refused the result: {error}"
-                    self._hand_in(lease, "failure", {"error": message[:4000]})
+                    permanent = isinstance(body, bytes)
+                    self._hand_in(lease, "failure", {"error": message[:4000], "permanent": permanent})
                 return None
             except GraspDBError as error:
                 if last:
