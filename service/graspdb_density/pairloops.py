@@ -108,6 +108,16 @@ def _wrapped(angle):  # type: ignore[no-untyped-def]
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
+@inlined
+def _plane_entries(q, plane):  # type: ignore[no-untyped-def]
+    """The entries a, b, c of a rotation's 2x2 matrix in a plane of two axes, see `composition_angles`."""
+    if plane == 0:
+        return q[0], q[1], q[2]
+    if plane == 1:
+        return q[0], q[2], -q[1]
+    return q[1], q[2], q[0]
+
+
 @exact
 def composition_angles(q, plane):  # type: ignore[no-untyped-def]
     """The composition ``R_a(alpha) R_b(beta)`` nearest to a rotation: alpha, beta and the sine of the angle
@@ -119,12 +129,7 @@ def composition_angles(q, plane):  # type: ignore[no-untyped-def]
     entries, and twice the determinant is the sine of the angle left.
     """
     w = q[3]
-    if plane == 0:
-        a, b, c = q[0], q[1], q[2]
-    elif plane == 1:
-        a, b, c = q[0], q[2], -q[1]
-    else:
-        a, b, c = q[1], q[2], q[0]
+    a, b, c = _plane_entries(q, plane)
     both = math.atan2(a + b, w - c)
     apart = math.atan2(a - b, w + c)
     return _wrapped(both + apart), _wrapped(both - apart), 2.0 * abs(w * c - a * b)
@@ -195,8 +200,10 @@ def rotation_pairs(  # type: ignore[no-untyped-def]
                             other[:] = relative
                             _product(back, other, relative)
                     for plane in range(3):
-                        alpha, beta, rest = composition_angles(relative, plane)
-                        if rest <= sine:
+                        e, g, h = _plane_entries(relative, plane)
+                        # Most are too far from every composition: told before any angle is taken.
+                        if 2.0 * abs(relative[3] * h - e * g) <= sine:
+                            alpha, beta, _ = composition_angles(relative, plane)
                             x = math.floor((alpha + math.pi) / step + 0.5) % bins
                             y = math.floor((beta + math.pi) / step + 0.5) % bins
                             b = (plane * bins + x) * bins + y

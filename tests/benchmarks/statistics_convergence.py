@@ -1,0 +1,150 @@
+"""Speed and memory of the convergence measure (eq 9), beside SciPy's neighbour search and sparse product.
+
+The peer builds the same kernel matrix with ``scipy.spatial.cKDTree`` (pairs within five standard deviations
+of position) and NumPy, and multiplies it with the same bootstrap weights; it runs on a tenth of the points.
+Times are medians, of the wall clock unless a column says otherwise; memory is the peak of a whole process
+that does nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import resource
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from graspdb_density import IsotropicKernel, se3
+from graspdb_density.convergence import bootstrap_similarity, convergence_curve
+from graspdb_density.rows import LEAST, KernelRows
+from graspdb_density.threads import processors
+
+Poses = tuple[se3.Floats, se3.Floats]
+KERNEL = IsotropicKernel(0.015, math.radians(15.0))
+REPLICATES = 50
+
+
+class Gaussian:
+    """An anisotropic kernel: wide along x and z and about y, as the paper finds."""
+
+    weights = np.ones(1)
+    means = np.zeros((1, 6))
+    covariances = np.diag(np.square([0.02, 0.008, 0.02, 0.2, 0.4, 0.2]))[None]
+
+
+def shell(count: int, rng: np.random.Generator) -> Poses:
+    """Grasps on an ellipsoid of semi-axes 0.2, 0.1, 0.1 m, moved along its normal within 20 mm, any roll."""
+    axes = np.array([0.2, 0.1, 0.1])
+    unit = rng.standard_normal((count, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    normal = unit / axes
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    positions = unit * axes + normal * rng.uniform(-0.01, 0.01, (count, 1))
+    z = -normal + 0.4 * rng.standard_normal((count, 3))
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    frames = se3.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
+    roll = np.zeros((count, 3))
+    roll[:, 2] = rng.uniform(-np.pi, np.pi, count)
+    return positions, se3.multiply(frames, se3.from_rotation_vector(roll))
+
+
+def peer_similarity(rows: KernelRows, points: int, rng: np.random.Generator) -> float:
+    """Eq 9 with SciPy and NumPy."""
+    p, q = rows.sample(points, rng)
+    tree = cKDTree(rows.positions)
+    found = tree.query_ball_point(p, 5.0 * KERNEL.sigma_position_m)
+    lengths = np.array([len(f) for f in found])
+    columns = np.concatenate([np.asarray(f, dtype=np.int64) for f in found])
+    at = np.repeat(np.arange(points), lengths)
+    square = np.sum((p[at] - rows.positions[columns]) ** 2, axis=1) / (2.0 * KERNEL.sigma_position_m**2)
+    own = rows.quaternions_xyzw
+    cosine = np.maximum(
+        np.abs(np.sum(q[at] * own[columns], axis=1)),
+        np.abs(np.sum(q[at] * se3.jaw_twin(own)[columns], axis=1)),
+    )
+    value = np.exp(KERNEL.kappa * (cosine - 1.0) - square)
+    kept = value > LEAST
+    matrix = csr_matrix((value[kept], (at[kept], columns[kept])), shape=(points, rows.size))
+    counts = rng.multinomial(rows.size, np.full(rows.size, 1.0 / rows.size), size=REPLICATES).T
+    whole = matrix @ np.ones(rows.size)
+    return float(np.sqrt((matrix @ counts) / whole[:, None]).mean())
+
+
+def timed(work: Callable[[], object], rounds: int) -> tuple[float, float]:
+    """Median seconds by the wall clock, and by this process's processors (which others don't disturb)."""
+    times, busy = [], []
+    for _ in range(rounds):
+        started, spent = time.perf_counter(), time.process_time()
+        work()
+        times.append(time.perf_counter() - started)
+        busy.append(time.process_time() - spent)
+    return statistics.median(times), statistics.median(busy)
+
+
+def _peak(count: int, points: int) -> float:
+    """MB of this process at its peak."""
+    rows = KernelRows(*shell(count, np.random.default_rng(0)), KERNEL)
+    bootstrap_similarity(rows, np.random.default_rng(1), replicates=REPLICATES, points=points)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def peak(count: int, points: int) -> float:
+    """As `_peak`, of a process of its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_peak, (count, points))
+
+
+def main() -> None:
+    """Print the table."""
+    rng = np.random.default_rng(0)
+    threads = processors()
+    head = ("grasps", "points", "kernel", "s", "seconds", "CPU s", f"{threads} threads", "MB")
+    print("{:>8} {:>8} {:>12} {:>7} {:>8} {:>7} {:>10} {:>6}".format(*head))
+    sizes = ((20_000, 20_000, 5), (160_000, 20_000, 3), (160_000, 160_000, 1))
+    for count, points, rounds in sizes:
+        poses = shell(count, rng)
+        for name, kernel in (("isotropic", KERNEL), ("anisotropic", Gaussian())):
+            if name == "anisotropic" and points > 20_000:
+                continue
+            rows = KernelRows(*poses, kernel)
+            bootstrap_similarity(rows, np.random.default_rng(1), points=200)  # compiles
+
+            def measure(threads: int = 1, rows: KernelRows = rows, points: int = points) -> float:
+                return bootstrap_similarity(
+                    rows, np.random.default_rng(1), replicates=REPLICATES, points=points, threads=threads
+                ).value
+
+            s = measure()
+            one, cpu = timed(measure, rounds)
+            both, _ = timed(lambda measure=measure: measure(threads), rounds)  # type: ignore[misc]
+            memory = f"{peak(count, points):.0f}" if name == "isotropic" else ""
+            print(
+                f"{count:>8} {points:>8} {name:>12} {s:>7.4f} "
+                f"{one:>8.2f} {cpu:>7.2f} {both:>10.2f} {memory:>6}",
+                flush=True,
+            )
+    rows = KernelRows(*shell(20_000, rng), KERNEL)
+    _, ours = timed(lambda: bootstrap_similarity(rows, np.random.default_rng(1), points=2_000), 3)
+    _, peer = timed(lambda: peer_similarity(rows, 2_000, np.random.default_rng(1)), 3)
+    print(
+        f"20,000 grasps, 2,000 points: {ours:.2f} CPU s; SciPy and NumPy {peer:.2f}, "
+        f"{peer / ours:.0f} times as long"
+    )
+    for count in (20_000, 160_000):
+        poses = shell(count, rng)
+        wall, cpu = timed(lambda poses=poses: convergence_curve(*poses, KERNEL), 1)  # type: ignore[misc]
+        print(
+            f"curve to {count} grasps, 5 subsets a point, held-out likelihood: {wall:.1f} s, CPU {cpu:.1f} s"
+        )
+
+
+if __name__ == "__main__":
+    main()
