@@ -245,12 +245,9 @@ def anisotropic(rng: np.random.Generator) -> None:
         ROUNDS, lambda: sampled.log_density(*poses, cutoff=None), lambda: fitted.log_density(*poses)
     )
     cut, _ = interleaved(ROUNDS, lambda: sampled.log_density(*poses), lambda: None)
+    print(f"1,000 rows of 900 components: {1e6 * slow / 300:.0f} over all, {1e6 * cut / 300:.0f} cut off")
     print(
-        f"1,000 rows of 900 components: {1e6 * slow / 300:.0f} over all, {1e6 * cut / 300:.0f} cut off;",
-        end="",
-    )
-    print(
-        f" a mirrored mixture of 2: {1e6 * quick / 300:.1f}, {slow / quick:.0f} and {cut / quick:.0f} times faster"
+        f"a mirrored mixture of 2: {1e6 * quick / 300:.1f}, {slow / quick:.0f} and {cut / quick:.0f} times faster"
     )
 
 
