@@ -435,3 +435,18 @@ def test_noisy_rates_are_made_monotone() -> None:
     )
     assert match.reached
     assert match.achieved == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("framed", [False, True])
+def test_a_curve_under_an_anisotropic_kernel(shell: Shell, framed: bool) -> None:
+    """A Gaussian of the isotropic kernel's widths gives its curve, whatever the frames."""
+    rng = np.random.default_rng(10)
+    p, q = shell(400, rng)
+    frames = se3.to_matrix(se3.random_quaternions(400, rng)) if framed else None
+    kernel = IsotropicKernel(0.03, math.radians(12.0))
+    gaussian = _gaussian(*[0.03] * 3, *[math.radians(12.0)] * 3)
+    one = cv.convergence_curve(p, q, kernel, points=2_000, replicates=20)
+    two = cv.convergence_curve(p, q, gaussian, frames=frames, points=2_000, replicates=20)
+    for a, b in zip(one.points, two.points, strict=True):
+        assert a.similarity == pytest.approx(b.similarity, abs=0.03)
+        assert a.log_likelihood == pytest.approx(b.log_likelihood, abs=0.3)
