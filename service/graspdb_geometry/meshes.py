@@ -26,6 +26,7 @@ from graspdb_geometry._formats import (
     read_glb,
     write_glb,
 )
+from graspdb_geometry._repair import repair
 
 #: Metres per unit.
 UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -109,7 +110,9 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
     """Read a mesh from memory and check it.
 
     Vertices at the same place are merged (STL repeats each of them), triangles that repeat a vertex are
-    dropped with a warning, a solid that is inside out is turned.
+    dropped with a warning, a solid that is inside out is turned. A surface that is not closed is mended
+    where that is no guess: seams sewn, triangles wound alike, small holes filled; the warnings say what was
+    done, or why it could not be closed.
 
     Parameters
     ----------
@@ -148,7 +151,8 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
     vertices = np.concatenate([g.vertices for g in geometries]) * UNITS[unit]
     faces = np.concatenate([g.faces + offset for g, offset in zip(geometries, offsets, strict=True)])
     _check_size(vertices[np.unique(faces)], unit)
-    return _canonical(vertices, faces)
+    mesh = _canonical(vertices, faces)
+    return mesh if _closed(mesh.faces) else _mended(mesh)
 
 
 def properties(mesh: Mesh, unit: str = "m") -> MeshProperties:
@@ -412,6 +416,17 @@ def _canonical(vertices: FloatArray, faces: FaceArray) -> Mesh:
         triangles = np.ascontiguousarray(triangles[:, ::-1])
         warnings.append("the surface was inside out and has been turned")
     return Mesh(np.ascontiguousarray(merged), np.ascontiguousarray(triangles), tuple(warnings))
+
+
+def _mended(mesh: Mesh) -> Mesh:
+    """The mesh closed, or as it was with the reasons why it can't be."""
+    mended = repair(mesh.vertices, mesh.faces)
+    if len(mended.faces) and _closed(mended.faces):
+        closed = _canonical(mended.vertices, mended.faces)
+        note = f"the mesh was not watertight and has been mended: {', '.join(mended.done)}"
+        return Mesh(closed.vertices, closed.faces, (*mesh.warnings, note, *closed.warnings))
+    reasons = mended.left or ["its triangles can't be wound alike"]
+    return Mesh(mesh.vertices, mesh.faces, (*mesh.warnings, f"it can't be closed: {', '.join(reasons)}"))
 
 
 def _closed(faces: FaceArray) -> bool:

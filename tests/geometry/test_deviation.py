@@ -1,0 +1,59 @@
+"""The distance between convex parts and the mesh they stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from graspdb.examples import EXAMPLES, example
+from graspdb_geometry import meshes
+from graspdb_geometry.deviation import deviation
+from graspdb_geometry.meshes import Mesh, Part
+
+
+def part(mesh: trimesh.Trimesh) -> Part:
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+def solid(mesh: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_parts_by_construction_are_the_object(name: str) -> None:
+    thing = example(name)
+    found = deviation(meshes.load(thing.stl(), "model/stl"), thing.parts)
+    assert found.largest_m < 1e-7
+
+
+def test_a_filled_hollow_is_a_bulge() -> None:
+    tube = trimesh.creation.annulus(r_min=0.02, r_max=0.03, height=0.1, sections=64)
+    found = deviation(solid(tube), [part(trimesh.creation.cylinder(radius=0.03, height=0.1, sections=64))])
+    # The lids' centres are as far as the bore's radius from the tube's surface.
+    assert found.bulge_m == pytest.approx(0.02, abs=1e-3)
+    assert found.gap_m < 1e-6
+
+
+def test_a_missing_part_is_a_gap() -> None:
+    boxes = [trimesh.creation.box((0.04, 0.04, 0.04)) for _ in range(2)]
+    boxes[1].apply_translation([0, 0, 0.1])
+    both = trimesh.util.concatenate(boxes)
+    found = deviation(solid(both), [part(boxes[0])])
+    assert found.gap_m == pytest.approx(0.1, abs=1e-3)
+    assert found.bulge_m < 1e-9
+
+
+def test_swollen_parts_are_as_far_off_as_they_swelled() -> None:
+    inner, outer = trimesh.creation.box((0.04, 0.05, 0.06)), trimesh.creation.box((0.042, 0.052, 0.062))
+    found = deviation(solid(inner), [part(outer)])
+    # The corners are the farthest: sqrt(3) mm, which samples only come near to.
+    assert 0.0014 < found.bulge_m <= 0.001 * np.sqrt(3)
+    assert found.gap_m == 0.0
+    assert deviation(solid(outer), [part(inner)]).gap_m == pytest.approx(0.001 * np.sqrt(3), rel=0.2)
+
+
+def test_the_same_input_gives_the_same_answer() -> None:
+    thing = example("mug")
+    mesh = meshes.load(thing.stl(), "model/stl")
+    assert deviation(mesh, thing.parts[:20]) == deviation(mesh, thing.parts[:20])
