@@ -170,6 +170,25 @@ class End(Enum):
 
 
 @dataclass(frozen=True)
+class Contacts:
+    """What presses on the object at one instant.
+
+    Attributes
+    ----------
+    normals : (K, 3) float64
+        Contact normals in the tool frame, pointing into the object.
+    forces : (K,) float64
+        Normal contact forces in newtons, as exerted with ``Gripper.closing_force_n``.
+    fingers : (K,) int64
+        Which body presses: 0 and 1 the fingers, -1 the palm.
+    """
+
+    normals: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    fingers: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
 class Closing:
     """The jaw after a closing.
 
@@ -180,12 +199,8 @@ class Closing:
         Both fingers had touched the object at the same time.
     opening_m : float
         Distance between the fingers; of a stalled jaw, what it holds is this wide.
-    normals : (K, 3) float64
-        Contact normals in the tool frame, pointing into the object.
-    forces : (K,) float64
-        Normal contact forces in newtons, as exerted with ``Gripper.closing_force_n``.
-    fingers : (K,) int64
-        Which body presses: 0 and 1 the fingers, -1 the palm.
+    contacts : tuple of Contacts
+        Several instants of a stalled jaw; none of any other.
     position, quaternion_xyzw
         The object's pose in the tool frame.
     steps : int
@@ -195,9 +210,7 @@ class Closing:
     end: End
     touched: bool
     opening_m: float
-    normals: NDArray[np.float64]
-    forces: NDArray[np.float64]
-    fingers: NDArray[np.int64]
+    contacts: tuple[Contacts, ...]
     position: Vector
     quaternion_xyzw: Quaternion
     steps: int

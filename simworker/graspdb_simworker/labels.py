@@ -15,13 +15,15 @@ minimum of its support function over unit directions d
 
     h(d) = sum_i f_i max(0, n_i . d + mu sqrt(1 - (n_i . d)^2)).
 
-``f_i`` is scaled by the gripper's force over the force the jaw was simulated with, see
+Where the forces ring because the object still moves, several instants of the stalled jaw are rated and
+the median counts. ``f_i`` is scaled by the gripper's force over the force the jaw was simulated with, see
 :func:`graspdb_simworker.bodies.closing_force`.
 """
 
 from __future__ import annotations
 
 import math
+import statistics
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -29,7 +31,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from graspdb_simworker.bodies import Closing, End, Gripper
+from graspdb_simworker.bodies import Closing, Contacts, End, Gripper
 
 GRAVITY_M_S2 = 9.80665
 MERGE_COSINE = 1.0 - 1e-8
@@ -315,6 +317,13 @@ def weakest_force(
     return float(value), direction
 
 
+def rating(contacts: Contacts, gripper: Gripper, mass_kg: float, friction: float) -> float:
+    """Largest weight that the contacts hold in the worst direction, over the object's weight."""
+    scale = gripper.force_n / gripper.closing_force_n
+    force, _ = weakest_force(contacts.normals, contacts.forces * scale, friction)
+    return force / (mass_kg * GRAVITY_M_S2)
+
+
 def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float) -> Label:
     """Name a closing's outcome and rate it.
 
@@ -330,7 +339,5 @@ def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float
         return Label(Outcome.TIMEOUT, width, math.nan)
     if closing.end is End.UNSTABLE:
         return SIMULATION_ERROR
-    scale = gripper.force_n / gripper.closing_force_n
-    force, _ = weakest_force(closing.normals, closing.forces * scale, friction)
-    quality = force / (mass_kg * GRAVITY_M_S2)
+    quality = statistics.median(rating(now, gripper, mass_kg, friction) for now in closing.contacts)
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from graspdb_simworker.bodies import (
     Closing,
+    Contacts,
     End,
     Gripper,
     MassProperties,
@@ -36,6 +37,7 @@ from graspdb_simworker.bodies import (
     Vector,
     mass_properties,
 )
+from graspdb_simworker.labels import rating
 
 Fidelity = Literal["standard", "fine"]
 
@@ -44,9 +46,15 @@ APPROACH_GAP_M = 0.0005
 COLLISION_MARGIN_M = 0.0005
 """Bullet inflates convex hulls by this much; boxes keep their size."""
 CONTACT_BREAKING_M = 0.002
-STALL_WINDOW_S = 0.030
 STALL_PROGRESS_M = 5e-5
-"""The jaw has stalled once it closed less than this within the window (at full speed it closes 3.6 mm)."""
+"""The jaw has stalled once it closed less than this by the ages below: 5 mm at full speed by the first."""
+READING_AGES_S = (0.040, 0.060, 0.080, 0.100, 0.120)
+"""Contacts are read at these ages of the stall, until a reading leaves no doubt."""
+NO_DOUBT = 0.4
+"""A reading further than this from 1, the least that holds the weight, is the last one. Nearer to it, a
+heavy object that still swings between the fingers makes the forces ring, so that chance has a say at any
+single instant, but less in the median of five. (Chosen on 1,200 grasps of the elongated D: one reading
+after 30 ms agrees with the fine step in .981 of the labels, this rule in .993 at an eighth more steps.)"""
 SLACK_S = 0.5
 """A closing may last this much longer than the fingers need to meet at full speed."""
 _PARKED: Vector = (0.0, 0.0, -1000.0)
@@ -96,6 +104,7 @@ class GraspWorld:
         visible: bool = False,
     ) -> None:
         self.gripper = gripper
+        self.friction = friction
         self.stepping = STEPPING[fidelity]
         self.mass = mass_properties(parts, mass_kg)
         self._visible = visible
@@ -326,6 +335,7 @@ class GraspWorld:
         opening = 2.0 * start
         # The opening at the beginning of the running stall window.
         mark_opening, mark_time = opening, 0.0
+        contacts: list[Contacts] = []
         steps = 0
         end = End.TIMEOUT
         while elapsed < limit:
@@ -351,15 +361,20 @@ class GraspWorld:
                     if dt != stepping.approach_dt_s:
                         self._drive(dt)
                     mark_opening, mark_time = opening, elapsed
+                    contacts.clear()
             if mark_opening - opening > STALL_PROGRESS_M:
                 mark_opening, mark_time = opening, elapsed
-            elif elapsed - mark_time >= STALL_WINDOW_S - 1e-9:
-                end = End.STALLED
-                break
+                contacts.clear()
+            elif elapsed - mark_time >= READING_AGES_S[len(contacts)] - 1e-9:
+                contacts.append(self._contacts())
+                distance = abs(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction) - 1.0)
+                if distance > NO_DOUBT or len(contacts) == len(READING_AGES_S):
+                    end = End.STALLED
+                    break
             if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
                 end = End.EMPTY
                 break
-        return self._closing(end, touched, opening, steps)
+        return self._closing(end, touched, opening, contacts, steps)
 
     def _body_pose(self, position: Vector, quaternion_xyzw: Quaternion) -> tuple[Vector, Quaternion]:
         """Pose of the object's principal frame in the tool frame.
@@ -387,15 +402,14 @@ class GraspWorld:
                 physicsClientId=self._client,
             )
 
-    def _contacts(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """Normals into the object (K, 3), normal forces (K,) and which body presses (K,)."""
+    def _contacts(self) -> Contacts:
         contacts = [
             contact
             for contact in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
             if contact[9] > 0.0
         ]
         # contactNormalOnB points from B, the object, to A: turned round it points into the object.
-        return (
+        return Contacts(
             np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
             np.array([contact[9] for contact in contacts], dtype=np.float64),
             np.array([contact[3] for contact in contacts], dtype=np.int64),
@@ -404,22 +418,22 @@ class GraspWorld:
     def _between(self) -> bool:
         return bool(pybullet.getClosestPoints(self._object, self._column, 0.0, physicsClientId=self._client))
 
-    def _closing(self, end: End, touched: bool, opening: float, steps: int) -> Closing:
+    def _closing(
+        self, end: End, touched: bool, opening: float, contacts: Sequence[Contacts], steps: int
+    ) -> Closing:
         where, orientation = pybullet.getBasePositionAndOrientation(
             self._object, physicsClientId=self._client
         )
-        normals, forces = np.empty((0, 3)), np.empty(0)
-        fingers = np.empty(0, dtype=np.int64)
         if not all(map(math.isfinite, (*where, *orientation))):
             end = End.UNSTABLE
         elif end is End.STALLED:
-            normals, forces, fingers = self._contacts()
             # Bullet's hulls are inflated by the margin on both sides; the object is not.
             opening -= 2.0 * COLLISION_MARGIN_M
         quaternion = _multiply(orientation, self._to_body)
         shift = _rotate(quaternion, self.mass.centre)
         position = (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2])
-        return Closing(end, touched, opening, normals, forces, fingers, position, quaternion, steps)
+        held = tuple(contacts) if end is End.STALLED else ()
+        return Closing(end, touched, opening, held, position, quaternion, steps)
 
     def _park(self) -> None:
         """Empty Bullet's caches: the object far away, one step without any contact."""

@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from graspdb.wire import OUTCOME_CODES
-from graspdb_simworker.bodies import Closing, End, Gripper, closing_force
+from graspdb_simworker.bodies import Closing, Contacts, End, Gripper, closing_force
 from graspdb_simworker.labels import GRAVITY_M_S2, Outcome, label_of, weakest_force
 
 FLOAT = NDArray[np.float64]
@@ -139,15 +139,13 @@ def test_one_contact_and_none_hold_nothing() -> None:
     )
 
 
-def closing(end: End, *, touched: bool = True, force: float = 10.0) -> Closing:
+def closing(end: End, *forces: float, touched: bool = True) -> Closing:
     normals = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
     return Closing(
         end,
         touched,
         0.02,
-        normals,
-        np.full(2, force),
-        np.array([0, 1]),
+        tuple(Contacts(normals, np.full(2, force), np.array([0, 1])) for force in forces or (10.0,)),
         (0.0, 0.0, 0.0),
         (0.0, 0.0, 0.0, 1.0),
         9,
@@ -178,13 +176,18 @@ def test_light_objects_are_closed_on_gently_and_rated_at_full_force() -> None:
     assert (closing_force(40.0, 0.29), closing_force(40.0, 0.3), closing_force(5.0, 0.1)) == (10.0, 40.0, 5.0)
     hold = 2.0 * 0.4 * 40.0 * math.cos(math.atan(0.4))
     for mass, measured in ((0.1, 10.0), (0.5, 40.0)):
-        label = label_of(closing(End.STALLED, force=measured), jaw(mass), mass, 0.4)
+        label = label_of(closing(End.STALLED, measured), jaw(mass), mass, 0.4)
         assert label.quality == pytest.approx(hold / (mass * GRAVITY_M_S2), rel=1e-6)
     # Heavier than the contacts hold.
-    heavy = label_of(closing(End.STALLED, force=40.0), jaw(3.1), 3.1, 0.4)
+    heavy = label_of(closing(End.STALLED, 40.0), jaw(3.1), 3.1, 0.4)
     assert heavy.outcome is Outcome.WRENCH_INSUFFICIENT
     assert heavy.quality == pytest.approx(hold / (3.1 * GRAVITY_M_S2), rel=1e-6)
 
 
 def test_codes_are_those_of_the_wire() -> None:
     assert {outcome.name.lower(): outcome.value for outcome in Outcome} == OUTCOME_CODES
+
+
+def test_of_several_readings_the_median_counts() -> None:
+    ringing = label_of(closing(End.STALLED, 1.0, 40.0, 30.0), jaw(0.5), 0.5, 0.4)
+    assert ringing.quality == label_of(closing(End.STALLED, 30.0), jaw(0.5), 0.5, 0.4).quality
