@@ -70,14 +70,17 @@ def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tu
     began = time.monotonic()
     mesh = convexity.read(content, order["media_type"], order["unit"])
     target = convexity.target_m(mesh)
+    best = float("inf")
     for threshold in convexity.THRESHOLDS:
         yield messages.NOTE, f"CoACD at threshold {threshold:g}".encode()
         found = convexity.decompose(mesh, threshold, max_parts=order["max_parts"], seed=order["seed"])
-        yield messages.RESULT, found.glb
+        if found.deviation_m < best:
+            best = found.deviation_m
+            yield messages.RESULT, found.glb
         note = f"{found.parts} parts at threshold {threshold:g}, {1000 * found.deviation_m:.2g} mm off"
         yield messages.NOTE, note.encode()
         # A finer one takes longer; what there is by now is worth more than nothing at the end.
-        if found.deviation_m <= target or time.monotonic() - began > order["seconds"] / 3:
+        if found.deviation_m <= target or time.monotonic() - began > order["seconds"] / 6:
             return
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 import struct
 import threading
 from typing import Any
@@ -174,11 +175,8 @@ def test_what_an_object_lacks_is_said(sqlite_http: httpx.Client) -> None:
     assert http.post("/objects/ghost/sweeps", json={}).status_code == 404
     http.post("/objects", json={"id": "bare"})
     assert problem(http.post("/objects/bare/sweeps", json={}))[:2] == (409, "mesh-missing")
-    # Two boxes are no convex body, and nobody has said which parts they are made of.
     put_mesh(http, "bare", stl(box_stl((0.02, 0.02, 0.1)), box_stl((0.02, 0.02, 0.1), 0.06)))
-    answer = http.post("/objects/bare/sweeps", json={})
-    assert problem(answer)[:2] == (409, "convex-parts-missing")
-    assert "PUT /objects/bare/convex-parts" in answer.json()["title"]
+    assert problem(http.post("/objects/bare/sweeps", json={}))[2] == ["mass_kg"]
     http.post("/objects", json={"id": "massless"})
     put_mesh(http, "massless", stl(box_stl((0.04, 0.04, 0.1))))
     assert problem(http.post("/objects/massless/sweeps", json={}))[2] == ["mass_kg"]
@@ -192,7 +190,19 @@ def test_a_mesh_in_the_wrong_unit_is_noticed(sqlite_http: httpx.Client) -> None:
     put_mesh(sqlite_http, "giant", stl(box_stl((4.0, 4.0, 9.0))))
     answer = sqlite_http.post("/objects/giant/sweeps", json={"grid": {"max_poses": 100}})
     assert problem(answer) == (422, "mesh-size", ["mesh"])
-    assert "unit=" in answer.json()["title"]
+    title = answer.json()["title"]
+    assert "sent with unit=m;" in title
+    assert "0.09 m with unit=cm" in title or "0.229 m with unit=in" in title
+    assert "unit=mm" not in title
+    put_mesh(sqlite_http, "giant", stl(box_stl((4.0, 4.0, 9.0))), unit="cm")
+    start(sqlite_http, "giant", grid={"max_poses": 100})
+    # As small as this no unit helps that it could have been sent in.
+    put_mesh_again = {"id": "speck", "mass_kg": 1}
+    sqlite_http.post("/objects", json=put_mesh_again)
+    put_mesh(sqlite_http, "speck", stl(box_stl((0.4, 0.4, 0.5))), unit="mm")
+    title = sqlite_http.post("/objects/speck/sweeps", json={}).json()["title"]
+    assert "far too small" in title
+    assert "unit=m:" in title or "unit=m " in title
 
 
 @pytest.mark.parametrize(
@@ -200,6 +210,8 @@ def test_a_mesh_in_the_wrong_unit_is_noticed(sqlite_http: httpx.Client) -> None:
     [
         ({"tip_offset_m": 0.2}, "gripper"),
         ({"max_opening_m": 5e-4}, "gripper"),
+        ({"max_speed_m_s": 1e-6}, "gripper"),
+        ({"force_n": 1e-6}, "gripper"),
         ({"finger": {"width_m": 2e-5, "thickness_m": 0.01, "length_m": 0.05}}, "gripper"),
     ],
 )
@@ -266,9 +278,32 @@ def test_a_grid_over_the_limit_says_how_to_shrink_it(serve: Any, sqlite_url: str
         answer = http.post("/objects/box/sweeps", json={})
         assert problem(answer) == (422, "too-many-poses", ["grid"])
         title = answer.json()["title"]
-        for way in ("max_poses of at most 10000", "position_step_m", "rotation_step_deg", "margin_m"):
-            assert way in title
+        assert "max_poses=10000" in title
+        assert "unit" not in title
+        # What is named is enough by itself, and the step before would not be.
+        step = float(re.search(r"position_step_m=([\d.]+)", title)[1])  # type: ignore[index]
+        too_fine = http.post("/objects/box/sweeps", json={"grid": {"position_step_m": step - 0.001}})
+        assert problem(too_fine)[1] == "too-many-poses"
+        start(http, grid={"position_step_m": step})
         start(http, grid={"max_poses": 10_000})
+
+
+def test_every_way_to_shrink_a_grid_is_enough(serve: Any, sqlite_url: str) -> None:
+    with httpx.Client(base_url=serve(sqlite_url, max_sweep_poses=1_000_000), timeout=60) as http:
+        add_box(http)
+        title = http.post("/objects/box/sweeps", json={}).json()["title"]
+        ways = dict(re.findall(r"(position_step_m|rotation_step_deg|margin_m)=([\d.]+)", title))
+        assert set(ways) == {"position_step_m", "rotation_step_deg", "margin_m"}
+        for field, value in ways.items():
+            start(http, grid={field: float(value)})
+
+
+def test_a_large_grid_of_a_large_object_asks_about_the_unit(sqlite_http: httpx.Client) -> None:
+    sqlite_http.post("/objects", json={"id": "duck", "mass_kg": 1})
+    put_mesh(sqlite_http, "duck", stl(box_stl((1.2, 1.5, 1.6))))
+    answer = sqlite_http.post("/objects/duck/sweeps", json={})
+    assert problem(answer)[1] == "too-many-poses"
+    assert "unit wrong? It is 1.6 m long" in answer.json()["title"]
 
 
 def test_thousands_of_jobs_are_made_at_once(http: httpx.Client) -> None:

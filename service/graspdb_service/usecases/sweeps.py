@@ -24,17 +24,15 @@ from graspdb.wire import (
     SweepInfo,
 )
 from graspdb.wire.sweeps import FailedChunk
-from graspdb_geometry.grids import PoseGrid
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import conflict, invalid, not_found
 from graspdb_service.storage import batches, grippers, jobs, sweeps, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
-from graspdb_service.usecases import decompositions, plans, queries
+from graspdb_service.usecases import decompositions, plans, queries, simulability
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.idempotency import Created, replay_or
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.scenes import shape_of
 
 #: More chunks than this are bookkeeping without a use: no lab has so many workers.
 MAX_CHUNKS = 100_000
@@ -42,9 +40,6 @@ MAX_CHUNKS = 100_000
 WANTED_CHUNKS = 16
 #: ... down to these many poses. Given and drawn poses lie at the object, where each needs physics.
 MIN_GRID_CHUNK, MIN_POSES_CHUNK, MAX_POSES_CHUNK = 1_000, 10, 2_000
-#: An object's longest side in openings of the gripper, beyond which its unit is wrong or its gripper.
-MAX_SIZE_IN_OPENINGS, MIN_SIZE_IN_OPENINGS = 40.0, 0.01
-MIN_OPENING_M = 1e-3
 
 _CURSOR = re.compile(r"(\d{1,9})\.(\d{1,9})")
 
@@ -160,19 +155,10 @@ def _new_id(created_ms: int) -> str:
 def _world(row: ObjectRow, profile: GripperProfile) -> _World:
     if row.mesh_info is None or row.mesh_sha256 is None:
         raise conflict("mesh-missing", f"Object {row.slug!r} has no mesh: PUT /objects/{row.slug}/mesh first")
-    try:
-        shape_of(profile)
-    except ValueError as error:
-        raise invalid("gripper", str(error), "This gripper can't be simulated") from None
-    if profile.max_opening_m < MIN_OPENING_M:
-        raise invalid(
-            "gripper",
-            f"max_opening_m is {profile.max_opening_m:g}, below {MIN_OPENING_M:g}: metres are meant",
-            "This gripper can't be simulated",
-        )
+    simulability.check_gripper(profile)
     box = row.mesh_info["bounding_box"]
     lower, upper = np.array(box["lower"]), np.array(box["upper"])
-    _check_size(row, float(np.max(upper - lower)), profile)
+    simulability.check_size(row, float(np.max(upper - lower)), profile)
     snapshot = {
         "mesh_sha256": row.mesh_sha256,
         "parts_sha256": row.parts_sha256,
@@ -185,22 +171,6 @@ def _world(row: ObjectRow, profile: GripperProfile) -> _World:
     if snapshot["mass_kg"] is None:
         snapshot["density_kg_m3"] = row.density_kg_m3
     return _World(row, snapshot, profile)
-
-
-def _check_size(row: ObjectRow, longest: float, profile: GripperProfile) -> None:
-    opening = profile.max_opening_m
-    if MIN_SIZE_IN_OPENINGS * opening <= longest <= MAX_SIZE_IN_OPENINGS * opening:
-        return
-    unit = (row.mesh_info or {}).get("unit", "m")
-    size = "large" if longest > opening else "small"
-    raise ProblemError(
-        422,
-        "mesh-size",
-        f"The mesh of {row.slug!r} is {longest:g} m long, far too {size} for a gripper that opens"
-        f" {opening:g} m. It was sent with unit={unit}: is that right?"
-        f" PUT /objects/{row.slug}/mesh?unit=mm|cm|m|in again, or take another gripper",
-        errors=[("mesh", f"{longest:g} m long")],
-    )
 
 
 def _mass(row: ObjectRow) -> float | None:
@@ -241,23 +211,8 @@ def _plan(ctx: Context, slug: str, spec: SweepCreate, world: _World) -> _Plan:
         field = next((name for name in fields if name in text), "position_step_m")
         raise invalid(f"grid.{field}", text) from None
     if count > ctx.settings.max_sweep_poses:
-        raise _too_many(wish, grid, count, ctx.settings.max_sweep_poses)
+        raise simulability.too_many_poses(world.object, plan, world.profile, ctx.settings.max_sweep_poses)
     return _Plan("grid", count, grid=plan, full_count=full)
-
-
-def _too_many(wish: GridSpec, grid: PoseGrid, count: int, limit: int) -> ProblemError:
-    # Positions are in a volume: the step's cube makes their number.
-    step = float(np.ceil(wish.position_step_m * (grid.candidate_total / limit) ** (1 / 3) * 2000) / 2000)
-    ways = f"max_poses of at most {limit} (a random part of the grid)"
-    if step <= 1.0:
-        ways += f", a position_step_m of about {step:g}"
-    return ProblemError(
-        422,
-        "too-many-poses",
-        f"The grid has {count} poses, and a sweep at most {limit} (max_sweep_poses in /info). Shrink it by"
-        f" {ways}, a larger rotation_step_deg, a smaller margin_m or a region",
-        errors=[("grid", f"{count} poses")],
-    )
 
 
 def _given(ctx: Context, poses: Any) -> _Plan:
