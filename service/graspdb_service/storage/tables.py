@@ -271,6 +271,51 @@ workers = Table(
     Column("poses_done", BigInteger, nullable=False),
 )
 
+# Kernels fitted on an object's trials or given by their components; usable on any object.
+kernels = Table(
+    "kernels",
+    metadata,
+    # In the order they were made: which is the newest does not depend on a clock.
+    Column("number", BigId, primary_key=True, autoincrement=True),
+    Column("id", String(36), nullable=False, unique=True),
+    Column("kind", String(16), nullable=False),
+    Column("alignment", String(16), nullable=False),
+    Column("gripper", ForeignKey("grippers.id")),
+    # The object it was fitted on; what it was and at which revision stays in the provenance.
+    Column("object_id", ForeignKey("objects.id", ondelete="SET NULL"), index=True),
+    Column("components", JSON, nullable=False),
+    Column("provenance", JSON, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    sqlite_autoincrement=True,
+)
+
+# Reports that are computed or have been: one row for an object, revision and set of parameters, leased to
+# the process that computes it.
+report_runs = Table(
+    "report_runs",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False),
+    Column("revision", BigInteger, nullable=False),
+    Column("report", String(32), nullable=False),
+    # SHA-256 of report, parameters and the version that computes.
+    Column("parameters_key", String(64), nullable=False),
+    Column("parameters", JSON, nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("progress", Double, nullable=False),
+    Column("lease_id", String(36)),
+    # Seconds since the epoch by the database's clock.
+    Column("lease_expires_at", Double),
+    # JSON as it is answered.
+    Column("result", Text),
+    # Why it failed, a problem's members; null where the service itself did.
+    Column("problem", JSON(none_as_null=True)),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("finished_at", UtcDateTime),
+    UniqueConstraint("object_id", "parameters_key", "revision"),
+    CheckConstraint("state IN ('running', 'done', 'failed', 'cancelled')", name="state"),
+)
+
 idempotency_keys = Table(
     "idempotency_keys",
     metadata,
