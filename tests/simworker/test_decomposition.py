@@ -1,0 +1,197 @@
+"""Real decompositions, by the child alone and by the whole worker, and what becomes of hopeless ones."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import trimesh
+
+from graspdb.transport import Transport
+from graspdb.wire import DecomposePayload
+from graspdb_geometry import meshes
+from graspdb_geometry.deviation import deviation
+from graspdb_simworker import decomposition
+from graspdb_simworker.decomposition import DecompositionFailed, Limits
+from graspdb_simworker.loop import Worker
+from graspdb_simworker.supervisor import Cancelled
+
+LIMITS = Limits(seconds=120.0)
+PAYLOAD = DecomposePayload(object="angle", mesh="/objects/angle/mesh", mesh_sha256="", unit="mm")
+
+
+def angle_stl(open_by: int = 0) -> bytes:
+    """An L of 20 mm thick legs, 80 mm long and 30 mm wide, in millimetres; some triangles may be missing."""
+    outline = np.array([(0, 0), (80, 0), (80, 20), (20, 20), (20, 80), (0, 80)], dtype=np.float64)
+    count = len(outline)
+    vertices = np.concatenate([np.c_[outline, np.zeros(count)], np.c_[outline, np.full(count, 30.0)]])
+    bottom = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
+    faces = [(a, c, b) for a, b, c in bottom] + [(a + count, b + count, c + count) for a, b, c in bottom]
+    for i in range(count):
+        j = (i + 1) % count
+        faces += [(i, j, j + count), (i, j + count, i + count)]
+    mesh = trimesh.Trimesh(vertices - [30, 30, 15], faces, process=False)
+    data = mesh.subdivide().subdivide()
+    data.update_faces(np.arange(len(data.faces)) >= open_by)
+    stl: bytes = data.export(file_type="stl")
+    return stl
+
+
+VOLUME = (0.08 * 0.02 + 0.06 * 0.02) * 0.03
+
+
+def check_parts(glb: bytes) -> None:
+    parts = meshes.parts_from_glb(glb)
+    assert 2 <= len(parts) <= 8
+    volume = sum(float(trimesh.Trimesh(v, f, process=False).volume) for v, f in parts)
+    assert volume == pytest.approx(VOLUME, rel=0.01)
+    mesh = meshes.load(angle_stl(), "model/stl", "mm")
+    assert deviation(mesh, parts).largest_m < 1e-3
+
+
+def test_an_angle_is_split_the_same_every_time() -> None:
+    notes: list[str] = []
+    first = decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notes.append)
+    check_parts(first)
+    assert "threshold 0.05" in notes[0]
+    assert "mm off" in notes[-1]
+    assert decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS) == first
+
+
+def test_too_little_time_is_said_with_the_way_out() -> None:
+    with pytest.raises(DecompositionFailed, match=r"more than 0\.05 s .*--decompose-seconds.*convex parts"):
+        decomposition.decompose(PAYLOAD, angle_stl(), limits=Limits(seconds=0.05))
+
+
+def test_too_little_memory_is_said_with_the_way_out() -> None:
+    with pytest.raises(DecompositionFailed, match="memory"):
+        decomposition.decompose(PAYLOAD, angle_stl(), limits=Limits(120.0, 150 * 2**20))
+
+
+def test_what_is_no_mesh_is_refused_with_the_reason() -> None:
+    with pytest.raises(DecompositionFailed, match="not STL"):
+        decomposition.decompose(PAYLOAD, b"hello", limits=LIMITS)
+
+
+def test_a_child_that_dies_is_told_apart() -> None:
+    command = (sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    with pytest.raises(DecompositionFailed, match="SIGSEGV"):
+        decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS, command=command)
+
+
+def test_the_best_so_far_is_taken_when_time_is_over() -> None:
+    script = (
+        "import time; from graspdb_simworker import messages as m;"
+        "m.receive(0); m.send(1, m.RESULT, b'coarse'); m.send(1, m.RESULT, b'finer'); time.sleep(60)"
+    )
+    found = decomposition.decompose(
+        PAYLOAD, angle_stl(), limits=Limits(seconds=10.0), command=(sys.executable, "-c", script)
+    )
+    assert found == b"finer"
+
+
+def test_it_stops_when_it_is_not_wanted_any_more() -> None:
+    began = time.monotonic()
+    command = (sys.executable, "-c", "import time; time.sleep(600)")
+    with pytest.raises(Cancelled):
+        decomposition.decompose(
+            PAYLOAD,
+            angle_stl(),
+            limits=LIMITS,
+            wanted=lambda: time.monotonic() < began + 0.5,
+            command=command,
+        )
+
+
+@pytest.fixture
+def url(serve: Callable[..., str], sqlite_url: str) -> str:
+    return serve(sqlite_url, retry_after_s=0.2, lease_s=6.0)
+
+
+def upload(http: httpx.Client, content: bytes) -> dict[str, Any]:
+    made = http.post("/objects", json={"id": "angle", "density_kg_m3": 1_000})
+    assert made.status_code == 201, made.text
+    stored = http.put("/objects/angle/mesh?unit=mm", content=content, headers={"Content-Type": "model/stl"})
+    assert stored.status_code == 200, stored.text
+    info: dict[str, Any] = stored.json()
+    return info
+
+
+def sweep(http: httpx.Client, **grid: Any) -> dict[str, Any]:
+    answer = http.post("/objects/angle/sweeps", json={"grid": {"max_poses": 3_000, "seed": 2, **grid}})
+    assert answer.status_code == 202, answer.text
+    made: dict[str, Any] = answer.json()
+    return made
+
+
+def test_a_foreign_mesh_with_a_hole_is_swept_from_end_to_end(url: str) -> None:
+    """Uploaded in millimetres and not watertight: mended, decomposed, simulated, and a grasp comes out."""
+    with httpx.Client(base_url=url, timeout=60) as http, Transport(url, retries=0) as transport:
+        info = upload(http, angle_stl(open_by=3))
+        assert info["watertight"]
+        assert any("mended" in warning for warning in info["warnings"])
+        made = sweep(http)
+        assert made["waiting_for"]["state"] == "queued"
+        # A worker without CoACD leaves it alone.
+        Worker(transport, name="plain", exit_when_idle=True).run()
+        assert http.get(f"/sweeps/{made['id']}").json()["poses_done"] == 0
+
+        seen: set[str] = set()
+        worker = Worker(transport, name="able", exit_when_idle=True, decompositions=LIMITS)
+        thread = threading.Thread(target=worker.run, daemon=True)
+        thread.start()
+        while thread.is_alive():
+            waiting = http.get(f"/sweeps/{made['id']}").json()["waiting_for"]
+            if waiting and waiting["state"] == "running":
+                seen.add(waiting["progress"] or waiting["worker"])
+            thread.join(0.1)
+        assert seen
+        assert worker.tally.failures == 0
+        now = http.get(f"/sweeps/{made['id']}").json()
+        assert (now["state"], now["poses_done"], now["waiting_for"]) == ("done", 3_000, None)
+        assert now["outcomes"]["success"] > 0
+        assert now["outcomes"]["collision"] > 0
+        thing = http.get("/objects/angle").json()
+        assert thing["convex_parts"]["parts"] >= 2
+        assert thing["convex_parts"]["deviation_m"] < 1e-3
+        check_parts(http.get("/objects/angle/convex-parts").content)
+        best = http.get("/objects/angle/best-grasp").json()
+        assert best["status"] == "ok"
+
+
+def test_a_failed_decomposition_fails_the_sweep_with_its_reason(url: str) -> None:
+    with httpx.Client(base_url=url, timeout=60) as http, Transport(url, retries=0) as transport:
+        upload(http, angle_stl())
+        made = sweep(http)
+        worker = Worker(transport, name="hasty", exit_when_idle=True, decompositions=Limits(seconds=0.05))
+        worker.run()
+        # No second attempt: it would end the same way.
+        assert worker.tally.failures == 1
+        now = http.get(f"/sweeps/{made['id']}").json()
+        assert now["state"] == "failed"
+        assert "--decompose-seconds" in now["failed_chunks"][0]["error"]
+        assert "PUT /objects/angle/convex-parts" in now["failed_chunks"][0]["error"]
+
+
+def test_a_cancelled_sweep_stops_the_decomposition(url: str) -> None:
+    with httpx.Client(base_url=url, timeout=60) as http, Transport(url, retries=0) as transport:
+        upload(http, trimesh.creation.torus(30, 10, 256, 128).export(file_type="stl"))
+        made = sweep(http)
+        worker = Worker(transport, name="cancelled", exit_when_idle=True, decompositions=LIMITS)
+        thread = threading.Thread(target=worker.run, daemon=True)
+        thread.start()
+        deadline = time.monotonic() + 60.0
+        while http.get(f"/sweeps/{made['id']}").json()["waiting_for"]["state"] != "running":
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert http.post(f"/sweeps/{made['id']}/cancel").is_success
+        thread.join(60.0)
+        assert not thread.is_alive()
+        assert (worker.tally.jobs, worker.tally.lost) == (0, 1)
+        assert http.get("/objects/angle").json()["convex_parts"] is None
