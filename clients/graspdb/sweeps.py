@@ -305,6 +305,8 @@ class SweepBar(AbstractContextManager[ProgressCallback]):
         left = ""
         if self._hint:
             left = self._hint
+        elif info.waiting_for is not None and info.state == "queued":
+            left = f"convex parts: {info.waiting_for.progress or info.waiting_for.state}"
         elif info.state in FINISHED or info.state == "queued":
             left = info.state
         elif info.time_left_s is not None:
