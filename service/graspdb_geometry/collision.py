@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from graspdb_geometry import _convex_kernels, _surface_kernels
+from graspdb_geometry import _convex_kernels, _surface_kernels, _width_kernels
 from graspdb_geometry.grippers import GripperShape
 
 FloatArray = npt.NDArray[np.float64]
@@ -147,6 +147,17 @@ class Scene:
         hits: npt.NDArray[np.bool_] = codes == COLLIDES
         return hits
 
+    def widths(
+        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
+    ) -> FloatArray:
+        """How far apart the fingers are once both touch the object, metres, (n,).
+
+        That is the object's extent along y between the fingers, for a free object is centred as they close.
+        NaN where the open gripper collides or nothing is between the fingers.
+        """
+        _, travel = self.classify(positions, quaternions, shape, threads)
+        return np.asarray(shape.max_opening_m - travel.sum(axis=1), dtype=np.float64)
+
 
 class Surface:
     """An object as triangles, for queries before it has convex parts; immutable, thread-safe.
@@ -201,6 +212,22 @@ class Surface:
 
         _in_blocks(run, len(p), threads)
         return hits
+
+    def widths(
+        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
+    ) -> FloatArray:
+        """As :meth:`Scene.widths`."""
+        p, q = _poses(positions, quaternions)
+        column = np.ascontiguousarray(_gripper_boxes(shape, None, 0.0)[3])
+        extents = np.empty((len(p), 2))
+
+        def run(block: slice) -> None:
+            _width_kernels.surface_extents(p[block], q[block], column, self._tree, extents[block])
+
+        _in_blocks(run, len(p), threads)
+        width: FloatArray = extents[:, 1] - extents[:, 0]
+        width[self.collides(p, q, shape, threads=threads)] = np.nan
+        return width
 
     @classmethod
     def _build(cls, corners: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:

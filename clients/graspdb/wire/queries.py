@@ -26,6 +26,9 @@ from graspdb.wire.base import (
 WidthM = Annotated[float, Field(gt=0, le=1.0)]
 WidthDeg = Annotated[float, Field(gt=0, le=90.0)]
 Angle = Annotated[float, Field(gt=0, le=180.0)]
+NoiseM = Annotated[float, Field(ge=0, le=1.0)]
+NoiseDeg = Annotated[float, Field(ge=0, le=90.0)]
+Extent = Annotated[float, Field(gt=0, le=1_000.0)]
 
 
 class KernelSpec(Request):
@@ -148,14 +151,53 @@ ObjectPose = Annotated[Vector7, BeforeValidator(_object_pose)]
 """The object frame in the world frame: x, y, z, qx, qy, qz, qw (a pose's object is accepted too)."""
 
 
-class BestGraspRequest(Selection):
-    """The constrained maximum (figure 2).
+Objective = Literal["density", "success_probability", "robust"]
+Averaged = Literal["density", "success_probability"]
+
+MAX_HALF_SPACES = 200
+MAX_OBSTACLE_BOXES = 200
+MAX_OBSTACLE_POINTS = 50_000
+MAX_CANDIDATES = 10_000
+MAX_EXCLUDED = 1_000
+
+
+class ObstacleBox(Pose):
+    """A box that the gripper must not touch: edge lengths, and the pose of its centre in ``frame``."""
+
+    size_m: tuple[Extent, Extent, Extent]
+    quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+class Obstacles(Request):
+    """What else stands around, in ``frame``: boxes, and points of a sensor, each a ball."""
+
+    boxes: Annotated[list[ObstacleBox], Field(max_length=MAX_OBSTACLE_BOXES)] = Field(default_factory=list)
+    points: Annotated[list[Position], Field(max_length=MAX_OBSTACLE_POINTS)] = Field(default_factory=list)
+    point_radius_m: Annotated[float, Field(ge=0, le=1)] = 0.005
+
+
+class GraspConstraints(Selection):
+    """What a best grasp is chosen by, as far as it fits a query string.
 
     All constraints are in ``frame``: world if ``object_pose`` is given, else object.
+
+    ``objective``: the density; ``success_probability``, which ranks by the lower end of its interval; or
+    ``robust``, the mean of ``robust_of`` (by default the success probability where attempts tell it, else the
+    density) under noise. ``pose_noise_*`` is noise of the object's pose about the centre of its bounding box
+    and acts on the left; ``tool_noise_*`` is the tool's own and acts on the right. Deviations per axis.
+
+    ``include`` limits which scores of a grasp are computed. Without it the success probability comes along
+    where the objective needs it or the selection has few enough attempts to give it at once.
     """
 
     count: Annotated[int, Field(ge=1, le=1_000)] = 1
-    objective: Literal["density"] = "density"
+    objective: Objective = "density"
+    robust_of: Averaged | None = None
+    pose_noise_m: NoiseM | None = None
+    pose_noise_deg: NoiseDeg | None = None
+    tool_noise_m: NoiseM | None = None
+    tool_noise_deg: NoiseDeg | None = None
+    include: list[LikelihoodColumn] | None = None
     box_min: Position | None = None
     box_max: Position | None = None
     sphere: Vector4 | None = None
@@ -165,10 +207,28 @@ class BestGraspRequest(Selection):
     closing: Direction | None = None
     closing_cone_deg: Angle | None = None
     collision_free: bool | None = None
+    pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
+    max_width_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     object_pose: ObjectPose | None = None
     frame: Literal["world", "object"] | None = None
     min_separation_m: Annotated[float, Field(gt=0, le=10)] | None = None
     min_separation_deg: Angle | None = None
+
+
+class BestGraspRequest(GraspConstraints):
+    """The constrained maximum (figure 2).
+
+    ``half_spaces``: rows nx, ny, nz, d that keep n.x >= d at the tool's origin. ``candidates``: only these
+    poses are ranked, as they are; a grasp's ``candidate`` is its place among them. ``exclude``: no grasp
+    within both separations of one of these.
+    """
+
+    half_spaces: Annotated[list[Vector4], Field(max_length=MAX_HALF_SPACES)] | None = None
+    obstacles: Obstacles | None = None
+    candidates: Annotated[list[Pose], Field(min_length=1, max_length=MAX_CANDIDATES)] | PoseColumns | None = (
+        None
+    )
+    exclude: Annotated[list[Pose], Field(max_length=MAX_EXCLUDED)] | PoseColumns | None = None
 
 
 class WorldPose(Response):
@@ -177,11 +237,16 @@ class WorldPose(Response):
 
 
 class Grasp(Response):
-    """A grasp in the object frame, and in the world's where the object's pose was given."""
+    """A grasp in the object frame, and in the world's where the object's pose was given.
+
+    ``score`` is what it was ranked by. ``width_m`` is the jaw's opening once both fingers touch the object,
+    null where geometry or gripper is unknown or nothing is between the fingers.
+    """
 
     position: Triple
     quaternion_xyzw: Quadruple
     world: WorldPose | None = None
+    score: float | None = None
     density: float
     log_density: float
     relative: float
@@ -189,9 +254,20 @@ class Grasp(Response):
     interval: Interval | None = None
     effective_trials: float | None = None
     collision_free: bool | None = None
+    candidate: int | None = None
     width_m: float | None = None
     nearest_trials: list[int] = Field(default_factory=list)
     active_constraints: list[str] = Field(default_factory=list)
+
+
+class Ranking(Response):
+    """What grasps were ranked by; ``score`` in words, noise as it was taken into account."""
+
+    objective: Objective
+    score: str
+    robust_of: Averaged | None = None
+    pose_noise: str | None = None
+    tool_noise: str | None = None
 
 
 class BestGrasps(Response):
@@ -201,6 +277,7 @@ class BestGrasps(Response):
     status: Literal["ok", "fewer", "infeasible", "no_successes"]
     grasps: list[Grasp]
     nearest: Grasp | None = None
+    ranking: Ranking | None = None
     revision: int
     kernel: KernelInfo
 
@@ -219,3 +296,20 @@ class Samples(Response):
     position: list[Triple]
     quaternion_xyzw: list[Quadruple]
     proposal_density: list[float]
+
+
+Strategy = Literal["density", "uncertainty", "edges"]
+
+
+class ProposalsRequest(SamplesRequest):
+    """Grasps to try next. ``density``: where successes lie. ``uncertainty``: where one more trial teaches
+    most. ``edges``: along the object's edges, before anything is known."""
+
+    strategy: Strategy = "density"
+
+
+class Proposals(Samples):
+    """Poses to try, in columns; ``criterion`` says how they were drawn."""
+
+    strategy: Strategy
+    criterion: str

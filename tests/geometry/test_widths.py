@@ -1,0 +1,40 @@
+"""How far apart the fingers are once both touch the object."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graspdb_geometry.collision import Scene, Surface, box_part
+from graspdb_geometry.grippers import PG70
+
+BOX = box_part([0.01, 0.02, 0.05], [0, 0, 0], [0, 0, 0, 1])
+
+
+def test_a_box_by_hand() -> None:
+    down = [1.0, 0.0, 0.0, 0.0]
+    turned = [2**-0.5, 2**-0.5, 0.0, 0.0]  # tool y along the object's x
+    poses = [[0, 0, 0.04], [0, 0.005, 0.04], [0, 0, 0.04], [0, 0, 0.2], [0, 0.02, 0.04]]
+    quaternions = [down, down, turned, down, down]
+    expected = [0.04, 0.04, 0.02, np.nan, np.nan]  # beside it: as wide; beyond: nothing; into it: collides
+    for solid in (Scene([BOX]), Surface(*BOX, watertight=True)):
+        np.testing.assert_allclose(solid.widths(poses, quaternions, PG70), expected, atol=2e-7)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_parts_and_surface_agree(seed: int, random_hull: Any, random_poses: Any) -> None:
+    from scipy.spatial import ConvexHull
+
+    rng = np.random.default_rng(seed)
+    points = random_hull(rng) * 0.5
+    hull = ConvexHull(points)
+    scene, surface = Scene([(points, [])]), Surface(points, hull.simplices, watertight=True)
+    positions, quaternions = random_poses(rng, 3_000, 0.08)
+    a, b = scene.widths(positions, quaternions, PG70), surface.widths(positions, quaternions, PG70)
+    both = ~np.isnan(a) & ~np.isnan(b)
+    assert both.sum() > 50
+    np.testing.assert_allclose(a[both], b[both], atol=1e-6)
+    # Poses that differ only touch: a corner within the tolerance.
+    assert (np.isnan(a) != np.isnan(b)).sum() <= 3
