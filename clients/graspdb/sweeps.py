@@ -159,7 +159,13 @@ class Sweep:
         """Why nothing happens, if that is for want of a worker."""
         if self.info.state != "queued":
             return None
-        if Listing(self._transport, "/workers", wire.WorkerInfo).first(1):
+        workers = Listing(self._transport, "/workers", wire.WorkerInfo).first(100)
+        parts = self.info.waiting_for
+        if workers and parts is not None and parts.state == "queued":
+            if any("decompose" in worker.capabilities for worker in workers):
+                return None
+            return "no worker that has CoACD has come yet, which makes the convex parts: graspdb[sim]"
+        if workers:
             return None
         return f"no worker has come yet: graspdb-simworker run --url {self._transport.url}"
 

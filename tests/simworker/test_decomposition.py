@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from graspdb import Client
 from graspdb.transport import Transport
 from graspdb.wire import DecomposePayload
 from graspdb_geometry import meshes
@@ -141,6 +142,8 @@ def test_a_foreign_mesh_with_a_hole_is_swept_from_end_to_end(url: str) -> None:
         # A worker without CoACD leaves it alone.
         Worker(transport, name="plain", exit_when_idle=True).run()
         assert http.get(f"/sweeps/{made['id']}").json()["poses_done"] == 0
+        with Client(url) as db:
+            assert "CoACD" in str(db.sweeps.get(made["id"]).hint())
 
         seen: set[str] = set()
         worker = Worker(transport, name="able", exit_when_idle=True, decompositions=LIMITS)

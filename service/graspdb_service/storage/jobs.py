@@ -149,6 +149,7 @@ def claim(
             lease_id=fresh_id(),
             lease_expires_at=unix_now() + lease_s,
             worker=worker,
+            progress=None,
         )
         .returning(*_COLUMNS)
     )
