@@ -36,6 +36,14 @@ from graspdb.wire.jobs import (
     SimulateResult,
     WorkerInfo,
 )
+from graspdb.wire.kernels import (
+    KernelComponent,
+    KernelCreate,
+    KernelProvenance,
+    KernelWidths,
+    KernelWindow,
+    StoredKernel,
+)
 from graspdb.wire.objects import BoundingBox, MeshInfo, ObjectCreate, ObjectInfo, ObjectPatch, PartsInfo
 from graspdb.wire.queries import (
     BestGraspRequest,
@@ -96,8 +104,13 @@ __all__ = [
     "GripperProfile",
     "Interval",
     "Intervals",
+    "KernelComponent",
+    "KernelCreate",
     "KernelInfo",
+    "KernelProvenance",
     "KernelSpec",
+    "KernelWidths",
+    "KernelWindow",
     "LeaseRenewed",
     "LikelihoodRequest",
     "Likelihoods",
@@ -130,6 +143,7 @@ __all__ = [
     "SimulateResult",
     "Slug",
     "Source",
+    "StoredKernel",
     "SweepCreate",
     "SweepInfo",
     "SweepOutcomes",

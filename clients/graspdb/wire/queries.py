@@ -52,12 +52,20 @@ class Selection(Request):
 
 
 class KernelInfo(Response):
-    """The kernel that answered; ``rule`` says how its widths were chosen."""
+    """The kernel that answered; ``rule`` says how its widths were chosen.
+
+    Of a stored kernel ``sigma_*`` are those of the isotropic one with equal determinants; ``widths_*`` are
+    its standard deviations along and about x, y and z.
+    """
 
     kind: str
     sigma_position_m: float
     sigma_rotation_deg: float
     rule: str
+    id: str | None = None
+    alignment: str | None = None
+    widths_m: Triple | None = None
+    widths_deg: Triple | None = None
 
 
 class DensityInfo(Response):

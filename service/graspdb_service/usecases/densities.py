@@ -15,6 +15,7 @@ from graspdb_density import (
     DEFAULT_KERNEL,
     GraspDensity,
     IsotropicKernel,
+    MixtureDensity,
     choose_widths,
     importance_weights,
     widths_prefix,
@@ -23,9 +24,11 @@ from graspdb_density.density import CUTOFF
 from graspdb_density.kernels import POSITION_LIMITS_M, ROTATION_LIMITS
 from graspdb_density.widths import FIRST_CHOICE
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
-from graspdb_service.storage import objects, trials
+from graspdb_service.storage import kernels, objects, trials
 from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases import shapes
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.selection import Filters, Selected, resolve
@@ -44,14 +47,18 @@ _RESOLVED = 4_096
 
 @dataclass(frozen=True)
 class KernelChoice:
-    """The kernel a request asks for; None: widths by the default rule."""
+    """The kernel a request asks for; all None: isotropic, widths by the default rule.
+
+    ``stored`` is a stored kernel's id, or ``anisotropic`` for the newest of the object and gripper.
+    """
 
     sigma_position_m: float | None = None
     sigma_rotation_deg: float | None = None
+    stored: str | None = None
 
     @property
     def by_default(self) -> bool:
-        return self.sigma_position_m is None and self.sigma_rotation_deg is None
+        return self.sigma_position_m is None and self.sigma_rotation_deg is None and self.stored is None
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
@@ -60,7 +67,7 @@ def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
     Raises
     ------
     ProblemError
-        422 for widths given twice; 409 or 404 for a kernel that does not exist, naming those that do.
+        422 for widths given twice, or beside a stored kernel.
     """
     choice, cutoff = _choice(request)
     for name, value, (low, high) in (
@@ -97,15 +104,17 @@ def _choice(request: Selection) -> tuple[KernelChoice, float | None]:
             return choice, CUTOFF
         exact = kernel.cutoff is None or kernel.cutoff > _LARGEST_CUTOFF
         return choice, None if exact else kernel.cutoff
-    if kernel == "anisotropic":
-        raise conflict(
-            "kernel-not-fitted",
-            "No anisotropic kernel has been fitted for this object and gripper; kernels there are: isotropic",
-            kernels=["isotropic"],
+    if kernel in (None, "isotropic"):
+        return beside, CUTOFF
+    given = [name for name in ("sigma_position_m", "sigma_rotation_deg") if getattr(beside, name) is not None]
+    if given:
+        raise ProblemError(
+            422,
+            "invalid-request",
+            "A stored kernel has its own widths",
+            errors=[(name, "only the isotropic kernel takes widths") for name in given],
         )
-    if kernel not in (None, "isotropic"):
-        raise not_found("kernel", str(kernel), "kernels there are: isotropic")
-    return beside, CUTOFF
+    return KernelChoice(stored=kernel), CUTOFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +124,10 @@ class Built:
     Attributes
     ----------
     density
-        None where no trial of the selection succeeded.
+        None where no trial of the selection succeeded. With a stored kernel the density under the isotropic
+        one of equal determinants.
+    shaped
+        The density under the stored kernel, where one was asked for.
     seq
         (N,) sequence numbers of its rows, ascending.
     proposal_density
@@ -137,11 +149,18 @@ class Built:
     proposal_density: Floats | None
     weight_unit: float | None
     chosen_from: int = 0
+    shaped: MixtureDensity | None = None
+
+    @property
+    def asked(self) -> GraspDensity | MixtureDensity | None:
+        """The density under the kernel that was asked for."""
+        return self.density if self.shaped is None else self.shaped
 
     @property
     def nbytes(self) -> int:
         own = self.seq.nbytes + (0 if self.proposal_density is None else self.proposal_density.nbytes)
-        return own + (0 if self.density is None else self.density.nbytes) + 4_096
+        held = sum(part.nbytes for part in (self.density, self.shaped) if part is not None)
+        return own + held + 4_096
 
 
 @dataclass(frozen=True)
@@ -197,12 +216,50 @@ class Densities:
             As :meth:`current`.
         """
         row, selected = self.current(slug, filters)
+        stored = None
+        if kernel.stored is not None:
+            stored = self.stored(row, selected, kernel.stored)
+            kernel = KernelChoice(stored=stored.id)
         key = _Key(row.id, selected.filters, kernel)
         return self._cache.get(
             key,
             lambda built: built.revision >= row.revision,
-            lambda before: self._refresh(key, slug, before),
+            lambda before: self._refresh(key, slug, before, stored),
         )
+
+    def stored(self, row: ObjectRow, selected: Selected, name: str) -> KernelRow:
+        """The stored kernel with this id, or the newest of the object and gripper for ``anisotropic``.
+
+        Raises
+        ------
+        ProblemError
+            404 without such a kernel; 409 where none was fitted, or for another gripper's.
+        """
+        with self._database.read() as tx:
+            if name == "anisotropic":
+                newest = kernels.newest(tx, row.id, selected.gripper)
+                found = None if newest is None else kernels.find(tx, newest)
+            else:
+                found = kernels.find(tx, name)
+            others = [] if found else kernels.page(tx, after=0, limit=20, object_id=row.id, gripper=None)
+        names = ["isotropic", *(kernel.id for kernel in others)]
+        if found is None and name == "anisotropic":
+            gripper = f', "gripper": "{selected.gripper}"' if selected.gripper else ""
+            raise conflict(
+                "kernel-not-fitted",
+                "No anisotropic kernel has been fitted for this object and gripper: fit one with"
+                f' POST /kernels {{"object": "{row.slug}"{gripper}}}; kernels there are: {", ".join(names)}',
+                kernels=names,
+            )
+        if found is None:
+            raise not_found("kernel", name, f"kernels there are: {', '.join(names)} (GET /kernels)")
+        if found.gripper not in (None, selected.gripper) and selected.gripper is not None:
+            raise conflict(
+                "kernel-of-another-gripper",
+                f"Kernel {found.id} was fitted for the gripper {found.gripper!r}, these trials are of"
+                f" {selected.gripper!r}: fit one for it with POST /kernels",
+            )
+        return found
 
     @property
     def nbytes(self) -> int:
@@ -211,7 +268,7 @@ class Densities:
     def __len__(self) -> int:
         return len(self._cache)
 
-    def _refresh(self, key: _Key, slug: str, before: Built | None) -> Built:
+    def _refresh(self, key: _Key, slug: str, before: Built | None, stored: KernelRow | None) -> Built:
         with self._database.read() as tx:
             row = require_object(tx, slug, key.object_id)
             selected = resolve(tx, row.id, key.filters)
@@ -228,6 +285,9 @@ class Densities:
             return replace(
                 before, revision=row.revision, last_seq=row.last_seq, object_row=row, selected=selected
             )
+        if stored is not None:
+            frame = shapes.frame_of(stored, row)
+            return self._compute.run(lambda: _build_shaped(stored, frame, row, selected, rows, before))
         return self._compute.run(
             lambda: _build(key.kernel, row, selected, rows, before, self._compute.threads)
         )
@@ -313,6 +373,46 @@ def _build(
         symmetric=symmetric,
     )
     return replace(built, density=density, weight_unit=unit)
+
+
+def _build_shaped(
+    stored: KernelRow,
+    frame: Floats | None,
+    row: ObjectRow,
+    selected: Selected,
+    rows: trials.Columns,
+    before: Built | None,
+) -> Built:
+    """The density under a stored kernel; built anew when rows come, from those kept and the new ones."""
+    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
+    proposal = None if np.isnan(rows.proposal_density).all() else rows.proposal_density
+    position, quaternion, seq = rows.position, rows.quaternion_xyzw, rows.seq
+    if before is not None and before.density is not None:
+        old = before.density
+        seq = np.concatenate([before.seq, seq])
+        proposal = _joined(before.proposal_density, len(before.seq), proposal, len(rows))
+        position = np.concatenate([old.positions, position])
+        quaternion = np.concatenate([old.quaternions_xyzw, quaternion])
+        symmetric = np.concatenate([old.symmetric, symmetric])
+    kernel = shapes.load(stored)
+    built = Built(
+        revision=row.revision,
+        epoch=row.epoch,
+        last_seq=row.last_seq,
+        object_row=row,
+        selected=selected,
+        kernel=shapes.info_of(stored, kernel),
+        density=None,
+        seq=seq,
+        proposal_density=proposal,
+        weight_unit=None,
+    )
+    if not len(seq):
+        return built
+    shaped = MixtureDensity(
+        position, quaternion, kernel=kernel, weights=_weights(proposal), symmetric=symmetric, frames=frame
+    )
+    return replace(built, density=shaped.isotropic, shaped=shaped)
 
 
 def _extended(

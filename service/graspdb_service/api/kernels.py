@@ -1,0 +1,59 @@
+"""Stored kernels: ``/kernels``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from graspdb.wire import Page, Slug
+from graspdb.wire.kernels import KernelCreate, StoredKernel
+from graspdb_service.api.routing import (
+    Ctx,
+    Cursor,
+    IdempotencyKey,
+    Limit,
+    RawBody,
+    encode_cursor,
+    number_cursor,
+    scope,
+    tagged_json,
+)
+from graspdb_service.usecases import kernels
+
+router = APIRouter(tags=["kernels"])
+
+
+@router.post("/kernels", status_code=201, response_model=StoredKernel, **scope("admin"))
+def create_kernel(
+    ctx: Ctx, request: KernelCreate, response: Response, body: RawBody, key: IdempotencyKey
+) -> object:
+    """Fit a kernel on an object's successes, or store one given by its components."""
+    made = kernels.create(ctx, request, key=key, body=body)
+    response.headers["Location"] = made.location
+    return made.body
+
+
+@router.get("/kernels", **scope("read"))
+def list_kernels(
+    ctx: Ctx,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+    object: Annotated[Slug | None, Query(description="Only those fitted on this object.")] = None,
+    gripper: Annotated[Slug | None, Query(description="Only those for this gripper.")] = None,
+) -> Page[StoredKernel]:
+    """The kernels, oldest first."""
+    items, after = kernels.page(ctx, after=number_cursor(cursor), limit=limit, object=object, gripper=gripper)
+    return Page(items=items, next=encode_cursor(after))
+
+
+@router.get("/kernels/{id}", response_model=StoredKernel, **scope("read"))
+def get_kernel(ctx: Ctx, id: str, request: Request) -> Response:
+    """One kernel: components, widths, and what it was fitted on."""
+    return tagged_json(request, kernels.get(ctx, id))
+
+
+@router.delete("/kernels/{id}", status_code=204, **scope("admin"))
+def delete_kernel(ctx: Ctx, id: str) -> None:
+    """Delete a kernel; queries that name it are answered 404 from then on."""
+    kernels.remove(ctx, id)

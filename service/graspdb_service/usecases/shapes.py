@@ -1,0 +1,79 @@
+"""Stored kernels as the maths takes them, and the axes of an object they may be aligned with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import KernelInfo
+from graspdb_density import AnisotropicKernel
+from graspdb_service.problems import conflict
+from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.storage.objects import ObjectRow
+
+Floats = NDArray[np.float64]
+
+
+def load(row: KernelRow) -> AnisotropicKernel:
+    """The kernel of a stored row, which was checked when it came."""
+    return AnisotropicKernel(
+        np.array([item["weight"] for item in row.components]),
+        np.array([item["mean"] for item in row.components]),
+        np.array([item["covariance"] for item in row.components]),
+        "gripper" if row.alignment == "gripper" else "fixed",
+    )
+
+
+def frame_of(row: KernelRow, item: ObjectRow) -> Floats | None:
+    """The axes (3, 3) that a kernel's translations are along on an object; None: each grasp's gripper."""
+    return principal_axes(item) if row.alignment == "object" else None
+
+
+def info_of(row: KernelRow, kernel: AnisotropicKernel) -> KernelInfo:
+    """What a query says of the kernel it used."""
+    widths = np.sqrt(np.diag(kernel.overall_covariance))
+    alike = kernel.isotropic
+    fitted = row.provenance.get("object")
+    origin = f"fitted on {fitted!r}" if fitted else "given by its components"
+    return KernelInfo(
+        kind="anisotropic",
+        id=row.id,
+        alignment=row.alignment,
+        sigma_position_m=alike.sigma_position_m,
+        sigma_rotation_deg=math.degrees(alike.sigma_rotation),
+        widths_m=_triple(widths[:3]),
+        widths_deg=_triple(np.degrees(widths[3:])),
+        rule=f"stored kernel, {origin}; success_probability uses the isotropic kernel of equal determinants",
+    )
+
+
+def principal_axes(row: ObjectRow) -> Floats:
+    """The object's principal axes as columns (3, 3), right-handed, the longest way first.
+
+    An axis has no sign of its own: the largest component of the first two is made positive.
+
+    Raises
+    ------
+    ProblemError
+        409 ``mesh-missing`` without a closed mesh to take them from.
+    """
+    inertia = None if row.mesh_info is None else row.mesh_info.get("inertia_m5")
+    if inertia is None:
+        why = "has no mesh" if row.mesh_info is None else "has a mesh that is not watertight"
+        raise conflict(
+            "mesh-missing",
+            f"Object {row.slug!r} {why}, so its principal axes are not known:"
+            f" PUT /objects/{row.slug}/mesh with a closed mesh, or use alignment=gripper",
+        )
+    _, axes = np.linalg.eigh(np.array(inertia, dtype=np.float64))
+    for column in (0, 1):
+        axes[:, column] *= np.sign(axes[np.argmax(np.abs(axes[:, column])), column])
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    return np.asarray(axes, dtype=np.float64)
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
