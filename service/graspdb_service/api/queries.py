@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
+import orjson
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, BeforeValidator, ValidationError
@@ -13,6 +14,7 @@ from graspdb.wire import (
     BestGraspRequest,
     BestGrasps,
     DensityInfo,
+    GraspConstraints,
     LikelihoodRequest,
     Likelihoods,
     Samples,
@@ -21,17 +23,21 @@ from graspdb.wire import (
     Slug,
 )
 from graspdb.wire.base import Position, Quaternion
-from graspdb.wire.queries import LikelihoodColumn
+from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn
 from graspdb_service import __version__
 from graspdb_service.api.columns import columns_json, read_object, read_poses
+from graspdb_service.api.jsonpieces import LongArray
 from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
 from graspdb_service.problems import ProblemError
-from graspdb_service.usecases import queries
+from graspdb_service.usecases import bestgrasp, queries
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.selection import Filters
 from graspdb_service.usecases.success import LEVEL
 
 router = APIRouter(tags=["queries"])
+
+T = TypeVar("T", bound=BaseModel)
+Q = TypeVar("Q", bound=Selection)
 
 
 def _listed(value: Any) -> Any:
@@ -57,10 +63,11 @@ class LikelihoodQuery(SelectionQuery):
     include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
 
 
-class BestGraspQuery(BestGraspRequest):
+class BestGraspQuery(GraspConstraints):
     """The best grasp's constraints in a query string."""
 
     kernel: Slug | None = None
+    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
 
 
 class LikelihoodOptions(Selection):
@@ -72,6 +79,7 @@ class LikelihoodOptions(Selection):
 @router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read"))
 def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQuery, Query()]) -> Response:
     """The density of a selection of trials: kernel, widths and their rule, counts, effective sample size."""
+    query = _pinned(ctx, id, query)
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
@@ -84,6 +92,7 @@ def get_likelihood(
     ctx: Ctx, id: str, request: Request, query: Annotated[LikelihoodQuery, Query()]
 ) -> Response:
     """How likely one grasp is; columns of length one."""
+    query = _pinned(ctx, id, query)
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
@@ -101,15 +110,9 @@ def get_likelihood(
 )
 def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
     """How likely each of many grasps is: columns in the poses' order."""
-    sent = media_type(request)
-    if sent and not sent.endswith("json"):
-        raise ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json")
-    content = read_object(body)
+    content = _json_body(request, body)
     poses = content.pop("poses", None)
-    try:
-        options = LikelihoodOptions.model_validate(content)
-    except ValidationError as error:
-        raise RequestValidationError(error.errors(include_input=False)) from None
+    options = _validated(LikelihoodOptions, content)
     positions, quaternions = read_poses(poses)
     answer = queries.likelihood(ctx, id, options, positions, quaternions, options.include)
     return _likelihoods(answer)
@@ -120,17 +123,23 @@ def get_best_grasp(
     ctx: Ctx, id: str, request: Request, query: Annotated[BestGraspQuery, Query()]
 ) -> Response:
     """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
+    query = _pinned(ctx, id, query)
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
-    answer, object_id = queries.best_grasps(ctx, id, query)
+    answer, object_id = bestgrasp.best_grasps(ctx, id, query)
     return _json(answer, _tag(object_id, answer.revision, query))
 
 
-@router.post("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
-def post_best_grasp(ctx: Ctx, id: str, query: BestGraspRequest) -> Response:
-    """As GET, the constraints as JSON."""
-    answer, _ = queries.best_grasps(ctx, id, query)
+@router.post(
+    "/objects/{id}/best-grasp",
+    response_model=BestGrasps,
+    **scope("read", body={"application/json": BestGraspRequest}),
+)
+def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
+    """As GET, the constraints as JSON; also half spaces, obstacles, candidates and poses to exclude."""
+    query = _validated(BestGraspRequest, _json_body(request, body))
+    answer, _ = bestgrasp.best_grasps(ctx, id, query)
     return _json(answer)
 
 
@@ -167,10 +176,51 @@ def _likelihoods(answer: queries.LikelihoodAnswer, headers: dict[str, str] | Non
     return columns_json({"revision": answer.revision, "kernel": answer.kernel.model_dump()}, columns, headers)
 
 
+def _json_body(request: Request, body: bytes) -> dict[str, Any]:
+    sent = media_type(request)
+    if sent and not sent.endswith("json"):
+        raise ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json")
+    return read_object(body)
+
+
+def _validated(model: type[T], content: Any) -> T:
+    try:
+        return model.model_validate(_as_lists(content))
+    except ValidationError as error:
+        raise RequestValidationError(error.errors(include_input=False)) from None
+
+
+def _as_lists(content: Any) -> Any:
+    """Long arrays as lists, cut where no model takes more."""
+    if isinstance(content, dict):
+        return {name: _as_lists(value) for name, value in content.items()}
+    if not isinstance(content, LongArray):
+        return content
+    items: list[Any] = []
+    try:
+        for piece in content:
+            items += piece
+            if len(items) > MAX_OBSTACLE_POINTS:
+                break
+    except orjson.JSONDecodeError:
+        raise ProblemError(
+            400, "invalid-json", "The body is not valid JSON", errors=[("body", "not valid JSON")]
+        ) from None
+    return items
+
+
 def _json(answer: BaseModel, tag: str | None = None) -> Response:
     return Response(
         answer.model_dump_json(), media_type="application/json", headers={} if tag is None else {"ETag": tag}
     )
+
+
+def _pinned(ctx: Context, slug: str, query: Q) -> Q:
+    """With the id of the newest kernel in the place of ``anisotropic``: another answer, another ETag."""
+    if query.kernel != "anisotropic":
+        return query
+    row, selected = ctx.densities.current(slug, Filters.of(query))
+    return query.model_copy(update={"kernel": ctx.densities.stored(row, selected, "anisotropic").id})
 
 
 def _known(ctx: Context, slug: str, request: Request, query: Selection) -> Response | None:

@@ -1,35 +1,49 @@
-"""From the constraints a person asks for, in either frame, to a region in the object frame."""
+"""From the constraints a person asks for, in either frame, to what a search takes, in the object's."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
-from graspdb.wire import BestGraspRequest
+from graspdb.wire import BestGraspRequest, GraspConstraints, Obstacles, Pose, PoseColumns
 from graspdb_density import Region, se3
+from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError
 
 Floats = NDArray[np.float64]
+Poses = tuple[Floats, Floats]
 
 _AXES = np.eye(3)
+#: Limits that miss each other by less than this meet: they come rounded, and are turned.
+_TOUCH_M = 1e-8
+_NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """A region in the object frame and what its parts were called in the request.
+    """What bounds a grasp, in the object frame, and what its parts were called in the request.
 
     Attributes
     ----------
     object_pose
         The object frame in the world frame (position, quaternion), where it was given.
+    obstacles
+        What the gripper must not touch besides the object.
+    candidates, exclude
+        Poses (n, 3), (n, 4): the only ones to rank, and those to stay away from.
     """
 
     region: Region
     half_space_names: tuple[str, ...]
-    object_pose: tuple[Floats, Floats] | None
+    object_pose: Poses | None
+    obstacles: tuple[Scene | PointCloud, ...] = ()
+    candidates: Poses | None = None
+    exclude: Poses | None = None
 
     def named(self, active: tuple[str, ...]) -> list[str]:
         """The request's names of the region's active limits, each once."""
@@ -42,7 +56,7 @@ class Constraints:
                 names.append({"spheres": "sphere"}.get(kind, kind))
         return list(dict.fromkeys(names))
 
-    def to_world(self, position: Floats, quaternion: Floats) -> tuple[Floats, Floats] | None:
+    def to_world(self, position: Floats, quaternion: Floats) -> Poses | None:
         """A grasp (object frame) in the world frame, where the object's pose is known."""
         if self.object_pose is None:
             return None
@@ -50,7 +64,7 @@ class Constraints:
         return p, se3.canonical(se3.normalise(q))
 
 
-def constraints(request: BestGraspRequest, *, jaw_symmetric: bool = True) -> Constraints:
+def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Constraints:
     """Check a request's constraints and bring them to the object frame.
 
     Boxes become half spaces, for in the object frame they may stand askew.
@@ -71,29 +85,20 @@ def constraints(request: BestGraspRequest, *, jaw_symmetric: bool = True) -> Con
         values = np.array(request.object_pose)
         pose = values[:3], values[3:]
     in_world = pose is not None and request.frame != "object"
-    rotation = se3.to_matrix(pose[1]) if in_world and pose is not None else np.eye(3)
-    shift = pose[0] if in_world and pose is not None else np.zeros(3)
+    shift, turn = pose if in_world and pose is not None else (np.zeros(3), se3.IDENTITY)
+    rotation = se3.to_matrix(turn)
 
-    names, planes = [], []
-    if request.box_min is not None:
-        for axis, low in zip(_AXES, request.box_min, strict=True):
-            names.append("box_min")
-            planes.append((axis, low))
-    if request.box_max is not None:
-        for axis, high in zip(_AXES, request.box_max, strict=True):
-            names.append("box_max")
-            planes.append((-axis, -high))
-    if request.above_plane is not None:
-        normal = np.array(request.above_plane[:3])
-        length = float(np.linalg.norm(normal))
-        names.append("above_plane")
-        planes.append((normal / length, request.above_plane[3] / length))
+    names, planes = _planes(request)
     # n . (R x + t) >= d is (R^T n) . x >= d - n . t.
     rows = [[*(rotation.T @ normal), d - float(normal @ shift)] for normal, d in planes]
     spheres = None
     if request.sphere is not None:
         centre = rotation.T @ (np.array(request.sphere[:3]) - shift)
         spheres = [[*centre, request.sphere[3]]]
+    apart = _apart(names, np.array(rows).reshape(-1, 4), None if spheres is None else np.array(spheres[0]))
+    if apart:
+        told = "no position fulfils " + " and ".join(apart) + " at once"
+        raise _contradiction([(name, told) for name in apart])
     try:
         region = Region(
             half_spaces=rows or None,
@@ -108,10 +113,105 @@ def constraints(request: BestGraspRequest, *, jaw_symmetric: bool = True) -> Con
         # What is left to contradict after the checks above are the two cones.
         cones = ("approach_cone_deg", "closing_cone_deg")
         raise _contradiction([(name, str(error)) for name in cones]) from None
-    return Constraints(region, tuple(names), pose)
+    into = se3.inverse(shift, turn)
+    posted = request if isinstance(request, BestGraspRequest) else BestGraspRequest()
+    return Constraints(
+        region,
+        tuple(names),
+        pose,
+        _obstacles(posted.obstacles, into),
+        _moved(posted.candidates, into),
+        _moved(posted.exclude, into),
+    )
 
 
-def _check(request: BestGraspRequest) -> None:
+def _planes(request: GraspConstraints) -> tuple[list[str], list[tuple[Floats, float]]]:
+    """Half spaces n, d by the names of the fields they come from."""
+    names: list[str] = []
+    planes: list[tuple[Floats, float]] = []
+    for axis, low in zip(_AXES, request.box_min or (), strict=False):
+        names.append("box_min")
+        planes.append((axis, low))
+    for axis, high in zip(_AXES, request.box_max or (), strict=False):
+        names.append("box_max")
+        planes.append((-axis, -high))
+    given = [] if request.above_plane is None else [("above_plane", request.above_plane)]
+    if isinstance(request, BestGraspRequest):
+        given += [(f"half_spaces.{i}", row) for i, row in enumerate(request.half_spaces or ())]
+    for name, row in given:
+        normal = np.array(row[:3])
+        length = float(np.linalg.norm(normal))
+        names.append(name)
+        planes.append((normal / length, row[3] / length))
+    return names, planes
+
+
+def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud, ...]:
+    solids: list[Scene | PointCloud] = []
+    if given is not None and given.boxes:
+        parts = []
+        for box in given.boxes:
+            p, q = se3.compose(*into, np.array(box.position), np.array(box.quaternion_xyzw))
+            parts.append(box_part(np.array(box.size_m) / 2, p, q))
+        solids.append(Scene(parts))
+    if given is not None and given.points:
+        points = into[0] + se3.rotate(into[1], np.array(given.points))
+        solids.append(PointCloud(points, given.point_radius_m))
+    return tuple(solids)
+
+
+def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | None:
+    if poses is None:
+        return None
+    if isinstance(poses, PoseColumns):
+        p, q = np.array(poses.position), np.array(poses.quaternion_xyzw)
+    else:
+        p = np.array([pose.position for pose in poses]).reshape(-1, 3)
+        q = np.array([pose.quaternion_xyzw for pose in poses]).reshape(-1, 4)
+    p, q = se3.compose(*into, p, q)
+    return p, se3.normalise(q)
+
+
+def _apart(names: Sequence[str], planes: Floats, sphere: Floats | None) -> list[str]:
+    """The fewest fields that leave no position together, as far as dropping one after the other tells."""
+    fields = list(dict.fromkeys(names)) + ([] if sphere is None else ["sphere"])
+
+    def contradict(chosen: Sequence[str]) -> bool:
+        rows = planes[[name in chosen for name in names]]
+        return not _meet(rows, sphere if "sphere" in chosen else None)
+
+    if len(fields) < 2 or not contradict(fields):
+        return []
+    for name in list(fields):
+        rest = [field for field in fields if field != name]
+        if rest and contradict(rest):
+            fields = rest
+    return fields
+
+
+def _meet(planes: Floats, sphere: Floats | None) -> bool:
+    """Whether half spaces (K, 4), with a sphere (4,), have a common point.
+
+    The point of the half spaces nearest to the sphere's centre is that of a least-distance problem, which is
+    one of non-negative least squares (Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    """
+    if not len(planes):
+        return True
+    centre = np.zeros(3) if sphere is None else sphere[:3]
+    normals, limits = planes[:, :3], planes[:, 3] - planes[:, :3] @ centre - _TOUCH_M
+    # The problem in units of the largest distance, where its residual tells empty from far.
+    unit = max(float(np.abs(limits).max()), 1e-3)
+    table = np.vstack([normals.T, limits / unit])
+    target = np.array([0.0, 0.0, 0.0, 1.0])
+    multipliers, residual = nnls(table, target)
+    if residual < 1e-9:
+        return False
+    rest = table @ multipliers - target
+    nearest = -rest[:3] / rest[3] * unit
+    return sphere is None or float(np.linalg.norm(nearest)) <= sphere[3] + _TOUCH_M
+
+
+def _check(request: GraspConstraints) -> None:
     errors = []
     if request.box_min is not None and request.box_max is not None:
         for axis, low, high in zip("xyz", request.box_min, request.box_max, strict=True):
@@ -126,18 +226,36 @@ def _check(request: BestGraspRequest) -> None:
             errors.append((name, f"{name}_cone_deg needs it: the axis of the cone"))
     if request.sphere is not None and not request.sphere[3] > 0:
         errors.append(("sphere", "its fourth number is the radius and must be positive"))
-    if request.above_plane is not None and np.linalg.norm(request.above_plane[:3]) < 1e-9:
-        errors.append(("above_plane", "its first three numbers are the normal and must not be zero"))
-    for name in ("sphere", "above_plane"):
-        value = getattr(request, name)
-        if value is not None and max(abs(x) for x in value) > 1e6:
+    vectors = {"sphere": request.sphere, "above_plane": request.above_plane}
+    if isinstance(request, BestGraspRequest):
+        vectors |= {f"half_spaces.{i}": row for i, row in enumerate(request.half_spaces or ())}
+    for name, value in vectors.items():
+        if value is None:
+            continue
+        if name != "sphere" and np.linalg.norm(value[:3]) < 1e-9:
+            errors.append((name, "its first three numbers are the normal and must not be zero"))
+        if max(abs(x) for x in value) > 1e6:
             errors.append((name, "metres, and at most 1e6: is the unit right?"))
     if request.frame == "world" and request.object_pose is None:
         errors.append(("object_pose", "constraints in the world frame need the object's pose in it"))
     if request.object_pose is not None and max(abs(x) for x in request.object_pose[:3]) > 1e6:
         errors.append(("object_pose", "metres, and at most 1e6: is the unit right?"))
+    if request.pregrasp_distance_m is not None and request.collision_free is False:
+        message = "a free approach and collision_free=false contradict each other"
+        errors += [("pregrasp_distance_m", message), ("collision_free", message)]
+    errors += _objective(request)
     if errors:
         raise _contradiction(errors)
+
+
+def _objective(request: GraspConstraints) -> list[tuple[str, str]]:
+    given = [name for name in _NOISE if getattr(request, name) is not None]
+    if request.objective == "robust":
+        if not any(getattr(request, name) for name in given):
+            return [(name, "objective=robust needs noise: one of the four above 0") for name in _NOISE]
+        return []
+    beside = [*given, *(["robust_of"] if request.robust_of is not None else [])]
+    return [(name, f"counts with objective=robust only, not with {request.objective}") for name in beside]
 
 
 def _contradiction(errors: list[tuple[str, str]]) -> ProblemError:

@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import math
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import (
-    BestGraspRequest,
-    BestGrasps,
     DensityInfo,
-    Grasp,
-    Interval,
     KernelInfo,
     Selection,
-    WorldPose,
 )
 from graspdb.wire.queries import LikelihoodColumn
-from graspdb_density import GraspDensity, Maximum, Region, se3
-from graspdb_density.maximum import Admissible
+from graspdb_density import GraspDensity, MixtureDensity, se3
 from graspdb_density.weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.problems import ProblemError, conflict
-from graspdb_service.usecases.constraints import Constraints, constraints
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.densities import Built, kernel_of
 from graspdb_service.usecases.scenes import CollisionTest
 from graspdb_service.usecases.selection import Filters
-from graspdb_service.usecases.success import LEVEL
 
 Floats = NDArray[np.float64]
 
@@ -133,7 +123,7 @@ def likelihood(
         built = built_for(ctx, slug, request)
         logs = relative = free = None
         if asked("density", "log_density", "relative"):
-            density = built.density
+            density = built.asked
             if density is None:
                 logs, relative = np.full(count, -np.inf), np.zeros(count)
             else:
@@ -162,14 +152,22 @@ def likelihood(
 
 
 def _log_density(
-    ctx: Context, density: GraspDensity, positions: Floats, quaternions: Floats, cutoff: float | None
+    ctx: Context,
+    density: GraspDensity | MixtureDensity,
+    positions: Floats,
+    quaternions: Floats,
+    cutoff: float | None,
 ) -> Floats:
     logs = np.empty(len(positions))
+    threads = ctx.compute.threads
 
     def work(part: slice) -> None:
-        logs[part] = density.log_density(
-            positions[part], quaternions[part], cutoff=cutoff, threads=ctx.compute.threads
-        )
+        p, q = positions[part], quaternions[part]
+        if isinstance(density, GraspDensity):
+            logs[part] = density.log_density(p, q, cutoff=cutoff, threads=threads)
+        else:
+            # It sums whatever matters, however far.
+            logs[part] = density.log_density(p, q, threads=threads)
 
     ctx.compute.blocks(len(positions), _BLOCK, work)
     return logs
@@ -185,147 +183,11 @@ def _free(ctx: Context, test: CollisionTest, positions: Floats, quaternions: Flo
     return free
 
 
-def _global_maximum(ctx: Context, density: GraspDensity) -> float:
-    return ctx.compute.run(lambda: density.global_maximum(ctx.compute.threads)).log_density
-
-
-# -- the best grasps ---------------------------------------------------------------------------------------
-
-
-def best_grasps(ctx: Context, slug: str, request: BestGraspRequest) -> tuple[BestGrasps, int]:
-    """The best distinct grasps under the request's constraints, and the object's internal id."""
-    kernel_of(request)
-    constraints(request)
-    with ctx.compute.admitted():
-        built = built_for(ctx, slug, request)
-        limits = constraints(request, jaw_symmetric=built.selected.jaw_symmetric)
-        if request.collision_free:
-            test: CollisionTest | None = ctx.scenes.require(built.object_row, built.selected)
-        else:
-            test = ctx.scenes.test(built.object_row, built.selected)
-        must_be_free = request.collision_free is not False and test is not None
-        density = built.density
-        if density is None:
-            return _answer(built, "no_successes", []), built.object_row.id
-        admissible = test.free if must_be_free and test is not None else None
-        threads = ctx.compute.threads
-        found = ctx.compute.run(
-            lambda: density.maximum(
-                limits.region,
-                count=request.count,
-                min_separation_m=_or(request.min_separation_m, _SEPARATION_M),
-                min_separation=math.radians(_or(request.min_separation_deg, _SEPARATION_DEG)),
-                admissible=admissible,
-                threads=threads,
-            )
-        )
-        if found:
-            grasps = _described(ctx, slug, built, density, limits, test, found)
-            status = "ok" if len(grasps) >= request.count else "fewer"
-            return _answer(built, status, grasps), built.object_row.id
-        closest = ctx.compute.run(lambda: _closest(density, limits.region, admissible))
-        nearest = _described(ctx, slug, built, density, limits, test, closest)
-        return _answer(built, "infeasible", [], *nearest), built.object_row.id
-
-
-def _answer(built: Built, status: str, grasps: list[Grasp], nearest: Grasp | None = None) -> BestGrasps:
-    return BestGrasps.model_validate(
-        {
-            "status": status,
-            "grasps": grasps,
-            "nearest": nearest,
-            "revision": built.revision,
-            "kernel": built.kernel,
-        }
-    )
-
-
-def _described(
-    ctx: Context,
-    slug: str,
-    built: Built,
-    density: GraspDensity,
-    limits: Constraints,
-    test: CollisionTest | None,
-    found: list[Maximum],
-) -> list[Grasp]:
-    """What is known of grasps that a search found."""
-    if not found:
-        return []
-    positions = np.array([item.position for item in found])
-    quaternions = np.array([item.quaternion_xyzw for item in found])
-    free = None if test is None else _free(ctx, test, positions, quaternions)
-    estimates = ctx.successes.estimate(slug, built, positions, quaternions, free)
-    top = _global_maximum(ctx, density)
-    nearest = ctx.compute.run(
-        lambda: [_nearest_trials(built, density, p, q) for p, q in zip(positions, quaternions, strict=True)]
-    )
-    grasps = []
-    for i, item in enumerate(found):
-        world = limits.to_world(item.position, item.quaternion_xyzw)
-        probability, low, high = (
-            float(column[i]) for column in (estimates.probability, estimates.low, estimates.high)
-        )
-        known = math.isfinite(probability)
-        grasps.append(
-            Grasp(
-                position=_numbers(item.position),
-                quaternion_xyzw=_numbers(item.quaternion_xyzw),
-                world=None
-                if world is None
-                else WorldPose(position=_numbers(world[0]), quaternion_xyzw=_numbers(world[1])),
-                density=math.exp(item.log_density),
-                log_density=item.log_density,
-                relative=min(math.exp(item.log_density - top), 1.0),
-                success_probability=probability if known else None,
-                interval=Interval(level=LEVEL, low=low, high=high) if known else None,
-                effective_trials=float(estimates.effective_trials[i]),
-                collision_free=None if free is None else bool(free[i]),
-                nearest_trials=nearest[i],
-                active_constraints=limits.named(item.active_constraints),
-            )
-        )
-    return grasps
-
-
-def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quaternion: Floats) -> list[int]:
-    """Sequence numbers of the successes nearest to a pose in the kernel's own measure."""
-    kernel = density.kernel
-    centres, rotations = density.positions, density.quaternions_xyzw
-    cosine = np.abs(rotations @ quaternion)
-    turned = np.abs(rotations @ se3.jaw_twin(quaternion))
-    cosine = np.where(density.symmetric, np.maximum(cosine, turned), cosine)
-    squared = np.sum((centres - position) ** 2, axis=1) / kernel.sigma_position_m**2
-    value = kernel.kappa * cosine - 0.5 * squared
-    count = min(_NEAREST_TRIALS, len(value))
-    best = np.argpartition(-value, count - 1)[:count]
-    best = best[np.argsort(-value[best], kind="stable")]
-    return [int(seq) for seq in built.seq[best]]
-
-
-def _closest(density: GraspDensity, region: Region, admissible: Admissible | None) -> list[Maximum]:
-    """The success that violates the region least, in widths of the kernel, and is admissible; or none."""
-    kernel = density.kernel
-    p, q, _ = region.project(density.positions, density.quaternions_xyzw)
-    shift = np.sum((p - density.positions) ** 2, axis=1) / kernel.sigma_position_m**2
-    turn = se3.angle_between(q, density.quaternions_xyzw) ** 2 / kernel.sigma_rotation**2
-    order = np.argsort(shift + turn, kind="stable")
-    for start in range(0, len(order), _CANDIDATES):
-        rows = order[start : start + _CANDIDATES]
-        p, q = density.positions[rows], density.quaternions_xyzw[rows]
-        free = np.arange(len(rows)) if admissible is None else np.flatnonzero(admissible(p, q))
-        if free.size:
-            at = slice(int(free[0]), int(free[0]) + 1)
-            return [Maximum(p[at][0], se3.canonical(q[at][0]), float(density.log_density(p[at], q[at])[0]))]
-    return []
-
-
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
-
-
-def _numbers(values: Floats) -> Any:
-    return tuple(float(value) for value in values)
+def _global_maximum(ctx: Context, density: GraspDensity | MixtureDensity) -> float:
+    if isinstance(density, GraspDensity):
+        return ctx.compute.run(lambda: density.global_maximum(ctx.compute.threads)).log_density
+    # What a search found is ranked by the mixture; ``log_density`` is that of the isotropic kernel.
+    return ctx.compute.run(density.global_maximum).score
 
 
 # -- samples -----------------------------------------------------------------------------------------------
@@ -368,7 +230,7 @@ def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | 
     chosen = secrets.randbits(63) if seed is None else seed
     with ctx.compute.admitted():
         built = built_for(ctx, slug, selection)
-        density = built.density
+        density = built.asked
         if density is None:
             raise conflict(
                 "no-successes",

@@ -47,6 +47,16 @@ class CollisionTest:
         """Which poses (n, 3), (n, 4) the open gripper can take without overlapping the object."""
         return ~self.solid.collides(positions, quaternions, self.shape, threads=threads)
 
+    def free_on_the_way(
+        self, positions: Floats, quaternions: Floats, distance_m: float, threads: int = 1
+    ) -> NDArray[np.bool_]:
+        """As :meth:`free`, all along the straight approach that starts this far back."""
+        return ~self.solid.collides(positions, quaternions, self.shape, threads=threads, retreat_m=distance_m)
+
+    def widths(self, positions: Floats, quaternions: Floats, threads: int = 1) -> Floats:
+        """The jaw's opening (n,) once both fingers touch the object; NaN where it collides or misses."""
+        return self.solid.widths(positions, quaternions, self.shape, threads=threads)
+
 
 class Scenes:
     """Prepared geometry, by content: the same parts are prepared once, whichever object they belong to."""

@@ -92,6 +92,26 @@ class Successes:
         self._compute = compute
         self._cache: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
+    def model(self, slug: str, built: Built, *, collisions_known: bool) -> SuccessModel | None:
+        """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
+
+        Parameters
+        ----------
+        collisions_known
+            Whether geometry and gripper are known: then attempts that collided are left out.
+        """
+        key = _Key(
+            built.object_row.id,
+            built.selected.filters,
+            built.kernel.sigma_position_m,
+            built.kernel.sigma_rotation_deg,
+            collisions_known,
+        )
+        found = self._cache.get(
+            key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
+        )
+        return found.model if found.model is not None and found.model.size else None
+
     def estimate(
         self, slug: str, built: Built, positions: Floats, quaternions: Floats, free: NDArray[np.bool_] | None
     ) -> Estimates:
@@ -102,19 +122,20 @@ class Successes:
         free : (n,) bool or None
             Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
         """
-        key = _Key(
-            built.object_row.id,
-            built.selected.filters,
-            built.kernel.sigma_position_m,
-            built.kernel.sigma_rotation_deg,
-            free is not None,
+        return self.under(
+            self.model(slug, built, collisions_known=free is not None), positions, quaternions, free
         )
-        found = self._cache.get(
-            key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
-        )
+
+    def under(
+        self,
+        model: SuccessModel | None,
+        positions: Floats,
+        quaternions: Floats,
+        free: NDArray[np.bool_] | None,
+    ) -> Estimates:
+        """As :meth:`estimate`, under a model from :meth:`model`."""
         estimates = Estimates.unknown(len(positions))
-        model = found.model
-        if model is not None and model.size:
+        if model is not None:
 
             def work(part: slice) -> None:
                 answer = model.evaluate(
