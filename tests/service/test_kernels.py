@@ -1,0 +1,241 @@
+"""Stored kernels: fitted on trials or given, used in every query, and what goes wrong with them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from graspdb_density import AnisotropicKernel, MixtureDensity, se3
+
+Floats = NDArray[np.float64]
+Poses = tuple[Floats, Floats]
+Post = Callable[..., dict[str, Any]]
+Make = Callable[..., str]
+
+SPREAD = np.array([0.02, 0.004, 0.01, 0.08, 0.4, 0.08])
+
+
+def ridges(count: int = 400, seed: int = 0) -> Poses:
+    """Grasps wide along x and about y of the gripper, about six places."""
+    rng = np.random.default_rng(seed)
+    at, to = rng.normal(size=(6, 3)) * 0.08, se3.random_quaternions(6, rng)
+    which = rng.integers(6, size=count)
+    xi = rng.normal(size=(count, 6)) * SPREAD
+    p = at[which] + np.einsum("nij,nj->ni", se3.to_matrix(to[which]), xi[:, :3])
+    return p, se3.multiply(to[which], se3.from_rotation_vector(xi[:, 3:]))
+
+
+def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def fit(http: httpx.Client, **request: Any) -> dict[str, Any]:
+    answer = http.post("/kernels", json=request)
+    assert answer.status_code == 201, answer.text
+    body: dict[str, Any] = answer.json()
+    assert answer.headers["location"] == f"/kernels/{body['id']}"
+    return body
+
+
+def loaded(kernel: dict[str, Any]) -> AnisotropicKernel:
+    parts = kernel["components"]
+    return AnisotropicKernel(
+        [c["weight"] for c in parts], [c["mean"] for c in parts], [c["covariance"] for c in parts]
+    )
+
+
+def diagonal(*widths: float) -> list[list[float]]:
+    return np.diag(np.square(widths)).tolist()
+
+
+GIVEN = {"components": [{"covariance": diagonal(0.02, 0.006, 0.01, 0.1, 0.3, 0.1)}]}
+
+
+def test_fitted_listed_used_and_deleted(http: httpx.Client, make_object: Make, post: Post) -> None:
+    make_object(http)
+    poses = ridges()
+    post(http, "thing", poses, gripper="pg70")
+    told = problem(http.get("/objects/thing/density?kernel=anisotropic"), 409)
+    assert told["type"].endswith("kernel-not-fitted")
+    assert 'POST /kernels {"object": "thing", "gripper": "pg70"}' in told["title"]
+
+    made = fit(http, object="thing")
+    assert (made["gripper"], made["alignment"], made["kind"]) == ("pg70", "gripper", "anisotropic")
+    source = made["provenance"]
+    assert (source["origin"], source["object"], source["successes"]) == ("fitted", "thing", 400)
+    assert source["revision"] == http.get("/objects/thing").json()["revision"]
+    assert source["window"] == {"position_m": 0.03, "rotation_deg": 45}
+    assert source["log_likelihood"] > source["isotropic_log_likelihood"]
+    assert 0.5 < source["similarity"] <= 1
+    assert made["widths_m"][0] > 1.5 * made["widths_m"][1]
+    assert made["widths_deg"][1] > 1.5 * made["widths_deg"][0]
+    assert http.get(f"/kernels/{made['id']}").json() == made
+
+    other = fit(http, **GIVEN)
+    assert (other["gripper"], other["provenance"]["origin"]) == (None, "given")
+    assert [k["id"] for k in http.get("/kernels").json()["items"]] == [made["id"], other["id"]]
+    assert [k["id"] for k in http.get("/kernels?object=thing").json()["items"]] == [made["id"]]
+    first = http.get("/kernels?limit=1").json()
+    assert [k["id"] for k in http.get(f"/kernels?cursor={first['next']}").json()["items"]] == [other["id"]]
+
+    for name in ("anisotropic", made["id"]):
+        used = http.get(f"/objects/thing/density?kernel={name}").json()["kernel"]
+        assert (used["kind"], used["id"], used["alignment"]) == ("anisotropic", made["id"], "gripper")
+        assert used["widths_m"] == pytest.approx(made["widths_m"])
+    # The newest is used, and no cached answer of the one before.
+    tag = http.get("/objects/thing/density?kernel=anisotropic").headers["etag"]
+    newest = fit(http, object="thing", window={"position_m": 0.02, "rotation_deg": 30})
+    answer = http.get("/objects/thing/density?kernel=anisotropic", headers={"If-None-Match": tag})
+    assert (answer.status_code, answer.json()["kernel"]["id"]) == (200, newest["id"])
+
+    assert http.delete(f"/kernels/{newest['id']}").status_code == 204
+    assert problem(http.delete(f"/kernels/{newest['id']}"), 404)
+    assert problem(http.get(f"/objects/thing/density?kernel={newest['id']}"), 404)
+    used = http.get("/objects/thing/density?kernel=anisotropic").json()["kernel"]
+    assert used["id"] == made["id"]
+    # A kernel outlives the object it was fitted on.
+    assert http.delete("/objects/thing").status_code == 204
+    assert http.get(f"/kernels/{made['id']}").json()["provenance"]["object"] == "thing"
+
+
+def test_queries_answer_what_the_maths_does(sqlite_http: httpx.Client, make_object: Make, post: Post) -> None:
+    http = sqlite_http
+    make_object(http)
+    poses = ridges()
+    g = np.random.default_rng(5).random(400) + 0.5
+    post(http, "thing", poses, proposal_density=g)
+    kernel = fit(http, **GIVEN)
+    density = MixtureDensity(*poses, kernel=loaded(kernel), weights=1.0 / g)
+    asked = poses[0][:50] + 0.003, poses[1][:50]
+    body = {"position": asked[0].tolist(), "quaternion_xyzw": asked[1].tolist()}
+    found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": kernel["id"]}).json()
+    np.testing.assert_allclose(found["log_density"], density.log_density(*asked), atol=2e-3)
+    assert max(found["relative"]) <= 1
+    assert found["kernel"]["id"] == kernel["id"]
+
+    best = http.get(f"/objects/thing/best-grasp?kernel={kernel['id']}&count=3").json()
+    assert best["status"] == "ok"
+    top = best["grasps"][0]
+    assert top["relative"] == pytest.approx(1, abs=0.02)
+    exact = density.log_density([top["position"]], [top["quaternion_xyzw"]])[0]
+    assert top["log_density"] == pytest.approx(exact, abs=2e-3)
+    assert top["log_density"] >= max(found["log_density"]) - 1e-3
+    logs = [grasp["log_density"] for grasp in best["grasps"]]
+    assert logs == sorted(logs, reverse=True)
+    half = float(np.median(poses[0][:, 0]))
+    inside = http.post(
+        "/objects/thing/best-grasp", json={"kernel": kernel["id"], "above_plane": [1, 0, 0, half]}
+    ).json()
+    assert inside["grasps"][0]["position"][0] >= half - 1e-6
+
+    drawn = http.post(
+        "/objects/thing/samples", json={"count": 2_000, "seed": 3, "kernel": kernel["id"]}
+    ).json()
+    p, q = np.array(drawn["position"]), np.array(drawn["quaternion_xyzw"])
+    np.testing.assert_allclose(np.log(drawn["proposal_density"]), density.log_density(p, q), atol=2e-3)
+    # Mean log density of its own draws is minus the entropy: as that of the maths' own draws.
+    own = density.log_density(*density.sample(2_000, np.random.default_rng(8)))
+    assert np.log(drawn["proposal_density"]).mean() == pytest.approx(own.mean(), abs=0.25)
+
+    # Trials that come later are in the next answer.
+    more = ridges(50, seed=9)
+    post(http, "thing", more, proposal_density=np.ones(50))
+    grown = MixtureDensity(
+        np.concatenate([poses[0], more[0]]), np.concatenate([poses[1], more[1]]), kernel=loaded(kernel),
+        weights=np.concatenate([1.0 / g, np.ones(50)]),
+    )  # fmt: skip
+    found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": kernel["id"]}).json()
+    np.testing.assert_allclose(found["log_density"], grown.log_density(*asked), atol=2e-3)
+
+
+def test_aligned_with_the_object(
+    sqlite_http: httpx.Client, make_object: Make, post: Post, put_box: Callable[..., Any]
+) -> None:
+    http = sqlite_http
+    make_object(http)
+    told = problem(http.post("/kernels", json={"object": "thing", "alignment": "object"}), 409)
+    assert "PUT /objects/thing/mesh" in told["title"]
+    put_box(http, "thing")
+    rng = np.random.default_rng(0)
+    # Wide along the object's longest axis, its z, whatever way the gripper stands.
+    p = rng.normal(size=(300, 3)) * [0.003, 0.003, 0.04]
+    q = se3.multiply(
+        np.array([0.0, 0.5**0.5, 0.0, 0.5**0.5]), se3.from_rotation_vector(rng.normal(size=(300, 3)) * 0.1)
+    )
+    post(http, "thing", (p, q))
+    made = fit(http, object="thing", alignment="object")
+    # The longest way first.
+    assert made["widths_m"][0] > 1.5 * max(made["widths_m"][1:])
+    answer = http.get("/objects/thing/density?kernel=anisotropic")
+    assert answer.json()["kernel"]["alignment"] == "object"
+    told = problem(
+        http.post("/kernels", json={"object": "thing", "alignment": "object", "components": 2}), 422
+    )
+    assert told["errors"][0]["field"] == "components"
+    make_object(http, "bare")
+    post(http, "bare", (p, q))
+    told = problem(http.get(f"/objects/bare/density?kernel={made['id']}"), 409)
+    assert told["type"].endswith("mesh-missing")
+
+
+def test_another_grippers_kernel_is_refused(sqlite_http: httpx.Client, make_object: Make, post: Post) -> None:
+    http = sqlite_http
+    make_object(http)
+    post(http, "thing", ridges(), gripper="pg70")
+    kernel = fit(http, gripper="panda", **GIVEN)["id"]
+    for answer in (
+        http.get(f"/objects/thing/density?kernel={kernel}"),
+        http.get(f"/objects/thing/best-grasp?kernel={kernel}"),
+        http.post("/objects/thing/samples", json={"count": 3, "kernel": kernel}),
+    ):
+        told = problem(answer, 409)
+        assert told["type"].endswith("kernel-of-another-gripper")
+        assert "panda" in told["title"]
+        assert "pg70" in told["title"]
+
+
+def test_bad_kernels_are_refused_with_reasons(
+    sqlite_http: httpx.Client, make_object: Make, post: Post
+) -> None:
+    http = sqlite_http
+    make_object(http)
+
+    def refused(status: int, **request: Any) -> str:
+        told = problem(http.post("/kernels", json=request), status)
+        return " ".join([told["title"], *(f"{e['field']} {e['message']}" for e in told.get("errors", []))])
+
+    assert "nothing to fit" in refused(409, object="thing")
+    post(http, "thing", ridges(40))
+    assert "at least 50 successes; there are 40, so 10 more" in refused(409, object="thing")
+    assert "at most" not in refused(404, object="nothing")
+    assert "alignment edge" in refused(422, object="thing", alignment="edge")
+    assert "name the object" in refused(422)
+    assert "fitted on nothing: object" in refused(422, object="thing", **GIVEN)
+    singular = np.diag([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.0]).tolist()
+    assert "singular" in refused(422, components=[{"covariance": singular}])
+    wide = diagonal(0.01, 0.01, 0.01, 0.1, math.radians(60), 0.1)
+    assert "60 degrees" in refused(422, components=[{"covariance": wide}])
+    assert "components" in refused(422, components=[{"covariance": np.eye(5).tolist()}])
+    assert "no gripper 'nope'" in refused(422, gripper="nope", **GIVEN)
+    kernel = fit(http, **GIVEN)["id"]
+    told = problem(http.get(f"/objects/thing/density?kernel={kernel}&sigma_position_m=0.01"), 422)
+    assert told["errors"][0]["field"] == "sigma_position_m"
+    assert (
+        "kernels there are: isotropic"
+        in problem(http.get("/objects/thing/density?kernel=nope"), 404)["title"]
+    )
+
+
+def test_the_same_request_twice_makes_one_kernel(http: httpx.Client) -> None:
+    headers = {"Idempotency-Key": "once"}
+    first, again = (http.post("/kernels", json=GIVEN, headers=headers).json() for _ in range(2))
+    assert first == again
+    assert len(http.get("/kernels").json()["items"]) == 1
