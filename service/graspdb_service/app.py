@@ -24,7 +24,18 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspdb_service import __version__
-from graspdb_service.api import grippers, jobs, kernels, meshes, objects, operations, queries, sweeps, trials
+from graspdb_service.api import (
+    grippers,
+    jobs,
+    kernels,
+    meshes,
+    objects,
+    operations,
+    queries,
+    reports,
+    sweeps,
+    trials,
+)
 from graspdb_service.api.document import document
 from graspdb_service.api.routing import declared_parameters, media_type, refuse_unknown_parameters
 from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
@@ -50,6 +61,7 @@ ROUTERS = [
     trials.router,
     queries.router,
     kernels.router,
+    reports.router,
     sweeps.router,
     jobs.router,
 ]

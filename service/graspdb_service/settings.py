@@ -39,5 +39,7 @@ class Settings(BaseSettings):
     max_attempts: Annotated[int, Field(ge=1)] = 4
     """A job whose lease ran out this often is failed: it may be what kills the workers."""
     chunk_poses: Annotated[int, Field(ge=1)] = 20_000
+    report_wait_s: Annotated[float, Field(ge=0, le=60)] = 10.0
+    """How long a request waits for a report before it is told where the report will be."""
     retry_after_s: Annotated[float, Field(gt=0)] = 2.0
     """How long an idle worker is told to wait before it asks for jobs again."""

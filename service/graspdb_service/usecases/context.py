@@ -9,6 +9,7 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.densities import Densities
+from graspdb_service.usecases.report_runs import ReportRuns
 from graspdb_service.usecases.scenes import Scenes
 from graspdb_service.usecases.success import Successes
 
@@ -23,20 +24,25 @@ class Context:
     densities: Densities
     scenes: Scenes
     successes: Successes
+    reports: ReportRuns
     mesh_children: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
         compute = Compute(settings.threads)
+        densities = Densities(database, compute, settings.max_density_cache_bytes)
+        scenes = Scenes(database, compute)
         return cls(
             settings=settings,
             database=database,
             compute=compute,
-            densities=Densities(database, compute, settings.max_density_cache_bytes),
-            scenes=Scenes(database, compute),
+            densities=densities,
+            scenes=scenes,
             successes=Successes(database, compute, settings.max_density_cache_bytes),
+            reports=ReportRuns(settings, database, densities, scenes),
         )
 
     def close(self) -> None:
+        self.reports.close()
         self.compute.close()
         self.database.dispose()

@@ -30,9 +30,6 @@ from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.idempotency import Created, replay_or
 from graspdb_service.usecases.selection import Filters
 
-#: Alignments that there is geometry for.
-ALIGNMENTS = ("gripper", "object")
-
 
 def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
     """Store a kernel.
@@ -43,7 +40,7 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
         404 for the object, 422 for components that make no kernel or an alignment that can't be measured,
         409 where the trials don't suffice to fit one.
     """
-    check_alignment(request.alignment)
+    shapes.check_alignment(request.alignment)
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
@@ -51,14 +48,6 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
         return Created(info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
     return replay_or(ctx, scope="POST /kernels", key=key, request=body, create=make)
-
-
-def check_alignment(alignment: str) -> None:
-    """422 for an alignment that can't be measured yet."""
-    if alignment not in ALIGNMENTS:
-        raise invalid(
-            "alignment", f"{alignment} is not measured yet: alignments there are: {', '.join(ALIGNMENTS)}"
-        )
 
 
 def get(ctx: Context, id: str) -> StoredKernel:

@@ -9,11 +9,22 @@ from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo
 from graspdb_density import AnisotropicKernel
-from graspdb_service.problems import conflict
+from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
 
 Floats = NDArray[np.float64]
+
+#: Alignments that there is geometry for.
+ALIGNMENTS = ("gripper", "object")
+
+
+def check_alignment(alignment: str) -> None:
+    """422 for an alignment that can't be measured yet."""
+    if alignment not in ALIGNMENTS:
+        raise invalid(
+            "alignment", f"{alignment} is not measured yet: alignments there are: {', '.join(ALIGNMENTS)}"
+        )
 
 
 def load(row: KernelRow) -> AnisotropicKernel:

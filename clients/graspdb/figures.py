@@ -1,0 +1,320 @@
+"""Figures of reports: one drawing for the service's PNG and SVG and for ``.plot()`` in a notebook.
+
+Drawn with matplotlib's figure objects and without pyplot, so that a server may draw from its threads. Colours
+are Okabe and Ito's, which colour-blind readers tell apart; heat maps are viridis. What has no data is white
+and hatched, never a colour.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import threading
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire.reports import (
+    AnisotropyHistogram,
+    AnisotropyReport,
+    AnisotropyTolerance,
+    AnyReport,
+    CalibrationReport,
+    ConvergenceReport,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw", "rendered"]
+
+Floats = NDArray[np.float64]
+
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
+_COLOURS = (BLUE, ORANGE, GREEN)
+_DPI = 120
+# Matplotlib shares its font cache and text paths between figures.
+_LOCK = threading.Lock()
+
+
+def rendered(report: AnyReport, format: Literal["png", "svg"]) -> bytes:
+    """The figure of a report as a file's bytes."""
+    with _LOCK:
+        figure = draw(report)
+        target = io.BytesIO()
+        # No date: the same report gives the same bytes.
+        metadata = {"Date": None} if format == "svg" else {"Software": None}
+        figure.savefig(target, format=format, dpi=_DPI, metadata=metadata)
+        return target.getvalue()
+
+
+def draw(report: AnyReport) -> Figure:
+    """The figure of a report.
+
+    Raises
+    ------
+    ImportError
+        Without matplotlib; the message says how to install it.
+    """
+    try:
+        from matplotlib.figure import Figure as NewFigure
+    except ImportError as error:
+        raise ImportError("figures need matplotlib: pip install 'graspdb[plot]'") from error
+    if isinstance(report, ConvergenceReport):
+        figure = NewFigure(figsize=(8.0, 6.4), layout="constrained")
+        _convergence(figure, report)
+    elif isinstance(report, AnisotropyReport):
+        figure = NewFigure(figsize=(14.0, 11.5))
+        _anisotropy(figure, report)
+    else:
+        figure = NewFigure(figsize=(6.6, 7.2), layout="constrained")
+        _calibration(figure, report)
+    return figure
+
+
+def _title(figure: Figure, report: AnyReport, kind: str) -> None:
+    of = ", ".join(x for x in (report.gripper, report.protocol, report.source) if x)
+    title = f"{report.object}: {kind}" + (f" ({of})" if of else "") + f", revision {report.revision}"
+    figure.suptitle(f"{title}\n{_wrapped(report.text, round(11 * figure.get_figwidth()))}", fontsize=10)
+
+
+def _wrapped(text: str, width: int) -> str:
+    lines = [""]
+    for word in text.split():
+        if len(lines[-1]) + len(word) + 1 > width and lines[-1]:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return "\n".join(lines)
+
+
+def _plain(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+# -- convergence
+
+
+def _convergence(figure: Figure, report: ConvergenceReport) -> None:
+    _title(figure, report, "are there enough grasps?")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for curve, colour in zip(report.curves, _COLOURS, strict=False):
+        grasps = [point.grasps for point in curve.points]
+        kernel = curve.kernel
+        widths = f"{1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°"
+        top.errorbar(
+            grasps,
+            [point.similarity for point in curve.points],
+            yerr=[point.deviation for point in curve.points],
+            color=colour,
+            marker="o",
+            markersize=4,
+            capsize=3,
+            linewidth=1.5,
+            label=f"{curve.label} ({widths})",
+        )
+        bottom.errorbar(
+            grasps,
+            [point.log_likelihood for point in curve.points],
+            yerr=[point.log_likelihood_error for point in curve.points],
+            color=colour,
+            marker="s",
+            markersize=4,
+            capsize=3,
+            linewidth=1.5,
+        )
+        needed = curve.verdict.needed
+        if needed.low is not None and needed.high is not None and needed.high > needed.low:
+            top.axvspan(needed.low, needed.high, color=colour, alpha=0.12, linewidth=0)
+        if needed.value is not None:
+            word = "extrapolated" if curve.verdict.extrapolated else "reached"
+            top.axvline(
+                needed.value, color=colour, linestyle=":", linewidth=1.2,
+                label=f"{curve.verdict.target:g} {word} at {needed.value:,.0f} grasps"
+                f" ({_number(needed.low)} to {_number(needed.high)})",
+            )  # fmt: skip
+    target = report.curves[0].verdict.target
+    top.axhline(target, color=GREY, linestyle="--", linewidth=1, label=f"target {target:g}")
+    top.set_xscale("log")
+    top.set_ylabel(f"similarity s (eq 9)\nbars: deviation of {report.replicates} replicates")
+    top.set_ylim(top=1.0)
+    top.legend(fontsize=8, loc="lower right", framealpha=0.9)
+    bottom.set_ylabel("held-out log density\n[nats of 1/(m³ rad³)]")
+    bottom.set_xlabel(
+        f"successful grasps (means over {report.subsets} subsets; {report.held_out:,} held out)"
+    )
+    for axes in (top, bottom):
+        _plain(axes)
+
+
+def _number(value: float | None) -> str:
+    return "can't be told" if value is None else f"{value:,.0f}"
+
+
+# -- anisotropy
+
+
+def _anisotropy(figure: Figure, report: AnisotropyReport) -> None:
+    frame = "gripper" if report.alignment == "gripper" else f"{report.alignment}'s axes"
+    _title(figure, report, f"what a success tells about its vicinity ({report.method}, {frame})")
+    # Placed by hand: a layout that measures every label takes seconds for as many axes.
+    rows = [
+        figure.add_gridspec(1, columns, left=0.06, right=right, bottom=bottom, top=top, wspace=space)
+        for columns, right, bottom, top, space in (
+            (len(report.translations), 0.9, 0.69, 0.88, 0.12),
+            (len(report.rotations), 0.9, 0.32, 0.63, 0.2),
+            (len(report.tolerances), 0.98, 0.05, 0.22, 0.08),
+        )
+    ]
+    image: Any = None
+    for i, histogram in enumerate(report.translations):
+        axes = figure.add_subplot(rows[0][0, i])
+        image = _heat(axes, histogram, 1e3)
+        low, high = histogram.slice_m or (0.0, 0.0)
+        axes.set_title(f"z {1e3 * low:.0f} to {1e3 * high:.0f} mm, n = {_total(histogram)}", fontsize=8)
+        axes.set_xlabel("x [mm]", fontsize=8)
+        if i == 0:
+            axes.set_ylabel("y [mm]", fontsize=8)
+        else:
+            axes.set_yticklabels([])
+    for i, histogram in enumerate(report.rotations):
+        axes = figure.add_subplot(rows[1][0, i])
+        image = _heat(axes, histogram, 180.0 / math.pi)
+        first, second = (name[1:] for name in histogram.axes)
+        axes.set_title(f"rotation about {first}, then {second}; n = {_total(histogram)}", fontsize=8)
+        axes.set_xlabel(f"about {first} [deg]", fontsize=8)
+        axes.set_ylabel(f"about {second} [deg]", fontsize=8)
+    bar = figure.colorbar(image, cax=figure.add_axes((0.93, 0.36, 0.015, 0.5)))
+    bar.set_label("share of displaced grasps that succeed (hatched: none tried)", fontsize=8)
+    for i, item in enumerate(report.tolerances):
+        _profile(figure.add_subplot(rows[2][0, i]), item, report.level, first=i == 0)
+
+
+def _total(histogram: AnisotropyHistogram) -> str:
+    return f"{sum(map(sum, histogram.count)):,}"
+
+
+def _heat(axes: Axes, histogram: AnisotropyHistogram, factor: float) -> Any:
+    value = _array(histogram.probability)
+    axes.set_facecolor("white")
+    x, y = (factor * np.asarray(edge) for edge in histogram.edges)
+    axes.fill_between(
+        [x[0], x[-1]], y[0], y[-1], facecolor="white", edgecolor="0.8", hatch="////", linewidth=0
+    )
+    image = axes.pcolormesh(
+        x, y, np.ma.masked_invalid(value.T), cmap="viridis", vmin=0.0, vmax=1.0, linewidth=0, rasterized=True
+    )
+    axes.plot(0.0, 0.0, marker="+", color="white", markersize=7, markeredgewidth=1.6)
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7)
+    return image
+
+
+def _array(values: Sequence[Sequence[float | None]]) -> Floats:
+    return np.array([[math.nan if v is None else v for v in row] for row in values], dtype=np.float64)
+
+
+def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool) -> None:
+    turn = item.unit == "rad"
+    factor, unit = (180.0 / math.pi, "deg") if turn else (1e3, "mm")
+    name = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
+    at = factor * np.asarray(item.displacement)
+    if len(at):
+        axes.fill_between(
+            at, item.profile_low, item.profile_high, color=BLUE, alpha=0.2, linewidth=0,
+            label=f"{level:.0%} interval",
+        )  # fmt: skip
+        axes.plot(at, item.probability, color=BLUE, marker=".", markersize=4, linewidth=1.2)
+    axes.axhline(0.5, color=GREY, linestyle="--", linewidth=0.8)
+    if item.half_width is None:
+        told = "nothing tried"
+    else:
+        more = "> " if item.beyond else "< " if item.within else ""
+        told = f"{more}{factor * item.half_width:.0f} {unit}"
+        if item.low is not None and item.high is not None and not more:
+            told += f" ({factor * item.low:.0f} to {factor * item.high:.0f})"
+        for end, sign in ((item.minus, -1.0), (item.plus, 1.0)):
+            if end is not None:
+                axes.axvline(sign * factor * end, color=ORANGE, linestyle=":", linewidth=1.2)
+    axes.set_title(f"{name}: {told}\nn = {sum(item.count):,}", fontsize=8)
+    axes.set_ylim(0.0, 1.02)
+    axes.set_xlabel(f"[{unit}]", fontsize=8)
+    axes.tick_params(labelsize=7)
+    if first:
+        axes.set_ylabel("share that succeeds\n(others unchanged)", fontsize=8)
+    else:
+        axes.set_yticklabels([])
+    _plain(axes)
+
+
+# -- calibration
+
+
+def _calibration(figure: Figure, report: CalibrationReport) -> None:
+    _title(figure, report, "can success_probability be believed?")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1.3))
+    known = [item for item in report.bins if item.predicted is not None and item.observed is not None]
+    predicted = np.array([item.predicted for item in known], dtype=np.float64)
+    observed = np.array([item.observed for item in known], dtype=np.float64)
+    low = np.array([item.low if item.low is not None else item.observed for item in known], dtype=np.float64)
+    high = np.array(
+        [item.high if item.high is not None else item.observed for item in known], dtype=np.float64
+    )
+    top.plot([0, 1], [0, 1], color=GREY, linestyle="--", linewidth=1, label="as predicted")
+    top.axhline(
+        report.share, color=GREEN, linestyle=":", linewidth=1.2, label=f"all attempts: {report.share:.3f}"
+    )
+    top.errorbar(
+        predicted,
+        observed,
+        yerr=[np.maximum(observed - low, 0.0), np.maximum(high - observed, 0.0)],
+        color=BLUE,
+        marker="o",
+        markersize=5,
+        capsize=3,
+        linewidth=1.5,
+        label=f"held-out attempts, {report.level:.0%} intervals over {report.blocks} blocks",
+    )
+    top.set_ylabel("share that succeeded")
+    top.set_xlim(0, 1)
+    top.set_ylim(0, 1.02)
+    top.legend(fontsize=8, loc="upper left", framealpha=0.9)
+    scores = [
+        f"Brier skill {_told(report.skill.value)} ({_told(report.skill.low)} to {_told(report.skill.high)})"
+    ]
+    if report.free_skill is not None:
+        scores.append(f"not colliding {_told(report.free_skill.value)}")
+    scores += [
+        f"ECE above 0.1: {_told(report.ece)}",
+        f"AUC: probability {_told(report.auc_probability)}, density {_told(report.auc_density)}",
+    ]
+    top.text(
+        0.98, 0.03, "\n".join(scores), transform=top.transAxes, ha="right", va="bottom", fontsize=8,
+        bbox={"facecolor": "white", "edgecolor": "0.8", "boxstyle": "round"},
+    )  # fmt: skip
+    edges = [item.lower for item in report.bins]
+    counts = [item.count for item in report.bins]
+    bottom.bar(
+        edges, counts, width=[item.upper - item.lower for item in report.bins], align="edge", color=BLUE,
+        edgecolor="white",
+    )  # fmt: skip
+    for item in report.bins:
+        if item.count:
+            bottom.annotate(
+                f"{item.count:,}", (0.5 * (item.lower + item.upper), item.count), ha="center", va="bottom",
+                fontsize=7,
+            )  # fmt: skip
+    bottom.set_yscale("log")
+    bottom.set_ylim(top=10 * max(counts, default=1))
+    bottom.set_ylabel("attempts judged")
+    bottom.set_xlabel("predicted success probability")
+    for axes in (top, bottom):
+        _plain(axes)
+
+
+def _told(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f}"

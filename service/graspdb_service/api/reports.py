@@ -1,0 +1,177 @@
+"""Reports on an object's trials: ``/objects/{id}/reports`` and the runs that compute them."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request, Response
+
+from graspdb.wire.kernels import Alignment
+from graspdb.wire.reports import (
+    REPORTS,
+    AnisotropyReport,
+    CalibrationReport,
+    ConvergenceReport,
+    Matching,
+    Method,
+    ReportRun,
+)
+from graspdb_service import __version__
+from graspdb_service.api.queries import SelectionQuery
+from graspdb_service.api.routing import Ctx, etag, not_modified, scope
+from graspdb_service.problems import ProblemError
+from graspdb_service.storage.report_runs import RunRow
+from graspdb_service.usecases import report_runs
+from graspdb_service.usecases.context import Context
+
+router = APIRouter(tags=["reports"])
+
+Format = Literal["json", "png", "svg"]
+_MEDIA: dict[str, Format] = {
+    "application/json": "json",
+    "image/png": "png",
+    "image/svg+xml": "svg",
+}
+_TYPES = {name: media for media, name in _MEDIA.items()}
+_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The report; its figure where Accept prefers image/png or image/svg+xml",
+        "content": {"image/png": {}, "image/svg+xml": {}},
+    },
+    202: {"model": ReportRun, "description": "Under way: Location says where it will be"},
+}
+
+
+class ConvergenceQuery(SelectionQuery):
+    """Which trials and kernel; ``matching`` says how the isotropic kernel beside a stored one is chosen."""
+
+    matching: Matching | None = None
+
+
+class AnisotropyQuery(SelectionQuery):
+    """``empirical`` counts pairs of trials; ``density`` compares the density of successes with attempts'."""
+
+    method: Method = "empirical"
+    alignment: Alignment = "gripper"
+
+
+@router.get(
+    "/objects/{id}/reports/convergence",
+    response_model=ConvergenceReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_convergence(
+    ctx: Ctx, id: str, request: Request, query: Annotated[ConvergenceQuery, Query()]
+) -> Response:
+    """Have we tried enough? Similarity and held-out likelihood against the number of successes."""
+    return _answer(ctx, id, "convergence", request, query, {"matching": query.matching})
+
+
+@router.get(
+    "/objects/{id}/reports/anisotropy",
+    response_model=AnisotropyReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_anisotropy(
+    ctx: Ctx, id: str, request: Request, query: Annotated[AnisotropyQuery, Query()]
+) -> Response:
+    """How far off may the gripper be? Success by displacement from successes, tolerances by axis."""
+    options = {"method": query.method, "alignment": query.alignment}
+    return _answer(ctx, id, "anisotropy", request, query, options)
+
+
+@router.get(
+    "/objects/{id}/reports/calibration",
+    response_model=CalibrationReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_calibration(
+    ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQuery, Query()]
+) -> Response:
+    """Can success probabilities be believed? Judged on outcomes of blocks of space left out."""
+    return _answer(ctx, id, "calibration", request, query, {})
+
+
+@router.get("/report-runs/{id}", **scope("read"))
+def get_run(ctx: Ctx, id: str) -> ReportRun:
+    """A report's computation: state, progress, and the report once it is done."""
+    return report_runs.model(ctx.reports.get(id))
+
+
+@router.post("/report-runs/{id}/cancel", **scope("read"))
+def cancel_run(ctx: Ctx, id: str) -> ReportRun:
+    """Stop computing; a run that has ended stays as it is."""
+    return report_runs.model(ctx.reports.cancel(id))
+
+
+def _answer(
+    ctx: Context,
+    slug: str,
+    report: str,
+    request: Request,
+    query: SelectionQuery,
+    options: Mapping[str, str | None],
+) -> Response:
+    wanted = _wanted(request.headers.get("accept", ""))
+    if wanted != "json" and importlib.util.find_spec("matplotlib") is None:
+        raise ProblemError(
+            406,
+            "not-acceptable",
+            "Figures need matplotlib on the server: pip install 'graspdb[plot]'; take JSON",
+        )
+    run = ctx.reports.report(slug, report, query, options)
+    if run.state == "running":
+        return Response(
+            report_runs.model(run).model_dump_json(),
+            status_code=202,
+            media_type="application/json",
+            headers={"Location": f"/report-runs/{run.id}", "Retry-After": "2"},
+        )
+    tag = etag(run.object_id, run.revision, run.parameters_key[:24], wanted, __version__)
+    headers = {"ETag": tag, "Vary": "Accept"}
+    known = not_modified(request, tag)
+    if known is not None:
+        return known
+    assert run.result is not None
+    body = run.result.encode() if wanted == "json" else _figure(run, wanted)
+    return Response(body, media_type=_TYPES[wanted], headers=headers)
+
+
+def _wanted(accept: str) -> Format:
+    """The format with the highest weight, JSON among equals.
+
+    Raises
+    ------
+    ProblemError
+        406 where none of ours is accepted.
+    """
+    weights: dict[Format, float] = {}
+    for part in accept.split(",") if accept.strip() else ["*/*"]:
+        media, *parameters = (item.strip().lower() for item in part.split(";"))
+        weight = 1.0
+        for item in parameters:
+            name, _, value = item.partition("=")
+            if name.strip() == "q":
+                try:
+                    weight = float(value)
+                except ValueError:
+                    weight = 0.0
+        for known, name in _MEDIA.items():
+            whole = media in ("*/*", known.partition("/")[0] + "/*")
+            if media == known or (whole and name not in weights):
+                weights[name] = weight
+    accepted = {name: weight for name, weight in weights.items() if weight > 0.0}
+    if not accepted:
+        raise ProblemError(406, "not-acceptable", f"A report comes as {', '.join(_MEDIA)}")
+    return max(_MEDIA.values(), key=lambda name: accepted.get(name, 0.0))
+
+
+def _figure(run: RunRow, wanted: Literal["png", "svg"]) -> bytes:
+    from graspdb import figures
+
+    return figures.rendered(REPORTS[run.report].model_validate_json(run.result or ""), wanted)

@@ -1,0 +1,185 @@
+"""Report runs: one row for an object, revision and parameters, leased to whoever computes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, delete, or_, select, update
+
+from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.tables import objects, report_runs
+from graspdb_service.storage.upsert import insert
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """A run as stored. ``object`` is the object's slug, ``live`` whether somebody holds its lease.
+
+    ``problem`` is a problem's members where a request was at fault; null in a failed run where the service
+    was, or where its process died.
+    """
+
+    id: str
+    object_id: int
+    object: str
+    revision: int
+    report: str
+    parameters_key: str
+    parameters: dict[str, Any]
+    state: str
+    progress: float
+    result: str | None
+    problem: dict[str, Any] | None
+    created_at: datetime
+    finished_at: datetime | None
+    live: bool
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a run computes."""
+
+    object_id: int
+    revision: int
+    report: str
+    parameters_key: str
+    parameters: dict[str, Any]
+
+
+def get(tx: Tx, id: str) -> RunRow | None:
+    """The run with this id."""
+    return _one(tx, report_runs.c.id == id)
+
+
+def find(tx: Tx, question: Question) -> RunRow | None:
+    """The run of a question, whatever became of it."""
+    return _one(tx, _same(question))
+
+
+def ask(tx: Tx, question: Question, *, id: str, lease_id: str, lease_s: float) -> bool:
+    """Take a question's run: make it, or start anew what was cancelled, failed through no fault of the
+    request, or whose holder is gone. False where it is done or somebody else's.
+    """
+    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
+    made = tx.execute(
+        insert(tx, report_runs)
+        .values(
+            id=id,
+            object_id=question.object_id,
+            revision=question.revision,
+            report=question.report,
+            parameters_key=question.parameters_key,
+            parameters=question.parameters,
+            state="running",
+            progress=0.0,
+            created_at=datetime.now(UTC),
+            **lease,
+        )
+        .on_conflict_do_nothing()
+        .returning(report_runs.c.id)
+    ).first()
+    if made is None:
+        return _take(tx, _same(question), lease)
+    # Answers to the same question about a past state of the object are asked for no more.
+    tx.execute(
+        delete(report_runs).where(
+            report_runs.c.object_id == question.object_id,
+            report_runs.c.parameters_key == question.parameters_key,
+            report_runs.c.revision < question.revision,
+            or_(report_runs.c.state != "running", report_runs.c.lease_expires_at < unix_now()),
+        )
+    )
+    return True
+
+
+def take_over(tx: Tx, id: str, *, lease_id: str, lease_s: float) -> bool:
+    """Take a run whose holder is gone."""
+    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
+    return _take(tx, and_(report_runs.c.id == id, report_runs.c.state == "running"), lease)
+
+
+def renew(tx: Tx, held: Mapping[str, tuple[str, float]], *, lease_s: float) -> set[str]:
+    """Keep runs by ``{id: (lease_id, progress)}``; those that are still held."""
+    kept = set()
+    for id, (lease_id, progress) in sorted(held.items()):
+        statement = (
+            update(report_runs)
+            .where(_held(id, lease_id))
+            .values(progress=progress, lease_expires_at=unix_now() + lease_s)
+        )
+        if tx.execute(statement).rowcount:
+            kept.add(id)
+    return kept
+
+
+def finish(
+    tx: Tx,
+    id: str,
+    lease_id: str,
+    *,
+    result: str | None = None,
+    problem: dict[str, Any] | None = None,
+) -> bool:
+    """Store how a run ended: done with its result, else failed; False where it is held no more."""
+    values = {
+        "state": "failed" if result is None else "done",
+        "progress": 1.0,
+        "result": result,
+        "problem": problem,
+        "lease_id": None,
+        "lease_expires_at": None,
+        "finished_at": datetime.now(UTC),
+    }
+    return bool(tx.execute(update(report_runs).where(_held(id, lease_id)).values(**values)).rowcount)
+
+
+def release(tx: Tx, id: str, lease_id: str) -> None:
+    """Give a run up, for whoever comes next."""
+    tx.execute(update(report_runs).where(_held(id, lease_id)).values(lease_expires_at=0.0))
+
+
+def cancel(tx: Tx, id: str) -> bool:
+    """End a run that is still under way; False where it is not."""
+    statement = (
+        update(report_runs)
+        .where(report_runs.c.id == id, report_runs.c.state == "running")
+        .values(state="cancelled", lease_id=None, lease_expires_at=None, finished_at=datetime.now(UTC))
+    )
+    return bool(tx.execute(statement).rowcount)
+
+
+def _take(tx: Tx, which: ColumnElement[bool], lease: dict[str, Any]) -> bool:
+    free = or_(
+        report_runs.c.state == "cancelled",
+        and_(report_runs.c.state == "failed", report_runs.c.problem.is_(None)),
+        and_(report_runs.c.state == "running", report_runs.c.lease_expires_at < unix_now()),
+    )
+    fresh = {"state": "running", "progress": 0.0, "problem": None, "finished_at": None}
+    return bool(tx.execute(update(report_runs).where(which, free).values(**fresh, **lease)).rowcount)
+
+
+def _held(id: str, lease_id: str) -> ColumnElement[bool]:
+    return and_(report_runs.c.id == id, report_runs.c.lease_id == lease_id, report_runs.c.state == "running")
+
+
+def _same(question: Question) -> ColumnElement[bool]:
+    return and_(
+        report_runs.c.object_id == question.object_id,
+        report_runs.c.parameters_key == question.parameters_key,
+        report_runs.c.revision == question.revision,
+    )
+
+
+def _one(tx: Tx, which: ColumnElement[bool]) -> RunRow | None:
+    stored = [report_runs.c[name] for name in RunRow.__dataclass_fields__ if name in report_runs.c]
+    live = and_(report_runs.c.lease_expires_at.is_not(None), report_runs.c.lease_expires_at >= unix_now())
+    query = (
+        select(*stored, objects.c.slug.label("object"), live.label("live"))
+        .join(objects, objects.c.id == report_runs.c.object_id)
+        .where(which)
+    )
+    row = tx.execute(query).first()
+    return None if row is None else RunRow(**{**row._mapping, "live": bool(row.live)})

@@ -1,0 +1,204 @@
+"""What a success tells about its vicinity: the anisotropy report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire.reports import (
+    AnisotropyHistogram,
+    AnisotropyReport,
+    AnisotropyTolerance,
+)
+from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
+from graspdb_density.anisotropy import (
+    LEAST_SUCCESSES,
+    Histogram,
+    Tolerance,
+    attempt_density,
+    empirical,
+    smoothed,
+)
+from graspdb_density.rows import Progress
+from graspdb_service.problems import conflict
+from graspdb_service.usecases import shapes
+from graspdb_service.usecases.alltrials import AllTrials
+from graspdb_service.usecases.densities import Built
+from graspdb_service.usecases.reportparts import (
+    LEVEL,
+    Sources,
+    attempts_of,
+    finite,
+    head,
+    need_failures,
+    said,
+)
+
+Floats = NDArray[np.float64]
+
+#: Attempts that stand for all where their density is asked for.
+_LOCAL_ATTEMPTS = 200_000
+#: The middle bin of a profile, whose pairs hardly differ, ends before this share of its reach.
+_MIDDLE = 0.03
+
+
+def anisotropy_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> AnisotropyReport:
+    method, alignment = options["method"], options["alignment"]
+    frames = shapes.principal_axes(built.object_row) if alignment == "object" else None
+    successes = built.selected.successes
+    if successes < LEAST_SUCCESSES:
+        raise conflict(
+            "too-few-trials",
+            f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
+            f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
+        )
+    everything = attempts_of(sources, built)
+    need_failures(everything, "What a success tells about its vicinity", 1)
+    weights = None
+    if not np.isnan(everything.proposal).all() and np.nanstd(everything.proposal[everything.success]) > 0.0:
+        weights = importance_weights(everything.proposal)
+    density = built.density
+    if method == "empirical":
+        found = said(
+            lambda: empirical(
+                everything.position,
+                everything.quaternion,
+                everything.success,
+                rotation_keys=None if everything.keys is None else everything.keys[0],
+                position_keys=None if everything.keys is None else everything.keys[1],
+                alignment=_alignment(alignment),
+                frames=frames,
+                symmetric=bool(everything.symmetric.all()),
+                weights=weights,
+                level=LEVEL,
+                progress=progress,
+            )
+        )
+    else:
+        assert density is not None
+        found = said(
+            lambda: smoothed(
+                density,
+                _local_attempts(everything, density.kernel),
+                alignment=_alignment(alignment),
+                frames=frames,
+                level=LEVEL,
+                threads=sources.threads,
+                progress=progress,
+            )
+        )
+    tolerances = [_tolerance(item) for item in found.tolerances]
+    unknown = [item.axis for item in tolerances if item.half_width is None]
+    warnings = (
+        []
+        if not unknown
+        else [
+            f"nothing was tried displaced along or about {', '.join(unknown)} alone: a grid's trials, or"
+            " many more, tell that"
+        ]
+    )
+    return AnisotropyReport.model_validate(
+        {
+            **head(built),
+            "text": _tolerances_text(tolerances, alignment),
+            "warnings": warnings,
+            "method": method,
+            "alignment": alignment,
+            "level": LEVEL,
+            "grasps": found.grasps,
+            "attempts": len(everything),
+            "translation_pairs": found.translation_pairs,
+            "rotation_pairs": found.rotation_pairs,
+            "kernel": None if method == "empirical" else built.kernel,
+            "tolerances": tolerances,
+            "translations": [_histogram(item) for item in found.translations],
+            "rotations": [_histogram(item) for item in found.rotations],
+        }
+    )
+
+
+def _alignment(name: str) -> Any:
+    return name
+
+
+def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Floats, Floats], Floats]:
+    """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
+    rows = np.arange(len(everything))
+    if len(rows) > _LOCAL_ATTEMPTS:
+        rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_LOCAL_ATTEMPTS, replace=False))
+    density = GraspDensity.build(
+        everything.position[rows],
+        everything.quaternion[rows],
+        kernel=kernel,
+        symmetric=everything.symmetric[rows],
+    )
+    local, share = attempt_density(density), len(everything) / len(rows)
+    return lambda p, q: share * local(p, q)
+
+
+def _tolerance(item: Tolerance) -> AnisotropyTolerance:
+    # Where even the nearest trials mostly fail the crossing lies between them and the grasp itself.
+    distance = np.abs(item.displacement)
+    off = distance > _MIDDLE * distance.max(initial=0.0)
+    nearest = float(distance[off].min()) if off.any() else math.nan
+    within = bool(math.isfinite(item.half_width) and item.half_width < nearest)
+    return AnisotropyTolerance(
+        axis=item.axis,
+        unit="rad" if item.axis.startswith("r") else "m",
+        half_width=finite(nearest if within else item.half_width),
+        low=None if within else finite(item.low),
+        high=None if within else finite(item.high),
+        minus=finite(item.minus),
+        plus=finite(item.plus),
+        beyond=item.beyond,
+        within=within,
+        displacement=item.displacement.tolist(),
+        probability=item.probability.tolist(),
+        profile_low=item.profile_low.tolist(),
+        profile_high=item.profile_high.tolist(),
+        count=item.count.tolist(),
+    )
+
+
+def _histogram(item: Histogram) -> AnisotropyHistogram:
+    def numbers(values: Floats) -> list[list[float | None]]:
+        return [[finite(value) for value in row] for row in values.tolist()]
+
+    return AnisotropyHistogram(
+        axes=item.axes,
+        edges=(item.edges[0].tolist(), item.edges[1].tolist()),
+        slice_m=item.slice_m,
+        probability=numbers(item.probability),
+        low=numbers(item.low),
+        high=numbers(item.high),
+        count=item.count.tolist(),
+    )
+
+
+def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> str:
+    parts = []
+    for item in tolerances:
+        if item.half_width is None:
+            continue
+        turn = item.unit == "rad"
+        factor, unit = (180.0 / math.pi, "deg") if turn else (1e3, "mm")
+        more = "more than " if item.beyond else "less than " if item.within else ""
+        between = ""
+        if item.low is not None and item.high is not None and not more:
+            between = f" ({factor * item.low:.0f} to {factor * item.high:.0f})"
+        way = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
+        parts.append(f"{more}{factor * item.half_width:.0f} {unit}{between} {way}")
+    if not parts:
+        return "No tolerance can be told: no trial is displaced from a success along or about one axis alone."
+    axes = (
+        "the gripper's axes"
+        if alignment == "gripper"
+        else "the object's principal axes, rotations the gripper's"
+    )
+    return f"A good grasp forgives {', '.join(parts)} ({axes})."

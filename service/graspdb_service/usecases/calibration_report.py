@@ -1,0 +1,171 @@
+"""Can the numbers be believed? The calibration report."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire.reports import (
+    CalibrationBin,
+    CalibrationReport,
+)
+from graspdb_density import GraspDensity, SuccessModel, importance_weights
+from graspdb_density.anisotropy import (
+    LEAST_SUCCESSES,
+)
+from graspdb_density.calibration import area_under_curve, assign_blocks, calibrate
+from graspdb_density.rows import Progress
+from graspdb_service.problems import conflict
+from graspdb_service.usecases.alltrials import AllTrials
+from graspdb_service.usecases.densities import Built
+from graspdb_service.usecases.reportparts import (
+    LEVEL,
+    Sources,
+    attempts_of,
+    finite,
+    head,
+    interval,
+    need_failures,
+    said,
+)
+
+Floats = NDArray[np.float64]
+
+#: Outcomes judged: of those that collided fewer, for nearly all are right.
+_JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
+LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
+_FOLDS = 5
+
+
+def calibration_report(sources: Sources, built: Built, progress: Progress) -> CalibrationReport:
+    everything = attempts_of(sources, built)
+    successes = int(everything.success.sum())
+    if len(everything) < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
+        raise conflict(
+            "too-few-trials",
+            f"Calibration needs at least {LEAST_ATTEMPTS} attempts and {LEAST_SUCCESSES} successes in them,"
+            f" of sources that post failures, too; there are {len(everything)} and {successes}",
+        )
+    need_failures(everything, "Calibration", LEAST_FAILURES)
+    density = built.density
+    assert density is not None
+    kernel = density.kernel
+    test = sources.scenes.test(built.object_row, built.selected)
+    edge = 3.0 * kernel.sigma_position_m
+    blocks = said(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
+    judged, weights = _judged(everything)
+    p, q = everything.position[judged], everything.quaternion[judged]
+    won, collided = everything.success[judged], everything.collided[judged]
+    free = None if test is None else test.free(p, q, threads=sources.threads)
+    predicted, ranked = np.zeros(len(judged)), np.full(len(judged), -np.inf)
+    learned = everything.collided if test is not None else np.zeros(len(everything), dtype=bool)
+    proposal_known = not np.isnan(everything.proposal).all()
+    for fold in range(blocks.folds):
+        train = np.flatnonzero((blocks.fold != fold) & ~learned)
+        held = np.flatnonzero(blocks.fold[judged] == fold)
+        progress(fold / blocks.folds)
+        if not held.size or not train.size:
+            continue
+        model = SuccessModel.build(
+            everything.position[train],
+            everything.quaternion[train],
+            everything.success[train],
+            kernel=kernel,
+            symmetric=everything.symmetric[train],
+        )
+        progress((fold + 0.5) / blocks.folds)
+        predicted[held] = model.evaluate(p[held], q[held], threads=sources.threads).probability
+        kept = train[everything.success[train]]
+        if kept.size:
+            own = GraspDensity.build(
+                everything.position[kept],
+                everything.quaternion[kept],
+                kernel=kernel,
+                weights=importance_weights(everything.proposal[kept]) if proposal_known else None,
+                symmetric=everything.symmetric[kept],
+            )
+            ranked[held] = own.log_density(p[held], q[held], threads=sources.threads)
+    if free is not None:
+        predicted[~free] = 0.0
+    block = blocks.block[judged]
+    whole = calibrate(predicted, won, weights=weights, blocks=block, level=LEVEL)
+    apart = None
+    if test is not None and collided.any() and won[~collided].any() and not won[~collided].all():
+        alone = calibrate(
+            predicted[~collided],
+            won[~collided],
+            weights=weights[~collided],
+            blocks=block[~collided],
+            level=LEVEL,
+        )
+        apart = interval(alone.skill, alone.skill_low, alone.skill_high)
+    share = float(np.average(won, weights=weights))
+    report = CalibrationReport(
+        **head(built),
+        text="",
+        level=LEVEL,
+        kernel=built.kernel,
+        attempts=len(everything),
+        successes=successes,
+        judged=len(judged),
+        blocks=blocks.count,
+        block_edge_m=edge,
+        folds=blocks.folds,
+        collisions_known=test is not None,
+        share=share,
+        brier=whole.brier,
+        skill=interval(whole.skill, whole.skill_low, whole.skill_high),
+        free_skill=apart,
+        ece=finite(whole.ece),
+        auc_probability=finite(whole.auc),
+        auc_density=finite(area_under_curve(ranked, won, weights=weights)),
+        bins=[
+            CalibrationBin(
+                lower=item.lower,
+                upper=item.upper,
+                count=item.count,
+                weight=item.weight,
+                predicted=finite(item.predicted),
+                observed=finite(item.observed),
+                low=finite(item.low),
+                high=finite(item.high),
+            )
+            for item in whole.bins
+        ],
+        warnings=[]
+        if test is not None
+        else ["mesh or gripper is not known: collisions count as ordinary failures, which costs much skill"],
+    )
+    return report.model_copy(update={"text": _calibration_text(report)})
+
+
+def _judged(everything: AllTrials) -> tuple[NDArray[np.int64], Floats]:
+    """Rows to judge and what each stands for: drawn at random from those that collided and from the rest."""
+    rng = np.random.default_rng(0)
+    rows, weights = [], []
+    for chosen, most in ((~everything.collided, _JUDGED_FREE), (everything.collided, _JUDGED_COLLIDED)):
+        members = np.flatnonzero(chosen)
+        if not members.size:
+            continue
+        drawn = members if members.size <= most else np.sort(rng.choice(members, size=most, replace=False))
+        rows.append(drawn)
+        weights.append(np.full(drawn.size, members.size / drawn.size))
+    return np.concatenate(rows), np.concatenate(weights)
+
+
+def _calibration_text(report: CalibrationReport) -> str:
+    skill = report.skill
+    if skill.value is None:
+        text = "Every judged attempt had the same outcome, so there is nothing to predict."
+    else:
+        between = "" if skill.low is None or skill.high is None else f" ({skill.low:.2f} to {skill.high:.2f})"
+        text = f"Brier skill {skill.value:.2f}{between} on {report.judged:,} attempts it had not seen"
+        text += f" ({report.blocks} blocks of {1e3 * report.block_edge_m:.0f} mm)."
+    if report.ece is not None:
+        text += f" Where it predicts more than 0.1 it is off by {report.ece:.2f} on average."
+    if report.auc_probability is not None and report.auc_density is not None:
+        text += (
+            f" A success ranks above a failure with {report.auc_probability:.2f} by probability, with"
+            f" {report.auc_density:.2f} by density."
+        )
+    return text

@@ -1,0 +1,197 @@
+"""Have we tried enough? The convergence report."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import KernelInfo
+from graspdb.wire.reports import ConvergenceCurve as CurveModel
+from graspdb.wire.reports import (
+    ConvergencePoint,
+    ConvergenceReport,
+    ReportRange,
+)
+from graspdb.wire.reports import Verdict as VerdictModel
+from graspdb_density import GraspDensity, IsotropicKernel
+from graspdb_density.convergence import (
+    ConvergenceCurve,
+    convergence_curve,
+    curve_sizes,
+    needed_ratio,
+    verdict,
+)
+from graspdb_density.matching import Match, match_determinants, match_likelihood
+from graspdb_density.rows import Kernel, KernelRows, Progress
+from graspdb_service.problems import conflict
+from graspdb_service.usecases import shapes
+from graspdb_service.usecases.densities import Built
+from graspdb_service.usecases.reportparts import (
+    LEVEL,
+    Sources,
+    head,
+    interval,
+    said,
+)
+
+Floats = NDArray[np.float64]
+
+SUBSETS, REPLICATES, POINTS = 5, 50, 20_000
+
+
+def convergence_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> ConvergenceReport:
+    density = built.density
+    # Said before anything is computed.
+    said(lambda: curve_sizes(0 if density is None else density.size))
+    assert density is not None
+    matching = options.get("matching") if built.shaped is None else options.get("matching", "determinants")
+    if matching is not None and built.shaped is None:
+        raise conflict(
+            "nothing-to-match", "matching compares an anisotropic kernel with an isotropic one: name kernel="
+        )
+    share = 1.0 if built.shaped is None else 0.5
+    kernel: Kernel = density.kernel if built.shaped is None else built.shaped.kernel
+    frames = None
+    if built.shaped is not None and built.shaped.kernel.frame == "fixed":
+        frames = shapes.principal_axes(built.object_row)
+    curve = _curve(sources, density, kernel, frames, lambda done: progress(share * done))
+    curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
+    extra: dict[str, Any] = {}
+    if built.shaped is not None:
+        match = _matched(sources, density, kernel, frames, str(matching))
+        base = _curve(sources, density, match.kernel, None, lambda done: progress(0.5 + 0.5 * done))
+        curves.append(_curve_model("isotropic, matched", _isotropic_info(match), base))
+        ratio = needed_ratio(curve, base, level=LEVEL)
+        extra = {"matching": matching, "matched": match.reached, "ratio": interval(*ratio)}
+    judged = curves[0].verdict
+    return ConvergenceReport(
+        **head(built),
+        text=_convergence_text(curves[0], extra.get("ratio")),
+        level=LEVEL,
+        held_out=curve.held_out,
+        subsets=SUBSETS,
+        replicates=REPLICATES,
+        curves=curves,
+        warnings=[]
+        if judged.exponent > 0
+        else ["the curve does not rise: it is noise, or all grasps are alike"],
+        **extra,
+    )
+
+
+def _curve(
+    sources: Sources, density: GraspDensity, kernel: Kernel, frames: Floats | None, progress: Progress
+) -> ConvergenceCurve:
+    return said(
+        lambda: convergence_curve(
+            density.positions,
+            density.quaternions_xyzw,
+            kernel,
+            weights=density.weights,
+            symmetric=density.symmetric,
+            frames=frames,
+            subsets=SUBSETS,
+            replicates=REPLICATES,
+            points=POINTS,
+            threads=sources.threads,
+            progress=progress,
+        )
+    )
+
+
+def _matched(
+    sources: Sources, density: GraspDensity, kernel: Kernel, frames: Floats | None, rule: str
+) -> Match:
+    match = match_determinants(kernel)
+    if rule == "determinants":
+        return match
+    order = np.random.default_rng(0).permutation(density.size)
+    held, train = (
+        order[: max(1, min(2_000, density.size // 10))],
+        order[max(1, min(2_000, density.size // 10)) :],
+    )
+    p, q, w = density.positions, density.quaternions_xyzw, density.weights
+
+    def likelihood(used: Kernel) -> float:
+        rows = KernelRows(
+            p[train], q[train], used, weights=w[train], symmetric=density.symmetric[train],
+            frames=None if isinstance(used, IsotropicKernel) else frames,
+        )  # fmt: skip
+        return float(np.average(rows.log_density(p[held], q[held], threads=sources.threads), weights=w[held]))
+
+    return match_likelihood(likelihood(kernel), match.kernel, likelihood)
+
+
+def _isotropic_info(match: Match) -> KernelInfo:
+    return KernelInfo(
+        kind="isotropic",
+        sigma_position_m=match.kernel.sigma_position_m,
+        sigma_rotation_deg=math.degrees(match.kernel.sigma_rotation),
+        rule=f"matched by {match.rule}",
+    )
+
+
+def _curve_model(label: str, kernel: KernelInfo, curve: ConvergenceCurve) -> CurveModel:
+    judged = verdict(curve, level=LEVEL)
+    needed = judged.needed
+    least, best, most = judged.more
+    return CurveModel(
+        label=label,
+        kernel=kernel,
+        points=[
+            ConvergencePoint(
+                grasps=point.grasps,
+                similarity=point.similarity,
+                deviation=point.deviation,
+                log_likelihood=point.log_likelihood,
+                log_likelihood_error=point.log_likelihood_error,
+            )
+            for point in curve.points
+        ],
+        verdict=VerdictModel.model_validate(
+            {
+                "state": judged.state,
+                "grasps": judged.grasps,
+                "target": needed.target,
+                "similarity": interval(judged.similarity, judged.low, judged.high),
+                "needed": interval(needed.grasps, needed.low, needed.high),
+                "more": interval(best, least, most),
+                "extrapolated": needed.extrapolated,
+                "exponent": judged.exponent,
+            }
+        ),
+    )
+
+
+def _convergence_text(curve: CurveModel, ratio: ReportRange | None) -> str:
+    judged = curve.verdict
+    s = judged.similarity
+    told = f"similarity {s.value:.3f} ({s.low:.3f} to {s.high:.3f})"
+    if judged.state == "enough":
+        text = f"{judged.grasps:,} successful grasps are enough: {told} reaches {judged.target:g}."
+    elif judged.state == "borderline":
+        text = f"{judged.grasps:,} successful grasps are borderline: {told} holds {judged.target:g}."
+    else:
+        text = f"{judged.grasps:,} successful grasps are not enough: {told} is below {judged.target:g}."
+    if judged.state != "enough":
+        more = judged.more
+        if more.value is None:
+            text += " How many more it takes can't be told from this curve."
+        else:
+            least = 0 if more.low is None else more.low
+            high = "more than can be told" if more.high is None else f"{_rounded(more.high):,}"
+            text += f" About {_rounded(more.value):,} more are needed ({_rounded(least):,} to {high})."
+    if ratio is not None and ratio.value is not None:
+        between = "" if ratio.low is None or ratio.high is None else f" ({ratio.low:.2f} to {ratio.high:.2f})"
+        text += f" It takes {ratio.value:.2f}{between} times the grasps of the matched isotropic kernel."
+    return text
+
+
+def _rounded(value: float) -> int:
+    """Two figures: more would be pretence."""
+    return int(round(value, 1 - math.floor(math.log10(value)))) if value >= 1.0 else 0

@@ -1,0 +1,61 @@
+"""The reports, computed: parameters to the documents of :mod:`graspdb.wire.reports`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from graspdb.wire.reports import (
+    AnyReport,
+)
+from graspdb_density.rows import Progress
+from graspdb_service.usecases.anisotropy_report import anisotropy_report
+from graspdb_service.usecases.calibration_report import calibration_report
+from graspdb_service.usecases.convergence_report import convergence_report
+from graspdb_service.usecases.densities import KernelChoice
+from graspdb_service.usecases.reportparts import Sources
+from graspdb_service.usecases.selection import Filters
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Parameters of a report, everything resolved: the same ones give the same report of a revision."""
+
+    report: str
+    filters: Filters
+    kernel: KernelChoice
+    options: dict[str, str]
+
+    def document(self) -> dict[str, Any]:
+        """As a run keeps it."""
+        return {
+            "report": self.report,
+            "filters": vars(self.filters),
+            "kernel": vars(self.kernel),
+            "options": self.options,
+        }
+
+    @classmethod
+    def of(cls, document: dict[str, Any]) -> Asked:
+        return cls(
+            document["report"],
+            Filters(**document["filters"]),
+            KernelChoice(**document["kernel"]),
+            document["options"],
+        )
+
+
+def compute(sources: Sources, slug: str, asked: Asked, progress: Progress) -> AnyReport:
+    """The report.
+
+    Raises
+    ------
+    ProblemError
+        409 where the trials don't suffice, saying what is missing and how much of it.
+    """
+    built = sources.densities.get(slug, asked.filters, asked.kernel)
+    if asked.report == "convergence":
+        return convergence_report(sources, built, asked.options, progress)
+    if asked.report == "anisotropy":
+        return anisotropy_report(sources, built, asked.options, progress)
+    return calibration_report(sources, built, progress)
