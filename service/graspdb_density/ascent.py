@@ -17,14 +17,20 @@ import math
 import numpy as np
 
 from . import compiled, projection
-from .compiler import exact
+from .compiler import exact, fast
 
+F32 = np.float32
 __all__ = ["climb", "score_centres", "thin"]
 
 
 #: Columns of a path: position, quaternion, kernel sum.
 PATH = 8
-_RELAXATION = 1.6
+#: Longest step as a multiple of the mean shift's, and in kernel widths where it is longer than that.
+_LONGEST, _FARTHEST = 40.0, 1.0
+#: A climb gathers kernels anew after so many kernel widths, and before it ends where it has moved more than
+#: the second.
+_STRAYED, _SETTLED = 0.8, 0.3
+_GATHERED = 512
 
 
 @exact
@@ -116,70 +122,184 @@ def thin(positions, quaternions, first, limit, separation_m, separation, twins, 
     return count
 
 
+@fast
+def _exponents(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, out):
+    """Exponents of a run's nearest ends."""
+    for k in range(np.uint64(end - begin)):
+        i = np.uint64(begin) + k
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        out[k] = max(abs(a), abs(b)) - kappa - (dx * dx + dy * dy + dz * dz)
+
+
+@fast
+def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
+    """Kernels whose exponent at a pose is above ``-cut``, into ``near`` (8, ...): as ``data``, but every end
+    (twin, antipode) a kernel of its own with the sign that faces the pose. Answers how many there are.
+    """
+    fx, fy, fz, k = F32(px), F32(py), F32(pz), F32(kappa)
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    least = F32(-cut)
+    count = 0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, compiled.TWIN])
+        for r in range(compiled._runs(start, table, s, px, py, pz, math.sqrt(cut), runs)):
+            begin = runs[r, 0]
+            while begin < runs[r, 1]:
+                stop = min(begin + _GATHERED, runs[r, 1])
+                _exponents(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, buffer)
+                for i in range(stop - begin):
+                    if buffer[i] <= least:
+                        continue
+                    j = begin + i
+                    u0, u1, u2, u3 = data[3, j], data[4, j], data[5, j], data[6, j]
+                    dx, dy, dz = data[0, j] - fx, data[1, j] - fy, data[2, j] - fz
+                    base = -k - (dx * dx + dy * dy + dz * dz)
+                    for end in range(4 if twin > F32(0.0) else 2):
+                        if end == 2:
+                            # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z).
+                            u0, u1, u2, u3 = u1, -u0, u3, -u2
+                        elif end > 0:
+                            u0, u1, u2, u3 = -u0, -u1, -u2, -u3
+                        if base + u0 * q0 + u1 * q1 + u2 * q2 + u3 * q3 > least and count < near.shape[1]:
+                            near[0, count], near[1, count], near[2, count] = data[0, j], data[1, j], data[2, j]
+                            near[3, count], near[4, count] = u0, u1
+                            near[5, count], near[6, count] = u2, u3
+                            near[7, count] = data[7, j]
+                            count += 1
+                begin = stop
+    return count
+
+
+@fast
+def _moments(near, begin, end, px, py, pz, qx, qy, qz, qw, kappa, sums):
+    """Add to ``sums`` (8,) k, k (p_i - p) and the pull k mu_i of gathered kernels, scaled units."""
+    s = F32(0.0)
+    sx, sy, sz = F32(0.0), F32(0.0), F32(0.0)
+    m0, m1, m2, m3 = F32(0.0), F32(0.0), F32(0.0), F32(0.0)
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = near[0, i] - px
+        dy = near[1, i] - py
+        dz = near[2, i] - pz
+        u0, u1, u2, u3 = near[3, i], near[4, i], near[5, i], near[6, i]
+        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
+        k = near[7, i] * compiled._exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+        s += k
+        sx += k * dx
+        sy += k * dy
+        sz += k * dz
+        m0 += k * u0
+        m1 += k * u1
+        m2 += k * u2
+        m3 += k * u3
+    sums[0] += s
+    sums[1] += sx
+    sums[2] += sy
+    sums[3] += sz
+    sums[4] += m0
+    sums[5] += m1
+    sums[6] += m2
+    sums[7] += m3
+
+
 @exact
 def climb(
-    data, start, table, centre, scale, planes, spheres, cones, kappa, radius, wide, positions, quaternions,
-    tolerance, path, lengths,
+    data, start, table, centre, scale, planes, spheres, cones, kappa, cut, positions, quaternions, gain,
+    path, lengths,
 ):  # fmt: skip
-    """Projected mean shift from every pose (K, ...); ``path`` (K, steps, PATH) gets the feasible poses
-    passed.
+    """Climb from every pose (K, ...); ``path`` (K, steps, PATH) gets the feasible poses passed.
 
-    The last pose of a path is its best. ``tolerance`` ends a climb, in units of the kernel's widths.
+    Kernels are gathered once around a pose and used while the climb stays near: those with an exponent above
+    ``-cut``. So sums are too low by what is farther, a per cent or so in dense data; it is flat and hardly
+    moves the maximum, but to compare poses of different climbs their sums have to be taken anew.
+
+    The last pose of a path is its best. A climb ends where the next step promises to raise the log density by
+    less than ``gain``.
     """
     runs = np.empty((compiled.MAX_RUNS, 2), dtype=np.int64)
-    sums = np.empty(9)
-    p, q, best_p, best_q = np.empty(3), np.empty(4), np.empty(3), np.empty(4)
-    turn_unit = 0.5 * math.sqrt(kappa)
+    buffer = np.empty(_GATHERED, dtype=np.float32)
+    near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
+    sums = np.empty(8)
+    # Poses and steps in units of the kernel's widths: position over sigma, sqrt(kappa) times the quaternion.
+    unit, turn = 1.0 / (scale * math.sqrt(2.0)), math.sqrt(kappa)
+    p, q, x, step, gathered = np.empty(3), np.empty(4), np.empty(7), np.empty(7), np.empty(7)
+    last_x, last_step, best_x, best_step = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
     for j in range(positions.shape[0]):
         p[:] = positions[j]
         q[:] = quaternions[j]
-        best = -1.0
-        relaxation = 1.0
+        best, top, known, plain, worst, older = -1.0, 0, False, True, 0.0, 0.0
+        count = -1
         lengths[j] = 0
-        target_p, target_q = np.empty(3), np.empty(4)
-        for _ in range(path.shape[1]):
+        while lengths[j] < path.shape[1]:
             px, py, pz = (p[0] - centre[0]) * scale, (p[1] - centre[1]) * scale, (p[2] - centre[2]) * scale
-            compiled.moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums)
-            if sums[0] <= 0.0:
-                break
-            if sums[0] < best * (1.0 - 1e-6) and relaxation > 1.0:
-                # Too long a step: back to the best pose and from there by a plain step.
-                relaxation = 1.0
-                p[:] = best_p
-                q[:] = best_q
-            elif sums[0] < best:
-                break
-            else:
-                row = path[j, lengths[j]]
-                row[0:3] = p
-                row[3:7] = q
-                row[7] = sums[0]
-                lengths[j] += 1
-                moved = 1.0
-                if best > 0.0:
-                    moved = 0.0
-                    for i in range(3):
-                        moved += ((p[i] - best_p[i]) * scale) ** 2
-                    dot = 0.0
-                    for i in range(4):
-                        dot += q[i] * best_q[i]
-                    moved += 4.0 * turn_unit**2 * max(0.0, 2.0 - 2.0 * abs(dot))
-                best = sums[0]
-                best_p[:] = p
-                best_q[:] = q
-                if moved < tolerance * tolerance:
-                    break
+            apart = 0.0
+            if count >= 0:
                 for i in range(3):
-                    target_p[i] = p[i] + sums[1 + i] / (sums[0] * scale)
-                length = math.sqrt(sums[4] ** 2 + sums[5] ** 2 + sums[6] ** 2 + sums[7] ** 2)
+                    apart += (p[i] / unit - gathered[i]) ** 2
                 for i in range(4):
-                    target_q[i] = sums[4 + i] / length if length > 0.0 else q[i]
-                relaxation = _RELAXATION
-            norm = 0.0
+                    apart += (q[i] * turn - gathered[3 + i]) ** 2
+            if count < 0 or apart > _STRAYED * _STRAYED:
+                count = _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near)
+                gathered[0:3] = p / unit
+                gathered[3:7] = q * turn
+                apart = 0.0
+                # Other kernels, other sums: what was seen before is no measure.
+                best, known, plain, worst, older = -1.0, False, True, 0.0, 0.0
+            sums[:] = 0.0
+            for begin in range(0, count, compiled.BLOCK):
+                _moments(
+                    near, begin, min(begin + compiled.BLOCK, count), F32(px), F32(py), F32(pz),
+                    F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa), F32(kappa),
+                    sums,
+                )  # fmt: skip
+            here = sums[0]
+            if here <= 0.0:
+                break
+            row = path[j, lengths[j]]
+            row[0:3] = p
+            row[3:7] = q
+            row[7] = here
+            lengths[j] += 1
+            if here < min(worst, older):
+                # Too long a step: back to the best pose and from there by a plain one, which can't descend.
+                if plain:
+                    break
+                x[:] = best_x
+                step[:] = best_step
+                known, plain = False, True
+                worst, older = best, best
+            else:
+                worst, older = here, worst if best > 0.0 else here
+                x[0:3] = p / unit
+                x[3:7] = q * turn
+                length = math.sqrt(sums[4] ** 2 + sums[5] ** 2 + sums[6] ** 2 + sums[7] ** 2)
+                for i in range(3):
+                    step[i] = sums[1 + i] / (here * scale * unit)
+                for i in range(4):
+                    step[3 + i] = sums[4 + i] / length * turn - x[3 + i] if length > 0.0 else 0.0
+                if here > best:
+                    best, top = here, lengths[j] - 1
+                    best_x[:] = x
+                    best_step[:] = step
+                plain = False
+            # The inverse curvature that the last two poses saw along their difference (Barzilai, Borwein).
+            ahead, moved, bent, size = 1.0, 0.0, 0.0, 0.0
+            for i in range(7):
+                size += step[i] * step[i]
+                if known:
+                    moved += (x[i] - last_x[i]) ** 2
+                    bent += (x[i] - last_x[i]) * (last_step[i] - step[i])
+            if known:
+                ahead = moved / bent if bent * _LONGEST > moved else _LONGEST
+                ahead = max(1.0, min(ahead, _FARTHEST / math.sqrt(size) if size > 0.0 else 1.0))
             for i in range(3):
-                p[i] = p[i] + relaxation * (target_p[i] - p[i])
+                p[i] = (x[i] + ahead * step[i]) * unit
+            norm = 0.0
             for i in range(4):
-                q[i] = q[i] + relaxation * (target_q[i] - q[i])
+                q[i] = x[3 + i] + ahead * step[3 + i]
                 norm += q[i] * q[i]
             norm = math.sqrt(norm)
             for i in range(4):
@@ -187,3 +307,22 @@ def climb(
             there = projection.project_position(planes, spheres, p)
             if not (projection.project_rotation(cones, q) and there):
                 break
+            size = 0.0
+            for i in range(3):
+                size += (p[i] / unit - x[i]) ** 2
+            for i in range(4):
+                size += (q[i] * turn - x[3 + i]) ** 2
+            # Half the slope times the step, the gain of a parabola.
+            if 0.5 * size < gain * ahead:
+                if apart < _SETTLED * _SETTLED:
+                    break
+                # At rest among the kernels of a while ago: gather anew.
+                count = -1
+            last_x[:] = x
+            last_step[:] = step
+            known = True
+        if lengths[j] > 0 and best > 0.0 and top != lengths[j] - 1:
+            for i in range(PATH):
+                held = path[j, top, i]
+                path[j, top, i] = path[j, lengths[j] - 1, i]
+                path[j, lengths[j] - 1, i] = held

@@ -456,6 +456,20 @@ def sums(data, start, table, centre, scale, positions, quaternions, kappa, radiu
 
 
 @fast
+def reached(start, table, centre, scale, positions, radius, out):
+    """How many kernels a sum at each pose visits, into ``out`` (M,) int64."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        out[j] = 0
+        for s in range(table.shape[0]):
+            for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+                out[j] += runs[r, 1] - runs[r, 0]
+
+
+@fast
 def moments(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
     """The moments at every pose into ``out`` (M, 9)."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)

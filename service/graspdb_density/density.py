@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import compiled, reference, se3
 from .cells import Cells
+from .centres import CentreSums, centre_sums
 from .kernels import HAAR_VOLUME, IsotropicKernel
 from .se3 import Floats
 from .threads import for_blocks
@@ -52,7 +53,7 @@ class GraspDensity:
         symmetric: NDArray[np.bool_],
         cells: Cells,
         unit: float,
-        centre_sums: Floats | None = None,
+        ranking: CentreSums | None = None,
     ) -> None:
         self._kernel = kernel
         self._positions = positions
@@ -63,7 +64,7 @@ class GraspDensity:
         self._unit = unit
         self._total = float(weights.sum())
         self._lock = threading.Lock()
-        self._centre_sums = centre_sums
+        self._ranking = ranking
         self._global: Maximum | None = None
 
     # -- building
@@ -130,7 +131,7 @@ class GraspDensity:
             np.concatenate([self._symmetric, flags]),
             cells,
             self._unit,
-            self._centre_sums,
+            self._ranking,
         )
 
     # -- what it holds
@@ -161,6 +162,11 @@ class GraspDensity:
         return np.asarray(self._weights / self._total, dtype=np.float64)
 
     @property
+    def raw_weights(self) -> Floats:
+        """(N,) in the unit of the cells, of about 1."""
+        return np.asarray(self._weights / self._unit, dtype=np.float64)
+
+    @property
     def symmetric(self) -> NDArray[np.bool_]:
         """(N,) whether a row has a twin."""
         return self._symmetric
@@ -174,7 +180,7 @@ class GraspDensity:
     def nbytes(self) -> int:
         """Bytes of every array held, caches included."""
         own = (self._positions, self._quaternions, self._weights, self._symmetric)
-        cached = self._centre_sums
+        cached = self._ranking
         return sum(a.nbytes for a in own) + self._cells.nbytes + (0 if cached is None else cached.nbytes)
 
     @property
@@ -299,6 +305,20 @@ class GraspDensity:
         )  # fmt: skip
         return out
 
+    def kernel_sums(self, positions: Floats, quaternions: Floats, *, cutoff: float, threads: int = 1) -> Floats:
+        """Kernel sums (M,) within a cut-off, 0 where nothing is in reach; poses already checked."""
+        cells = self._cells
+        out = np.empty(len(positions))
+
+        def work(begin: int, end: int) -> None:
+            compiled.sums(
+                cells.data, cells.start, cells.table, cells.centre, cells.scale, positions[begin:end],
+                quaternions[begin:end], self._kernel.kappa, scaled_radius(cutoff), self.wide, out[begin:end],
+            )  # fmt: skip
+
+        for_blocks(work, len(positions), block=16, threads=threads)
+        return out
+
     # -- sampling
     # ---------------------------------------------------------------------------------------------------
 
@@ -324,50 +344,14 @@ class GraspDensity:
     # -----------------------------------------------------------------------------------------------------
 
     def centre_sums(self, threads: int = 1) -> Floats:
-        """Kernel sum at every row (N,), cached; carried over by `extend` and completed with what is new."""
+        """Kernel sum at every row (N,), estimated where the sums over all pairs would take long; cached."""
+        return self.ranking(threads).values
+
+    def ranking(self, threads: int = 1) -> CentreSums:
+        """What rows' centres are worth; carried over by `extend` and completed with what is new."""
         with self._lock:
-            known = self._centre_sums
-            if known is not None and len(known) == self.size:
-                return known
-            fresh = self._compute_centre_sums(known, threads)
-            self._centre_sums = fresh
-            return fresh
-
-    def _compute_centre_sums(self, known: Floats | None, threads: int) -> Floats:
-        cells = self._cells
-        # Three standard deviations rank centres well enough; the refinement that follows uses the full reach.
-        radius = scaled_radius(3.0)
-        kappa, wide = self._kernel.kappa, self.wide
-        carried = 0 if known is None or 8 * (self.size - len(known)) > self.size else len(known)
-        ordered = np.empty(self.size)
-        if known is not None and carried:
-            old = cells.rows < carried
-            ordered[old] = known[cells.rows[old]]
-            ordered[~old] = 0.0
-            new = np.arange(carried, self.size)
-            compiled.scatter_sums(
-                cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                self._positions[new], self._quaternions[new],
-                self._weights[new] / self._unit, self._symmetric[new], kappa, radius, wide, ordered,
-            )  # fmt: skip
-            todo = np.flatnonzero(~old)
-        else:
-            todo = np.arange(self.size)
-        rows = cells.rows[todo]
-        positions, quaternions = self._positions[rows], self._quaternions[rows]
-        out = np.empty(len(rows))
-
-        def work(begin: int, end: int) -> None:
-            compiled.sums(
-                cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                positions[begin:end], quaternions[begin:end], kappa, radius, wide, out[begin:end],
-            )  # fmt: skip
-
-        for_blocks(work, len(rows), block=_QUERY_BLOCK, threads=threads)
-        ordered[todo] = out
-        result = np.empty(self.size)
-        result[cells.rows] = ordered
-        return result
+            self._ranking = centre_sums(self, self._ranking, threads)
+            return self._ranking
 
     def maximum(
         self,

@@ -33,10 +33,19 @@ Admissible = Callable[[Floats, Floats], NDArray[np.bool_]]
 #: standard deviations.
 REACH = 4.0
 _STARTS = 24
-#: All starts climb a few steps; those that then are near the best climb on.
-_FIRST_STEPS, _STEPS = 8, 48
+#: Kernel widths between two starts.
+_SPREAD = 1.0
+#: All starts climb a few steps among the nearest kernels; those that then are near the best climb on. The
+#: cuts are exponents, of 3 and 4 standard deviations.
+_FIRST_STEPS, _FIRST_CUT = 10, 4.5
+_STEPS, _CUT = 60, 8.0
 _PROMISING, _FINALISTS = 0.9, 8
-_TOLERANCE = 2e-3
+#: A climb ends where the next step promises no more than this in log density.
+_GAIN = 1e-5
+#: Where centres are ranked by a sample of kernels: so many times the starts.
+_ROUGH_STARTS = 2
+#: Of the poses passed, how many are kept and how many kernel widths they are apart.
+_PASSED, _APART = 96, 0.3
 _SHORTLIST = 1024
 #: Poses shown to ``admissible`` at a time and in all while looking for starts.
 _BATCH = 64
@@ -142,12 +151,14 @@ class Search:
         self.threads = threads
         self.twins = bool(density.symmetric.all())
         self.checks = 0
+        self.ranking = density.ranking(threads)
 
     # -- steps
     # ------------------------------------------------------------------------------------------------------
 
     def run(self, count: int, separation_m: float, separation: float) -> list[Maximum]:
-        starts = self.starts(max(self.starts_wanted, 3 * count))
+        wanted = max(self.starts_wanted, 3 * count)
+        starts = self.starts(wanted if self.ranking.sample is None else _ROUGH_STARTS * wanted)
         if not len(starts):
             return []
         pool, ends = self.climbed(starts, max(_FINALISTS, 2 * count))
@@ -220,7 +231,7 @@ class Search:
             kept[:known] = np.arange(known)
             total = ascent.thin(
                 np.ascontiguousarray(joined_p[order]), np.ascontiguousarray(joined_q[order]), known, limit,
-                kernel.sigma_position_m, kernel.sigma_rotation, self.twins, kept,
+                _SPREAD * kernel.sigma_position_m, _SPREAD * kernel.sigma_rotation, self.twins, kept,
             )  # fmt: skip
             picked = order[kept[known:total]]
             if self.admissible is None or not picked.size:
@@ -239,7 +250,7 @@ class Search:
     def scores(self) -> tuple[Floats, NDArray[np.bool_]]:
         density, region = self.density, self.region
         kernel = density.kernel
-        sums = density.centre_sums(self.threads)
+        sums = self.ranking.values
         scores, turned = np.empty(density.size), np.empty(density.size, dtype=bool)
 
         def work(begin: int, end: int) -> None:
@@ -254,16 +265,17 @@ class Search:
         return scores, turned
 
     def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
-        """Every pose passed while climbing, and the ends."""
-        passed, ends = self.climb(starts, _FIRST_STEPS)
+        """Poses passed while climbing, and the ends."""
+        passed, ends = self.climb(starts, _FIRST_STEPS, _FIRST_CUT)
+        ends = self.scored(ends)
         if not len(ends):
             return passed, ends
-        ends = ends.sort()
-        promising = int(np.sum(ends.sums >= _PROMISING * ends.sums[0]))
-        on, last = self.climb(ends.take(np.arange(min(promising, finalists))), _STEPS)
-        return passed.joined(on), last
+        on, last = self.climb(best_of(ends, _PROMISING, finalists), _STEPS)
+        last = self.scored(last)
+        return self.scored(self.thinned(passed.joined(on))).joined(ends).joined(last), last
 
-    def climb(self, starts: Pool, steps: int) -> tuple[Pool, Pool]:
+    def climb(self, starts: Pool, steps: int, cut: float = _CUT) -> tuple[Pool, Pool]:
+        """Poses passed from every start and the ends; their sums are those of `ascent.climb`."""
         density, region, cells = self.density, self.region, self.density.cells
         path = np.empty((len(starts), steps, ascent.PATH))
         lengths = np.empty(len(starts), dtype=np.int64)
@@ -272,15 +284,28 @@ class Search:
             part = slice(begin, end)
             ascent.climb(
                 cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                region.planes, region.balls, region.cones,
-                density.kernel.kappa, REACH / math.sqrt(2.0), density.wide,
-                starts.positions[part], starts.quaternions[part], _TOLERANCE, path[part], lengths[part],
+                region.planes, region.balls, region.cones, density.kernel.kappa, cut,
+                starts.positions[part], starts.quaternions[part], _GAIN, path[part], lengths[part],
             )  # fmt: skip
 
         for_blocks(work, len(starts), block=4, threads=self.threads)
         passed = path[np.arange(steps)[None, :] < lengths[:, None]]
         moved = np.flatnonzero(lengths)
         return pool_of(passed), pool_of(path[moved, lengths[moved] - 1])
+
+    def scored(self, pool: Pool) -> Pool:
+        """With sums over all kernels."""
+        return Pool(pool.positions, pool.quaternions, self.sums(pool.positions, pool.quaternions))
+
+    def thinned(self, pool: Pool) -> Pool:
+        """The best poses of a pool that are a few tenths of a kernel's width apart."""
+        kernel, pool = self.density.kernel, pool.sort()
+        kept = np.empty(_PASSED, dtype=np.int64)
+        total = ascent.thin(
+            pool.positions, pool.quaternions, 0, _PASSED,
+            _APART * kernel.sigma_position_m, _APART * kernel.sigma_rotation, self.twins, kept,
+        )  # fmt: skip
+        return pool.take(kept[:total])
 
     def check(self, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
         assert self.admissible is not None
@@ -291,7 +316,7 @@ class Search:
         return allowed
 
     def sums(self, positions: Floats, quaternions: Floats) -> Floats:
-        return np.asarray(self.density.moments(positions, quaternions, cutoff=REACH)[:, 0], dtype=np.float64)
+        return self.density.kernel_sums(positions, quaternions, cutoff=REACH, threads=self.threads)
 
     def choose(self, pool: Pool, count: int, separation_m: float, separation: float) -> list[int]:
         """Indices of the best distinct admissible poses of a sorted pool."""
@@ -350,6 +375,13 @@ class Search:
             else:
                 step *= 0.5
         return passed
+
+
+def best_of(pool: Pool, share: float, most: int) -> Pool:
+    """The best poses, at most ``most``, whose sums are at least ``share`` of the highest."""
+    pool = pool.sort()
+    enough = int(np.sum(pool.sums >= share * pool.sums[0]))
+    return pool.take(np.arange(min(enough, most)))
 
 
 def pool_of(rows: Floats) -> Pool:

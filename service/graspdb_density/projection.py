@@ -1,7 +1,7 @@
 """Nearest feasible poses, compiled.
 
-Positions: Dykstra's alternating projections (1986) onto half-spaces and balls, which converge to the nearest
-point of their intersection. Rotations: the nearest rotation whose approach and closing axes lie in their
+Positions: the dual method for half-spaces; Dykstra's alternating projections (1986) where there are balls
+too, which converge to the nearest point of their intersection. Rotations: the nearest rotation whose approach and closing axes lie in their
 cones; one cone in closed form (turn the axis to the cone's rim about their common normal), two by sequential
 quadratic programming on the rotation vector, whose subproblem with two constraints is solved exactly.
 
@@ -220,13 +220,104 @@ def project_rotation(cones, q):
 
 
 @exact
+def _nearest_in_polyhedron(planes, goal, p):
+    """The point nearest to ``goal`` inside half-spaces, by the dual method of Goldfarb and Idnani (1983).
+
+    Exact after a few exchanges, where alternating projections crawl along planes that meet at a small angle.
+    Answers whether there is such a point; ``p`` is set only then.
+    """
+    active, force = np.empty(3, dtype=np.int64), np.zeros(4)
+    share, way = np.empty(3), np.empty(3)
+    x = goal.copy()
+    count = 0
+    for _ in range(8 * planes.shape[0] + 8):
+        worst, chosen = 0.0, -1
+        for k in range(planes.shape[0]):
+            miss = planes[k, 3] + MARGIN_M
+            for i in range(3):
+                miss -= planes[k, i] * x[i]
+            if miss > worst:
+                worst, chosen = miss, k
+        if worst <= 0.5 * MARGIN_M:
+            p[:] = x
+            return True
+        force[3] = 0.0
+        while True:
+            normal = planes[chosen]
+            # The chosen normal as a sum of active ones (share) and what is square to them (way).
+            way[:] = normal[:3]
+            share[:] = 0.0
+            if count > 0:
+                gram, right = np.zeros((count, count)), np.zeros(count)
+                for a in range(count):
+                    for i in range(3):
+                        right[a] += planes[active[a], i] * normal[i]
+                        for b in range(count):
+                            gram[a, b] += planes[active[a], i] * planes[active[b], i]
+                if not _solved(gram, right):
+                    return False
+                for a in range(count):
+                    share[a] = right[a]
+                    for i in range(3):
+                        way[i] -= right[a] * planes[active[a], i]
+            square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+            free = square > 1e-12 and count < 3
+            step, dropped = 1e300, -1
+            for a in range(count):
+                if share[a] > 1e-12 and force[a] / share[a] < step:
+                    step, dropped = force[a] / share[a], a
+            if free:
+                miss = normal[3] + MARGIN_M - normal[0] * x[0] - normal[1] * x[1] - normal[2] * x[2]
+                full = miss / square
+                if full <= step:
+                    step, dropped = full, -1
+            elif dropped < 0:
+                return False
+            if free:
+                for i in range(3):
+                    x[i] += step * way[i]
+            for a in range(count):
+                force[a] -= step * share[a]
+            force[3] += step
+            if dropped < 0:
+                active[count], force[count] = chosen, force[3]
+                count += 1
+                break
+            for a in range(dropped, count - 1):
+                active[a], force[a] = active[a + 1], force[a + 1]
+            count -= 1
+    return False
+
+
+@exact
+def _solved(gram, right):
+    """Solve a positive definite system of at most 3 unknowns in place; False where it is singular."""
+    n = gram.shape[0]
+    for a in range(n):
+        if gram[a, a] < 1e-10:
+            return False
+        for b in range(a + 1, n):
+            factor = gram[b, a] / gram[a, a]
+            for i in range(a, n):
+                gram[b, i] -= factor * gram[a, i]
+            right[b] -= factor * right[a]
+    for a in range(n - 1, -1, -1):
+        for i in range(a + 1, n):
+            right[a] -= gram[a, i] * right[i]
+        right[a] /= gram[a, a]
+    return True
+
+
+@exact
 def project_position(planes, spheres, p):
     """Move p (3,) in place to the nearest point inside planes and spheres; whether it got there."""
     count = planes.shape[0] + spheres.shape[0]
     if count == 0 or position_excess(planes, spheres, p) <= 0.0:
         return True
+    before = p.copy()
+    if spheres.shape[0] == 0 and _nearest_in_polyhedron(planes, before, p):
+        return True
     memory = np.zeros((count, 3))
-    before = np.empty(3)
     for sweep in range(400):
         moved = 0.0
         for k in range(count):
