@@ -160,6 +160,43 @@ def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float
     return (float(q[0]), float(q[1]), float(q[2]), float(q[3]))
 
 
+def obj_of_parts(parts: Sequence[Part], mass: MassProperties) -> str:
+    """Parts in the principal frame as a Wavefront OBJ, a group a part."""
+    lines: list[str] = []
+    offset = 1
+    for number, (vertices, faces) in enumerate(parts):
+        lines.append(f"o part{number}")
+        for vertex in mass.to_principal(np.asarray(vertices, dtype=np.float64)):
+            lines.append("v {:.9g} {:.9g} {:.9g}".format(*vertex))
+        for face in np.asarray(faces):
+            lines.append("f {} {} {}".format(*(int(i) + offset for i in face)))
+        offset += len(vertices)
+    return "\n".join(lines) + "\n"
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Rotate by b, then by a; quaternions xyzw."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotate(q: Quaternion, v: Vector) -> Vector:
+    """A vector rotated by a unit quaternion xyzw."""
+    x, y, z, w = q
+    tx, ty, tz = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
+    return (
+        v[0] + w * tx + y * tz - z * ty,
+        v[1] + w * ty + z * tx - x * tz,
+        v[2] + w * tz + x * ty - y * tx,
+    )
+
+
 class End(Enum):
     """Why a closing ended."""
 
@@ -189,6 +226,25 @@ class Contacts:
 
 
 @dataclass(frozen=True)
+class Carried:
+    """How the object came through lift and shake.
+
+    Attributes
+    ----------
+    held : bool
+        Both fingers still press on it at the end.
+    translation_m : float
+        Farthest that the point of the object at the tool's origin moved from there.
+    rotation_rad : float
+        Farthest that the object turned in the jaw.
+    """
+
+    held: bool
+    translation_m: float
+    rotation_rad: float
+
+
+@dataclass(frozen=True)
 class Closing:
     """The jaw after a closing.
 
@@ -205,6 +261,8 @@ class Closing:
         The object's pose in the tool frame.
     steps : int
         Simulation steps spent.
+    carried : Carried, optional
+        How the object came through lift and shake, where that was asked for and the jaw had stalled.
     """
 
     end: End
@@ -214,3 +272,4 @@ class Closing:
     position: Vector
     quaternion_xyzw: Quaternion
     steps: int
+    carried: Carried | None = None

@@ -24,7 +24,7 @@ from graspdb_simworker.bodies import Gripper, Part, closing_force
 from graspdb_simworker.labels import Label, Outcome, label_of
 from graspdb_simworker.scene import GraspWorld
 
-PROTOCOLS = ("wrench",)
+PROTOCOLS = ("wrench", "lift")
 """Protocols this worker can simulate."""
 
 
@@ -82,7 +82,14 @@ def prepare(payload: SimulatePayload, parts: Sequence[Part]) -> Workpiece:
     return Workpiece(
         parts=parts,
         scene=collision.Scene(parts),
-        world=GraspWorld(parts, payload.mass_kg, payload.friction, gripper, payload.fidelity),
+        world=GraspWorld(
+            parts,
+            payload.mass_kg,
+            payload.friction,
+            gripper,
+            payload.fidelity,
+            lifts=payload.protocol == "lift",
+        ),
         gripper=gripper,
         shape=shape_of(payload.gripper),
         mass_kg=payload.mass_kg,

@@ -1,7 +1,8 @@
-"""From a closing to a label: can the contact forces hold the object against gravity, whichever way down is?
+"""From a closing to a label, by one of two protocols.
 
-The test is the paper's: forces only. Two contacts may be enough although the object could turn about
-the line through them; with torques no grasp by two contacts would pass at all.
+**wrench**: can the contact forces hold the object against gravity, whichever way down is? The test is
+the paper's: forces only. Two contacts may be enough although the object could turn about the line
+through them; with torques no grasp by two contacts would pass at all.
 
 A contact i with normal n_i (into the object) and measured normal force f_i can exert any force of its
 capped friction cone
@@ -18,6 +19,11 @@ minimum of its support function over unit directions d
 Where the forces ring because the object still moves, several instants of the stalled jaw are rated and
 the median counts. ``f_i`` is scaled by the gripper's force over the force the jaw was simulated with, see
 :func:`graspdb_simworker.bodies.closing_force`.
+
+**lift**: is the object still held, and where it was, after the jaw lifted and shook it
+(:mod:`graspdb_simworker.lifting`)? A grasp on two points may well hold the object and let it swing; so the
+object may move by :data:`MOVED_M` at the tool's origin and turn by :data:`TURNED_RAD` at most, the steps of
+the default grid: further off it is another grasp.
 """
 
 from __future__ import annotations
@@ -31,9 +37,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from graspdb_simworker.bodies import Closing, Contacts, End, Gripper
+from graspdb_simworker.bodies import Carried, Closing, Contacts, End, Gripper
 
 GRAVITY_M_S2 = 9.80665
+MOVED_M = 0.010
+TURNED_RAD = math.radians(15.0)
+WORST_QUALITY = -1000.0
 MERGE_COSINE = 1.0 - 1e-8
 """Contacts whose normals differ less than this (0.008 degrees) act as one: their cones add up to one cone."""
 _COARSE = 96
@@ -67,8 +76,10 @@ class Label:
     width_m : float
         Distance between the fingers at the end.
     quality : float
-        Largest weight the contacts hold in the worst direction, over the object's weight: success from
-        1 on. NaN where no force was measured.
+        ``wrench``: largest weight the contacts hold in the worst direction, over the object's weight;
+        success from 1 on. ``lift``: 1 minus the farthest displacement in the jaw, in units of what is
+        allowed (the larger of translation / 10 mm and rotation / 15 degrees); 1 did not move at all,
+        success down to 0. NaN where nothing was measured.
     """
 
     outcome: Outcome
@@ -330,7 +341,7 @@ def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float
     ``missed``: nothing was between the fingers, or the object was pushed out before both touched it;
     ``slipped``: both had touched it and it was squeezed out; ``timeout``: the jaw neither stalled nor
     closed; ``simulation_error``: a pose that is not finite any more; ``wrench_insufficient``: the force
-    test failed.
+    test failed. After a lift: ``dropped``: not held at the end; ``slipped``: held, but moved too far.
     """
     width = max(0.0, closing.opening_m)
     if closing.end is End.EMPTY:
@@ -339,5 +350,17 @@ def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float
         return Label(Outcome.TIMEOUT, width, math.nan)
     if closing.end is End.UNSTABLE:
         return SIMULATION_ERROR
+    if closing.carried is not None:
+        return _carried_label(closing.carried, width)
     quality = statistics.median(rating(now, gripper, mass_kg, friction) for now in closing.contacts)
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
+
+
+def _carried_label(carried: Carried, width_m: float) -> Label:
+    quality = 1.0 - max(carried.translation_m / MOVED_M, carried.rotation_rad / TURNED_RAD)
+    if not math.isfinite(quality):
+        return SIMULATION_ERROR
+    quality = max(WORST_QUALITY, quality)
+    if not carried.held:
+        return Label(Outcome.DROPPED, width_m, quality)
+    return Label(Outcome.SUCCESS if quality >= 0.0 else Outcome.SLIPPED, width_m, quality)

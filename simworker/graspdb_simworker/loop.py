@@ -43,7 +43,7 @@ from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, Pybullet
 
 log = logging.getLogger("graspdb.simworker")
 
-CAPABILITIES = ("simulate",)
+CAPABILITIES = ("simulate", "lift")
 """Job kinds, and protocols beyond ``wrench``, that this worker claims."""
 GLB = "model/gltf-binary"
 MAX_BACKOFF_S = 15.0

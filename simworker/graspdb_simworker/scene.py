@@ -17,7 +17,7 @@ import math
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -26,7 +26,9 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
+from graspdb_simworker import lifting, urdf
 from graspdb_simworker.bodies import (
+    Carried,
     Closing,
     Contacts,
     End,
@@ -36,6 +38,9 @@ from graspdb_simworker.bodies import (
     Quaternion,
     Vector,
     mass_properties,
+    multiply,
+    obj_of_parts,
+    rotate,
 )
 from graspdb_simworker.labels import rating
 
@@ -61,20 +66,23 @@ SLACK_S = 0.5
 _PARKED: Vector = (0.0, 0.0, -1000.0)
 _IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 _EMPTY_CHECK_STEPS = 16
+_GEAR_FORCES = 100.0
+"""The coupling of the fingers may exert so many times the closing force: as good as rigid."""
 
 
 @dataclass(frozen=True)
 class Stepping:
-    """How time is cut: until both fingers touch, and from then on."""
+    """How time is cut: until both fingers touch, from then on, and while the object is carried."""
 
     approach_dt_s: float
     squeeze_dt_s: float
+    carry_dt_s: float
     solver_iterations: int
 
 
 STEPPING: dict[str, Stepping] = {
-    "standard": Stepping(1.0 / 240.0, 1.0 / 480.0, 50),
-    "fine": Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200),
+    "standard": Stepping(1.0 / 240.0, 1.0 / 480.0, 1.0 / 480.0, 50),
+    "fine": Stepping(1.0 / 2000.0, 1.0 / 2000.0, 1.0 / 2000.0, 200),
 }
 
 
@@ -90,8 +98,12 @@ class GraspWorld:
         Coulomb friction coefficient between object and gripper.
     gripper : Gripper
     fidelity : {'standard', 'fine'}
+    lifts : bool
+        Lift and shake what is held after every closing, see :mod:`graspdb_simworker.lifting`.
     visible : bool
-        Build what can be seen, for :meth:`picture`.
+        Build what can be seen, for :attr:`pictures`.
+    film_every_s : float
+        Take a picture at such intervals, not only at the end.
     """
 
     def __init__(
@@ -102,23 +114,35 @@ class GraspWorld:
         gripper: Gripper,
         fidelity: Fidelity = "standard",
         *,
+        lifts: bool = False,
         visible: bool = False,
+        film_every_s: float = math.inf,
     ) -> None:
         self.gripper = gripper
         self.friction = friction
         self.stepping = STEPPING[fidelity]
         self.mass = mass_properties(parts, mass_kg)
         self._visible = visible
-        self._picture: NDArray[np.uint8] | None = None
+        # What is lifted must not turn where faces hold it: contact by faces, see urdf.py. It takes longer.
+        self._lifts = lifts
+        self._film_every_s = film_every_s
+        self._filmed_s = 0.0
+        self.pictures: list[NDArray[np.uint8]] = []
+        """The last closing from two sides, each (480, 1280, 3), drawn by pybullet's CPU renderer; the end
+        is last. Empty unless the world is visible."""
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("pybullet could not open a DIRECT world")
         self._to_body = self.mass.inverse_rotation()
         try:
             self._configure()
-            self._jaw = self._build_gripper()
-            self._object = self._build_object(parts, self.mass)
+            if lifts:
+                self._jaw, self._object = self._load_bodies(parts)
+            else:
+                self._jaw = self._build_gripper()
+                self._object = self._build_object(parts, self.mass)
             self._column = self._build_column()
+            self._gear = self._build_gear() if lifts else -1
             self._finish_bodies(math.sqrt(friction))
             self._park()
         except BaseException:
@@ -149,6 +173,7 @@ class GraspWorld:
             contactBreakingThreshold=CONTACT_BREAKING_M,
             deterministicOverlappingPairs=1,
             numSubSteps=0,
+            enableSAT=int(self._lifts),
             physicsClientId=self._client,
         )
 
@@ -201,7 +226,7 @@ class GraspWorld:
         # frame is the principal frame of inertia, so that no inertial offset is left to go wrong.
         with tempfile.TemporaryDirectory(prefix="graspdb-parts-") as folder:
             path = Path(folder) / "parts.obj"
-            path.write_text(_obj_of_parts(parts, mass), encoding="ascii")
+            path.write_text(obj_of_parts(parts, mass), encoding="ascii")
             shape = pybullet.createCollisionShape(
                 pybullet.GEOM_MESH, fileName=os.fspath(path), physicsClientId=self._client
             )
@@ -220,6 +245,26 @@ class GraspWorld:
             raise RuntimeError("pybullet refused the object's convex parts")
         return body
 
+    def _load_bodies(self, parts: Sequence[Part]) -> tuple[int, int]:
+        """Gripper and object with contact by faces."""
+        flags = pybullet.URDF_INITIALIZE_SAT_FEATURES | pybullet.URDF_USE_INERTIA_FROM_FILE
+        with tempfile.TemporaryDirectory(prefix="graspdb-bodies-") as name:
+            folder = Path(name)
+            jaw = pybullet.loadURDF(
+                os.fspath(urdf.write_gripper(folder, self.gripper)),
+                basePosition=(0.0, 0.0, self.gripper.palm_centre_z),
+                useFixedBase=1,
+                flags=flags,
+                physicsClientId=self._client,
+            )
+            body = pybullet.loadURDF(
+                os.fspath(urdf.write_object(folder, parts, self.mass)),
+                basePosition=_PARKED,
+                flags=flags,
+                physicsClientId=self._client,
+            )
+        return int(jaw), int(body)
+
     def _build_column(self) -> int:
         """A ghost as large as the space between the open fingers: it collides with nothing and answers
         one question."""
@@ -236,27 +281,61 @@ class GraspWorld:
         pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
         return body
 
+    def _build_gear(self) -> int:
+        """What couples the fingers while they carry: both joints move alike. Idle until then."""
+        gear = pybullet.createConstraint(
+            self._jaw,
+            0,
+            self._jaw,
+            1,
+            pybullet.JOINT_GEAR,
+            jointAxis=(0.0, 1.0, 0.0),
+            parentFramePosition=(0.0, 0.0, 0.0),
+            childFramePosition=(0.0, 0.0, 0.0),
+            physicsClientId=self._client,
+        )
+        self._couple(gear, 0.0)
+        return int(gear)
+
+    def _couple(self, gear: int, force_n: float) -> None:
+        pybullet.changeConstraint(gear, gearRatio=-1, maxForce=force_n, physicsClientId=self._client)
+
     def _finish_bodies(self, friction_root: float) -> None:
         # Bullet multiplies the coefficients of the two bodies, hence the root.
+        surface = {
+            "lateralFriction": friction_root,
+            "spinningFriction": 0.0,
+            "rollingFriction": 0.0,
+            "restitution": 0.0,
+        }
         for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
             for link in links:
-                pybullet.changeDynamics(
-                    body,
-                    link,
-                    lateralFriction=friction_root,
-                    spinningFriction=0.0,
-                    rollingFriction=0.0,
-                    restitution=0.0,
-                    linearDamping=0.0,
-                    angularDamping=0.0,
-                    jointDamping=0.0,
-                    collisionMargin=COLLISION_MARGIN_M,
-                    activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                    physicsClientId=self._client,
-                )
+                # In a call of its own: beside a setting that only a base has, such as a damping or a
+                # margin, pybullet drops all others of a link without a word.
+                pybullet.changeDynamics(body, link, physicsClientId=self._client, **surface)
+            pybullet.changeDynamics(
+                body,
+                -1,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
+                collisionMargin=COLLISION_MARGIN_M,
+                activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+                physicsClientId=self._client,
+            )
+        for link in (0, 1):
+            pybullet.changeDynamics(self._jaw, link, jointDamping=0.0, physicsClientId=self._client)
         pybullet.changeDynamics(
             self._object, -1, localInertiaDiagonal=self.mass.inertia, physicsClientId=self._client
         )
+
+    def frictions(self) -> list[float]:
+        """Coefficients between the object and palm, first and second finger, as Bullet multiplies them."""
+        roots = [
+            pybullet.getDynamicsInfo(body, link, physicsClientId=self._client)[1]
+            for body, link in ((self._object, -1), (self._jaw, -1), (self._jaw, 0), (self._jaw, 1))
+        ]
+        return [roots[0] * root for root in roots[1:]]
 
     # -- one grasp -----------------------------------------------------------------------------------------
 
@@ -273,24 +352,21 @@ class GraspWorld:
             geometry.
         """
         try:
+            self.pictures.clear()
+            self._filmed_s = 0.0
             closing = self._close(position, quaternion_xyzw, travel_m)
             if self._visible:
-                self._picture = self._render()
+                self.pictures.append(self._render())
             return closing
         finally:
             self._park()
 
-    def picture(self) -> NDArray[np.uint8]:
-        """The end of the last closing from two sides, (480, 1280, 3), drawn by pybullet's CPU renderer.
-
-        Raises
-        ------
-        RuntimeError
-            In a world that is not visible, or before the first closing.
-        """
-        if self._picture is None:
-            raise RuntimeError("only a visible world has a picture, and only after a closing")
-        return self._picture
+    def _film(self, dt: float) -> None:
+        """Take a picture when it is time for the next."""
+        self._filmed_s += dt
+        if self._visible and self._filmed_s >= self._film_every_s:
+            self._filmed_s = 0.0
+            self.pictures.append(self._render())
 
     def _render(self) -> NDArray[np.uint8]:
         width, height = 640, 480
@@ -343,6 +419,7 @@ class GraspWorld:
             pybullet.stepSimulation(physicsClientId=client)
             steps += 1
             elapsed += dt
+            self._film(dt)
             first, second = pybullet.getJointStates(jaw, (0, 1), physicsClientId=client)
             opening = first[0] + second[0]
             if not math.isfinite(opening):
@@ -369,13 +446,16 @@ class GraspWorld:
             elif elapsed - mark_time >= READING_AGES_S[len(contacts)] - 1e-9:
                 contacts.append(self._contacts())
                 distance = abs(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction) - 1.0)
-                if distance > NO_DOUBT or len(contacts) == len(READING_AGES_S):
+                if self._lifts or distance > NO_DOUBT or len(contacts) == len(READING_AGES_S):
                     end = End.STALLED
                     break
             if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
                 end = End.EMPTY
                 break
-        return self._closing(end, touched, opening, contacts, steps)
+        closing = self._closing(end, touched, opening, contacts, steps)
+        if self._lifts and closing.end is End.STALLED:
+            return replace(closing, carried=self._carry())
+        return closing
 
     def _body_pose(self, position: Vector, quaternion_xyzw: Quaternion) -> tuple[Vector, Quaternion]:
         """Pose of the object's principal frame in the tool frame.
@@ -387,7 +467,7 @@ class GraspWorld:
         inverse = (-x, -y, -z, w)
         centre = self.mass.centre
         offset = (centre[0] - position[0], centre[1] - position[1], centre[2] - position[2])
-        return _rotate(inverse, offset), _multiply(inverse, self.mass.principal_xyzw)
+        return rotate(inverse, offset), multiply(inverse, self.mass.principal_xyzw)
 
     def _drive(self, dt: float) -> None:
         # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
@@ -416,6 +496,55 @@ class GraspWorld:
             np.array([contact[3] for contact in contacts], dtype=np.int64),
         )
 
+    def _carry(self) -> Carried:
+        """Lift and shake what the stalled jaw holds."""
+        client, body, dt = self._client, self._object, self.stepping.carry_dt_s
+        # Where the jaw closes with less than its force, every force is scaled alike and time runs slower
+        # by the root: the same motion, in slow motion.
+        scale = self.gripper.closing_force_n / self.gripper.force_n
+        pace = math.sqrt(scale)
+        self._drive(dt)
+        self._couple(self._gear, _GEAR_FORCES * self.gripper.closing_force_n)
+        pybullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
+        where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+        # The point of the object at the tool's origin, in the object's principal frame.
+        x, y, z, w = began = orientation
+        anchor = rotate((-x, -y, -z, w), (-where[0], -where[1], -where[2]))
+        translation = rotation = 0.0
+        held = True
+        for step in range(1, math.ceil(lifting.DURATION_S / (pace * dt)) + 1):
+            velocity, spin = pybullet.getBaseVelocity(body, physicsClientId=client)
+            force, torque = lifting.load(
+                lifting.frame_at((step - 0.5) * dt * pace),
+                self.mass,
+                where,
+                orientation,
+                (velocity[0] / pace, velocity[1] / pace, velocity[2] / pace),
+                (spin[0] / pace, spin[1] / pace, spin[2] / pace),
+            )
+            pybullet.applyExternalForce(
+                body, -1, [scale * f for f in force], where, pybullet.WORLD_FRAME, physicsClientId=client
+            )
+            pybullet.applyExternalTorque(
+                body, -1, [scale * f for f in torque], pybullet.WORLD_FRAME, physicsClientId=client
+            )
+            pybullet.stepSimulation(physicsClientId=client)
+            self._film(dt)
+            where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+            if step % _EMPTY_CHECK_STEPS:
+                continue
+            moved = rotate(orientation, anchor)
+            away = math.hypot(where[0] + moved[0], where[1] + moved[1], where[2] + moved[2])
+            translation, rotation = (
+                max(translation, away),
+                max(rotation, lifting.angle_between(began, orientation)),
+            )
+            if not self._between():
+                held = False
+                break
+        held = held and {0, 1} <= set(self._contacts().fingers.tolist())
+        return Carried(held, translation, rotation)
+
     def _between(self) -> bool:
         return bool(pybullet.getClosestPoints(self._object, self._column, 0.0, physicsClientId=self._client))
 
@@ -428,10 +557,11 @@ class GraspWorld:
         if not all(map(math.isfinite, (*where, *orientation))):
             end = End.UNSTABLE
         elif end is End.STALLED:
-            # Bullet's hulls are inflated by the margin on both sides; the object is not.
-            opening -= 2.0 * COLLISION_MARGIN_M
-        quaternion = _multiply(orientation, self._to_body)
-        shift = _rotate(quaternion, self.mass.centre)
+            # Bullet's hulls are inflated by the margin on both sides, but for contact by faces; the
+            # object is not.
+            opening -= 0.0 if self._lifts else 2.0 * COLLISION_MARGIN_M
+        quaternion = multiply(orientation, self._to_body)
+        shift = rotate(quaternion, self.mass.centre)
         position = (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2])
         held = tuple(contacts) if end is End.STALLED else ()
         return Closing(end, touched, opening, held, position, quaternion, steps)
@@ -439,6 +569,8 @@ class GraspWorld:
     def _park(self) -> None:
         """Empty Bullet's caches: the object far away, one step without any contact."""
         client, jaw = self._client, self._jaw
+        if self._lifts:
+            self._couple(self._gear, 0.0)
         pybullet.resetBasePositionAndOrientation(self._object, _PARKED, _IDENTITY, physicsClientId=client)
         pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
         for joint in (0, 1):
@@ -447,37 +579,3 @@ class GraspWorld:
             )
         self._drive(self.stepping.approach_dt_s)
         pybullet.stepSimulation(physicsClientId=client)
-
-
-def _obj_of_parts(parts: Sequence[Part], mass: MassProperties) -> str:
-    lines: list[str] = []
-    offset = 1
-    for number, (vertices, faces) in enumerate(parts):
-        lines.append(f"o part{number}")
-        for vertex in mass.to_principal(np.asarray(vertices, dtype=np.float64)):
-            lines.append("v {:.9g} {:.9g} {:.9g}".format(*vertex))
-        for face in np.asarray(faces):
-            lines.append("f {} {} {}".format(*(int(i) + offset for i in face)))
-        offset += len(vertices)
-    return "\n".join(lines) + "\n"
-
-
-def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def _rotate(q: Quaternion, v: Vector) -> Vector:
-    x, y, z, w = q
-    tx, ty, tz = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
-    return (
-        v[0] + w * tx + y * tz - z * ty,
-        v[1] + w * ty + z * tx - x * tz,
-        v[2] + w * tz + x * ty - y * tx,
-    )

@@ -112,4 +112,4 @@ def simulate_one(
     with GraspWorld(parts, payload.mass_kg, payload.friction, gripper, fidelity, visible=True) as world:
         closing = world.close(pose.position, pose.quaternion_xyzw, travel)
         label = label_of(closing, gripper, payload.mass_kg, payload.friction)
-        return Shown(label, world.picture())
+        return Shown(label, world.pictures[-1])
