@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from . import se3
-from .maximum import Admissible, Maximum, Pool, Search
+from .maximum import REACH, Admissible, Maximum, Pool, Search
 from .region import Region
 from .se3 import Floats
 
@@ -31,8 +31,13 @@ __all__ = ["PoseNoise", "Score", "expected", "search_scored"]
 Score = Callable[[Floats, Floats], Floats]
 
 _CANDIDATES = 192
-_CLIMBERS = 16
-_TRIES, _ROUNDS = 12, 24
+#: Centres whose score is asked for before any is climbed from: a density tells little of where another score
+#: is high.
+_ASKED = 4096
+#: Climbs, random steps a climb tries at a time, and how often: many for a little, the best of them further.
+_PHASES = ((64, 8, 12), (12, 12, 24))
+#: Steps in kernel widths.
+_FIRST_STEP, _LAST_STEP = 0.6, 5e-3
 
 
 def search_scored(
@@ -48,8 +53,10 @@ def search_scored(
 ) -> list[Maximum]:
     """The ``count`` best distinct grasps by ``score``, best first; arguments as in `maximum.search`.
 
-    Candidates are well separated centres of the density, projected into the region; the best climb by random
-    steps, drawn from a fixed seed, that shrink as they fail. ``Maximum.score`` is the score.
+    Candidates are well separated centres of the density, projected into the region, those of the highest
+    score among at most 4,096 centres: half of them where the density is highest, half drawn at random. The
+    best climb by random steps, drawn from a fixed seed, that shrink as they fail. ``Maximum.score`` is the
+    score.
     """
     found = _ScoredSearch(density, region or Region(), admissible, threads, score)
     return found.run(count, min_separation_m, min_separation)
@@ -78,36 +85,66 @@ class _ScoredSearch(Search):
     def values(self, positions: Floats, quaternions: Floats) -> Floats:
         return self.sums(positions, quaternions)
 
+    def starts(self, wanted: int) -> Pool:
+        density, kernel = self.density, self.density.kernel
+        promise, turned = self.scores()
+        rows = np.flatnonzero(promise > -np.inf)
+        if len(rows) > _ASKED:
+            rows = rows[np.argsort(-promise[rows], kind="stable")]
+            others = np.random.default_rng(0).permutation(rows[_ASKED // 2 :])[: _ASKED // 2]
+            rows = np.concatenate([rows[: _ASKED // 2], others])
+        positions, quaternions = density.positions[rows], density.quaternions_xyzw[rows]
+        quaternions = np.where(turned[rows][:, None], se3.jaw_twin(quaternions), quaternions)
+        p, q, inside = self.region.project(positions, quaternions)
+        inside &= np.linalg.norm(p - positions, axis=1) <= REACH * kernel.sigma_position_m
+        inside &= se3.angle_between(q, quaternions) <= REACH * kernel.sigma_rotation
+        p, q = p[inside], q[inside]
+        found = Pool(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
+        if len(p):
+            pool = Pool(p, q, self.sums(p, q)).sort()
+            found = self.add_distinct(found, pool.positions, pool.quaternions, wanted)
+        # Where none of these is admissible another may be.
+        return found if len(found) else super().starts(wanted)
+
     def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
-        kernel = self.density.kernel
         rng = np.random.default_rng(0)
-        best = starts.sort().take(np.arange(min(len(starts), max(_CLIMBERS, finalists))))
-        step = np.full(len(best), 0.6)
-        passed = best
-        for _ in range(_ROUNDS):
-            scale = np.repeat(step, _TRIES)[:, None]
-            at, to = np.repeat(best.positions, _TRIES, axis=0), np.repeat(best.quaternions, _TRIES, axis=0)
-            moved = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
-            turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
-            p, q, inside = self.region.project(moved, se3.multiply(to, turns))
-            scores = np.full(len(p), -np.inf)
-            scores[inside] = self.sums(p[inside], q[inside])
-            better = scores > np.repeat(best.sums, _TRIES)
-            if self.admissible is not None and better.any():
-                better[better] = self.check(p[better], q[better])
-            scores[~better] = -np.inf
-            table = scores.reshape(len(best), _TRIES)
-            winner = table.argmax(axis=1) + np.arange(len(best)) * _TRIES
-            moved_on = scores[winner] > -np.inf
-            step = np.where(moved_on, np.minimum(1.1 * step, 1.0), 0.6 * step)
-            if moved_on.any():
-                index = winner[moved_on]
-                best.positions[moved_on], best.quaternions[moved_on] = p[index], q[index]
-                best.sums[moved_on] = scores[index]
-                passed = passed.joined(best.take(moved_on))
-            if step.max() < 5e-3:
-                break
-        return passed, best
+        ends, step, passed = starts, np.full(len(starts), _FIRST_STEP), starts.take(np.arange(0))
+        for climbers, tries, rounds in _PHASES:
+            order = np.argsort(-ends.sums, kind="stable")[: max(climbers, finalists)]
+            ends, step = ends.take(order), step[order]
+            for _ in range(rounds):
+                ends, step, moved = self.stepped(ends, step, tries, rng)
+                passed = passed.joined(ends.take(moved))
+                if step.max() < _LAST_STEP:
+                    break
+        return starts.joined(passed), ends
+
+    def stepped(
+        self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator
+    ) -> tuple[Pool, Floats, NDArray[np.bool_]]:
+        """Every climb's best of some random steps, where it is better; the steps to try next; which moved."""
+        kernel = self.density.kernel
+        scale = np.repeat(step, tries)[:, None]
+        at, to = np.repeat(ends.positions, tries, axis=0), np.repeat(ends.quaternions, tries, axis=0)
+        moved = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
+        turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
+        p, q, inside = self.region.project(moved, se3.multiply(to, turns))
+        scores = np.full(len(p), -np.inf)
+        scores[inside] = self.sums(p[inside], q[inside])
+        better = scores > np.repeat(ends.sums, tries)
+        if self.admissible is not None and better.any():
+            better[better] = self.check(p[better], q[better])
+        scores[~better] = -np.inf
+        winner = scores.reshape(len(ends), tries).argmax(axis=1) + np.arange(len(ends)) * tries
+        on = scores[winner] > -np.inf
+        step = np.where(on, np.minimum(1.1 * step, 1.0), 0.6 * step)
+        pick = on[:, None]
+        there = Pool(
+            np.where(pick, p[winner], ends.positions),
+            np.where(pick, q[winner], ends.quaternions),
+            np.where(on, scores[winner], ends.sums),
+        )
+        return there, step, on
 
 
 @dataclass(frozen=True, slots=True)
