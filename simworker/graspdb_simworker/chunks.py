@@ -21,7 +21,7 @@ from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import GripperShape
 from graspdb_simworker.bodies import Gripper, Part, closing_force
-from graspdb_simworker.labels import Label, Outcome, label_of
+from graspdb_simworker.labels import Label, Outcome, compile_force_test, label_of
 from graspdb_simworker.scene import GraspWorld
 
 PROTOCOLS = ("wrench", "lift")
@@ -78,6 +78,7 @@ def prepare(payload: SimulatePayload, parts: Sequence[Part]) -> Workpiece:
         raise UnsupportedProtocol(
             f"this worker simulates {', '.join(PROTOCOLS)}; the sweep asks for {payload.protocol!r}"
         )
+    compile_force_test()
     gripper = gripper_of(payload.gripper, payload.mass_kg)
     return Workpiece(
         parts=parts,
