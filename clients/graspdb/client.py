@@ -8,6 +8,7 @@ from typing import Any
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
+from graspdb.kernels import Kernels
 from graspdb.objects import GraspObject, Objects
 from graspdb.pages import Listing, checked, segment
 from graspdb.results import table_html
@@ -33,7 +34,7 @@ class Client:
 
     Attributes
     ----------
-    objects, grippers, sweeps
+    objects, grippers, kernels, sweeps
         The collections on the service.
     """
 
@@ -50,6 +51,7 @@ class Client:
         )
         self.objects = Objects(self._transport)
         self.grippers = Grippers(self._transport)
+        self.kernels = Kernels(self._transport)
         self.sweeps = Sweeps(self._transport)
 
     @property

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from graspdb.client import Client
-from graspdb.errors import GraspDBError, Infeasible
+from graspdb.errors import Conflict, GraspDBError, Infeasible
 from graspdb.objects import GraspObject
 from graspdb.results import Grasp
 from graspdb.sweeps import OutcomeArrays, Sweep, SweepBar, duration
@@ -299,6 +299,7 @@ def _grasp_example(db: Client, children: Children, name: str, max_poses: int, co
     )
     console.print(f"\n[bold]Best grasp overall[/]\n{_grasp(item.best_grasp())}")
     console.print(f"\n{_in_workspace(item)}\n")
+    console.print(f"{_reports(item)}\n")
     shares = _check(item, children, console)
     return (
         f"[bold]{item.id}[/]: {successes:,} successes of {info.poses_done:,} poses.\n"
@@ -337,6 +338,21 @@ def _in_workspace(item: GraspObject) -> str:
     except Infeasible as error:
         return f"{title}\n  {escape(str(error))}"
     return f"{title}\n{_grasp(best)}"
+
+
+def _reports(item: GraspObject) -> str:
+    """How far a grasp may be off and whether enough was tried, or what it takes to say so."""
+    lines = []
+    for title, ask in (
+        ("Tolerance", item.reports.anisotropy),
+        ("Convergence", item.reports.convergence),
+    ):
+        try:
+            text = ask().text
+        except Conflict as error:
+            text = str(error)
+        lines.append(f"[bold]{title}[/]: {escape(text)}")
+    return "\n".join(lines)
 
 
 def _check(item: GraspObject, children: Children, console: Console) -> str:

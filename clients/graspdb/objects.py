@@ -14,6 +14,7 @@ from graspdb.errors import GraspDBError, Infeasible
 from graspdb.meshes import GLB, MeshLike, read_mesh, scene_of
 from graspdb.pages import Listing, checked, segment
 from graspdb.poses import as_poses, as_vector7
+from graspdb.reports import Reports
 from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses, table_html
 from graspdb.sweeps import Sweep, Sweeps, create_sweep
 from graspdb.transport import Transport
@@ -31,8 +32,8 @@ class GraspObject:
     """An object on the service.
 
     ``info`` is what the service said last; :meth:`refresh` asks again. ``trials`` and ``batches`` hold what
-    has been tried, the methods ask what follows from it. All poses are of the tool frame in the object
-    frame, in metres, quaternions xyzw.
+    has been tried, the methods ask what follows from it, and ``reports`` whether that was enough. All poses
+    are of the tool frame in the object frame, in metres, quaternions xyzw.
 
     Queries take the *selection* of trials a density is built from: ``gripper``, ``protocol``, ``source``,
     and the ``kernel`` (``"isotropic"`` or its widths ``sigma_position_m``, ``sigma_rotation_deg``).
@@ -44,6 +45,7 @@ class GraspObject:
         self.info = info
         self.trials = Trials(transport, info.id)
         self.batches = Batches(transport, info.id)
+        self.reports = Reports(transport, self._path)
 
     @property
     def id(self) -> str:

@@ -1,0 +1,296 @@
+"""Reports: how far a grasp may be off, whether enough was tried, whether the numbers can be believed."""
+
+from __future__ import annotations
+
+import html
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb import wire
+from graspdb.errors import GraspDBError, error_for
+from graspdb.transport import Transport
+from graspdb.wire.reports import (
+    REPORTS,
+    AnisotropyReport,
+    AnisotropyTolerance,
+    CalibrationReport,
+    ConvergenceReport,
+    ReportRun,
+    Verdict,
+)
+from graspdb.wire.reports import Report as ReportModel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Anisotropy", "Calibration", "Convergence", "Report", "Reports"]
+
+Floats = NDArray[np.float64]
+R = TypeVar("R", bound=ReportModel)
+Progress = Callable[[ReportRun], None]
+
+_POLL_S = 0.5
+
+
+class Report(Generic[R]):
+    """A report; ``text`` is its answer in words and ``raw`` the whole of it."""
+
+    def __init__(self, raw: R) -> None:
+        self.raw = raw
+
+    @property
+    def text(self) -> str:
+        """The answer in words."""
+        return self.raw.text
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to mind."""
+        return self.raw.warnings
+
+    def plot(self) -> Figure:
+        """The figure, as the service draws it; a notebook shows it. Needs matplotlib (extra ``plot``)."""
+        from graspdb.figures import draw
+
+        # Every model of a report that there is, is one that can be drawn.
+        raw: Any = self.raw
+        return draw(raw)
+
+    def save(self, path: str | Path) -> None:
+        """Write the figure to a ``.png`` or ``.svg`` file."""
+        Path(path).write_bytes(_rendered(self.raw, path))
+
+    def __repr__(self) -> str:
+        told = "".join(f"\n  mind: {warning}" for warning in self.warnings)
+        return (
+            f"<{type(self).__name__} of {self.raw.object}, revision {self.raw.revision}: {self.text}{told}>"
+        )
+
+    def _repr_html_(self) -> str:
+        mind = "".join(f"<li>{html.escape(warning)}</li>" for warning in self.warnings)
+        title = html.escape(f"{type(self).__name__} of {self.raw.object}, revision {self.raw.revision}")
+        return f"<p><b>{title}</b><br>{html.escape(self.text)}</p>" + (f"<ul>{mind}</ul>" if mind else "")
+
+
+def _rendered(raw: Any, path: str | Path) -> bytes:
+    from graspdb.figures import rendered
+
+    suffix = Path(path).suffix.lower()
+    if suffix == ".png":
+        return rendered(raw, "png")
+    if suffix == ".svg":
+        return rendered(raw, "svg")
+    raise ValueError(f"figures are .png or .svg files, not {suffix or path!r}")
+
+
+class Convergence(Report[ConvergenceReport]):
+    """Have we tried enough? Arrays are those of the kernel asked for, by rising number of grasps."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """``enough``, ``more`` or ``borderline``, and how many more."""
+        return self.raw.curves[0].verdict
+
+    @property
+    def enough(self) -> bool:
+        """Whether the density would hardly change if its grasps were drawn again."""
+        return self.verdict.state == "enough"
+
+    @property
+    def grasps(self) -> NDArray[np.int64]:
+        """(P,) successful grasps."""
+        return np.array([point.grasps for point in self.raw.curves[0].points], dtype=np.int64)
+
+    @property
+    def similarity(self) -> Floats:
+        """(P,) eq 9: 1 where bootstrap replicates agree with the whole."""
+        return np.array([point.similarity for point in self.raw.curves[0].points])
+
+    @property
+    def log_likelihood(self) -> Floats:
+        """(P,) mean log density of held-out grasps, nats of 1/(m^3 rad^3)."""
+        return np.array([point.log_likelihood for point in self.raw.curves[0].points])
+
+
+class Anisotropy(Report[AnisotropyReport]):
+    """What a success tells about its vicinity."""
+
+    @property
+    def tolerances(self) -> dict[str, AnisotropyTolerance]:
+        """By axis: ``x``, ``y``, ``z`` in metres, ``rx``, ``ry``, ``rz`` in radians."""
+        return {item.axis: item for item in self.raw.tolerances}
+
+    @property
+    def forgives(self) -> dict[str, float | None]:
+        """Half width by axis, metres and radians; None where nothing was tried."""
+        return {axis: item.half_width for axis, item in self.tolerances.items()}
+
+
+class Calibration(Report[CalibrationReport]):
+    """Whether ``success_probability`` can be believed."""
+
+    @property
+    def skill(self) -> float | None:
+        """Brier skill: 1 is perfect, 0 no better than the share of successes."""
+        return self.raw.skill.value
+
+    @property
+    def predicted(self) -> Floats:
+        """(B,) mean prediction of every bin; nan where empty."""
+        return _column(item.predicted for item in self.raw.bins)
+
+    @property
+    def observed(self) -> Floats:
+        """(B,) share that came true."""
+        return _column(item.observed for item in self.raw.bins)
+
+
+def _column(values: Any) -> Floats:
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+class Reports:
+    """``mug.reports``. All of them take the selection of trials and the kernel, as queries do.
+
+    They wait until the report is computed; ``progress`` is called with its run meanwhile, and ``timeout_s``
+    ends the wait, not the computation: asking again goes on waiting.
+    """
+
+    def __init__(self, transport: Transport, path: str) -> None:
+        self._transport = transport
+        self._path = path
+
+    def convergence(
+        self,
+        *,
+        matching: str | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: str | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> Convergence:
+        """Whether there are enough successful grasps, and how many more it takes.
+
+        Parameters
+        ----------
+        matching
+            With a stored kernel: how the isotropic one beside it is chosen, ``determinants`` or
+            ``likelihood``.
+
+        Raises
+        ------
+        Conflict
+            For too few successes, saying how many are needed.
+        """
+        params = {
+            "matching": matching,
+            **_selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg),
+        }
+        return Convergence(self._get("convergence", ConvergenceReport, params, progress, timeout_s))
+
+    def anisotropy(
+        self,
+        *,
+        method: str | None = None,
+        alignment: str | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: str | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> Anisotropy:
+        """How far a good grasp may be displaced along and about every axis.
+
+        Parameters
+        ----------
+        method
+            ``empirical`` counts pairs of trials; ``density`` compares densities.
+        alignment
+            Translations along the axes of the ``gripper`` or the ``object``'s principal ones.
+        """
+        params = {
+            "method": method,
+            "alignment": alignment,
+            **_selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg),
+        }
+        return Anisotropy(self._get("anisotropy", AnisotropyReport, params, progress, timeout_s))
+
+    def calibration(
+        self,
+        *,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: str | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> Calibration:
+        """How often grasps hold that are predicted to, judged on trials the prediction has not seen."""
+        params = _selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg)
+        return Calibration(self._get("calibration", CalibrationReport, params, progress, timeout_s))
+
+    def _get(
+        self,
+        name: str,
+        model: type[R],
+        params: Mapping[str, Any],
+        progress: Progress | None,
+        timeout_s: float | None,
+    ) -> R:
+        began = time.monotonic()
+        answer = self._transport.request(
+            "GET", f"{self._path}/reports/{name}", params=params, headers={"Accept": "application/json"}
+        )
+        if answer.status_code != 202:
+            return model.model_validate(answer.json())
+        location = answer.headers["Location"]
+        while True:
+            run = ReportRun.model_validate(self._transport.json("GET", location))
+            if progress is not None:
+                progress(run)
+            if run.result is not None:
+                return model.model_validate(run.result)
+            if run.problem is not None:
+                raise error_for(wire.Problem.model_validate(run.problem))
+            if run.state != "running":
+                raise GraspDBError(f"the report was {run.state}: ask again to compute it anew")
+            if timeout_s is not None and time.monotonic() - began > timeout_s:
+                raise TimeoutError(
+                    f"the {name} report is {run.progress:.0%} done after {timeout_s:g} s; it goes on"
+                )
+            time.sleep(_POLL_S)
+
+    def __repr__(self) -> str:
+        return f"<reports: {', '.join(REPORTS)}>"
+
+
+def _selection(
+    gripper: str | None,
+    protocol: str | None,
+    source: str | None,
+    kernel: str | None,
+    sigma_position_m: float | None,
+    sigma_rotation_deg: float | None,
+) -> dict[str, Any]:
+    return {
+        "gripper": gripper,
+        "protocol": protocol,
+        "source": source,
+        "kernel": kernel,
+        "sigma_position_m": sigma_position_m,
+        "sigma_rotation_deg": sigma_rotation_deg,
+    }
