@@ -1,0 +1,146 @@
+"""Reports and kernels through the SDK and the command line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graspdb import Client, cli
+from graspdb.errors import Conflict, NotFound
+from graspdb.objects import GraspObject
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+def field(count: int = 2_000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (N, 7) about one grasp and whether they hold: wide along x, narrow along y."""
+    rng = np.random.default_rng(seed)
+    widths = np.array([0.03, 0.006, 0.012, 0.2, 0.8, 0.2])
+    xi = rng.uniform(-2.0, 2.0, (count, 6)) * widths
+    angle = np.linalg.norm(xi[:, 3:], axis=1, keepdims=True)
+    q = np.concatenate([xi[:, 3:] / angle * np.sin(angle / 2), np.cos(angle / 2)], axis=1)
+    return np.concatenate([xi[:, :3], q], axis=1), np.sum((xi / widths) ** 2, axis=1) < 5.0
+
+
+@pytest.fixture
+def thing(db: Client, fresh_id: str) -> GraspObject:
+    item = db.objects.create(fresh_id)
+    item.trials.add(*field())
+    return item
+
+
+@pytest.fixture
+def run(service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run ``graspdb`` with these arguments: exit code, standard output, standard error."""
+    monkeypatch.setenv("GRASPDB_URL", service_url)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def invoke(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["graspdb", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        code = ended.value.code
+        return (code if isinstance(code, int) else 0 if code is None else 1), captured.out, captured.err
+
+    return invoke
+
+
+def test_reports_have_words_arrays_and_figures(thing: GraspObject, tmp_path: Path) -> None:
+    convergence = thing.reports.convergence()
+    assert convergence.enough == (convergence.verdict.state == "enough")
+    assert len(convergence.grasps) == len(convergence.similarity) == len(convergence.log_likelihood) >= 4
+    assert (np.diff(convergence.grasps) > 0).all()
+    assert convergence.text in repr(convergence)
+    assert "Convergence of" in convergence._repr_html_()
+
+    anisotropy = thing.reports.anisotropy()
+    assert set(anisotropy.tolerances) == {"x", "y", "z", "rx", "ry", "rz"}
+    x, y = anisotropy.forgives["x"], anisotropy.forgives["y"]
+    assert x is not None
+    assert y is not None
+    assert x > 1.5 * y
+    assert "forgives" in repr(anisotropy)
+
+    calibration = thing.reports.calibration()
+    assert calibration.skill is not None
+    assert calibration.skill > 0
+    assert len(calibration.predicted) == len(calibration.observed) == 10
+    assert calibration.warnings
+    assert "mind:" in repr(calibration)
+
+    for report in (convergence, anisotropy, calibration):
+        figure = report.plot()
+        texts = " ".join(text.get_text() for text in figure.findobj(lambda a: hasattr(a, "get_text")))
+        assert thing.id in texts
+        # Everything drawn lies on the page.
+        box = figure.get_tightbbox()
+        assert box.width <= figure.get_figwidth() + 0.01
+        assert box.height <= figure.get_figheight() + 0.01
+    png, svg = tmp_path / "a.png", tmp_path / "a.svg"
+    convergence.save(png)
+    convergence.save(svg)
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in svg.read_bytes()
+    with pytest.raises(ValueError, match=r"\.pdf"):
+        convergence.save(tmp_path / "a.pdf")
+
+
+def test_too_few_trials_raise_what_is_needed(db: Client, fresh_id: str) -> None:
+    item = db.objects.create(fresh_id)
+    with pytest.raises(Conflict, match="at least 200 successful grasps"):
+        item.reports.convergence()
+    with pytest.raises(Conflict, match="at least 20 successes"):
+        item.reports.anisotropy()
+    with pytest.raises(Conflict, match="POST /kernels"):
+        item.reports.convergence(kernel="anisotropic")
+
+
+def test_kernels_are_fitted_and_used(db: Client, thing: GraspObject) -> None:
+    made = db.kernels.fit(thing.id)
+    assert made.id in [kernel.id for kernel in db.kernels]
+    assert made.widths_m[0] > made.widths_m[1]
+    assert made.id in repr(made)
+    assert "covariance" not in repr(made)
+    used = thing.density(kernel="anisotropic").kernel
+    assert (used.id, used.alignment) == (made.id, "gripper")
+    assert thing.best_grasp(kernel=made.id).relative == pytest.approx(1, abs=0.02)
+    given = db.kernels.create([{"covariance": made.components[0].covariance}])
+    assert given.provenance.origin == "given"
+    for kernel in (made, given):
+        db.kernels.delete(kernel.id)
+    with pytest.raises(NotFound):
+        db.kernels.get(made.id)
+
+
+def test_on_the_command_line(run: Run, thing: GraspObject, tmp_path: Path) -> None:
+    png = tmp_path / "out.png"
+    code, out, err = run("report", thing.id, "convergence", "--figure", str(png))
+    assert code == 0, err
+    assert "similarity" in out
+    assert png.read_bytes().startswith(b"\x89PNG")
+    code, out, _ = run("report", thing.id, "anisotropy", "--method", "empirical")
+    assert (code, "forgives" in out) == (0, True)
+    code, out, err = run("report", thing.id, "calibration")
+    assert (code, "Brier skill" in out, "Mind:" in err) == (0, True, True)
+    code, out, _ = run("--json", "report", thing.id, "calibration")
+    assert json.loads(out)["report"] == "calibration"
+    code, _, err = run("report", thing.id, "anisotropy", "--matching", "likelihood")
+    assert (code, "no such option" in err) == (2, True)
+    assert run("report", thing.id, "guesses")[0] == 2
+    assert run("report", thing.id, "convergence", "--figure", "x.pdf")[0] == 2
+    code, _, err = run("report", thing.id, "anisotropy", "--alignment", "object")
+    assert (code, "has no mesh" in err) == (1, True)
+
+    code, out, _ = run("--json", "kernels", "fit", thing.id)
+    kernel = json.loads(out)["id"]
+    assert kernel in run("kernels", "list")[1]
+    code, out, _ = run("report", thing.id, "convergence", "--kernel", kernel)
+    assert (code, "times the grasps of the matched isotropic kernel" in out) == (0, True)
+    assert run("kernels", "delete", kernel)[0] == 0
+    assert kernel not in run("kernels", "list")[1]
