@@ -19,7 +19,8 @@ def _expected(method: str, path: str) -> str:
         return "public"
     if path.startswith("/jobs") or (method, path) in FOR_WORKERS:
         return "jobs:work"
-    if method == "get" or path.endswith(COMPUTING):
+    # Who may have a report computed may stop it.
+    if method == "get" or path.endswith(COMPUTING) or path == "/report-runs/{id}/cancel":
         return "read"
     if "/trials" in path or "/batches" in path:
         return "trials:write"
