@@ -82,6 +82,8 @@ def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(tmp_path: Path) ->
     assert process.poll() is None, out
     assert "Simulated 20,000 poses" in out
     assert out.index("Best grasp overall") < out.index("Best grasp in a workspace")
+    assert re.search(r"Tolerance: A good grasp forgives .*\d+ (mm|deg)", out)
+    assert re.search(r"Convergence: \d+ successful grasps are ", out)
     assert re.search(
         r"Of 100 draws from the density, .* \d+ \(0\.\d\d; 90 % interval 0\.\d\d to 0\.\d\d\)", out
     )
