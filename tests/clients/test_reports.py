@@ -140,6 +140,11 @@ def test_on_the_command_line(run: Run, thing: GraspObject, tmp_path: Path) -> No
     code, out, _ = run("--json", "kernels", "fit", thing.id)
     kernel = json.loads(out)["id"]
     assert kernel in run("kernels", "list")[1]
+    code, out, _ = run("density", thing.id, "--kernel", "anisotropic")
+    assert (code, "anisotropic" in out) == (0, True)
+    assert run("best-grasp", thing.id, "--kernel", kernel)[0] == 0
+    assert run("samples", thing.id, "--kernel", kernel)[0] == 0
+    assert run("likelihood", thing.id, "--pose=0,0,0,0,0,0,1", "--kernel", kernel)[0] == 0
     code, out, _ = run("report", thing.id, "convergence", "--kernel", kernel)
     assert (code, "times the grasps of the matched isotropic kernel" in out) == (0, True)
     assert run("kernels", "delete", kernel)[0] == 0

@@ -76,6 +76,7 @@ def vector_option(help: str, *names: str, count: int = 3, metavar: str = "x,y,z"
 Gripper = Annotated[str | None, typer.Option(help="Only trials with this gripper.")]
 Protocol = Annotated[str | None, typer.Option(help="Only trials with this protocol.")]
 Source = Annotated[str | None, typer.Option(help="Only trials from: simulation, robot, human, import.")]
+Kernel = Annotated[str | None, typer.Option(help="isotropic, anisotropic, or a stored kernel's id.")]
 SigmaPosition = Annotated[
     float | None, typer.Option("--sigma-position-m", help="Kernel width in position, metres.")
 ]

@@ -10,6 +10,7 @@ import typer
 from graspdb.cli.common import (
     ERRORS,
     Gripper,
+    Kernel,
     ObjectId,
     Protocol,
     SigmaPosition,
@@ -33,6 +34,7 @@ def density(
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
+    kernel: Kernel = None,
     sigma_position_m: SigmaPosition = None,
     sigma_rotation_deg: SigmaRotation = None,
 ) -> None:
@@ -43,17 +45,18 @@ def density(
             gripper=gripper,
             protocol=protocol,
             source=source,
+            kernel=kernel,
             sigma_position_m=sigma_position_m,
             sigma_rotation_deg=sigma_rotation_deg,
         )
     if state.json:
         out(found)
         return
-    kernel = found.kernel
+    used = found.kernel
     rows: dict[str, Any] = {
         "object": f"{found.object}, revision {found.revision}",
-        "kernel": f"{kernel.kind}, {kernel.sigma_position_m * 1e3:.1f} mm, {kernel.sigma_rotation_deg:.1f}°",
-        "widths": kernel.rule,
+        "kernel": f"{used.kind}, {used.sigma_position_m * 1e3:.1f} mm, {used.sigma_rotation_deg:.1f}°",
+        "widths": used.rule,
         "selection": ", ".join(x for x in (found.gripper, found.protocol, found.source) if x) or "all trials",
         "successes": f"{found.size:,}",
         "effective sample size": f"{found.effective_sample_size:,.0f}",
@@ -95,6 +98,7 @@ def best_grasp(
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
+    kernel: Kernel = None,
     sigma_position_m: SigmaPosition = None,
     sigma_rotation_deg: SigmaRotation = None,
 ) -> None:
@@ -124,6 +128,7 @@ def best_grasp(
                 gripper=gripper,
                 protocol=protocol,
                 source=source,
+                kernel=kernel,
                 sigma_position_m=sigma_position_m,
                 sigma_rotation_deg=sigma_rotation_deg,
             )
@@ -185,6 +190,7 @@ def likelihood(
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
+    kernel: Kernel = None,
     sigma_position_m: SigmaPosition = None,
     sigma_rotation_deg: SigmaRotation = None,
     limit: Annotated[int, typer.Option(min=1, help="Rows of the table; --json gives all.")] = 20,
@@ -200,6 +206,7 @@ def likelihood(
             gripper=gripper,
             protocol=protocol,
             source=source,
+            kernel=kernel,
             sigma_position_m=sigma_position_m,
             sigma_rotation_deg=sigma_rotation_deg,
         )
@@ -237,6 +244,7 @@ def samples(
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
+    kernel: Kernel = None,
     sigma_position_m: SigmaPosition = None,
     sigma_rotation_deg: SigmaRotation = None,
     csv: Annotated[
@@ -252,6 +260,7 @@ def samples(
             gripper=gripper,
             protocol=protocol,
             source=source,
+            kernel=kernel,
             sigma_position_m=sigma_position_m,
             sigma_rotation_deg=sigma_rotation_deg,
         )

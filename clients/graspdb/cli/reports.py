@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from graspdb.cli.common import (
     ERRORS,
     Gripper,
+    Kernel,
     ObjectId,
     Protocol,
     SigmaPosition,
@@ -25,8 +26,6 @@ from graspdb.reports import Anisotropy, Calibration, Convergence
 from graspdb.wire.reports import REPORTS, ReportRange, ReportRun
 
 kernels = typer.Typer(help="Stored kernels.", no_args_is_help=True)
-
-Kernel = Annotated[str | None, typer.Option(help="isotropic, anisotropic, or a stored kernel's id.")]
 
 
 def report(
