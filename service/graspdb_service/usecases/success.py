@@ -30,6 +30,8 @@ from graspdb_service.usecases.selection import Filters, Selected, resolve
 Floats = NDArray[np.float64]
 
 LEVEL = 0.9
+#: Attempts of the random sample that searches feel their way by where a model has far more of them.
+_SAMPLE, _LARGE = 100_000, 400_000
 _SUCCESS, _COLLISION = OUTCOME_CODES["success"], OUTCOME_CODES["collision"]
 _NO_ATTEMPT = OUTCOME_CODES["simulation_error"]
 
@@ -52,7 +54,7 @@ class Estimates:
 
 @dataclass(frozen=True, eq=False)
 class _Attempts:
-    """A model as of a revision, and the repeat key of every sweep in it."""
+    """A model as of a revision, and the repeat key of every sweep in it; ``sample`` of a large one."""
 
     revision: int
     epoch: int
@@ -60,10 +62,19 @@ class _Attempts:
     tried: frozenset[int]
     sweeps: Mapping[str, str]
     model: SuccessModel | None
+    sample: SuccessModel | None
 
     @property
     def nbytes(self) -> int:
-        return 4_096 + (0 if self.model is None else self.model.nbytes)
+        return 4_096 + sum(part.nbytes for part in (self.model, self.sample) if part is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """All attempts, and the ones to search by: a random sample where all would take too long."""
+
+    whole: SuccessModel
+    quick: SuccessModel
 
 
 @dataclass(frozen=True)
@@ -92,7 +103,7 @@ class Successes:
         self._compute = compute
         self._cache: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
-    def model(self, slug: str, built: Built, *, collisions_known: bool) -> SuccessModel | None:
+    def model(self, slug: str, built: Built, *, collisions_known: bool) -> Model | None:
         """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
 
         Parameters
@@ -110,7 +121,9 @@ class Successes:
         found = self._cache.get(
             key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
         )
-        return found.model if found.model is not None and found.model.size else None
+        if found.model is None or not found.model.size:
+            return None
+        return Model(found.model, found.sample or found.model)
 
     def estimate(
         self, slug: str, built: Built, positions: Floats, quaternions: Floats, free: NDArray[np.bool_] | None
@@ -122,13 +135,12 @@ class Successes:
         free : (n,) bool or None
             Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
         """
-        return self.under(
-            self.model(slug, built, collisions_known=free is not None), positions, quaternions, free
-        )
+        model = self.model(slug, built, collisions_known=free is not None)
+        return self.under(model, positions, quaternions, free)
 
     def under(
         self,
-        model: SuccessModel | None,
+        model: Model | None,
         positions: Floats,
         quaternions: Floats,
         free: NDArray[np.bool_] | None,
@@ -138,7 +150,7 @@ class Successes:
         if model is not None:
 
             def work(part: slice) -> None:
-                answer = model.evaluate(
+                answer = model.whole.evaluate(
                     positions[part], quaternions[part], level=LEVEL, threads=self._compute.threads
                 )
                 estimates.probability[part] = answer.probability
@@ -174,21 +186,28 @@ class Successes:
                 swept=False,
                 without=without,
             )
-        old = None if before is None else before.model
+        kernel = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
+        old, sample = (None, None) if before is None else (before.model, before.sample)
+        new = self._compute.run(lambda: _joined(rows, swept, selected, without))
+        size = len(new.success) + (0 if old is None else old.size)
+        if old is not None and sample is None and size > _LARGE:
+            # It has outgrown being searched itself: a sample needs what came before, too.
+            return self._refresh(key, slug, None)
+        model = self._compute.run(lambda: _extended(old, new, kernel))
+        if size > _LARGE:
+            share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
+            chosen = np.random.default_rng(row.revision).random(len(new.success)) < share
+            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel))
+        return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
-        def build() -> SuccessModel | None:
-            new = _joined(rows, swept, selected, without)
-            if not len(new.success):
-                return old
-            columns = new.position, new.quaternion, new.success
-            if old is not None:
-                return old.extend(*columns, symmetric=new.symmetric)
-            kernel = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
-            return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
 
-        return _Attempts(
-            row.revision, row.epoch, row.last_seq, selected.tried, names, self._compute.run(build)
-        )
+def _extended(old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel) -> SuccessModel | None:
+    if not len(new.success):
+        return old
+    columns = new.position, new.quaternion, new.success
+    if old is not None:
+        return old.extend(*columns, symmetric=new.symmetric)
+    return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
 
 
 def _read_swept(tx: Tx, object_id: int, selected: Selected, before: _Attempts | None) -> list[_Swept]:
@@ -227,6 +246,11 @@ class _Columns:
     quaternion: Floats
     success: NDArray[np.bool_]
     symmetric: NDArray[np.bool_]
+
+    def take(self, chosen: NDArray[np.bool_]) -> _Columns:
+        return _Columns(
+            self.position[chosen], self.quaternion[chosen], self.success[chosen], self.symmetric[chosen]
+        )
 
 
 def _joined(rows: trials.Columns, swept: list[_Swept], selected: Selected, without: list[int]) -> _Columns:

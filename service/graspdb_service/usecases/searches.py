@@ -1,0 +1,276 @@
+"""Searches for the best grasps: what is asked, which poses are admissible, and where the best ones are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graspdb.wire import GraspConstraints, Ranking
+from graspdb_density import GraspDensity, Maximum, MixtureDensity, se3, search_scored
+from graspdb_density.maximum import Admissible
+from graspdb_density.scored import Score
+from graspdb_geometry.grippers import GripperShape
+from graspdb_service.usecases.constraints import Constraints, Poses
+from graspdb_service.usecases.densities import Built
+from graspdb_service.usecases.scenes import CollisionTest, shape_of
+from graspdb_service.usecases.success import Model
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_SEPARATION_M = 0.01
+_SEPARATION_DEG = 20.0
+#: Successes shown to the collision test at a time while looking for the nearest admissible one.
+_CANDIDATES = 1_024
+#: A chance is told within so many standard deviations of a success, position and rotation together. Farther
+#: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
+_NEAR = 2.0
+#: Grasps found by the quick score that are scored again, those that go on climbing, by so many steps.
+_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 4, 8, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A request about one density, everything looked up."""
+
+    request: GraspConstraints
+    built: Built
+    density: GraspDensity
+    limits: Constraints
+    test: CollisionTest | None
+    chances: bool
+    """Whether grasps are told with their success probability."""
+    model: Model | None
+    admissible: Admissible | None
+    ranking: Ranking
+    score: Score | None
+    """None: the density's own search."""
+    quick: Score | None
+    """Nearly the score, and much faster: what a search feels its way by."""
+    threads: int
+
+    @property
+    def asked(self) -> GraspDensity | MixtureDensity:
+        """The density under the kernel asked for, where ``density`` is under an isotropic one."""
+        return self.density if self.built.shaped is None else self.built.shaped
+
+    @property
+    def separation(self) -> tuple[float, float]:
+        """Metres and radians from which on two grasps are distinct."""
+        request = self.request
+        return (
+            _or(request.min_separation_m, _SEPARATION_M),
+            math.radians(_or(request.min_separation_deg, _SEPARATION_DEG)),
+        )
+
+
+def admissible_for(question: Question, of_chances: bool) -> Admissible | None:
+    """Every constraint that a region can't express, the cheap ones first; a score ``of_chances`` has one."""
+    request, limits, test, threads = question.request, question.limits, question.test, question.threads
+    checks: list[Callable[[Floats, Floats], Bools]] = []
+    if of_chances:
+        checks.append(_near_successes(question.density, threads))
+    if limits.exclude is not None and len(limits.exclude[0]):
+        checks.append(_away_from(limits.exclude, question.separation, bool(question.density.symmetric.all())))
+    distance = request.pregrasp_distance_m or 0.0
+    if test is not None and request.collision_free is not False:
+        known = test
+        checks.append(lambda p, q: known.free_on_the_way(p, q, distance, threads))
+    profile = question.built.selected.profile
+    if limits.obstacles and profile is not None:
+        checks.append(_clear_of(limits, shape_of(profile), distance, threads))
+    if request.max_width_m is not None and test is not None:
+        wide, measured = request.max_width_m, test
+        checks.append(lambda p, q: measured.widths(p, q, threads) <= wide)
+    if not checks:
+        return None
+
+    def admissible(positions: Floats, quaternions: Floats) -> Bools:
+        left = np.arange(len(positions))
+        for check in checks:
+            if len(left):
+                left = left[check(positions[left], quaternions[left])]
+        allowed = np.zeros(len(positions), dtype=np.bool_)
+        allowed[left] = True
+        return allowed
+
+    return admissible
+
+
+def _near_successes(density: GraspDensity, threads: int) -> Callable[[Floats, Floats], Bools]:
+    """Whether some success is within `_NEAR`.
+
+    A kernel's exponent ``|dp|^2 / (2 sigma^2) + kappa (1 - q . q')`` is half a squared distance of points
+    (p / sigma, sqrt(kappa) q), both signs of q being one rotation.
+    """
+    kernel = density.kernel
+    scale, turn = 1.0 / kernel.sigma_position_m, math.sqrt(kernel.kappa)
+    tree = cKDTree(np.hstack([density.positions * scale, density.quaternions_xyzw * turn]))
+    twins = bool(density.symmetric.any())
+
+    def near(positions: Floats, quaternions: Floats) -> Bools:
+        ends = [quaternions, -quaternions]
+        if twins:
+            twin = se3.jaw_twin(quaternions)
+            ends += [twin, -twin]
+        found = np.zeros(len(positions), dtype=np.bool_)
+        for q in ends:
+            left = np.flatnonzero(~found)
+            points = np.hstack([positions[left] * scale, q[left] * turn])
+            distance, _ = tree.query(points, distance_upper_bound=_NEAR, workers=threads)
+            found[left] = np.isfinite(distance)
+        return found
+
+    return near
+
+
+def _away_from(
+    poses: Poses, separation: tuple[float, float], twins: bool
+) -> Callable[[Floats, Floats], Bools]:
+    def away(positions: Floats, quaternions: Floats) -> Bools:
+        near = np.zeros(len(positions), dtype=np.bool_)
+        for p, q in zip(*poses, strict=True):
+            angle = se3.angle_between(quaternions, q)
+            if twins:
+                angle = np.minimum(angle, se3.angle_between(quaternions, se3.jaw_twin(q)))
+            near |= (np.linalg.norm(positions - p, axis=1) <= separation[0]) & (angle <= separation[1])
+        return ~near
+
+    return away
+
+
+def _clear_of(
+    limits: Constraints, shape: GripperShape, distance: float, threads: int
+) -> Callable[[Floats, Floats], Bools]:
+    def clear(positions: Floats, quaternions: Floats) -> Bools:
+        hit = np.zeros(len(positions), dtype=np.bool_)
+        for solid in limits.obstacles:
+            hit |= solid.collides(positions, quaternions, shape, threads=threads, retreat_m=distance)
+        return ~hit
+
+    return clear
+
+
+# -- the search --------------------------------------------------------------------------------------------
+
+
+def found(question: Question) -> list[Maximum]:
+    request, density = question.request, question.density
+    if question.limits.candidates is not None:
+        return _ranked(question, question.limits.candidates)
+    separation_m, separation = question.separation
+    if question.score is None:
+        return question.asked.maximum(
+            question.limits.region,
+            count=request.count,
+            min_separation_m=separation_m,
+            min_separation=separation,
+            admissible=question.admissible,
+            threads=question.threads,
+        )
+    assert question.quick is not None
+    exact = question.quick is question.score
+    found = search_scored(
+        density,
+        question.quick,
+        question.limits.region,
+        count=request.count if exact else max(request.count, _FINALISTS),
+        min_separation_m=separation_m,
+        min_separation=separation,
+        admissible=question.admissible,
+        threads=question.threads,
+    )
+    return found if exact or not found else _polished(question, question.score, found)[: request.count]
+
+
+def _polished(question: Question, score: Score, found: list[Maximum]) -> list[Maximum]:
+    """Grasps by their own score, best first, the best of them after some more random steps uphill."""
+    kernel, region = question.density.kernel, question.limits.region
+    twins = bool(question.density.symmetric.all())
+    p, q = np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
+    values = score(p, q)
+    rng = np.random.default_rng(0)
+    for top in np.argsort(-values, kind="stable")[
+        : max(_POLISHED, min(question.request.count, 2 * _POLISHED))
+    ]:
+        others = np.arange(len(found)) != top
+        away = _away_from((p[others], q[others]), question.separation, twins)
+        step = 0.4
+        for _ in range(_ROUNDS):
+            turns = se3.from_rotation_vector(rng.standard_normal((_TRIES, 3)) * step * kernel.sigma_rotation)
+            moved = p[top] + rng.standard_normal((_TRIES, 3)) * step * kernel.sigma_position_m
+            at, to, inside = region.project(moved, se3.multiply(q[top], turns))
+            at, to = at[inside], to[inside]
+            there = score(at, to) if len(at) else np.empty(0)
+            better = np.flatnonzero(there > values[top])
+            better = better[away(at[better], to[better])] if len(better) else better
+            if len(better) and question.admissible is not None:
+                better = better[question.admissible(at[better], to[better])]
+            if len(better):
+                best = better[np.argmax(there[better])]
+                p[top], q[top], values[top] = at[best], to[best], there[best]
+            else:
+                step *= 0.6
+    logs = question.asked.log_density(p, q, threads=question.threads)
+    return [
+        Maximum(p[i], se3.canonical(q[i]), float(logs[i]), region.active(p[i], q[i]), float(values[i]))
+        for i in np.argsort(-values, kind="stable")
+    ]
+
+
+def _ranked(question: Question, poses: Poses) -> list[Maximum]:
+    """The admissible ones of given poses, best first, distinct where a separation was asked for."""
+    request, density, region = question.request, question.density, question.limits.region
+    index = np.flatnonzero(region.contains(*poses))
+    if question.admissible is not None and len(index):
+        index = index[question.admissible(poses[0][index], poses[1][index])]
+    if not len(index):
+        return []
+    p, q = poses[0][index], poses[1][index]
+    logs = question.asked.log_density(p, q, threads=question.threads)
+    scores = logs if question.score is None else question.score(p, q)
+    chosen: list[int] = []
+    separated = request.min_separation_m is not None or request.min_separation_deg is not None
+    for i in np.argsort(-scores, kind="stable"):
+        if len(chosen) == request.count:
+            break
+        if separated and chosen:
+            away = _away_from((p[chosen], q[chosen]), question.separation, bool(density.symmetric.all()))
+            if not away(p[i : i + 1], q[i : i + 1])[0]:
+                continue
+        chosen.append(int(i))
+    return [
+        Maximum(p[i], se3.canonical(q[i]), float(logs[i]), region.active(p[i], q[i]), float(scores[i]))
+        for i in chosen
+    ]
+
+
+def closest(question: Question) -> list[Maximum]:
+    """The success, or candidate, that violates the region least, in widths of the kernel, and is otherwise
+    admissible; or none."""
+    density, region, admissible = question.density, question.limits.region, question.admissible
+    kernel = density.kernel
+    positions, quaternions = question.limits.candidates or (density.positions, density.quaternions_xyzw)
+    p, q, _ = region.project(positions, quaternions)
+    shift = np.sum((p - positions) ** 2, axis=1) / kernel.sigma_position_m**2
+    turn = se3.angle_between(q, quaternions) ** 2 / kernel.sigma_rotation**2
+    order = np.argsort(shift + turn, kind="stable")
+    for start in range(0, len(order), _CANDIDATES):
+        rows = order[start : start + _CANDIDATES]
+        p, q = positions[rows], quaternions[rows]
+        free = np.arange(len(rows)) if admissible is None else np.flatnonzero(admissible(p, q))
+        if free.size:
+            at = slice(int(free[0]), int(free[0]) + 1)
+            log = float(question.asked.log_density(p[at], q[at])[0])
+            score = log if question.score is None else float(question.score(p[at], q[at])[0])
+            return [Maximum(p[at][0], se3.canonical(q[at][0]), log, (), score)]
+    return []
+
+
+def _or(value: float | None, default: float) -> float:
+    return default if value is None else value
