@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import math
 import os
 import signal
 import socket
@@ -148,24 +149,56 @@ ApiKey = Annotated[str | None, typer.Option(envvar="GRASPDB_API_KEY")]
 Numbers = Annotated[str, typer.Option(help="Comma-separated, object frame.")]
 
 
+Protocol = Annotated[str, typer.Option(help="wrench or lift.")]
+
+
 @app.command()
 def verify(
-    object_name: ObjectName,
+    object_name: ObjectName = "",
     count: Annotated[int, typer.Option(min=10, help="Grasps to simulate again.")] = 1000,
     gripper: GripperName = "pg70",
+    protocol: Protocol = "wrench",
+    sweep: Annotated[
+        str | None, typer.Option(help="Verify what the service has stored of this sweep instead.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the sample.")] = 0,
     url: ServiceUrl = None,
     api_key: ApiKey = None,
 ) -> None:
-    """Simulate a sample of the grid's physics poses at 1/2000 s and 200 iterations; print the agreement."""
+    """Simulate a sample of the grid's physics poses at 1/2000 s and 200 iterations; print the agreement.
+
+    With --sweep the sweep says which object, gripper and protocol, and its stored outcomes are compared;
+    all of them are read to sample fairly, so a sweep of a random part of the grid (--max-poses) is
+    verified sooner.
+    """
     _require_pybullet()
     from graspdb_simworker import sources, verification
 
     with _explained():
-        payload, parts = sources.load(object_name, gripper, url=url, api_key=api_key, seed=seed)
-        payload = verification.enough_poses(payload, parts, count)
-        with _progress("grasps") as progress:
-            found = verification.verify(payload, parts, count=count, seed=seed, progress=progress)
+        if sweep is not None:
+            if url is None:
+                raise ValueError("--sweep needs --url, the service that has it")
+            with _progress("poses read") as progress:
+                info, stored = sources.sweep_of(
+                    sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
+                )
+            object_name = info.object
+            payload, parts = sources.load(
+                info.object, info.gripper, protocol=info.protocol, url=url, api_key=api_key
+            )
+            with _progress("grasps") as progress:
+                found = verification.verify_stored(
+                    payload, parts, stored, count=count, seed=seed, progress=progress
+                )
+        elif object_name:
+            payload, parts = sources.load(
+                object_name, gripper, protocol=protocol, url=url, api_key=api_key, seed=seed
+            )
+            payload = verification.enough_poses(payload, parts, count)
+            with _progress("grasps") as progress:
+                found = verification.verify(payload, parts, count=count, seed=seed, progress=progress)
+        else:
+            raise ValueError("name an object, or a --sweep")
     typer.echo(f"{'outcome':20} {'found':>7} {'checked':>8} {'agree':>7} {'same name':>10}")
     for s in found.strata:
         name = s.outcome.name.lower()
@@ -184,26 +217,35 @@ def show(
     object_name: ObjectName,
     position: Numbers = "0,0,0",
     quaternion: Annotated[str, typer.Option(help="x,y,z,w of the tool in the object frame.")] = "0,0,0,1",
-    out: Annotated[Path, typer.Option(help="The PNG to write.")] = Path("grasp.png"),
+    out: Annotated[Path, typer.Option(help="A .png of the end, or a .gif of the whole.")] = Path("grasp.png"),
     gripper: GripperName = "pg70",
+    protocol: Protocol = "wrench",
     fine: Annotated[bool, typer.Option(help="1/2000 s and 200 iterations.")] = False,
     url: ServiceUrl = None,
     api_key: ApiKey = None,
 ) -> None:
-    """Simulate one grasp and draw how it ends, from two sides."""
+    """Simulate one grasp and draw it from two sides, seen from the jaw."""
     _require_pybullet()
-    from graspdb_simworker import png, sources
+    from graspdb_simworker import pictures, sources
 
     with _explained():
         pose = Pose.model_validate({"position": position, "quaternion_xyzw": quaternion})
-        payload, parts = sources.load(object_name, gripper, url=url, api_key=api_key)
-        shown = sources.simulate_one(payload, parts, pose, "fine" if fine else "standard")
-    if shown.picture is not None:
-        out.write_bytes(png.encode(shown.picture))
+        payload, parts = sources.load(object_name, gripper, protocol=protocol, url=url, api_key=api_key)
+        shown = sources.simulate_one(
+            payload,
+            parts,
+            pose,
+            "fine" if fine else "standard",
+            film_every_s=pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf,
+        )
+        written = pictures.write(out, shown.pictures)
     width, quality = (f"{v:.4g}" if v == v else "unknown" for v in (shown.label.width_m, shown.label.quality))
+    meaning = (
+        "(1: did not move in the jaw, below 0: too far)" if protocol == "lift" else "times the weight held"
+    )
     typer.echo(
-        f"{shown.label.outcome.name.lower()}: fingers {width} m apart, holds {quality} times the weight"
-        f" in the worst direction; {out if shown.picture is not None else 'no picture'}"
+        f"{shown.label.outcome.name.lower()}: fingers {width} m apart, quality {quality} {meaning};"
+        f" {written or 'no picture: decided by the geometry'}"
     )
 
 

@@ -1,14 +1,15 @@
 """Do the labels hold at a far finer time step? A sample of poses that met physics, simulated again.
 
 The sample is stratified by the outcome at the ordinary fidelity, so that rare outcomes are checked too;
-the agreement over all poses weighs each stratum by its share. The lower bound is the 5 % quantile of
+the agreement over all poses weighs each stratum by its share. The labels are either simulated here, or
+those that a service has stored for a sweep. The lower bound is the 5 % quantile of
 that weighted sum when each stratum's agreement follows its posterior under Jeffreys' prior, Beta(agree
 + 1/2, disagree + 1/2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +123,76 @@ def verify(
     finally:
         coarse.close()
         fine.close()
-    return _agreement(labels, labels[picked], again, rng)
+    found = {int(kind): float(n) for kind, n in zip(*np.unique(labels, return_counts=True), strict=True)}
+    return _agreement(found, labels[picked], again, rng)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A sample of a sweep's stored outcomes, and how many of each outcome the sweep has.
+
+    ``positions`` (n, 3) and ``quaternions`` (n, 4) of the tool in the object frame, ``outcomes`` (n,)
+    codes; within each outcome every pose of the sweep is as likely to be here.
+    """
+
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+    outcomes: NDArray[np.uint8]
+    counts: Mapping[int, int]
+
+
+def verify_stored(
+    payload: SimulatePayload,
+    parts: Sequence[Part],
+    stored: Stored,
+    *,
+    count: int,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Agreement:
+    """Simulate stored outcomes again at fine fidelity: a stratified sample of those that met physics.
+
+    Parameters
+    ----------
+    payload : SimulatePayload
+        Object, gripper and protocol.
+    parts : sequence of (vertices, faces)
+    stored : Stored
+    count : int
+        Poses to simulate again, as many as there are at most.
+    seed : int
+    progress
+        Told how many of how many closings are done.
+
+    Raises
+    ------
+    ValueError
+        If no pose of the sample meets physics.
+    """
+    fine = chunks.prepare(payload.model_copy(update={"fidelity": "fine"}), parts)
+    rng = np.random.default_rng(seed)
+    try:
+        codes, first = fine.scene.classify(stored.positions, stored.quaternions, fine.shape)
+        rows = np.flatnonzero(codes == collision.CONTACT)
+        if len(rows) == 0:
+            raise ValueError("no pose of this sweep needed physics")
+        travel = np.minimum(first.min(axis=1), 0.5 * fine.shape.max_opening_m)
+        labels = stored.outcomes[rows]
+        # A miss may be plain from the geometry: only the share that met physics counts.
+        found = {
+            int(kind): stored.counts[int(kind)]
+            * float((labels == kind).sum() / (stored.outcomes == kind).sum())
+            for kind in np.unique(labels)
+        }
+        picked = _stratified(labels, count, rng)
+        again = np.empty(len(picked), dtype=np.uint8)
+        for k, row in enumerate(rows[picked].tolist()):
+            label = fine.simulate(stored.positions[row], stored.quaternions[row], float(travel[row]))
+            again[k] = label.outcome
+            progress(k + 1, len(picked))
+    finally:
+        fine.close()
+    return _agreement(found, labels[picked], again, rng)
 
 
 def _stratified(labels: NDArray[np.uint8], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -140,7 +210,7 @@ def _stratified(labels: NDArray[np.uint8], count: int, rng: np.random.Generator)
 
 
 def _agreement(
-    labels: NDArray[np.uint8],
+    found: Mapping[int, float],
     before: NDArray[np.uint8],
     after: NDArray[np.uint8],
     rng: np.random.Generator,
@@ -152,13 +222,13 @@ def _agreement(
         strata.append(
             Stratum(
                 outcome=Outcome(int(kind)),
-                available=int((labels == kind).sum()),
+                available=round(found[int(kind)]),
                 checked=int(chosen.sum()),
                 agree=int((success == (kind == Outcome.SUCCESS)).sum()),
                 same=int((after[chosen] == kind).sum()),
             )
         )
-    weights = np.array([s.available for s in strata], dtype=np.float64)
+    weights = np.array([found[s.outcome] for s in strata], dtype=np.float64)
     weights /= weights.sum()
     shares = np.array([s.agree / s.checked for s in strata])
     same = np.array([s.same / s.checked for s in strata])

@@ -42,8 +42,7 @@ def test_disagreement_counts_by_the_share_of_its_outcome() -> None:
     after = before.copy()
     after[40:45] = Outcome.SUCCESS  # half the slipped ones are successes after all
     after[45:48] = Outcome.MISSED  # and some fail otherwise
-    labels = np.array([1] * 900 + [4] * 100, dtype=np.uint8)
-    found = verification._agreement(labels, before, after, np.random.default_rng(0))
+    found = verification._agreement({1: 900.0, 4: 100.0}, before, after, np.random.default_rng(0))
     assert found.agreement == pytest.approx(0.9 + 0.1 * 0.5)
     assert found.same == pytest.approx(0.9 + 0.1 * 0.2)
     # Forty of forty and five of ten, weighed: some percent lower at 95 %.
@@ -108,6 +107,9 @@ def test_show_names_what_is_wrong(tmp_path: Path) -> None:
         (("show", "teapot"), "teapot"),
         (("show", "mug", "--quaternion", "1,0,0,1"), "norm"),
         (("verify", "mug", "--gripper", "claw"), "claw"),
+        (("verify", "mug", "--protocol", "shake"), "shake"),
+        (("verify", "--sweep", "abc"), "--url"),
+        (("verify",), "name an object"),
     ):
         done = run(*arguments, folder=tmp_path)
         assert done.returncode == 1
