@@ -231,7 +231,7 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
         axes.plot(at, item.probability, color=BLUE, marker=".", markersize=4, linewidth=1.2)
     axes.axhline(0.5, color=GREY, linestyle="--", linewidth=0.8)
     if item.half_width is None:
-        told = "nothing tried"
+        told = "hidden by the kernel" if item.within else "nothing tried"
     else:
         more = "> " if item.beyond else "< " if item.within else ""
         told = f"{more}{factor * item.half_width:.0f} {unit}"

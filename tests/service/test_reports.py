@@ -168,6 +168,13 @@ def test_anisotropy_by_density_agrees_on_what_is_wide(filled: httpx.Client) -> N
 
     assert at("x", 0.015) > 1.3 * at("y", 0.015)
     assert at("ry", 0.4) > 1.3 * at("rx", 0.4)
+    # A wide kernel hides what is narrower: nothing is claimed of it.
+    body = ok(filled.get(REPORT + "anisotropy?method=density&sigma_position_m=0.03&sigma_rotation_deg=30"))
+    hidden = [item["axis"] for item in body["tolerances"] if item["within"]]
+    assert "y" in hidden
+    assert all(item["half_width"] is None for item in body["tolerances"] if item["within"])
+    assert any("smooths more than a grasp forgives" in warning for warning in body["warnings"])
+    assert "along y" not in body["text"]
 
 
 def test_calibration_judges_blocks_left_out(

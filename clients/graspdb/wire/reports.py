@@ -111,7 +111,8 @@ class AnisotropyHistogram(Response):
 class AnisotropyTolerance(Response):
     """How far a success may be displaced along (x, y, z; metres) or about (rx, ry, rz; radians) one axis
     until the chance of success falls to one half. ``beyond``: it does not within what was looked at;
-    ``within``: it has at the smallest displacement tried, and ``half_width`` is that one.
+    ``within``: it has at the smallest displacement tried, and ``half_width`` is that one (null where the
+    density's kernel hides it).
     """
 
     axis: str

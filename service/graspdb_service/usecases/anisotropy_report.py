@@ -94,15 +94,27 @@ def anisotropy_report(
             )
         )
     tolerances = [_tolerance(item) for item in found.tolerances]
-    unknown = [item.axis for item in tolerances if item.half_width is None]
-    warnings = (
-        []
-        if not unknown
-        else [
-            f"nothing was tried displaced along or about {', '.join(unknown)} alone: a grid's trials, or"
-            " many more, tell that"
+    hidden = [item.axis for item in tolerances if item.within] if method == "density" else []
+    if hidden:
+        # Smoothed shares that start below one half bound nothing.
+        tolerances = [
+            item.model_copy(update={"half_width": None, "minus": None, "plus": None}) if item.within else item
+            for item in tolerances
         ]
-    )
+    unknown = [item.axis for item in tolerances if item.half_width is None and item.axis not in hidden]
+    warnings = []
+    if unknown:
+        warnings.append(
+            f"nothing was tried displaced along or about {', '.join(unknown)} alone: a grid's trials, or many"
+            " more, tell that"
+        )
+    if hidden:
+        kernel = built.kernel
+        warnings.append(
+            f"the kernel ({1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f} deg)"
+            f" smooths more than a grasp forgives along or about {', '.join(hidden)}: shares stay below one half even"
+            " beside a success; method=empirical or a narrower kernel tells more"
+        )
     return AnisotropyReport.model_validate(
         {
             **head(built),
@@ -195,7 +207,7 @@ def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> s
         way = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
         parts.append(f"{more}{factor * item.half_width:.0f} {unit}{between} {way}")
     if not parts:
-        return "No tolerance can be told: no trial is displaced from a success along or about one axis alone."
+        return "No tolerance can be told from these trials; the warnings say why."
     axes = (
         "the gripper's axes"
         if alignment == "gripper"
