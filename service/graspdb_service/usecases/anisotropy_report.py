@@ -112,8 +112,8 @@ def anisotropy_report(
         kernel = built.kernel
         warnings.append(
             f"the kernel ({1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f} deg)"
-            f" smooths more than a grasp forgives along or about {', '.join(hidden)}: shares stay below one half even"
-            " beside a success; method=empirical or a narrower kernel tells more"
+            f" smooths more than a grasp forgives along or about {', '.join(hidden)}: shares stay below one"
+            " half even beside a success; method=empirical or a narrower kernel tells more"
         )
     return AnisotropyReport.model_validate(
         {
