@@ -165,7 +165,11 @@ def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
                         elif end > 0:
                             u0, u1, u2, u3 = -u0, -u1, -u2, -u3
                         if base + u0 * q0 + u1 * q1 + u2 * q2 + u3 * q3 > least and count < near.shape[1]:
-                            near[0, count], near[1, count], near[2, count] = data[0, j], data[1, j], data[2, j]
+                            near[0, count], near[1, count], near[2, count] = (
+                                data[0, j],
+                                data[1, j],
+                                data[2, j],
+                            )
                             near[3, count], near[4, count] = u0, u1
                             near[5, count], near[6, count] = u2, u3
                             near[7, count] = data[7, j]
@@ -203,6 +207,13 @@ def _moments(near, begin, end, px, py, pz, qx, qy, qz, qw, kappa, sums):
     sums[5] += m1
     sums[6] += m2
     sums[7] += m3
+
+
+@exact
+def _into(planes, spheres, cones, p, q):
+    """Project a pose in place; whether it got there."""
+    there = projection.project_position(planes, spheres, p)
+    return projection.project_rotation(cones, q) and there
 
 
 @exact
@@ -264,7 +275,7 @@ def climb(
             row[7] = here
             lengths[j] += 1
             if here < min(worst, older):
-                # Too long a step: back to the best pose and from there by a plain one, which can't descend.
+                # Too long a step: back to the best pose and from there by mean shift, which can't descend.
                 if plain:
                     break
                 x[:] = best_x
@@ -277,15 +288,20 @@ def climb(
                 x[3:7] = q * turn
                 length = math.sqrt(sums[4] ** 2 + sums[5] ** 2 + sums[6] ** 2 + sums[7] ** 2)
                 for i in range(3):
-                    step[i] = sums[1 + i] / (here * scale * unit)
+                    p[i] += sums[1 + i] / (here * scale)
                 for i in range(4):
-                    step[3 + i] = sums[4 + i] / length * turn - x[3 + i] if length > 0.0 else 0.0
+                    q[i] = sums[4 + i] / length if length > 0.0 else q[i]
+                if not _into(planes, spheres, cones, p, q):
+                    break
+                step[0:3] = p / unit - x[0:3]
+                step[3:7] = q * turn - x[3:7]
                 if here > best:
                     best, top = here, lengths[j] - 1
                     best_x[:] = x
                     best_step[:] = step
                 plain = False
-            # The inverse curvature that the last two poses saw along their difference (Barzilai, Borwein).
+            # The inverse curvature that the last two poses saw along their difference (Barzilai, Borwein), of
+            # the projected step: along a curved limit, the limit's curvature counts.
             ahead, moved, bent, size = 1.0, 0.0, 0.0, 0.0
             for i in range(7):
                 size += step[i] * step[i]
@@ -304,16 +320,10 @@ def climb(
             norm = math.sqrt(norm)
             for i in range(4):
                 q[i] /= norm
-            there = projection.project_position(planes, spheres, p)
-            if not (projection.project_rotation(cones, q) and there):
+            if not _into(planes, spheres, cones, p, q):
                 break
-            size = 0.0
-            for i in range(3):
-                size += (p[i] / unit - x[i]) ** 2
-            for i in range(4):
-                size += (q[i] * turn - x[3 + i]) ** 2
-            # Half the slope times the step, the gain of a parabola.
-            if 0.5 * size < gain * ahead:
+            # Half the slope times the way ahead, the gain of a parabola.
+            if 0.5 * ahead * size < gain:
                 if apart < _SETTLED * _SETTLED:
                     break
                 # At rest among the kernels of a while ago: gather anew.

@@ -140,9 +140,7 @@ def _sums(density: GraspDensity, cells: Cells, rows: NDArray[np.int64], threads:
     return result
 
 
-def _drawn(
-    density: GraspDensity, rows: NDArray[np.int64], rate: float
-) -> tuple[NDArray[np.int64], Floats]:
+def _drawn(density: GraspDensity, rows: NDArray[np.int64], rate: float) -> tuple[NDArray[np.int64], Floats]:
     """Systematic sample of rows in the order given, with the weights that make its sums unbiased."""
     probability = np.minimum(rate * density.raw_weights[rows], 1.0)
     steps = np.floor(np.cumsum(probability) + 0.5)

@@ -305,7 +305,9 @@ class GraspDensity:
         )  # fmt: skip
         return out
 
-    def kernel_sums(self, positions: Floats, quaternions: Floats, *, cutoff: float, threads: int = 1) -> Floats:
+    def kernel_sums(
+        self, positions: Floats, quaternions: Floats, *, cutoff: float, threads: int = 1
+    ) -> Floats:
         """Kernel sums (M,) within a cut-off, 0 where nothing is in reach; poses already checked."""
         cells = self._cells
         out = np.empty(len(positions))

@@ -37,15 +37,17 @@ _STARTS = 24
 _SPREAD = 1.0
 #: All starts climb a few steps among the nearest kernels; those that then are near the best climb on. The
 #: cuts are exponents, of 3 and 4 standard deviations.
-_FIRST_STEPS, _FIRST_CUT = 10, 4.5
+_FIRST_STEPS, _FIRST_CUT = 20, 4.5
 _STEPS, _CUT = 60, 8.0
 _PROMISING, _FINALISTS = 0.9, 8
+#: Share of starts without a near kernel from which on the second cut is used at once.
+_LOST = 0.2
 #: A climb ends where the next step promises no more than this in log density.
 _GAIN = 1e-5
 #: Where centres are ranked by a sample of kernels: so many times the starts.
 _ROUGH_STARTS = 2
-#: Of the poses passed, how many are kept and how many kernel widths they are apart.
-_PASSED, _APART = 96, 0.3
+#: Kernel widths between the poses passed that are kept.
+_APART = 0.3
 _SHORTLIST = 1024
 #: Poses shown to ``admissible`` at a time and in all while looking for starts.
 _BATCH = 64
@@ -267,17 +269,18 @@ class Search:
     def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
         """Poses passed while climbing, and the ends."""
         passed, ends = self.climb(starts, _FIRST_STEPS, _FIRST_CUT)
+        if np.mean(ends.sums == 0.0) > _LOST:
+            # In the tails no kernel is that near.
+            passed, ends = self.climb(starts, _FIRST_STEPS)
         ends = self.scored(ends)
-        if not len(ends):
-            return passed, ends
         on, last = self.climb(best_of(ends, _PROMISING, finalists), _STEPS)
         last = self.scored(last)
-        return self.scored(self.thinned(passed.joined(on))).joined(ends).joined(last), last
+        return self.scored(self.thinned(passed.joined(on), 4 * finalists)).joined(ends).joined(last), last
 
     def climb(self, starts: Pool, steps: int, cut: float = _CUT) -> tuple[Pool, Pool]:
         """Poses passed from every start and the ends; their sums are those of `ascent.climb`."""
         density, region, cells = self.density, self.region, self.density.cells
-        path = np.empty((len(starts), steps, ascent.PATH))
+        path = np.zeros((len(starts), steps, ascent.PATH))
         lengths = np.empty(len(starts), dtype=np.int64)
 
         def work(begin: int, end: int) -> None:
@@ -290,19 +293,23 @@ class Search:
 
         for_blocks(work, len(starts), block=4, threads=self.threads)
         passed = path[np.arange(steps)[None, :] < lengths[:, None]]
-        moved = np.flatnonzero(lengths)
-        return pool_of(passed), pool_of(path[moved, lengths[moved] - 1])
+        ends = pool_of(path[np.arange(len(starts)), np.maximum(lengths, 1) - 1])
+        still = lengths == 0
+        # Nothing near enough to climb on: the start is the end.
+        ends.positions[still], ends.quaternions[still] = starts.positions[still], starts.quaternions[still]
+        ends.sums[still] = 0.0
+        return pool_of(passed), ends
 
     def scored(self, pool: Pool) -> Pool:
         """With sums over all kernels."""
         return Pool(pool.positions, pool.quaternions, self.sums(pool.positions, pool.quaternions))
 
-    def thinned(self, pool: Pool) -> Pool:
+    def thinned(self, pool: Pool, most: int) -> Pool:
         """The best poses of a pool that are a few tenths of a kernel's width apart."""
         kernel, pool = self.density.kernel, pool.sort()
-        kept = np.empty(_PASSED, dtype=np.int64)
+        kept = np.empty(most, dtype=np.int64)
         total = ascent.thin(
-            pool.positions, pool.quaternions, 0, _PASSED,
+            pool.positions, pool.quaternions, 0, most,
             _APART * kernel.sigma_position_m, _APART * kernel.sigma_rotation, self.twins, kept,
         )  # fmt: skip
         return pool.take(kept[:total])

@@ -1,9 +1,10 @@
 """Nearest feasible poses, compiled.
 
-Positions: the dual method for half-spaces; Dykstra's alternating projections (1986) where there are balls
-too, which converge to the nearest point of their intersection. Rotations: the nearest rotation whose approach and closing axes lie in their
-cones; one cone in closed form (turn the axis to the cone's rim about their common normal), two by sequential
-quadratic programming on the rotation vector, whose subproblem with two constraints is solved exactly.
+Positions: the dual method for half-spaces; with balls, Dykstra's alternating projections (1986), which
+converge to the nearest point of the intersection. Rotations: the nearest rotation whose approach and closing
+axes lie in their cones; one cone in closed form (turn the axis to the cone's rim about their common normal),
+two by sequential quadratic programming on the rotation vector, whose subproblem with two constraints is
+solved exactly.
 
 A region is passed as ``planes`` (K, 4) of unit normals n and offsets d (n.x >= d), ``spheres`` (S, 4) of
 centres and radii, and ``cones`` (10,): approach axis, its angle, closing axis, its angle, 1 where the closing

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
-from graspdb_density import GraspDensity, IsotropicKernel, Region, nearest, se3
+from graspdb_density import GraspDensity, IsotropicKernel, Region, centres, nearest, se3
 from graspdb_density.maximum import Pool, Search
 
 Poses = tuple[se3.Floats, se3.Floats]
@@ -280,6 +281,108 @@ def test_bad_searches_are_refused() -> None:
         Region.box([1.0, 0.0, 0.0], [0.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="admissible answered shape"):
         density.maximum(admissible=lambda p, q: np.ones(1 + len(p), dtype=bool))
+
+
+def small_shell(count: int, shell: Shell, rng: np.random.Generator) -> Poses:
+    """The shell at 0.3 of its size: most kernels reach each other."""
+    p, q = shell(count, rng)
+    return 0.3 * p, q
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
+    seed: int, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(centres, "MOST_PAIRS", 3e7)
+    rng = np.random.default_rng(100 + seed)
+    rows = small_shell(20_000, shell, rng)
+    density = GraspDensity.build(*rows, kernel=KERNEL)
+    sample = density.ranking().sample
+    assert sample is not None
+    assert 2_000 < sample.data.shape[1] < 6_000
+    low = np.array([rng.uniform(-0.05, 0.0), -1.0, -1.0])
+    approach = rng.standard_normal(3), math.radians(50.0)
+    region = Region(
+        half_spaces=Region.box(low, [1.0, 1.0, 1.0]), approach=approach[0], approach_angle=approach[1]
+    )
+    found = density.maximum(region)
+    # The same climb from the 400 truly best rows.
+    values = np.where(region.contains(*rows), density.log_density(*rows, threads=2), -np.inf)
+    best = np.argsort(-values)[:400]
+    ends = Search(density, region, None, 2).climb(Pool(rows[0][best], rows[1][best], np.zeros(400)), 200)[1]
+    top = density.log_density(ends.positions, ends.quaternions).max()
+    assert math.exp(found[0].log_density - top) >= 0.999
+
+
+def test_sampled_centre_sums_are_unbiased_and_extended_alike(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(7)
+    p, q = small_shell(9_000, shell, rng)
+    weights, symmetric = rng.uniform(0.2, 3.0, 9_000), rng.random(9_000) < 0.7
+    exact = GraspDensity.build(p, q, kernel=KERNEL, weights=weights, symmetric=symmetric)
+    truth = exact.centre_sums()
+    assert exact.ranking().sample is None
+    monkeypatch.setattr(centres, "MOST_PAIRS", 3e7)
+    first = slice(0, 8_500)
+    old = GraspDensity.build(
+        p[first], q[first], kernel=KERNEL, weights=weights[first], symmetric=symmetric[first]
+    )
+    known = old.ranking()
+    grown = old.extend(p[8_500:], q[8_500:], weights=weights[8_500:], symmetric=symmetric[8_500:])
+    now = grown.ranking()
+    assert known.sample is not None
+    assert now.sample is not None
+    assert 0 < now.sample.data.shape[1] - known.sample.data.shape[1] < 450
+    unit = grown.weights[0] / grown.raw_weights[0] / (exact.weights[0] / exact.raw_weights[0])
+    ratio = now.values * unit / truth
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.01)
+    assert np.std(ratio) < 0.3
+    top = np.argsort(-truth)[:500]
+    assert np.std(ratio[top]) < 0.15
+    assert np.mean(ratio[8_500:]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_rows_of_the_sample_do_not_outrank_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Far from each other, every row is worth its own kernel, in the sample or not."""
+    monkeypatch.setattr(centres, "MOST_PAIRS", 0.0)
+    grid = np.stack(np.meshgrid(*[np.arange(14.0)] * 3), axis=-1).reshape(-1, 3)
+    density = GraspDensity.build(grid, np.tile(se3.IDENTITY, (len(grid), 1)), kernel=KERNEL)
+    assert density.ranking().sample is not None
+    np.testing.assert_allclose(density.centre_sums(), 0.5, rtol=1e-6)
+
+
+def test_planes_that_nearly_coincide_hold_no_climb_back(shell: Shell) -> None:
+    """A box with a slanted face almost along one of its own."""
+    density = GraspDensity.build(*shell(3_000, np.random.default_rng(5)), kernel=KERNEL)
+    slanted = np.array([-0.03, 0.999, -0.02, -0.05])
+    region = Region(half_spaces=np.vstack([Region.box([0.1, -0.1, -0.15], [0.22, -0.03, 0.15]), slanted]))
+    best = exhaustive(density, region, np.random.default_rng(6))
+    assert math.exp(density.maximum(region)[0].log_density - best) >= 0.999
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_projection_onto_a_polyhedron_is_exact(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 9))
+    normals = rng.standard_normal((count, 3))
+    if count > 1 and rng.random() < 0.5:
+        normals[-1] = normals[0] + 1e-3 * rng.standard_normal(3)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    inner = rng.normal(size=3) * 0.1
+    planes = np.hstack([normals, (normals @ inner - rng.uniform(0.0, 0.1, count))[:, None]])
+    goal = rng.normal(size=3) * 0.5
+    (near,), _, (inside,) = Region(half_spaces=planes).project(goal[None], se3.IDENTITY[None])
+    assert inside
+    assert (planes[:, :3] @ near >= planes[:, 3] - 1e-8).all()
+    # What pulls towards the goal is a sum of normals of the faces touched, none of them pushing.
+    touched = planes[planes[:, :3] @ near < planes[:, 3] + 1e-7, :3]
+    pull = near - goal
+    if np.linalg.norm(pull) < 1e-8:
+        return
+    _, rest = nnls(touched.T, pull)
+    assert rest < 1e-6
 
 
 @pytest.mark.long
