@@ -27,7 +27,7 @@ WidthM = Annotated[float, Field(gt=0, le=1.0)]
 WidthDeg = Annotated[float, Field(gt=0, le=90.0)]
 Angle = Annotated[float, Field(gt=0, le=180.0)]
 NoiseM = Annotated[float, Field(ge=0, le=1.0)]
-NoiseDeg = Annotated[float, Field(ge=0, le=90.0)]
+NoiseDeg = Annotated[float, Field(ge=0, le=60.0)]
 Extent = Annotated[float, Field(gt=0, le=1_000.0)]
 
 

@@ -32,7 +32,7 @@ _NEAREST_TRIALS = 5
 #: Up to so many attempts a model of success probability is built at once; above, it must be asked for.
 FEW_ATTEMPTS = 500_000
 #: Draws of the noise that a mean is taken over, and while searching.
-_NOISE_DRAWS, _FEW_DRAWS = 64, 16
+_NOISE_DRAWS, _FEW_DRAWS = 256, 16
 _CHANCES = frozenset({"success_probability", "interval", "effective_trials"})
 
 
@@ -124,10 +124,16 @@ def _question(ctx: Context, slug: str, request: GraspConstraints, built: Built) 
         quick=None,
         threads=ctx.compute.threads,
     )
+    return ctx.compute.run(lambda: _with_score(question, of_chances, averaged))
+
+
+def _with_score(question: Question, of_chances: bool, averaged: str) -> Question:
+    """A question with what ranks poses, and what refuses them."""
     question = replace(question, admissible=searches.admissible_for(question, of_chances))
-    if request.objective == "robust":
+    if question.request.objective == "robust":
         return _robust(question, averaged)
     if of_chances:
+        model = question.model
         assert model is not None
         told = f"lower end of the success probability's {LEVEL:.0%} interval"
         ranking = Ranking(objective="success_probability", score=told)
@@ -150,27 +156,31 @@ def _wants_chances(request: GraspConstraints, built: Built) -> bool:
 
 def _robust(question: Question, averaged: str) -> Question:
     request = question.request
-    told = {}
-    noises: dict[str, PoseNoise | None] = {"pose_noise": None, "tool_noise": None}
+    told: dict[str, str] = {}
+    noises: dict[str, PoseNoise] = {}
     pivot, named = _pivot(question)
-    for name in noises:
+    told_as = {
+        "pose_noise": f"the object about {named}, on the left",
+        "tool_noise": "the tool, on the right",
+    }
+    for name in told_as:
         metres = getattr(request, f"{name}_m") or 0.0
         degrees = getattr(request, f"{name}_deg") or 0.0
+        noises[name] = PoseNoise(metres, math.radians(degrees), pivot if name == "pose_noise" else (0.0,) * 3)
         if metres or degrees:
-            centre = pivot if name == "pose_noise" else (0.0, 0.0, 0.0)
-            noises[name] = PoseNoise(metres, math.radians(degrees), centre)
-            acts = "the tool, on the right"
-            if name == "pose_noise":
-                acts = f"the object about {named}, on the left"
-            told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {acts}"
-    value: Score = question.asked.density
+            told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {told_as[name]}"
     if averaged == "success_probability":
         assert question.model is not None
         value = _chances(question, question.model.quick, "probability")
-    score, quick = (
-        expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
-        for draws in (_NOISE_DRAWS, _FEW_DRAWS)
-    )
+    else:
+        value, noises = _widened(question, noises)
+    if any(noise.sigma_position_m or noise.sigma_rotation for noise in noises.values()):
+        score, quick = (
+            expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
+            for draws in (_NOISE_DRAWS, _FEW_DRAWS)
+        )
+    else:
+        score = quick = value
     unit = ", 1/(m^3 rad^3)" if averaged == "density" else ""
     ranking = Ranking.model_validate(
         {
@@ -181,6 +191,30 @@ def _robust(question: Question, averaged: str) -> Question:
         }
     )
     return replace(question, ranking=ranking, score=score, quick=quick)
+
+
+def _widened(question: Question, noises: dict[str, PoseNoise]) -> tuple[Score, dict[str, PoseNoise]]:
+    """A density under a kernel that is wider by the noise, and the noise that is left to draw.
+
+    An isotropic kernel takes all noise of the tool and the object's shifts; the object's turns move a grasp
+    the farther the longer its lever, which no one kernel does.
+    """
+    density, at_object, at_tool = question.asked, noises["pose_noise"], noises["tool_noise"]
+    if isinstance(density, MixtureDensity):
+        return density.density, noises
+    shift = math.hypot(at_object.sigma_position_m, at_tool.sigma_position_m)
+    wider = GraspDensity.build(
+        density.positions,
+        density.quaternions_xyzw,
+        kernel=density.kernel.widened(shift, at_tool.sigma_rotation),
+        weights=density.weights,
+        symmetric=density.symmetric,
+    )
+    left = {
+        "pose_noise": replace(at_object, sigma_position_m=0.0),
+        "tool_noise": replace(at_tool, sigma_position_m=0.0, sigma_rotation=0.0),
+    }
+    return wider.density, left
 
 
 def _pivot(question: Question) -> tuple[tuple[float, float, float], str]:

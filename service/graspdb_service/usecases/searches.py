@@ -31,7 +31,7 @@ _CANDIDATES = 1_024
 #: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
 _NEAR = 2.0
 #: Grasps found by the quick score that are scored again, those that go on climbing, by so many steps.
-_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 4, 8, 10
+_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 4, 8, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +232,11 @@ def _ranked(question: Question, poses: Poses) -> list[Maximum]:
     if not len(index):
         return []
     p, q = poses[0][index], poses[1][index]
+    few = max(request.count, _FINALISTS)
+    if question.quick is not question.score and question.quick is not None and len(p) > few:
+        # Only those that may be among the best are worth the score itself.
+        best = np.argsort(-question.quick(p, q), kind="stable")[:few]
+        p, q = p[best], q[best]
     logs = question.asked.log_density(p, q, threads=question.threads)
     scores = logs if question.score is None else question.score(p, q)
     chosen: list[int] = []
