@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from alembic import context
+
 from graspdb_service.storage.tables import UtcDateTime, metadata
 
 
