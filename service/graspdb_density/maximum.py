@@ -48,6 +48,8 @@ _GAIN = 1e-5
 _ROUGH_STARTS = 2
 #: Kernel widths between the poses passed that are kept.
 _APART = 0.3
+#: Around blocked climbs: poses searched from, random steps at a time, how often.
+_EXPLORED = ((32, 8, 6), (8, 12, 10), (3, 16, 20))
 _SHORTLIST = 1024
 #: Poses shown to ``admissible`` at a time and in all while looking for starts.
 _BATCH = 64
@@ -169,10 +171,8 @@ class Search:
         if self.admissible is not None and len(ends):
             allowed = self.check(ends.positions, ends.quaternions)
             if not allowed[int(np.argmax(ends.sums))]:
-                # The best climb ended where the gripper collides: look around the best pose that does not.
-                first = self.choose(pool, 1, separation_m, separation)
-                if first:
-                    pool = pool.joined(self.explore(pool.take(np.array(first)))).sort()
+                # The best climb ended where the gripper collides: look around the best poses that do not.
+                pool = pool.joined(self.explore(pool)).sort()
         chosen = self.choose(pool, count, separation_m, separation)
         if not chosen:
             return []
@@ -354,34 +354,55 @@ class Search:
             confirmed[batch[allowed]] = True
             usable[batch[~allowed]] = False
 
-    def explore(self, best: Pool) -> Pool:
-        """Random search around an admissible pose whose climb is blocked, in steps that shrink as they
-        fail.
+    def explore(self, pool: Pool) -> Pool:
+        """Random search from the best admissible poses, where the climbs that ignored it ended in collisions:
+        from many for a little, from the best of them further.
         """
         kernel = self.density.kernel
         rng = np.random.default_rng(0)
-        passed = best
-        step = 0.5
-        for _ in range(12):
-            count = 48
-            positions = best.positions + rng.standard_normal((count, 3)) * (step * kernel.sigma_position_m)
-            turns = se3.from_rotation_vector(rng.standard_normal((count, 3)) * (step * kernel.sigma_rotation))
-            p, q, inside = self.region.project(positions, se3.multiply(best.quaternions, turns))
-            p, q = p[inside], q[inside]
-            if not len(p):
-                step *= 0.5
-                continue
-            sums = self.sums(p, q)
-            better = np.flatnonzero(sums > best.sums[0])
-            if better.size:
-                better = better[self.check(p[better], q[better])]
-            if better.size:
-                top = better[np.argmax(sums[better])]
-                best = Pool(p[top : top + 1], q[top : top + 1], sums[top : top + 1])
-                passed = passed.joined(best)
-            else:
-                step *= 0.5
+        first = self.choose(pool, _EXPLORED[0][0], kernel.sigma_position_m, kernel.sigma_rotation)
+        ends, step = pool.take(np.array(first, dtype=np.intp)), np.full(len(first), 0.5)
+        passed = ends.take(np.arange(0))
+        for climbs, tries, rounds in _EXPLORED:
+            order = np.argsort(-ends.sums, kind="stable")[:climbs]
+            ends, step = ends.take(order), step[order]
+            for _ in range(rounds):
+                ends, step, moved = self.stepped(ends, step, tries, rng)
+                passed = passed.joined(ends.take(moved))
         return passed
+
+    def stepped(
+        self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator, longer: float = 1.0
+    ) -> tuple[Pool, Floats, NDArray[np.bool_]]:
+        """From each of some poses, the best of random steps where that is better and admissible.
+
+        Returns
+        -------
+        ends : Pool
+        step : (K,)
+            Lengths to try next, in kernel widths: times ``longer`` after a success, shorter after a failure.
+        moved : (K,) bool
+        """
+        kernel = self.density.kernel
+        scale = np.repeat(step, tries)[:, None]
+        at, to = np.repeat(ends.positions, tries, axis=0), np.repeat(ends.quaternions, tries, axis=0)
+        away = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
+        turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
+        p, q, inside = self.region.project(away, se3.multiply(to, turns))
+        scores = np.full(len(p), -np.inf)
+        scores[inside] = self.sums(p[inside], q[inside])
+        better = scores > np.repeat(ends.sums, tries)
+        if self.admissible is not None and better.any():
+            better[better] = self.check(p[better], q[better])
+        scores[~better] = -np.inf
+        winner = scores.reshape(len(ends), tries).argmax(axis=1) + np.arange(len(ends)) * tries
+        moved: NDArray[np.bool_] = scores[winner] > -np.inf
+        there = Pool(
+            np.where(moved[:, None], p[winner], ends.positions),
+            np.where(moved[:, None], q[winner], ends.quaternions),
+            np.where(moved, scores[winner], ends.sums),
+        )
+        return there, np.where(moved, np.minimum(longer * step, 1.0), 0.6 * step), moved
 
 
 def best_of(pool: Pool, share: float, most: int) -> Pool:

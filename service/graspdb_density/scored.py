@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 from scipy.stats import qmc
 
@@ -113,38 +113,11 @@ class _ScoredSearch(Search):
             order = np.argsort(-ends.sums, kind="stable")[: max(climbers, finalists)]
             ends, step = ends.take(order), step[order]
             for _ in range(rounds):
-                ends, step, moved = self.stepped(ends, step, tries, rng)
+                ends, step, moved = self.stepped(ends, step, tries, rng, longer=1.1)
                 passed = passed.joined(ends.take(moved))
                 if step.max() < _LAST_STEP:
                     break
         return starts.joined(passed), ends
-
-    def stepped(
-        self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator
-    ) -> tuple[Pool, Floats, NDArray[np.bool_]]:
-        """Every climb's best of some random steps, where it is better; the steps to try next; which moved."""
-        kernel = self.density.kernel
-        scale = np.repeat(step, tries)[:, None]
-        at, to = np.repeat(ends.positions, tries, axis=0), np.repeat(ends.quaternions, tries, axis=0)
-        moved = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
-        turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
-        p, q, inside = self.region.project(moved, se3.multiply(to, turns))
-        scores = np.full(len(p), -np.inf)
-        scores[inside] = self.sums(p[inside], q[inside])
-        better = scores > np.repeat(ends.sums, tries)
-        if self.admissible is not None and better.any():
-            better[better] = self.check(p[better], q[better])
-        scores[~better] = -np.inf
-        winner = scores.reshape(len(ends), tries).argmax(axis=1) + np.arange(len(ends)) * tries
-        on = scores[winner] > -np.inf
-        step = np.where(on, np.minimum(1.1 * step, 1.0), 0.6 * step)
-        pick = on[:, None]
-        there = Pool(
-            np.where(pick, p[winner], ends.positions),
-            np.where(pick, q[winner], ends.quaternions),
-            np.where(on, scores[winner], ends.sums),
-        )
-        return there, step, on
 
 
 @dataclass(frozen=True, slots=True)
