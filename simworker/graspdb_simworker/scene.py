@@ -58,9 +58,8 @@ READING_AGES_S = (0.040, 0.060, 0.080, 0.100, 0.120)
 NO_DOUBT = 0.8
 """A reading further than this from 1, the least that holds the weight, is the last one. Nearer to it, a
 heavy object that still swings between the fingers makes the forces ring, so that chance has a say at any
-single instant, but less in the median of five. (On 3,281 grasps of the elongated D one reading after
-30 ms agrees with the fine step in .983 of the labels, this rule in .991 at a quarter more steps. A
-damped object, fewer iterations or longer steps agree no better.)"""
+single instant, but less in the median of five. (On 2,081 grasps of the elongated D one reading after
+30 ms agrees with the fine step in .976 of the labels, this rule in .988 at a quarter more steps.)"""
 SLACK_S = 0.5
 """A closing may last this much longer than the fingers need to meet at full speed."""
 _PARKED: Vector = (0.0, 0.0, -1000.0)
