@@ -113,7 +113,7 @@ def _json_or_ndjson(path: str) -> Any:
     except ValueError as error:
         whole = error
     records = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if not line.strip():
             continue
         try:

@@ -34,7 +34,7 @@ def mug(http: httpx.Client) -> httpx.Client:
 def _all(http: httpx.Client, **query: Any) -> list[dict[str, Any]]:
     answer = http.get("/objects/mug/trials", params=query, headers={"Accept": "application/x-ndjson"})
     assert answer.status_code == 200, answer.text
-    return [json.loads(line) for line in answer.text.splitlines()]
+    return [json.loads(line) for line in answer.text.split("\n") if line]
 
 
 def test_one_trial(mug: httpx.Client) -> None:
