@@ -1,7 +1,7 @@
 """Cold start of a real server: a SQLite file of 3.5 million trials, 167,000 of them successes.
 
-The object is the graspable ellipsoid of the query benchmark. Successes lie on its shell; failures are moved and
-turned at random about the same shell, a quarter of them collisions. The file is written once, through the
+The object is the graspable ellipsoid of the query benchmark. Successes lie on its shell; failures are moved
+and turned at random about the same shell, a quarter of them collisions. The file is written once, through the
 storage layer; every round starts a new server process over it (imports and compiled code are loaded before
 ``/readyz`` says so) and asks it once. Memory is the server's own figure for the density.
 
