@@ -224,16 +224,29 @@ class GraspObject:
         self,
         *,
         count: int = 5,
+        objective: str | None = None,
+        robust_of: str | None = None,
+        pose_noise_m: float | None = None,
+        pose_noise_deg: float | None = None,
+        tool_noise_m: float | None = None,
+        tool_noise_deg: float | None = None,
         box: tuple[ArrayLike, ArrayLike] | None = None,
         sphere: ArrayLike | None = None,
         above_plane: ArrayLike | None = None,
+        half_spaces: ArrayLike | None = None,
         approach: ArrayLike | None = None,
         approach_cone_deg: float | None = None,
         closing: ArrayLike | None = None,
         closing_cone_deg: float | None = None,
         collision_free: bool | None = None,
+        obstacles: wire.Obstacles | Mapping[str, Any] | None = None,
+        pregrasp_distance_m: float | None = None,
+        max_width_m: float | None = None,
+        candidates: ArrayLike | Any | None = None,
+        exclude: ArrayLike | Any | None = None,
         object_pose: ArrayLike | Any | None = None,
         frame: str | None = None,
+        include: Sequence[str] | None = None,
         min_separation_m: float | None = None,
         min_separation_deg: float | None = None,
         gripper: str | None = None,
@@ -249,22 +262,44 @@ class GraspObject:
 
         Parameters
         ----------
+        objective
+            ``density`` (the default), ``success_probability`` (ranks by the lower end of its interval), or
+            ``robust``: the mean success probability, or density (``robust_of``), under noise.
+        pose_noise_m, pose_noise_deg, tool_noise_m, tool_noise_deg
+            That noise, deviations per axis: of the object's pose about its bounding box's centre (acts on the
+            left), and of the tool's (acts on the right).
         box
             Lower and upper corner (3,) of where the tool's origin may be, metres.
         sphere
             ``x, y, z, r``: the tool's origin is within ``r`` metres of the centre.
         above_plane
             ``nx, ny, nz, d``: n.x >= d at the tool's origin.
+        half_spaces
+            More such rows (K, 4).
         approach, approach_cone_deg
             Direction (3,) of the tool's z axis, and the half angle of the cone about it.
         closing, closing_cone_deg
             The same for the tool's y axis, in which the fingers close.
         collision_free
             That the gripper does not touch the object before it closes; true where it can be known.
+        obstacles
+            ``boxes`` (each ``size_m`` and a pose), ``points`` (K, 3) and their ``point_radius_m``: what the
+            open gripper must not touch either.
+        pregrasp_distance_m
+            The straight approach is free from this far back.
+        max_width_m
+            How far apart the fingers are at most, once both touch the object.
+        candidates
+            Rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is the place in them.
+        exclude
+            Poses to stay away from, by the separation.
         object_pose
             The object in the world: (4, 4) or ``x y z qx qy qz qw``.
         min_separation_m, min_separation_deg
             How far apart two grasps are, in either, to count as distinct.
+        include
+            Scores to compute, as in :meth:`likelihood`. By default the success probability comes along where
+            the objective needs it or there are at most 500,000 attempts.
 
         Raises
         ------
@@ -273,6 +308,19 @@ class GraspObject:
         """
         fields: dict[str, Any] = {
             "count": count,
+            "objective": objective,
+            "robust_of": robust_of,
+            "pose_noise_m": pose_noise_m,
+            "pose_noise_deg": pose_noise_deg,
+            "tool_noise_m": tool_noise_m,
+            "tool_noise_deg": tool_noise_deg,
+            "half_spaces": _rows("half_spaces", half_spaces, 4, "nx, ny, nz, d"),
+            "obstacles": _obstacles(obstacles),
+            "pregrasp_distance_m": pregrasp_distance_m,
+            "max_width_m": max_width_m,
+            "candidates": _pose_columns(candidates),
+            "exclude": _pose_columns(exclude),
+            "include": None if include is None else builtins.list(include),
             "sphere": _numbers("sphere", sphere, 4, "x, y, z, r"),
             "above_plane": _numbers("above_plane", above_plane, 4, "nx, ny, nz, d"),
             "approach": _numbers("approach", approach, 3, "x, y, z"),
@@ -333,17 +381,43 @@ class GraspObject:
             "sigma_rotation_deg": sigma_rotation_deg,
         }
         request = checked(wire.SamplesRequest, fields)
-        answer = wire.Samples.model_validate(
-            self._transport.json("POST", f"{self._path}/samples", body=request)
-        )
-        return SampledPoses(
-            position=np.array(answer.position, dtype=np.float64).reshape(-1, 3),
-            quaternion_xyzw=np.array(answer.quaternion_xyzw, dtype=np.float64).reshape(-1, 4),
-            proposal_density=np.array(answer.proposal_density, dtype=np.float64),
-            seed=answer.seed,
-            revision=answer.revision,
-            kernel=answer.kernel,
-        )
+        answer = self._transport.json("POST", f"{self._path}/samples", body=request)
+        return SampledPoses.from_wire(wire.Samples.model_validate(answer))
+
+    def proposals(
+        self,
+        count: int = 100,
+        *,
+        strategy: str = "density",
+        seed: int | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: Kernel | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+    ) -> SampledPoses:
+        """Grasps to try next; send ``proposal_density`` back with their trials.
+
+        Parameters
+        ----------
+        strategy
+            ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most.
+        """
+        fields = {
+            "count": count,
+            "seed": seed,
+            "strategy": strategy,
+            "gripper": gripper,
+            "protocol": protocol,
+            "source": source,
+            "kernel": kernel,
+            "sigma_position_m": sigma_position_m,
+            "sigma_rotation_deg": sigma_rotation_deg,
+        }
+        request = checked(wire.ProposalsRequest, fields)
+        answer = self._transport.json("POST", f"{self._path}/proposals", body=request)
+        return SampledPoses.from_wire(wire.Proposals.model_validate(answer))
 
     def sweep(
         self,
@@ -549,3 +623,29 @@ def _numbers(name: str, values: ArrayLike | None, count: int, what: str) -> list
         raise ValueError(f"{name} has shape {array.shape}; expected {count} numbers: {what}")
     numbers: list[float] = array.tolist()
     return numbers
+
+
+def _rows(name: str, values: ArrayLike | None, count: int, what: str) -> list[list[float]] | None:
+    if values is None:
+        return None
+    array = np.asarray(values, dtype=np.float64)
+    array = array[None] if array.ndim == 1 and array.size else array
+    if array.size and (array.ndim != 2 or array.shape[1] != count):
+        raise ValueError(f"{name} has shape {array.shape}; expected rows of {count} numbers: {what}")
+    rows: list[list[float]] = array.reshape(-1, count).tolist()
+    return rows
+
+
+def _pose_columns(poses: ArrayLike | Any | None) -> dict[str, Any] | None:
+    if poses is None:
+        return None
+    position, quaternion = as_poses(poses)
+    return {"position": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
+
+
+def _obstacles(obstacles: wire.Obstacles | Mapping[str, Any] | None) -> Any:
+    """Points may be an array."""
+    if obstacles is None or isinstance(obstacles, wire.Obstacles):
+        return obstacles
+    points = {"points": _rows("points", obstacles["points"], 3, "x, y, z")} if "points" in obstacles else {}
+    return {**obstacles, **points}

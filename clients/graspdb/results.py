@@ -74,6 +74,8 @@ class Grasp:
         (4,) unit quaternion, object frame.
     world
         The same grasp in the world frame, (4, 4); None unless the query gave the object's pose.
+    score
+        What it was ranked by; ``Grasps.ranking`` says what that is.
     density, log_density
         Grasp density in 1/(m^3 rad^3), and its natural logarithm.
     relative
@@ -82,8 +84,10 @@ class Grasp:
         Estimate, its interval and the trials it rests on; None where the service gives none.
     collision_free
         None until mesh and gripper are known.
+    candidate
+        Its place among the candidates that were given.
     width_m
-        Opening of the jaw at the grasp, metres.
+        Opening of the jaw once both fingers touch the object, metres.
     nearest_trials
         ``seq`` of the trials nearest to it.
     active_constraints
@@ -103,6 +107,8 @@ class Grasp:
     width_m: float | None = None
     nearest_trials: tuple[int, ...] = ()
     active_constraints: tuple[str, ...] = ()
+    score: float | None = None
+    candidate: int | None = None
     raw: wire.Grasp | None = field(default=None)
 
     @classmethod
@@ -123,6 +129,8 @@ class Grasp:
             width_m=grasp.width_m,
             nearest_trials=tuple(grasp.nearest_trials),
             active_constraints=tuple(grasp.active_constraints),
+            score=grasp.score,
+            candidate=grasp.candidate,
             raw=grasp,
         )
 
@@ -179,12 +187,14 @@ class Grasps(Sequence[Grasp]):
 
     ``status`` is ``ok``, or ``fewer`` if less than the asked number exist, or ``infeasible`` or
     ``no_successes`` if there is none; ``nearest`` is then the closest grasp outside the constraints.
+    ``ranking`` says what they are ranked by.
     """
 
     def __init__(self, answer: wire.BestGrasps) -> None:
         self.status = answer.status
         self.revision = answer.revision
         self.kernel = answer.kernel
+        self.ranking = answer.ranking
         self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest)
         self._grasps = tuple(Grasp.from_wire(grasp) for grasp in answer.grasps)
 
@@ -210,7 +220,8 @@ class Grasps(Sequence[Grasp]):
         """A DataFrame with a row a grasp (extra ``pandas``)."""
         position = np.array([g.position for g in self]).reshape(-1, 3)
         quaternion = np.array([g.quaternion_xyzw for g in self]).reshape(-1, 4)
-        names = ("density", "log_density", "relative", "success_probability", "collision_free", "width_m")
+        names = ["score", "density", "log_density", "relative", "success_probability", "effective_trials"]
+        names += ["collision_free", "width_m", "candidate"]
         columns = {name: [getattr(g, name) for g in self] for name in names}
         return to_pandas(pose_columns(position, quaternion) | columns)
 
@@ -315,7 +326,10 @@ def _of(values: Sequence[float | None], null: float) -> Floats:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SampledPoses:
-    """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials."""
+    """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials.
+
+    ``criterion`` says how proposals were drawn; None for plain samples.
+    """
 
     position: Floats
     quaternion_xyzw: Floats
@@ -323,6 +337,20 @@ class SampledPoses:
     seed: int
     revision: int
     kernel: wire.KernelInfo
+    criterion: str | None = None
+
+    @classmethod
+    def from_wire(cls, answer: wire.Samples) -> SampledPoses:
+        """From the service's answer."""
+        return cls(
+            position=np.array(answer.position, dtype=np.float64).reshape(-1, 3),
+            quaternion_xyzw=np.array(answer.quaternion_xyzw, dtype=np.float64).reshape(-1, 4),
+            proposal_density=np.array(answer.proposal_density, dtype=np.float64),
+            seed=answer.seed,
+            revision=answer.revision,
+            kernel=answer.kernel,
+            criterion=answer.criterion if isinstance(answer, wire.Proposals) else None,
+        )
 
     @property
     def matrices(self) -> Floats:

@@ -99,6 +99,11 @@ def test_trials_density_and_queries(run: Run, fresh_id: str, trials_file: str, t
     assert found["density"] == pytest.approx(
         [float(row["proposal_density"]) for row in csv.DictReader(io.StringIO(drawn))], rel=1e-3
     )
+    ranked = json.loads(run("--json", "best-grasp", fresh_id, "--candidates", str(poses))[1])
+    assert ranked["grasps"][0]["candidate"] == int(np.argmax(found["density"]))
+    assert ranked["ranking"]["objective"] == "density"
+    _, proposed, _ = run("proposals", fresh_id, "--count", "7", "--seed", "1", "--csv")
+    assert proposed == drawn
     code, out, _ = run("likelihood", fresh_id, "--pose", "0,0,0.06,1,0,0,0")
     assert code == 0
     assert "relative" in out

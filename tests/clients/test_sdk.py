@@ -255,6 +255,34 @@ def test_the_world_frame(grasped: GraspObject) -> None:
     assert np.allclose(same.position, best.position, atol=1e-4)
 
 
+def test_candidates_exclusions_and_half_spaces_as_arrays(grasped: GraspObject) -> None:
+    poses = np.array([[*LEFT, *grasped.best_grasp(sphere=[*LEFT, 0.03]).quaternion_xyzw], [*ABOVE, *DOWN]])
+    ranked = grasped.best_grasps(count=2, candidates=poses)
+    assert [grasp.candidate for grasp in ranked] == [1, 0]
+    assert ranked[0].score == pytest.approx(ranked[0].density)
+    assert ranked.ranking is not None
+    assert ranked.ranking.objective == "density"
+    aside = grasped.best_grasp(exclude=poses[1:], min_separation_m=0.05, min_separation_deg=180)
+    assert np.linalg.norm(aside.position - ABOVE) > 0.05
+    lower = grasped.best_grasp(half_spaces=np.array([[0, 0, -1, -0.02]]))
+    assert lower.position[2] <= 0.02 + 1e-6
+    robust = grasped.best_grasps(count=1, objective="robust", robust_of="density", tool_noise_m=0.005)
+    assert robust.ranking is not None
+    assert "right" in str(robust.ranking.tool_noise)
+    with pytest.raises(ValueError, match="half_spaces"):
+        grasped.best_grasp(half_spaces=[[0, 0, 1]])
+    with pytest.raises(InvalidInput, match="objective=robust"):
+        grasped.best_grasp(tool_noise_m=0.005)
+
+
+def test_proposals_go_back_with_their_density(grasped: GraspObject) -> None:
+    drawn = grasped.proposals(20, seed=1)
+    assert np.array_equal(drawn.poses, grasped.samples(20, seed=1).poses)
+    assert drawn.criterion == "draws from the density of successes"
+    assert grasped.samples(2).criterion is None
+    assert (drawn.proposal_density > 0).all()
+
+
 def test_no_grasp_raises_and_names_the_nearest(db: Client, grasped: GraspObject, fresh_id: str) -> None:
     with pytest.raises(Infeasible) as caught:
         grasped.best_grasp(box=([1, 1, 1], [2, 2, 2]))

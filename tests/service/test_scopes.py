@@ -11,7 +11,7 @@ from graspdb_service.settings import Settings
 
 PUBLIC = {"/livez", "/readyz", "/metrics", "/info"}
 FOR_WORKERS = {("get", "/objects/{id}/mesh"), ("get", "/objects/{id}/convex-parts")}
-COMPUTING = ("/likelihood", "/best-grasp", "/samples")
+COMPUTING = ("/likelihood", "/best-grasp", "/samples", "/proposals")
 
 
 def _expected(method: str, path: str) -> str:

@@ -1,4 +1,4 @@
-"""``graspdb density``, ``best-grasp``, ``likelihood`` and ``samples``."""
+"""``graspdb density``, ``best-grasp``, ``likelihood``, ``samples`` and ``proposals``."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from graspdb.cli.common import (
 )
 from graspdb.errors import Infeasible
 from graspdb.files import read_poses
+from graspdb.results import SampledPoses
 
 
 def density(
@@ -72,6 +73,16 @@ def best_grasp(
     context: typer.Context,
     id: ObjectId,
     count: Annotated[int, typer.Option(min=1, max=1_000, help="So many distinct grasps.")] = 1,
+    objective: Annotated[
+        str | None, typer.Option(help="density, success_probability (its interval's lower end) or robust.")
+    ] = None,
+    robust_of: Annotated[
+        str | None, typer.Option(help="What robust averages: success_probability or density.")
+    ] = None,
+    pose_noise_m: Annotated[float | None, typer.Option(help="Noise of the object's place, per axis.")] = None,
+    pose_noise_deg: Annotated[float | None, typer.Option(help="... of its turn, about its centre.")] = None,
+    tool_noise_m: Annotated[float | None, typer.Option(help="Noise of the tool's place, per axis.")] = None,
+    tool_noise_deg: Annotated[float | None, typer.Option(help="... of its turn.")] = None,
     box_min: Annotated[Vector | None, vector_option("Lower corner of the workspace.", "--box-min")] = None,
     box_max: Annotated[Vector | None, vector_option("Upper corner of the workspace.", "--box-max")] = None,
     sphere: Annotated[
@@ -88,6 +99,14 @@ def best_grasp(
     collision_free: Annotated[
         bool | None, typer.Option("--collision-free/--any", help="Whether the gripper must clear the object.")
     ] = None,
+    pregrasp_distance_m: Annotated[
+        float | None, typer.Option(help="The straight approach is free from this far back.")
+    ] = None,
+    max_width_m: Annotated[float | None, typer.Option(help="Fingers at most this far apart.")] = None,
+    candidates: Annotated[
+        str | None, typer.Option(help="Rank these poses: a file as `likelihood` reads it.")
+    ] = None,
+    exclude: Annotated[str | None, typer.Option(help="Stay away from these poses: a file.")] = None,
     object_pose: Annotated[
         Vector | None,
         vector_option("The object in the world.", "--object-pose", count=7, metavar="x,y,z,qx,qy,qz,qw"),
@@ -113,6 +132,16 @@ def best_grasp(
         try:
             found = db.objects.get(id).best_grasps(
                 count=count,
+                objective=objective,
+                robust_of=robust_of,
+                pose_noise_m=pose_noise_m,
+                pose_noise_deg=pose_noise_deg,
+                tool_noise_m=tool_noise_m,
+                tool_noise_deg=tool_noise_deg,
+                pregrasp_distance_m=pregrasp_distance_m,
+                max_width_m=max_width_m,
+                candidates=None if candidates is None else read_poses(candidates),
+                exclude=None if exclude is None else read_poses(exclude),
                 box=None if box_min is None or box_max is None else (box_min, box_max),
                 sphere=sphere,
                 above_plane=above_plane,
@@ -141,6 +170,7 @@ def best_grasp(
         out(
             {
                 "status": found.status,
+                "ranking": found.ranking,
                 "revision": found.revision,
                 "kernel": found.kernel,
                 "grasps": list(found),
@@ -264,11 +294,50 @@ def samples(
             sigma_position_m=sigma_position_m,
             sigma_rotation_deg=sigma_rotation_deg,
         )
+    _show_poses(found, csv=csv, json=state.json)
+
+
+def proposals(
+    context: typer.Context,
+    id: ObjectId,
+    count: Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")] = 10,
+    strategy: Annotated[
+        str, typer.Option(help="density: where successes lie; uncertainty: where a trial teaches most.")
+    ] = "density",
+    seed: Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")] = None,
+    gripper: Gripper = None,
+    protocol: Protocol = None,
+    source: Source = None,
+    kernel: Kernel = None,
+    sigma_position_m: SigmaPosition = None,
+    sigma_rotation_deg: SigmaRotation = None,
+    csv: Annotated[
+        bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")
+    ] = False,
+) -> None:
+    """Draw grasps to try next; their proposal_density goes back with the trials."""
+    state = state_of(context)
+    with state.client() as db:
+        found = db.objects.get(id).proposals(
+            count,
+            strategy=strategy,
+            seed=seed,
+            gripper=gripper,
+            protocol=protocol,
+            source=source,
+            kernel=kernel,
+            sigma_position_m=sigma_position_m,
+            sigma_rotation_deg=sigma_rotation_deg,
+        )
+    _show_poses(found, csv=csv, json=state.json)
+
+
+def _show_poses(found: SampledPoses, *, csv: bool, json: bool) -> None:
     if csv:
         typer.echo("x,y,z,qx,qy,qz,qw,proposal_density")
         for row, weight in zip(found.poses.tolist(), found.proposal_density.tolist(), strict=True):
             typer.echo(",".join(repr(value) for value in (*row, weight)))
-    elif state.json:
+    elif json:
         out(found)
     else:
         show_table(

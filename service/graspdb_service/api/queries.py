@@ -17,6 +17,8 @@ from graspdb.wire import (
     GraspConstraints,
     LikelihoodRequest,
     Likelihoods,
+    Proposals,
+    ProposalsRequest,
     Samples,
     SamplesRequest,
     Selection,
@@ -29,7 +31,7 @@ from graspdb_service.api.columns import columns_json, read_object, read_poses
 from graspdb_service.api.jsonpieces import LongArray
 from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
 from graspdb_service.problems import ProblemError
-from graspdb_service.usecases import bestgrasp, queries
+from graspdb_service.usecases import bestgrasp, proposals, queries
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.selection import Filters
 from graspdb_service.usecases.success import LEVEL
@@ -147,8 +149,19 @@ def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
 def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
     """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
     drawn = queries.draw(ctx, id, query, query.count, query.seed)
+    return _drawn(drawn, {})
+
+
+@router.post("/objects/{id}/proposals", response_model=Proposals, **scope("read"))
+def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
+    """Grasps to try next; sent back with the trial, ``proposal_density`` weights it."""
+    drawn, criterion = proposals.propose(ctx, id, query)
+    return _drawn(drawn, {"strategy": query.strategy, "criterion": criterion})
+
+
+def _drawn(drawn: queries.Draw, more: dict[str, Any]) -> Response:
     return columns_json(
-        {"revision": drawn.revision, "kernel": drawn.kernel.model_dump(), "seed": drawn.seed},
+        {"revision": drawn.revision, "kernel": drawn.kernel.model_dump(), "seed": drawn.seed, **more},
         {
             "position": drawn.position,
             "quaternion_xyzw": drawn.quaternion_xyzw,

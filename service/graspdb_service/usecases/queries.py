@@ -219,6 +219,28 @@ def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | 
     ProblemError
         413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
     """
+    check_count(ctx, count)
+    chosen = secrets.randbits(63) if seed is None else seed
+    with ctx.compute.admitted():
+        built = built_for(ctx, slug, selection)
+        density = built.asked
+        if density is None:
+            raise no_successes(slug)
+        position, quaternion = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
+        densities = density_at(ctx, density, position, quaternion)
+    return Draw(
+        object_id=built.object_row.id,
+        revision=built.revision,
+        kernel=built.kernel,
+        seed=chosen,
+        position=position,
+        quaternion_xyzw=se3.canonical(quaternion),
+        proposal_density=densities,
+    )
+
+
+def check_count(ctx: Context, count: int) -> None:
+    """413 for more draws than the service allows."""
     limit = ctx.settings.max_samples
     if count > limit:
         raise ProblemError(
@@ -227,24 +249,19 @@ def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | 
             f"{count} samples are over the limit of {limit}: draw them in several requests with other seeds",
             errors=[("count", f"at most {limit}")],
         )
-    chosen = secrets.randbits(63) if seed is None else seed
-    with ctx.compute.admitted():
-        built = built_for(ctx, slug, selection)
-        density = built.asked
-        if density is None:
-            raise conflict(
-                "no-successes",
-                "No trial of this selection succeeded, so there is no density to draw from:"
-                f" post trials (POST /objects/{slug}/trials) or sweep a grid first",
-            )
-        position, quaternion = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
-        logs = _log_density(ctx, density, position, quaternion, _PRECISE_CUTOFF)
-    return Draw(
-        object_id=built.object_row.id,
-        revision=built.revision,
-        kernel=built.kernel,
-        seed=chosen,
-        position=position,
-        quaternion_xyzw=se3.canonical(quaternion),
-        proposal_density=np.exp(logs),
+
+
+def no_successes(slug: str) -> ProblemError:
+    """409 where there is nothing to draw from."""
+    return conflict(
+        "no-successes",
+        "No trial of this selection succeeded, so there is no density to draw from:"
+        f" post trials (POST /objects/{slug}/trials) or sweep a grid first",
     )
+
+
+def density_at(
+    ctx: Context, density: GraspDensity | MixtureDensity, positions: Floats, quaternions: Floats
+) -> Floats:
+    """The density (n,) at draws from it."""
+    return np.exp(_log_density(ctx, density, positions, quaternions, _PRECISE_CUTOFF))

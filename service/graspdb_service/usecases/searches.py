@@ -74,7 +74,7 @@ def admissible_for(question: Question, of_chances: bool) -> Admissible | None:
     request, limits, test, threads = question.request, question.limits, question.test, question.threads
     checks: list[Callable[[Floats, Floats], Bools]] = []
     if of_chances:
-        checks.append(_near_successes(question.density, threads))
+        checks.append(near_successes(question.density, _NEAR, threads))
     if limits.exclude is not None and len(limits.exclude[0]):
         checks.append(_away_from(limits.exclude, question.separation, bool(question.density.symmetric.all())))
     distance = request.pregrasp_distance_m or 0.0
@@ -102,8 +102,8 @@ def admissible_for(question: Question, of_chances: bool) -> Admissible | None:
     return admissible
 
 
-def _near_successes(density: GraspDensity, threads: int) -> Callable[[Floats, Floats], Bools]:
-    """Whether some success is within `_NEAR`.
+def near_successes(density: GraspDensity, reach: float, threads: int) -> Callable[[Floats, Floats], Bools]:
+    """Whether some success is within so many standard deviations, position and rotation together.
 
     A kernel's exponent ``|dp|^2 / (2 sigma^2) + kappa (1 - q . q')`` is half a squared distance of points
     (p / sigma, sqrt(kappa) q), both signs of q being one rotation.
@@ -122,7 +122,7 @@ def _near_successes(density: GraspDensity, threads: int) -> Callable[[Floats, Fl
         for q in ends:
             left = np.flatnonzero(~found)
             points = np.hstack([positions[left] * scale, q[left] * turn])
-            distance, _ = tree.query(points, distance_upper_bound=_NEAR, workers=threads)
+            distance, _ = tree.query(points, distance_upper_bound=reach, workers=threads)
             found[left] = np.isfinite(distance)
         return found
 
