@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -255,6 +255,8 @@ class GraspObject:
         kernel: Kernel | None = None,
         sigma_position_m: float | None = None,
         sigma_rotation_deg: float | None = None,
+        verify: bool = False,
+        verify_timeout_s: float = 300.0,
     ) -> Grasps:
         """At most ``count`` distinct grasps, best first.
 
@@ -300,11 +302,18 @@ class GraspObject:
         include
             Scores to compute, as in :meth:`likelihood`. By default the success probability comes along where
             the objective needs it or there are at most 500,000 attempts.
+        verify
+            Have a worker simulate the grasps at the fine step before they are answered: ``grasp.simulated``
+            is what became of each, and those that held come first. The outcomes are stored as a check.
+        verify_timeout_s
+            How long to wait for that.
 
         Raises
         ------
         Infeasible
             If there is none; ``nearest`` is the closest grasp outside the constraints, where there is one.
+        TimeoutError
+            If the simulation has not finished in time; it says so where no worker has come.
         """
         fields: dict[str, Any] = {
             "count": count,
@@ -348,7 +357,9 @@ class GraspObject:
         answer = self._transport.json("POST", f"{self._path}/best-grasp", body=request)
         grasps = Grasps(wire.BestGrasps.model_validate(answer))
         if len(grasps):
-            return grasps
+            if not verify:
+                return grasps
+            return self._simulated(grasps, gripper, protocol, source, verify_timeout_s)
         if grasps.status == "no_successes":
             raise Infeasible(f"{self.id} has no successful trial yet, so there is no grasp to choose from")
         where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
@@ -356,6 +367,31 @@ class GraspObject:
             f"no grasp of {self.id} fulfils the constraints within reach of what was tried{where}",
             nearest=grasps.nearest,
         )
+
+    def _simulated(
+        self,
+        grasps: Grasps,
+        gripper: str | None,
+        protocol: str | None,
+        source: str | None,
+        timeout_s: float,
+    ) -> Grasps:
+        """The grasps with their outcomes in simulation, by the gripper and protocol of their trials."""
+        chosen = self.density(gripper=gripper, protocol=protocol, source=source)
+        sweep = self.sweep(
+            poses=grasps.matrices,
+            gripper=chosen.gripper,
+            protocol=chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None,
+            fidelity="fine",
+            purpose="check",
+        )
+        try:
+            sweep.wait(timeout=timeout_s)
+        except TimeoutError as error:
+            hint = sweep.hint()
+            raise TimeoutError(f"{error}{'' if hint is None else f': {hint}'}") from None
+        outcomes = sweep.outcomes()
+        return grasps.simulated(outcomes.outcome[np.argsort(outcomes.pose_index)].tolist())
 
     def samples(
         self,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import html
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
 import numpy as np
@@ -86,6 +87,8 @@ class Grasp:
         None until mesh and gripper are known.
     candidate
         Its place among the candidates that were given.
+    simulated
+        Outcome of the grasp simulated anew at the fine step, where that was asked for.
     width_m
         Opening of the jaw once both fingers touch the object, metres.
     nearest_trials
@@ -109,6 +112,7 @@ class Grasp:
     active_constraints: tuple[str, ...] = ()
     score: float | None = None
     candidate: int | None = None
+    simulated: str | None = None
     raw: wire.Grasp | None = field(default=None)
 
     @classmethod
@@ -166,6 +170,8 @@ class Grasp:
             )
         if self.collision_free is not None:
             rows["collision-free"] = "yes" if self.collision_free else "no"
+        if self.simulated is not None:
+            rows["simulated"] = self.simulated
         if self.width_m is not None:
             rows["width [m]"] = f"{self.width_m:.4f}"
         if self.active_constraints:
@@ -187,7 +193,8 @@ class Grasps(Sequence[Grasp]):
 
     ``status`` is ``ok``, or ``fewer`` if less than the asked number exist, or ``infeasible`` or
     ``no_successes`` if there is none; ``nearest`` is then the closest grasp outside the constraints.
-    ``ranking`` says what they are ranked by.
+    ``ranking`` says what they are ranked by. Where they were simulated before they were answered
+    (``verify=True``), those that held come first.
     """
 
     def __init__(self, answer: wire.BestGrasps) -> None:
@@ -211,6 +218,13 @@ class Grasps(Sequence[Grasp]):
     def __iter__(self) -> Iterator[Grasp]:
         return iter(self._grasps)
 
+    def simulated(self, outcomes: Sequence[str]) -> Grasps:
+        """The same grasps with what became of each in simulation; those that held come first."""
+        told = [replace(grasp, simulated=o) for grasp, o in zip(self._grasps, outcomes, strict=True)]
+        answer = copy.copy(self)
+        answer._grasps = tuple(sorted(told, key=lambda grasp: grasp.simulated != "success"))
+        return answer
+
     @property
     def matrices(self) -> Floats:
         """(N, 4, 4) tool frames in the object frame."""
@@ -221,7 +235,7 @@ class Grasps(Sequence[Grasp]):
         position = np.array([g.position for g in self]).reshape(-1, 3)
         quaternion = np.array([g.quaternion_xyzw for g in self]).reshape(-1, 4)
         names = ["score", "density", "log_density", "relative", "success_probability", "effective_trials"]
-        names += ["collision_free", "width_m", "candidate"]
+        names += ["collision_free", "width_m", "candidate", "simulated"]
         columns = {name: [getattr(g, name) for g in self] for name in names}
         return to_pandas(pose_columns(position, quaternion) | columns)
 

@@ -357,6 +357,21 @@ def test_a_sweep_simulates_every_pose_it_was_given(db: Client, fresh_id: str) ->
     assert item.info.outcomes.get("success", 0) == int(outcomes.success.sum())
 
 
+@pytest.mark.usefixtures("worker")
+def test_best_grasps_are_simulated_before_they_are_answered(db: Client, fresh_id: str) -> None:
+    box = _box((-0.015, -0.02, -0.05), (0.015, 0.02, 0.05))
+    item = db.objects.create(fresh_id, mesh=box, convex_parts=[box], mass_kg=0.1, friction=0.6)
+    # The second claims to have held, but there is nothing between its fingers.
+    poses = [[0, 0, 0.05, *DOWN], [0, 0, 0.3, *DOWN], [0, 0, 0.301, *DOWN]]
+    item.trials.add(poses, ["success"] * 3, gripper="pg70", source="robot")
+    found = item.best_grasps(count=2, verify=True, min_separation_m=0.1, verify_timeout_s=120)
+    assert [grasp.simulated for grasp in found] == ["success", "missed"]
+    assert np.isclose(found[0].position[2], 0.05, atol=0.01)
+    assert found[0].density < found[1].density  # what held goes first
+    assert item.refresh().info.trials == 3
+    assert item.best_grasp().simulated is None
+
+
 def test_a_long_sweep_goes_on_after_a_timeout_and_can_be_cancelled(db: Client, fresh_id: str) -> None:
     box = _box((-0.015, -0.02, -0.05), (0.015, 0.02, 0.05))
     item = db.objects.create(fresh_id, mesh=box, convex_parts=[box], mass_kg=0.1)

@@ -120,6 +120,9 @@ def best_grasp(
     kernel: Kernel = None,
     sigma_position_m: SigmaPosition = None,
     sigma_rotation_deg: SigmaRotation = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Simulate the grasps at the fine step first (needs a worker).")
+    ] = False,
 ) -> None:
     """Find the best grasp within constraints.
 
@@ -160,6 +163,7 @@ def best_grasp(
                 kernel=kernel,
                 sigma_position_m=sigma_position_m,
                 sigma_rotation_deg=sigma_rotation_deg,
+                verify=verify,
             )
         except Infeasible as error:
             if state.json:
@@ -190,6 +194,7 @@ def best_grasp(
             *(["in the world [m]"] if world else []),
             "density",
             "relative",
+            *(["simulated"] if verify else []),
         ),
         [
             (
@@ -199,6 +204,7 @@ def best_grasp(
                 *([numbers(g.world[:3, 3]) if g.world is not None else ""] if world else []),
                 f"{g.density:.4g}",
                 f"{g.relative:.3f}",
+                *([g.simulated or ""] if verify else []),
             )
             for number, g in enumerate(found, start=1)
         ],
