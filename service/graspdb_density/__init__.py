@@ -7,6 +7,7 @@ from .kernels import HAAR_VOLUME, IsotropicKernel
 from .maximum import Maximum, nearest
 from .mixture import MixtureDensity
 from .region import Region
+from .sampled import SampledKernel
 from .scored import PoseNoise, expected, search_scored
 from .success import SuccessEstimate, SuccessModel
 from .weights import effective_sample_size, importance_weights, mixture_weights
@@ -22,6 +23,7 @@ __all__ = [
     "MixtureDensity",
     "PoseNoise",
     "Region",
+    "SampledKernel",
     "SuccessEstimate",
     "SuccessModel",
     "WidthChoice",

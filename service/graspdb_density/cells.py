@@ -82,7 +82,12 @@ class Cells:
         centre = np.median(positions, axis=0)
         rows = np.arange(len(positions), dtype=np.int32)
         segments = tuple(
-            _sort(_soa(positions, quaternions, weights, chosen, flag, centre, scale), rows[chosen], flag)
+            _sort(
+                _soa(positions, quaternions, weights, chosen, flag, centre, scale),
+                rows[chosen],
+                flag,
+                centre * scale,
+            )
             for flag, chosen in ((True, symmetric), (False, ~symmetric))
             if chosen.any()
         )
@@ -115,6 +120,7 @@ class Cells:
                     np.concatenate([*(s.data for s in tail), data], axis=1),
                     np.concatenate([*(s.rows for s in tail), rows[chosen]]),
                     flag,
+                    self.centre * self.scale,
                 )
             )
         return self._assemble(tuple(segments), self.centre, self.scale)
@@ -231,23 +237,28 @@ def _edges() -> tuple[float, float]:
     return edge, edge / 2.0
 
 
-def _sort(data: NDArray[np.float32], rows: NDArray[np.int32], twin: bool) -> _Segment:
+def _sort(data: NDArray[np.float32], rows: NDArray[np.int32], twin: bool, anchor: Floats) -> _Segment:
+    """Sort rows by cells of a lattice through the object's origin, which lies at ``-anchor``.
+
+    So which kernels a query visits does not depend on how rows are split into segments: a density that was
+    extended cuts off what a rebuilt one does.
+    """
     positions = data[:3]
     count = data.shape[1]
     low, high = positions.min(axis=1).astype(np.float64), positions.max(axis=1).astype(np.float64)
     edge, edge_z = _edges()
     edges = np.array([edge, edge, edge_z])
     most = max(65_536, 8 * count)
+    origin, size = _lattice(low, high, edges, anchor)
     # Far outliers go to the border cells instead of stretching the grid; a spread that is too wide even so
     # gets larger cells.
-    origin, size = low, np.floor((high - low) / edges).astype(np.int64) + 1
     if np.prod(size.astype(np.float64)) > most:
-        origin = np.quantile(positions, 0.005, axis=1).astype(np.float64)
+        bottom = np.quantile(positions, 0.005, axis=1).astype(np.float64)
         top = np.quantile(positions, 0.995, axis=1).astype(np.float64)
-        size = np.floor((top - origin) / edges).astype(np.int64) + 1
+        origin, size = _lattice(bottom, top, edges, anchor)
         while np.prod(size.astype(np.float64)) > most:
             edges = edges * 1.25
-            size = np.floor((top - origin) / edges).astype(np.int64) + 1
+            origin, size = _lattice(bottom, top, edges, anchor)
     cell = np.floor((positions - origin[:, None].astype(np.float32)) / edges[:, None].astype(np.float32))
     index = np.clip(cell, 0, (size - 1)[:, None]).astype(np.int64)
     key = (index[0] * size[1] + index[1]) * size[2] + index[2]
@@ -265,3 +276,9 @@ def _sort(data: NDArray[np.float32], rows: NDArray[np.int32], twin: bool) -> _Se
         [np.minimum.reduceat(ordered[:3], first, axis=1), np.maximum.reduceat(ordered[:3], first, axis=1)]
     ).T
     return _Segment(ordered, rows[order], start, header, np.ascontiguousarray(boxes), twin)
+
+
+def _lattice(low: Floats, high: Floats, edges: Floats, anchor: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Corner of the lattice's cell that holds ``low``, and how many cells reach to ``high``."""
+    first = np.floor((low + anchor) / edges)
+    return first * edges - anchor, (np.floor((high + anchor) / edges) - first).astype(np.int64) + 1

@@ -31,7 +31,7 @@ __all__ = ["CentreSums", "centre_sums"]
 _RADIUS = 3.0 / math.sqrt(2.0)
 #: Most pairs of kernels to sum: some 0.2 s on one core.
 MOST_PAIRS = 5e8
-_LEAST_SAMPLE = 2_048
+_LEAST_SAMPLE = 4_096
 _PROBES = 256
 _QUERY_BLOCK = 1_024
 

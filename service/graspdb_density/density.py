@@ -101,7 +101,7 @@ class GraspDensity:
         p, q = se3.as_poses(positions, quaternions_xyzw)
         if not len(p):
             raise ValueError("a density needs at least one grasp")
-        w, flags = _row_values(weights, symmetric, len(p))
+        w, flags = row_values(weights, symmetric, len(p))
         unit = float(w.mean())
         cells = Cells.build(p, q, w / unit, flags, kernel.sigma_position_m)
         return cls(kernel, p, q, w, flags, cells, unit)
@@ -121,7 +121,7 @@ class GraspDensity:
         p, q = se3.as_poses(positions, quaternions_xyzw)
         if not len(p):
             return self
-        w, flags = _row_values(weights, symmetric, len(p), fill=self._total / self.size)
+        w, flags = row_values(weights, symmetric, len(p), fill=self._total / self.size)
         cells = self._cells.extend(p, q, w / self._unit, flags)
         return GraspDensity(
             self._kernel,
@@ -424,9 +424,10 @@ def scaled_radius(cutoff: float) -> float:
     return cutoff / math.sqrt(2.0)
 
 
-def _row_values(
+def row_values(
     weights: ArrayLike | None, symmetric: ArrayLike | bool, count: int, fill: float = 1.0
 ) -> tuple[Floats, NDArray[np.bool_]]:
+    """Weights and flags of rows, checked; ``fill`` where no weights are given."""
     w = np.full(count, fill) if weights is None else np.array(weights, dtype=np.float64)
     if w.shape != (count,):
         raise ValueError(f"weights have shape ({count},), not {w.shape}")

@@ -6,6 +6,7 @@ ask.
 
 from __future__ import annotations
 
+import copy
 import math
 from functools import cached_property
 
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import mixtureloops, se3
 from .anisotropic import AnisotropicKernel
 from .cells import Cells
-from .density import GraspDensity
+from .density import GraspDensity, row_values
 from .kernels import HAAR_VOLUME
 from .maximum import Admissible, Maximum
 from .region import Region
@@ -69,17 +70,15 @@ class MixtureDensity:
         rows = KernelRows(
             positions, quaternions_xyzw, kernel, weights=weights, symmetric=symmetric, frames=frames
         )
-        self._rows = rows
+        # Weights are kept in the unit of those given, so that further rows can be added in it.
+        self._total = float(rows.size) if weights is None else float(np.sum(weights))
+        self._unit = self._total / rows.size
         self._kernel = kernel
-        raw = rows.weights * rows.size
         spread = math.sqrt(max(float(np.linalg.eigvalsh(s[:3, :3])[-1]) for s in kernel.covariances))
         self._offset = float(np.linalg.norm(kernel.means[:, :3], axis=1).max())
         self._spread = spread
-        self._cells = Cells.build(rows.positions, rows.quaternions_xyzw, raw, rows.symmetric, spread)
-        own = se3.to_matrix(rows.quaternions_xyzw)
-        turned = own if frames is None else np.asarray(frames, dtype=np.float64)
-        self._frames = np.ascontiguousarray(np.broadcast_to(turned, (rows.size, 3, 3)).reshape(-1, 9))
-        self._sorted_frames = np.ascontiguousarray(self._frames[self._cells.rows].T, dtype=np.float32)
+        raw = rows.weights * rows.size
+        self._hold(rows, Cells.build(rows.positions, rows.quaternions_xyzw, raw, rows.symmetric, spread))
         peaks = kernel.log_peaks
         self._log_unit = float(peaks.max())
         self._log_weights = peaks - self._log_unit
@@ -90,6 +89,56 @@ class MixtureDensity:
         turn = max(float(np.linalg.eigvalsh(s[3:, 3:])[-1]) for s in kernel.covariances) ** 0.5
         mean_turn = float(np.linalg.norm(kernel.means[:, 3:], axis=1).max())
         self._narrow = turn <= NARROW and mean_turn + 2.5 * turn <= math.radians(75.0)
+
+    def _hold(self, rows: KernelRows, cells: Cells) -> None:
+        self._rows, self._cells = rows, cells
+        self._frames = rows.frames.reshape(-1, 9)
+        if self._kernel.frame == "gripper":
+            # Turned by the rows' own quaternions in the loops.
+            self._sorted_frames = np.zeros((9, 1), dtype=np.float32)
+        else:
+            self._sorted_frames = np.ascontiguousarray(self._frames[cells.rows].T, dtype=np.float32)
+
+    def extend(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        weights: ArrayLike | None = None,
+        symmetric: ArrayLike | bool = True,
+        frames: ArrayLike | None = None,
+    ) -> MixtureDensity:
+        """A density with further rows, weights in the unit of the first ones (None: their mean).
+
+        Equal to building from all rows within 1e-5 of the density; what is sorted stays sorted. Searches that
+        this density has been asked for go on from what they knew.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        if not len(p):
+            return self
+        w, flags = row_values(weights, symmetric, len(p), fill=self._unit_mean)
+        more = KernelRows(p, q, self._kernel, weights=w, symmetric=flags, frames=frames)
+        old = self._rows
+        rows = KernelRows(
+            np.concatenate([old.positions, p]),
+            np.concatenate([old.quaternions_xyzw, q]),
+            self._kernel,
+            weights=np.concatenate([old.weights * self._total, w]),
+            symmetric=np.concatenate([old.symmetric, flags]),
+            frames=None if frames is None else np.concatenate([old.frames, more.frames]),
+        )
+        grown = copy.copy(self)
+        for name in ("isotropic", "_global"):
+            grown.__dict__.pop(name, None)
+        grown._total = self._total + float(w.sum())
+        grown._hold(rows, self._cells.extend(p, q, w / self._unit, flags))
+        if "isotropic" in self.__dict__:
+            grown.__dict__["isotropic"] = self.isotropic.extend(p, q, weights=w, symmetric=flags)
+        return grown
+
+    @property
+    def _unit_mean(self) -> float:
+        """Mean weight, in the unit of the weights given."""
+        return self._total / self.size
 
     @property
     def kernel(self) -> AnisotropicKernel:
@@ -102,8 +151,8 @@ class MixtureDensity:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the arrays held for evaluation."""
-        return 2 * self._cells.nbytes + 2 * self._sorted_frames.nbytes + self._frames.nbytes
+        """Bytes of the arrays held for evaluation, `isotropic` not counted."""
+        return self._rows.nbytes + self._cells.nbytes + self._sorted_frames.nbytes
 
     @property
     def effective_sample_size(self) -> float:
@@ -117,7 +166,7 @@ class MixtureDensity:
             self._rows.positions,
             self._rows.quaternions_xyzw,
             kernel=self._kernel.isotropic,
-            weights=self._rows.weights,
+            weights=self._rows.weights * self._total,
             symmetric=self._rows.symmetric,
         )
 
@@ -137,7 +186,7 @@ class MixtureDensity:
         rows, turning = self._rows, float(self._kernel.frame == "gripper")
         log_rows = np.log(rows.weights * np.where(rows.symmetric, 0.5, 1.0))
         lowers, log_weights = self._lowers.astype(np.float32), self._log_weights.astype(np.float32)
-        unit = math.log(self.size)
+        unit = math.log(self._total / self._unit)
         out = np.empty(len(p))
 
         def work(begin: int, end: int) -> None:

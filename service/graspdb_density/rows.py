@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -132,17 +133,36 @@ class KernelRows:
         )
         self._own_frames = frames is None
         self._frames: Floats | None = None
+        # What needs sorted rows sorts them: densities of their own keep other cells.
+        self._sigma = 0.0
         if isinstance(kernel, IsotropicKernel):
-            sigma = kernel.sigma_position_m
-            self._reach = CUTOFF * sigma
+            self._sigma = kernel.sigma_position_m
+            self._reach = CUTOFF * self._sigma
             self.log_unit = kernel.log_peak
         else:
-            sigma = self._take_mixture(kernel)
-            self._frames = se3.to_matrix(q) if frames is None else _frames(frames, len(p))
-        self._cells = Cells.build(p, q, np.ones(len(p)), self.symmetric, sigma)
-        if self._frames is not None:
-            ordered = self._frames.reshape(-1, 9)[self._cells.rows]
-            self._sorted_frames = np.ascontiguousarray(ordered.T, dtype=np.float32)
+            self._sigma = self._take_mixture(kernel)
+            self._frames = None if frames is None else _frames(frames, len(p))
+
+    @cached_property
+    def frames(self) -> Floats:
+        """(N, 3, 3) axes that translations are measured along."""
+        return se3.to_matrix(self.quaternions_xyzw) if self._frames is None else self._frames
+
+    @cached_property
+    def _cells(self) -> Cells:
+        ones = np.ones(self.size)
+        return Cells.build(self.positions, self.quaternions_xyzw, ones, self.symmetric, self._sigma)
+
+    @cached_property
+    def _sorted_frames(self) -> NDArray[np.float32]:
+        return np.ascontiguousarray(self.frames.reshape(-1, 9)[self._cells.rows].T, dtype=np.float32)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays held, those made on demand included."""
+        held = [self.positions, self.quaternions_xyzw, self.weights, self.symmetric]
+        held += [self.__dict__[name] for name in ("frames", "_sorted_frames") if name in self.__dict__]
+        return sum(a.nbytes for a in held) + (self._cells.nbytes if "_cells" in self.__dict__ else 0)
 
     def _take_mixture(self, kernel: MixtureKernel) -> float:
         w = np.asarray(kernel.weights, dtype=np.float64)
@@ -280,9 +300,8 @@ class KernelRows:
         out = np.empty(len(p))
         out[near] = np.log(sums[near]) - math.log(self.size)
         if not near.all():
-            assert self._frames is not None
             log_rows = np.log(self.weights * np.where(self.symmetric, 0.5, 1.0))
-            frames = np.ascontiguousarray(self._frames.reshape(-1, 9))
+            frames = np.ascontiguousarray(self.frames.reshape(-1, 9))
             for j in np.flatnonzero(~near):
                 out[j] = rowloops.mixture_log_sum(
                     self.positions, self.quaternions_xyzw, frames, self.symmetric, self._own_frames, log_rows,
@@ -316,12 +335,11 @@ class KernelRows:
         else:
             vectors = self._draw_vectors(count, rng)
             turns = se3.from_rotation_vector(vectors[:, 3:])
-            assert self._frames is not None
-            moves = np.einsum("nij,nj->ni", self._frames[row], vectors[:, :3])
+            moves = np.einsum("nij,nj->ni", self.frames[row], vectors[:, :3])
             if self._own_frames:
                 # The twin's own x and y axes point the other way.
                 turned_moves = np.einsum(
-                    "nij,nj->ni", self._frames[row], vectors[:, :3] * np.array([-1.0, -1.0, 1.0])
+                    "nij,nj->ni", self.frames[row], vectors[:, :3] * np.array([-1.0, -1.0, 1.0])
                 )
                 moves = np.where(turned[:, None], turned_moves, moves)
         return self.positions[row] + moves, se3.multiply(centre, turns)

@@ -7,7 +7,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from .se3 import Floats
 
-__all__ = ["LOW_EFFECTIVE_SHARE", "effective_sample_size", "importance_weights", "mixture_weights"]
+__all__ = [
+    "LOW_EFFECTIVE_SHARE",
+    "effective_sample_size",
+    "importance_weights",
+    "mixture_weights",
+    "pooled_density",
+]
 
 #: Below this share of the rows, an effective sample size deserves a warning.
 LOW_EFFECTIVE_SHARE = 0.1
@@ -55,16 +61,44 @@ def mixture_weights(densities: ArrayLike, counts: ArrayLike, *, known: ArrayLike
     known : (N,) bool or None
         False where a trial came from none of them: it takes the mean weight of the rest.
     """
+    exposure = pooled_density(densities, counts)
+    if known is not None:
+        exposure = np.where(np.asarray(known, dtype=bool), exposure, np.nan)
+    return _filled(exposure)
+
+
+def pooled_density(densities: ArrayLike, counts: ArrayLike) -> Floats:
+    """What trials of several strategies were drawn with when seen as one: ``sum_k n_k g_k / sum_k n_k``.
+
+    Its reciprocals are `mixture_weights` but for their scale, which is that of ``1 / g``: so strategies
+    that can be evaluated may be weighed, as one, beside trials that know their own density only.
+
+    Parameters
+    ----------
+    densities : (N, K)
+        g_k at every trial, 1/(m^3 rad^3), each integrating to 1; 0 where a strategy proposes nothing.
+    counts : (K,)
+        Trials each strategy drew, failures included; not all 0.
+
+    Returns
+    -------
+    (N,) 1/(m^3 rad^3)
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes, and values that are negative or not finite.
+    """
     g = np.array(densities, dtype=np.float64)
     n = np.array(counts, dtype=np.float64)
     if g.ndim != 2 or n.shape != (g.shape[1],):
         raise ValueError(f"densities have shape (N, K) and counts (K,), not {g.shape} and {n.shape}")
     if not (np.isfinite(g).all() and (g >= 0.0).all() and np.isfinite(n).all() and (n >= 0.0).all()):
         raise ValueError("densities and counts must be finite and not negative")
-    exposure = g @ n
-    if known is not None:
-        exposure = np.where(np.asarray(known, dtype=bool), exposure, np.nan)
-    return _filled(exposure)
+    if not n.any():
+        raise ValueError("at least one strategy must have drawn a trial")
+    # Not a matrix product, whose rounding depends on how many rows there are.
+    return np.asarray((g * (n / n.sum())).sum(axis=1), dtype=np.float64)
 
 
 def effective_sample_size(weights: ArrayLike) -> float:

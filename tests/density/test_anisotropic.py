@@ -222,3 +222,37 @@ def test_frames_must_fit_the_kernel() -> None:
     with pytest.raises(ValueError, match="needs frames"):
         MixtureDensity(p, q, kernel=fixed)
     assert MixtureDensity(p, q, kernel=fixed, frames=np.eye(3)).size == 1
+
+
+@pytest.mark.parametrize("frame", ["gripper", "fixed"])
+def test_extending_equals_building(frame: str, shell: Shell, moved: Moved) -> None:
+    rng = np.random.default_rng(31)
+    kernel = correlated(rng, frame)
+    p, q = shell(3_000, rng)
+    weights, symmetric = rng.uniform(0.2, 5.0, 3_000), rng.random(3_000) < 0.7
+    frames = se3.to_matrix(se3.random_quaternions(3_000, rng)) if frame == "fixed" else None
+
+    def part(rows: slice) -> dict[str, object]:
+        return {
+            "weights": weights[rows],
+            "symmetric": symmetric[rows],
+            "frames": None if frames is None else frames[rows],
+        }
+
+    first, rest = slice(0, 2_500), slice(2_500, 3_000)
+    old = MixtureDensity(p[first], q[first], kernel=kernel, **part(first))  # type: ignore[arg-type]
+    old.global_maximum()
+    grown = old.extend(p[rest], q[rest], **part(rest))  # type: ignore[arg-type]
+    built = MixtureDensity(p, q, kernel=kernel, **part(slice(None)))  # type: ignore[arg-type]
+    poses = moved((p, q), 300, 0.01, 0.2, rng)
+    np.testing.assert_allclose(grown.log_density(*poses), built.log_density(*poses), atol=1e-5)
+    far = poses[0] + 1.0, poses[1]
+    np.testing.assert_allclose(grown.log_density(*far), built.log_density(*far), rtol=1e-6)
+    # Two units in the last place of kappa, about 100 here.
+    np.testing.assert_allclose(
+        grown.isotropic.log_density(*poses), built.isotropic.log_density(*poses), atol=2e-5
+    )
+    assert math.exp(grown.global_maximum().log_density - built.global_maximum().log_density) > 0.999
+    assert grown.size == 3_000
+    assert old.size == 2_500
+    assert grown.nbytes > old.nbytes

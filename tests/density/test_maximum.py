@@ -299,7 +299,7 @@ def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
     density = GraspDensity.build(*rows, kernel=KERNEL)
     sample = density.ranking().sample
     assert sample is not None
-    assert 2_000 < sample.data.shape[1] < 6_000
+    assert 3_000 < sample.data.shape[1] < 8_000
     low = np.array([rng.uniform(-0.05, 0.0), -1.0, -1.0])
     approach = rng.standard_normal(3), math.radians(50.0)
     region = Region(
@@ -346,7 +346,7 @@ def test_sampled_centre_sums_are_unbiased_and_extended_alike(
 def test_rows_of_the_sample_do_not_outrank_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Far from each other, every row is worth its own kernel, in the sample or not."""
     monkeypatch.setattr(centres, "MOST_PAIRS", 0.0)
-    grid = np.stack(np.meshgrid(*[np.arange(14.0)] * 3), axis=-1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(*[np.arange(18.0)] * 3), axis=-1).reshape(-1, 3)
     density = GraspDensity.build(grid, np.tile(se3.IDENTITY, (len(grid), 1)), kernel=KERNEL)
     assert density.ranking().sample is not None
     np.testing.assert_allclose(density.centre_sums(), 0.5, rtol=1e-6)

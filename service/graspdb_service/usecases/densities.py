@@ -383,8 +383,8 @@ def _build_shaped(
     rows: trials.Columns,
     before: Built | None,
 ) -> Built:
-    """The density under a stored kernel; built anew when rows come, from those kept and the new ones."""
-    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
+    """The density under a stored kernel; extended where all weights are equal, else built anew."""
+    fresh = symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
     proposal = None if np.isnan(rows.proposal_density).all() else rows.proposal_density
     position, quaternion, seq = rows.position, rows.quaternion_xyzw, rows.seq
     if before is not None and before.density is not None:
@@ -409,9 +409,12 @@ def _build_shaped(
     )
     if not len(seq):
         return built
-    shaped = MixtureDensity(
-        position, quaternion, kernel=kernel, weights=_weights(proposal), symmetric=symmetric, frames=frame
-    )
+    if before is not None and before.shaped is not None and proposal is None:
+        shaped = before.shaped.extend(rows.position, rows.quaternion_xyzw, symmetric=fresh, frames=frame)
+    else:
+        shaped = MixtureDensity(
+            position, quaternion, kernel=kernel, weights=_weights(proposal), symmetric=symmetric, frames=frame
+        )
     return replace(built, density=shaped.isotropic, shaped=shaped)
 
 
