@@ -254,6 +254,20 @@ def collides(
 
 
 @nb.njit(cache=True, nogil=True)
+def contains(points: FloatArray, tree: Tree, found: npt.NDArray[np.bool_]) -> None:
+    """Fill found: whether a point (n, 3) lies in the union of the solids that the surfaces bound."""
+    nodes = tree[0]
+    stack = np.empty(_STACK, dtype=np.int64)
+    for i in range(points.shape[0]):
+        found[i] = True
+        for a in range(3):
+            if abs(points[i, a] - nodes[0, 0, a]) > nodes[0, 1, a]:
+                found[i] = False
+        if found[i]:
+            found[i] = inside(points[i], tree, stack)
+
+
+@nb.njit(cache=True, nogil=True)
 def points_collide(
     positions: FloatArray,
     quaternions: FloatArray,

@@ -229,6 +229,13 @@ class Surface:
         width[self.collides(p, q, shape, threads=threads)] = np.nan
         return width
 
+    def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether points (n, 3) lie in the solid; in the union, where several closed pieces overlap."""
+        x = np.ascontiguousarray(points, dtype=np.float64)
+        found = np.empty(len(x), dtype=np.bool_)
+        _surface_kernels.contains(x, self._tree, found)
+        return found
+
     @classmethod
     def _build(cls, corners: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
         """Tree over triangles (F, 3, 3), halved at the median of the longest side of their centres."""
