@@ -1,11 +1,12 @@
-"""The packed outcomes of sweeps, read as attempts."""
+"""Sweeps as attempts: their packed outcomes, and how much of each grid was tried."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import func, select
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
@@ -40,3 +41,48 @@ def packed_chunks(
         .order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
     )
     return [PackedChunk(s, int(a), int(b), bytes(content)) for s, a, b, content in tx.execute(query)]
+
+
+@dataclass(frozen=True)
+class TriedGrid:
+    """How much of a collecting grid sweep is done.
+
+    ``places`` of the plan were simulated; ``kept`` of their poses no other sweep had stored before. ``grid``
+    is the plan as :class:`graspdb.wire.GridPlan` has it.
+    """
+
+    sweep_id: str
+    batch_id: int
+    repeat_key: str
+    grid: dict[str, Any]
+    places: int
+    kept: int
+
+
+def tried_grids(tx: Tx, object_id: int, *, provenance_ids: Collection[int]) -> list[TriedGrid]:
+    """Grids of which at least a chunk is done, in the order the sweeps were made."""
+    query = (
+        select(
+            sweeps.c.id,
+            batches.c.id,
+            sweeps.c.snapshot,
+            func.sum(jobs.c.stop - jobs.c.start),
+            batches.c.inserted + batches.c.packed,
+        )
+        # A sweep without its batch is one whose outcomes were deleted.
+        .join(batches, batches.c.sweep_id == sweeps.c.id)
+        .join(jobs, jobs.c.sweep_id == sweeps.c.id)
+        .where(
+            sweeps.c.object_id == object_id,
+            sweeps.c.purpose == "collect",
+            sweeps.c.plan == "grid",
+            sweeps.c.provenance_id.in_(sorted(provenance_ids)),
+            jobs.c.state == "done",
+        )
+        .group_by(sweeps.c.id, batches.c.id)
+        .order_by(sweeps.c.id)
+    )
+    return [
+        TriedGrid(sweep, int(batch), snapshot["repeat_key"], snapshot["grid"], int(places), int(kept))
+        for sweep, batch, snapshot, places, kept in tx.execute(query)
+    ]

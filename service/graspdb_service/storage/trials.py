@@ -57,7 +57,10 @@ class TrialColumns:
 
 @dataclass(frozen=True)
 class Columns:
-    """Stored trials in columns, ascending ``seq``; NaN where a trial has no ``proposal_density``."""
+    """Stored trials in columns, ascending ``seq``; NaN where a trial has no ``proposal_density``.
+
+    ``batch`` is the internal id of each trial's batch, where it was asked for.
+    """
 
     seq: IntArray
     position: FloatArray
@@ -65,6 +68,7 @@ class Columns:
     outcome: npt.NDArray[np.uint8]
     proposal_density: FloatArray
     provenance: IntArray
+    batch: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.seq)
@@ -179,17 +183,13 @@ def outcome_counts(tx: Tx, object_ids: Sequence[int]) -> dict[int, dict[int, int
 # --- reading columns ------------------------------------------------------------------------------------
 
 _READ = ("seq", "px", "py", "pz", "qx", "qy", "qz", "qw", "proposal_density", "provenance_id", "outcome")
-_BINARY_ROW = np.dtype(
-    [("fields", ">i2")]
-    + [
-        item
-        for name in _READ
-        for item in (
-            (f"{name}_bytes", ">i4"),
-            (name, {"seq": ">i8", "provenance_id": ">i8", "outcome": ">i2"}.get(name, ">f8")),
-        )
-    ]
-)
+_KINDS = {"seq": ">i8", "provenance_id": ">i8", "batch_id": ">i8", "outcome": ">i2"}
+
+
+def _binary_row(names: Sequence[str]) -> np.dtype[Any]:
+    """A row of binary COPY without nulls."""
+    fields = [item for n in names for item in ((f"{n}_bytes", ">i4"), (n, _KINDS.get(n, ">f8")))]
+    return np.dtype([("fields", ">i2"), *fields])
 
 
 def read(
@@ -201,10 +201,12 @@ def read(
     after_seq: int = 0,
     swept: bool = True,
     without: Sequence[int] = (),
+    batches: bool = False,
 ) -> Columns:
     """An object's trials as arrays, ascending ``seq``, those after ``after_seq``.
 
-    ``swept=False`` leaves out those that a sweep stored, ``without`` those with these outcome codes.
+    ``swept=False`` leaves out those that a sweep stored, ``without`` those with these outcome codes;
+    ``batches`` reads which batch each is of.
     """
     where = f"object_id = {int(object_id)} AND seq > {int(after_seq)}"
     if not swept:
@@ -217,14 +219,15 @@ def read(
         where += f" AND outcome = {SUCCESS}"
     if provenance_ids is not None:
         where += f" AND provenance_id IN ({', '.join(str(int(p)) for p in provenance_ids) or 'NULL'})"
+    columns = (*_READ, "batch_id") if batches else _READ
     if tx.dialect.name == "sqlite":
-        return _read_tuples(tx, where)
-    return _copy_out(tx, where)
+        return _read_tuples(tx, columns, where)
+    return _copy_out(tx, columns, where)
 
 
-def _read_tuples(tx: Tx, where: str) -> Columns:
+def _read_tuples(tx: Tx, columns: Sequence[str], where: str) -> Columns:
     # NULL would make an array of Python objects; no proposal density is negative.
-    names = ", ".join(f"coalesce({name}, -1.0)" if name == "proposal_density" else name for name in _READ)
+    names = ", ".join(f"coalesce({name}, -1.0)" if name == "proposal_density" else name for name in columns)
     cursor = tx.connection.cursor()
     try:
         cursor.execute(f"SELECT {names} FROM trials WHERE {where} ORDER BY seq")
@@ -233,7 +236,7 @@ def _read_tuples(tx: Tx, where: str) -> Columns:
             blocks.append(np.array(rows, dtype=np.float64))
     finally:
         cursor.close()
-    table = np.concatenate(blocks) if blocks else np.empty((0, len(_READ)))
+    table = np.concatenate(blocks) if blocks else np.empty((0, len(columns)))
     proposal = np.where(table[:, 8] < 0, np.nan, table[:, 8])
     return Columns(
         seq=table[:, 0].astype(np.int64),
@@ -242,12 +245,13 @@ def _read_tuples(tx: Tx, where: str) -> Columns:
         outcome=table[:, 10].astype(np.uint8),
         proposal_density=proposal,
         provenance=table[:, 9].astype(np.int64),
+        batch=table[:, 11].astype(np.int64) if len(columns) > len(_READ) else None,
     )
 
 
-def _copy_out(tx: Tx, where: str) -> Columns:
+def _copy_out(tx: Tx, columns: Sequence[str], where: str) -> Columns:
     names = ", ".join(
-        f"coalesce({name}, 'NaN'::float8)" if name == "proposal_density" else name for name in _READ
+        f"coalesce({name}, 'NaN'::float8)" if name == "proposal_density" else name for name in columns
     )
     cursor = tx.connection.cursor()
     try:
@@ -257,8 +261,9 @@ def _copy_out(tx: Tx, where: str) -> Columns:
     finally:
         cursor.close()
     # No column is null, so every row has the same width.
-    rows = (len(content) - len(_COPY_HEADER) - len(_COPY_END)) // _BINARY_ROW.itemsize
-    table = np.frombuffer(content, dtype=_BINARY_ROW, count=rows, offset=len(_COPY_HEADER))
+    layout = _binary_row(columns)
+    rows = (len(content) - len(_COPY_HEADER) - len(_COPY_END)) // layout.itemsize
+    table = np.frombuffer(content, dtype=layout, count=rows, offset=len(_COPY_HEADER))
     return Columns(
         seq=table["seq"].astype(np.int64),
         position=np.stack([table[name].astype(np.float64) for name in ("px", "py", "pz")], axis=1),
@@ -268,6 +273,7 @@ def _copy_out(tx: Tx, where: str) -> Columns:
         outcome=table["outcome"].astype(np.uint8),
         proposal_density=table["proposal_density"].astype(np.float64),
         provenance=table["provenance_id"].astype(np.int64),
+        batch=table["batch_id"].astype(np.int64) if "batch_id" in columns else None,
     )
 
 

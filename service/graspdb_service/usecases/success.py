@@ -8,23 +8,19 @@ probability 0 and attempts that collided tell nothing of the others; where it is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import OUTCOME_CODES
 from graspdb_density import IsotropicKernel, SuccessModel
-from graspdb_service.storage import attempts, sweeps, trials
-from graspdb_service.storage.attempts import PackedChunk
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.usecases import plans
+from graspdb_service.usecases import alltrials
+from graspdb_service.usecases.alltrials import AllTrials, Stored
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.densities import Built, require_object
-from graspdb_service.usecases.plans import ChunkPoses
 from graspdb_service.usecases.selection import Filters, Selected, resolve
 
 Floats = NDArray[np.float64]
@@ -32,8 +28,6 @@ Floats = NDArray[np.float64]
 LEVEL = 0.9
 #: Attempts of the random sample that searches feel their way by where a model has far more of them.
 _SAMPLE, _LARGE = 100_000, 400_000
-_SUCCESS, _COLLISION = OUTCOME_CODES["success"], OUTCOME_CODES["collision"]
-_NO_ATTEMPT = OUTCOME_CODES["simulation_error"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +78,6 @@ class _Key:
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Swept:
-    """A chunk with what tells its poses."""
-
-    sweep: SweepRow
-    chunk: PackedChunk
-    poses: ChunkPoses | None
 
 
 class Successes:
@@ -164,31 +149,22 @@ class Successes:
         return estimates
 
     def _refresh(self, key: _Key, slug: str, before: _Attempts | None) -> _Attempts:
-        without = [_NO_ATTEMPT, *([_COLLISION] if key.collisions_known else [])]
+        without = [alltrials.NO_ATTEMPT, *([alltrials.COLLISION] if key.collisions_known else [])]
         with self._database.read() as tx:
             row = require_object(tx, slug, key.object_id)
             selected = resolve(tx, row.id, key.filters)
             # A source whose first failure has come counts from now on with all it has posted.
             if before is not None and (before.epoch != row.epoch or before.tried != selected.tried):
                 before = None
-            swept = _read_swept(tx, row.id, selected, before)
-            names = _repeat_keys(swept, before)
+            stored = _fetch(tx, row.id, selected, without, before)
+            names = {**({} if before is None else before.sweeps), **stored.repeat_keys}
             if before is not None and len(set(names.values())) < len(names):
                 # Two sweeps of one grid share poses, which count once: looked at together.
                 before = None
-                swept = _read_swept(tx, row.id, selected, None)
-            rows = trials.read(
-                tx,
-                row.id,
-                provenance_ids=sorted(selected.tried),
-                successes_only=False,
-                after_seq=0 if before is None else before.last_seq,
-                swept=False,
-                without=without,
-            )
+                stored = _fetch(tx, row.id, selected, without, None)
         kernel = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
         old, sample = (None, None) if before is None else (before.model, before.sample)
-        new = self._compute.run(lambda: _joined(rows, swept, selected, without))
+        new = self._compute.run(lambda: _Columns.of(alltrials.joined(stored)))
         size = len(new.success) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
@@ -201,6 +177,19 @@ class Successes:
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
+def _fetch(
+    tx: Tx, object_id: int, selected: Selected, without: Sequence[int], before: _Attempts | None
+) -> Stored:
+    return alltrials.fetch(
+        tx,
+        object_id,
+        selected,
+        without=without,
+        after_seq=0 if before is None else before.last_seq,
+        after_revision=0 if before is None else before.revision,
+    )
+
+
 def _extended(old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel) -> SuccessModel | None:
     if not len(new.success):
         return old
@@ -208,34 +197,6 @@ def _extended(old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel) 
     if old is not None:
         return old.extend(*columns, symmetric=new.symmetric)
     return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
-
-
-def _read_swept(tx: Tx, object_id: int, selected: Selected, before: _Attempts | None) -> list[_Swept]:
-    """Chunks of sweeps since, with the poses of those that are no grid's."""
-    chunks = attempts.packed_chunks(
-        tx,
-        object_id,
-        provenance_ids=selected.tried,
-        after_revision=0 if before is None else before.revision,
-    )
-    rows = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
-    return [
-        _Swept(
-            rows[chunk.sweep_id],
-            chunk,
-            plans.chunk_poses(tx, rows[chunk.sweep_id], chunk.start, chunk.stop),
-        )
-        for chunk in chunks
-    ]
-
-
-def _repeat_keys(swept: list[_Swept], before: _Attempts | None) -> dict[str, str]:
-    """What tells whether two sweeps are of one grid, by sweep."""
-    found = {} if before is None else dict(before.sweeps)
-    for item in swept:
-        sweep = item.sweep
-        found[sweep.id] = sweep.snapshot["repeat_key"] if sweep.plan == "grid" else sweep.id
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,38 +208,12 @@ class _Columns:
     success: NDArray[np.bool_]
     symmetric: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, found: AllTrials) -> _Columns:
+        """What a model of success needs of them."""
+        return cls(found.position, found.quaternion, found.success, found.symmetric)
+
     def take(self, chosen: NDArray[np.bool_]) -> _Columns:
         return _Columns(
             self.position[chosen], self.quaternion[chosen], self.success[chosen], self.symmetric[chosen]
         )
-
-
-def _joined(rows: trials.Columns, swept: list[_Swept], selected: Selected, without: list[int]) -> _Columns:
-    flags = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
-    parts = [_Columns(rows.position, rows.quaternion_xyzw, rows.outcome == _SUCCESS, flags)]
-    seen: dict[str, list[NDArray[np.int64]]] = {}
-    for item in swept:
-        sweep, chunk = item.sweep, item.chunk
-        codes = np.frombuffer(chunk.outcomes, dtype=np.uint8)
-        kept = ~np.isin(codes, without)
-        if sweep.plan == "grid":
-            grid = plans.grid_of(sweep)
-            index = grid.pose_indices(chunk.start, chunk.stop)
-            earlier = seen.setdefault(sweep.snapshot["repeat_key"], [])
-            for known in earlier:
-                kept &= ~np.isin(index, known)
-            earlier.append(index[kept])
-            position, quaternion = grid.poses(index[kept])
-        else:
-            assert item.poses is not None
-            position, quaternion = item.poses.position[kept], item.poses.quaternion_xyzw[kept]
-        symmetric = selected.provenances[sweep.provenance_id]
-        parts.append(
-            _Columns(position, quaternion, codes[kept] == _SUCCESS, np.full(len(position), symmetric))
-        )
-    return _Columns(
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.quaternion for part in parts]),
-        np.concatenate([part.success for part in parts]),
-        np.concatenate([part.symmetric for part in parts]),
-    )
