@@ -115,3 +115,38 @@ def nearest(
                 if _squared_distance(x, segments[s, 0], segments[s, 1]) <= limit:
                     which[i] = -2
                     break
+
+
+@nb.njit(cache=True, nogil=True)
+def regions(
+    points: FloatArray,
+    closing: FloatArray,
+    centres: FloatArray,
+    axes: FloatArray,
+    half: FloatArray,
+    which: IntArray,
+    cosine: FloatArray,
+) -> None:
+    """Fill which: of the boxes (P) that hold a point the one whose second axis is most parallel to its
+    closing axis, -1 in none; and the cosine of that angle.
+    """
+    for i in range(points.shape[0]):
+        which[i] = -1
+        best = -1.0
+        for p in range(centres.shape[0]):
+            held = True
+            for a in range(3):
+                u = 0.0
+                for k in range(3):
+                    u += axes[p, k, a] * (points[i, k] - centres[p, k])
+                if abs(u) > half[p, a]:
+                    held = False
+                    break
+            if held:
+                c = 0.0
+                for k in range(3):
+                    c += axes[p, k, 1] * closing[i, k]
+                if abs(c) > best:
+                    best = abs(c)
+                    which[i] = p
+        cosine[i] = best if which[i] >= 0 else np.nan
