@@ -1,7 +1,8 @@
 """What a successful grasp tells about its vicinity: ``P(T(A) succeeds | A succeeds)`` by displacement T.
 
 Translations ``x``, ``y``, ``z`` are along the axes of a frame given for each grasp (``alignment``): the
-gripper's, the object's principal axes, or those of the nearest edge. Rotations ``rx``, ``ry``, ``rz`` are
+gripper's, the object's principal axes, those of the nearest edge, or of the pair of surfaces or edges it
+closes on. Rotations ``rx``, ``ry``, ``rz`` are
 about the gripper's axes; in planes of two they are compositions ``R_a(alpha) R_b(beta)`` (figure 8), of which
 ``R_x(180) R_y(180)`` is the jaw's mirror, not components of a rotation vector.
 
@@ -32,6 +33,7 @@ from .vicinity import (
     Anisotropy,
     Bins,
     Counts,
+    Frames,
     Histogram,
     Tallies,
     aligned_axes,
@@ -46,6 +48,7 @@ __all__ = [
     "Alignment",
     "Anisotropy",
     "Bins",
+    "Frames",
     "Histogram",
     "Tolerance",
     "attempt_density",
@@ -65,7 +68,7 @@ def empirical(
     rotation_keys: ArrayLike | None = None,
     position_keys: ArrayLike | None = None,
     alignment: Alignment = "gripper",
-    frames: ArrayLike | None = None,
+    frames: Frames | None = None,
     rotate_in_frame: bool = False,
     symmetric: bool = True,
     weights: ArrayLike | None = None,
@@ -90,8 +93,9 @@ def empirical(
         within ``tolerance`` and whose positions are within ``tolerance_m``.
     alignment, frames
         ``gripper``: no frames. ``object``: (3, 3), columns are the principal axes. ``edge``: (N, 3, 3),
-        columns tangent, normal x tangent, normal of the edge nearest to each trial; where not finite, the
-        gripper's own axes.
+        columns tangent, normal x tangent, normal of the edge nearest to each trial, or a function that tells
+        those of poses; ``surface-pair``: likewise, the pair's axes named as the gripper's that they are
+        nearest to. Where not finite, the gripper's own axes.
     rotate_in_frame : bool
         Rotate about the axes of the frame instead of the gripper's.
     symmetric : bool
@@ -133,7 +137,7 @@ def empirical(
     work = np.cumsum(shifted.lengths() + turned.lengths())
     count = max(min(LEAST_SUCCESSES, len(grasps)), int(np.searchsorted(work, max_candidates, side="right")))
     grasps = grasps[:count]
-    axes = aligned_axes(alignment, frames, q, grasps)
+    axes, aligned = aligned_axes(alignment, frames, p, q, grasps)
     share = resampling(weights, grasps, len(p), rng)
     columns = share.shape[1]
     along = Tallies(
@@ -170,10 +174,12 @@ def empirical(
             "no trial lies within reach of a success at the same rotation or the same position: trials on a "
             "grid, or many more, are needed"
         )
-    if (symmetric and alignment == "gripper") or alignment == "edge":
+    if (symmetric and alignment in ("gripper", "surface-pair")) or alignment == "edge":
         # The twin of A sees every translation mirrored; an edge's tangent has no sign either.
         _mirror(along, layout)
-    return report("empirical", alignment, layout, along, about, len(grasps), (used[0], used[1]), level)
+    return report(
+        "empirical", alignment, layout, along, about, len(grasps), (used[0], used[1]), level, aligned
+    )
 
 
 def _streamed(

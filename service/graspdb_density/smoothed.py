@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from . import reference, se3
 from .density import GraspDensity
@@ -17,6 +17,7 @@ from .vicinity import (
     Anisotropy,
     Bins,
     Counts,
+    Frames,
     Tallies,
     aligned_axes,
     check_enough,
@@ -32,7 +33,7 @@ def smoothed(
     attempts: float | Callable[[Floats, Floats], Floats],
     *,
     alignment: Alignment = "gripper",
-    frames: ArrayLike | None = None,
+    frames: Frames | None = None,
     bins: Bins | None = None,
     max_grasps: int = 100,
     level: float = 0.9,
@@ -52,7 +53,7 @@ def smoothed(
         Attempts per m^3 rad^3, twins sharing one attempt: for a grid its attempts / (8 pi^2 times its
         volume); or a function of poses, see `attempt_density`.
     alignment, frames
-        As for `empirical`; edge frames (N, 3, 3) for the rows of ``successes``.
+        As for `empirical`; frames (N, 3, 3) are those of the rows of ``successes``.
     max_grasps : int
         Successes A, drawn at random by weight.
 
@@ -68,7 +69,7 @@ def smoothed(
     rng = np.random.default_rng(seed)
     count = min(max_grasps, successes.size)
     grasps = rng.choice(successes.size, size=count, replace=False, p=successes.weights).astype(np.int64)
-    axes = aligned_axes(alignment, frames, successes.quaternions_xyzw, grasps)
+    axes, aligned = aligned_axes(alignment, frames, successes.positions, successes.quaternions_xyzw, grasps)
     share = resampling(None, grasps, successes.size, rng)
     moves = _bin_moves(layout)
     values: list[Floats] = []
@@ -83,7 +84,7 @@ def smoothed(
     for line, (low, high), columns in ((counts[1], moves[1], (0, 1, 2)), (counts[3], moves[3], (3, 4, 5))):
         line.moved = (0.5 * (low + high))[:, columns].sum(axis=1) * line.pairs
     along, about = Tallies(counts[0], counts[1]), Tallies(counts[2], counts[3])
-    return report("density", alignment, layout, along, about, count, (0, 0), level)
+    return report("density", alignment, layout, along, about, count, (0, 0), level, aligned)
 
 
 def attempt_density(attempts: GraspDensity) -> Callable[[Floats, Floats], Floats]:
@@ -150,14 +151,13 @@ def _shares(
     moves = np.concatenate(vectors)
     twin = bool(successes.symmetric[row])
     own = successes.quaternions_xyzw[row]
-    # Either twin may be the one displaced: for the gripper's frame that mirrors x and y.
+    # Either twin may be the one displaced: for frames that turn with the jaw that mirrors x and y.
     turned: NDArray[np.bool_] = np.asarray((rng.random(len(moves)) < 0.5) & twin)
     base = np.where(turned[:, None], se3.jaw_twin(own), own)
     shift = moves[:, :3].copy()
-    if alignment == "edge" or (alignment == "gripper" and twin):
-        flip: NDArray[np.bool_] = (
-            turned if alignment == "gripper" else np.asarray(rng.random(len(moves)) < 0.5)
-        )
+    turning = alignment in ("gripper", "surface-pair")
+    if alignment == "edge" or (turning and twin):
+        flip: NDArray[np.bool_] = turned if turning else np.asarray(rng.random(len(moves)) < 0.5)
         shift[flip, :2] *= -1.0
     p = successes.positions[row] + shift @ frame.T
     q = base

@@ -34,6 +34,8 @@ class Tolerance:
         Mean displacement of the pairs in each bin of the profile, rising; bins without pairs are left out.
     probability, profile_low, profile_high : (n,)
     count : (n,) int64
+    resampled : (R,)
+        Half widths in the resamples of the grasps, the same ones for every axis; nan without data.
     """
 
     axis: str
@@ -48,6 +50,7 @@ class Tolerance:
     profile_low: Floats
     profile_high: Floats
     count: NDArray[np.int64]
+    resampled: Floats
 
 
 def quantiles(values: Floats, level: float) -> tuple[Floats, Floats]:
@@ -117,6 +120,7 @@ def tolerances(
                 profile_low=np.fmin(least, value[known, 0]),
                 profile_high=np.fmax(most, value[known, 0]),
                 count=n[known],
+                resampled=width[1:],
             )
         )
     return result

@@ -5,6 +5,7 @@ tallies of what became of them, and the report made of those.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +23,7 @@ __all__ = [
     "Anisotropy",
     "Bins",
     "Counts",
+    "Frames",
     "Histogram",
     "Tallies",
     "aligned_axes",
@@ -30,7 +32,9 @@ __all__ = [
     "resampling",
 ]
 
-Alignment = Literal["gripper", "object", "edge"]
+Alignment = Literal["gripper", "object", "edge", "surface-pair"]
+#: Axes of grasps: an array, or what tells those (n, 3, 3) of poses (n, 3), (n, 4).
+Frames = ArrayLike | Callable[[Floats, Floats], Floats]
 #: Fewer successes than this say nothing about their vicinity.
 LEAST_SUCCESSES = 20
 PLANES = (("rx", "ry"), ("rx", "rz"), ("ry", "rz"))
@@ -107,8 +111,9 @@ class Anisotropy:
     """The report: five histograms of translations by z, one for each plane of rotations, and the tolerance
     along and about every axis.
 
-    ``grasps`` successes A were displaced; ``translation_pairs`` and ``rotation_pairs`` are pairs of trials, 0
-    for the smoothed method. Intervals hold with probability ``level``.
+    ``grasps`` successes A were displaced, ``aligned`` of them along axes of their own, the others along the
+    gripper's; ``translation_pairs`` and ``rotation_pairs`` are pairs of trials, 0 for the smoothed method.
+    Intervals hold with probability ``level``.
     """
 
     method: str
@@ -120,6 +125,7 @@ class Anisotropy:
     translation_pairs: int
     rotation_pairs: int
     level: float
+    aligned: int
 
 
 @dataclass(eq=False, slots=True)
@@ -170,32 +176,40 @@ def check_enough(successes: int) -> None:
 
 
 def aligned_axes(
-    alignment: Alignment, frames: ArrayLike | None, q: Floats, grasps: NDArray[np.int64]
-) -> Floats:
-    """Frames (A, 3, 3) of the grasps."""
+    alignment: Alignment, frames: Frames | None, p: Floats, q: Floats, grasps: NDArray[np.int64]
+) -> tuple[Floats, int]:
+    """Frames (A, 3, 3) of the grasps, and how many have one of their own rather than the gripper's."""
+    own = se3.to_matrix(q[grasps])
     if alignment == "gripper":
         if frames is not None:
             raise ValueError("alignment with the gripper takes no frames")
-        return se3.to_matrix(q[grasps])
-    if alignment not in ("object", "edge"):
-        raise ValueError(f"alignment is gripper, object or edge, not {alignment!r}")
+        return own, len(grasps)
+    if alignment not in ("object", "edge", "surface-pair"):
+        raise ValueError(f"alignment is gripper, object, edge or surface-pair, not {alignment!r}")
     if frames is None:
         raise ValueError(f"alignment with the {alignment} needs its frames")
-    f = np.asarray(frames, dtype=np.float64)
     if alignment == "object":
+        f = np.asarray(frames, dtype=np.float64)
         if f.shape != (3, 3):
             raise ValueError(f"the object's principal axes have shape (3, 3), not {f.shape}")
         f = np.broadcast_to(f, (len(grasps), 3, 3))
+        known = np.ones(len(grasps), dtype=bool)
     else:
-        if f.shape != (len(q), 3, 3):
-            raise ValueError(f"frames of edges have shape ({len(q)}, 3, 3), not {f.shape}")
-        f = f[grasps]
-        known: NDArray[np.bool_] = np.asarray(np.isfinite(f).all(axis=(1, 2)))
-        f = np.where(known[:, None, None], f, se3.to_matrix(q[grasps]))
+        if callable(frames):
+            f = np.asarray(frames(p[grasps], q[grasps]), dtype=np.float64)
+            expected = len(grasps)
+        else:
+            f = np.asarray(frames, dtype=np.float64)
+            expected = len(q)
+        if f.shape != (expected, 3, 3):
+            raise ValueError(f"frames of grasps have shape ({expected}, 3, 3), not {f.shape}")
+        f = f if callable(frames) else f[grasps]
+        known = np.asarray(np.isfinite(f).all(axis=(1, 2)), dtype=bool)
+        f = np.where(known[:, None, None], f, own)
     gram = np.einsum("nji,njk->nik", f, f)
     if not np.all(np.abs(gram - np.eye(3)) < se3.UNIT_TOLERANCE) or np.any(np.linalg.det(f) < 0.0):
         raise ValueError("the columns of a frame must be orthonormal and right-handed")
-    return np.ascontiguousarray(f)
+    return np.ascontiguousarray(f), int(known.sum())
 
 
 def resampling(
@@ -222,6 +236,7 @@ def report(
     grasps: int,
     used: tuple[int, int],
     level: float,
+    aligned: int,
 ) -> Anisotropy:
     """Tallies along translations and about rotations as the report."""
     if not 0.0 < level < 1.0:
@@ -257,6 +272,7 @@ def report(
         translation_pairs=used[0],
         rotation_pairs=used[1],
         level=level,
+        aligned=aligned,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -176,24 +176,31 @@ def _same(histograms: tuple[an.Histogram, ...], tried: Floats, won: Floats) -> N
         assert np.all(np.isnan(histogram.probability[~known]))
 
 
-@pytest.mark.parametrize("alignment", ["gripper", "object", "edge"])
+@pytest.mark.parametrize("alignment", ["gripper", "object", "edge", "surface-pair"])
 def test_pairs_by_tolerance_equal_brute_force(alignment: an.Alignment) -> None:
     rng = np.random.default_rng(1)
     trials = _scattered(110, rng)
     tolerance = math.radians(7.5)
-    frames: Floats | None = None
+    frames: an.Frames | None = None
+    aligned = int(trials.success.sum())
     used = se3.to_matrix(trials.quaternions)
     if alignment == "object":
         frames = se3.to_matrix(se3.random_quaternions(1, rng))[0]
         used = np.broadcast_to(frames, (110, 3, 3))
-    elif alignment == "edge":
-        frames = se3.to_matrix(se3.random_quaternions(110, rng))
-        frames[::3] = np.nan
-        used = np.where(np.isnan(frames), used, frames)
+    elif alignment != "gripper":
+        own = se3.to_matrix(se3.random_quaternions(110, rng))
+        own[::3] = np.nan
+        used = np.where(np.isnan(own), used, own)
+        aligned = int(np.isfinite(own[trials.success, 0, 0]).sum())
+        frames = own
+        if alignment == "surface-pair":
+            frames = lambda p, q: own[[int(np.flatnonzero((trials.positions == x).all(1))[0]) for x in p]]  # noqa: E731
+            trials = replace(trials, positions=trials.positions + np.arange(110)[:, None] * 1e-9)
     got = an.empirical(*trials.parts(), alignment=alignment, frames=frames)
     _same(got.translations, *_brute_translations(trials, used, tolerance, alignment != "object"))
     _same(got.rotations, *_brute_rotations(trials, 0.005, tolerance))
     assert got.grasps == trials.success.sum()
+    assert got.aligned == aligned
 
 
 def test_jaws_without_symmetry_have_no_twins() -> None:

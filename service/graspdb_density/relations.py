@@ -1,0 +1,90 @@
+"""Shares of attempts that succeeded, by what each attempt is related to, with intervals.
+
+Attempts at neighbouring poses fare alike, so the interval is from resampling blocks of space, and never
+narrower than that of as many independent attempts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import betaincinv
+
+__all__ = ["Share", "shares"]
+
+_RESAMPLES = 200
+#: Fewer blocks than this have no spread to resample.
+_LEAST_BLOCKS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """Successes among attempts; probability and interval are nan without any."""
+
+    attempts: int
+    successes: int
+    probability: float
+    low: float
+    high: float
+
+
+def shares(
+    success: ArrayLike,
+    group: ArrayLike,
+    positions: ArrayLike,
+    *,
+    groups: int,
+    block_m: float = 0.02,
+    level: float = 0.9,
+    seed: int = 0,
+) -> list[Share]:
+    """The share of successes in each group.
+
+    Parameters
+    ----------
+    success : (N,) bool
+    group : (N,) int
+        Below ``groups``; negative ones are left out.
+    positions : (N, 3) metres
+    block_m : float
+        Edge of the cubes of space that are resampled.
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes, numbers of groups out of range, or a level or edge that is none.
+    """
+    won = np.asarray(success, dtype=bool)
+    label = np.asarray(group, dtype=np.int64)
+    p = np.asarray(positions, dtype=np.float64)
+    if won.ndim != 1 or label.shape != won.shape or p.shape != (len(won), 3) or not np.isfinite(p).all():
+        raise ValueError("success, group and positions have shapes (N,), (N,) and (N, 3), all finite")
+    if groups < 1 or (len(label) and int(label.max()) >= groups):
+        raise ValueError("groups are numbered below their count")
+    if not 0.0 < level < 1.0 or not block_m > 0.0:
+        raise ValueError("level lies between 0 and 1, block_m is positive")
+    rng = np.random.default_rng(seed)
+    tail = 0.5 * (1.0 - level)
+    found = []
+    for number in range(groups):
+        chosen = label == number
+        n, k = int(chosen.sum()), int(won[chosen].sum())
+        if not n:
+            found.append(Share(0, 0, np.nan, np.nan, np.nan))
+            continue
+        low, high = betaincinv(k + 0.5, n - k + 0.5, tail), betaincinv(k + 0.5, n - k + 0.5, 1.0 - tail)
+        cell = np.floor(p[chosen] / block_m).astype(np.int64)
+        _, block = np.unique(cell, axis=0, return_inverse=True)
+        block = block.reshape(-1)
+        blocks = int(block.max()) + 1
+        if blocks >= _LEAST_BLOCKS:
+            tried = np.bincount(block, minlength=blocks).astype(np.float64)
+            held = np.bincount(block, weights=won[chosen], minlength=blocks)
+            again = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=_RESAMPLES)
+            drawn = (again @ held) / (again @ tried)
+            ends = np.quantile(drawn, [tail, 1.0 - tail])
+            low, high = min(low, ends[0]), max(high, ends[1])
+        found.append(Share(n, k, k / n, float(min(low, k / n)), float(max(high, k / n))))
+    return found
