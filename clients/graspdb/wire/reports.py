@@ -131,8 +131,49 @@ class AnisotropyTolerance(Response):
     count: list[int]
 
 
+class AnisotropyRelation(Response):
+    """How many attempts succeeded that lay alike to a pair the jaw can close on, collisions included.
+
+    ``relation``: ``surfaces`` (two opposite faces), ``coplanar-edges`` (two parallel edges of one face),
+    ``parallel-edges`` (two that point apart), or ``none`` (at no pair). ``angle_deg`` is the range of the
+    angle between the closing axis and the way from one side of the pair to the other. ``free_*`` leave out
+    the attempts that collided.
+    """
+
+    relation: str
+    angle_deg: tuple[float, float] | None
+    attempts: int
+    collisions: int
+    successes: int
+    probability: float | None
+    low: float | None
+    high: float | None
+    free_probability: float | None
+    free_low: float | None
+    free_high: float | None
+
+
+class AnisotropyHypothesis(Response):
+    """An expectation of the paper as a quotient of half widths, above 1 where it holds, with its interval.
+
+    ``x-wide`` and ``z-wide``: x or z over y; ``ry-wide``: turns about y over the wider of the others;
+    ``alignment-sharpens``: widest over narrowest translation, aligned over the gripper's axes. ``bound`` says
+    where a half width reaches beyond what was looked at; null values where nothing can be said.
+    """
+
+    name: str
+    ratio: float | None
+    low: float | None
+    high: float | None
+    verdict: Literal["confirmed", "denied", "undecided"]
+    bound: Literal["lower", "upper", "both"] | None = None
+
+
 class AnisotropyReport(Report):
-    """What a success tells about its vicinity, by displacement in the frame of ``alignment``."""
+    """What a success tells about its vicinity, by displacement in the frame of ``alignment``.
+
+    ``aligned`` of the ``grasps`` have axes of that alignment, the others the gripper's.
+    """
 
     report: Literal["anisotropy"] = "anisotropy"
     method: Method
@@ -146,6 +187,9 @@ class AnisotropyReport(Report):
     tolerances: list[AnisotropyTolerance]
     translations: list[AnisotropyHistogram]
     rotations: list[AnisotropyHistogram]
+    aligned: int | None = None
+    hypotheses: list[AnisotropyHypothesis] = Field(default_factory=list)
+    relations: list[AnisotropyRelation] = Field(default_factory=list)
 
 
 class CalibrationBin(Response):
