@@ -272,7 +272,7 @@ def test_too_little_is_said_with_what_is_needed(
     for path in ("anisotropy", "anisotropy?method=density"):
         assert "needs failures" in refused(path, "failures-needed")
     assert "of sources that post failures" in refused("calibration", "too-few-trials")
-    fields = {e["field"] for e in problem(http.get(REPORT + "anisotropy?alignment=edge"), 422)["errors"]}
+    fields = {e["field"] for e in problem(http.get(REPORT + "anisotropy?alignment=corner"), 422)["errors"]}
     assert fields == {"alignment"}
     problem(http.get(REPORT + "anisotropy?method=guess"), 422)
     problem(http.get(REPORT + "convergence?methods=x"), 422)

@@ -11,21 +11,25 @@ from numpy.typing import NDArray
 
 from graspdb.wire.reports import (
     AnisotropyHistogram,
+    AnisotropyHypothesis,
     AnisotropyReport,
     AnisotropyTolerance,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
 from graspdb_density.anisotropy import (
     LEAST_SUCCESSES,
+    Anisotropy,
+    Frames,
     Histogram,
     Tolerance,
     attempt_density,
     empirical,
     smoothed,
 )
+from graspdb_density.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_density.rows import Progress
 from graspdb_service.problems import conflict
-from graspdb_service.usecases import shapes
+from graspdb_service.usecases import relations, shapes
 from graspdb_service.usecases.alltrials import AllTrials
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.reportparts import (
@@ -42,6 +46,22 @@ Floats = NDArray[np.float64]
 
 #: Attempts that stand for all where their density is asked for.
 _LOCAL_ATTEMPTS = 200_000
+#: What x, y and z are, by alignment.
+_AXES = {
+    "gripper": "the gripper's axes: x sideways, y the way the fingers close, z the approach",
+    "object": "the object's principal axes, the longest first; rotations the gripper's",
+    "edge": "x along the nearest edge, y across it, z outwards; rotations the gripper's",
+    "surface-pair": (
+        "y from one side to the other of the pair of surfaces or edges that the jaw closes on, x and z along"
+        " it; rotations the gripper's"
+    ),
+}
+_EXPECTED = {
+    "x-wide": "x forgives {} as much as y",
+    "z-wide": "z forgives {} as much as y",
+    "ry-wide": "turns about y are forgiven {} as much as about x or z",
+    "alignment-sharpens": "the widest differs from the narrowest {} as much as along the gripper's axes",
+}
 #: The middle bin of a profile, whose pairs hardly differ, ends before this share of its reach.
 _MIDDLE = 0.03
 
@@ -49,8 +69,15 @@ _MIDDLE = 0.03
 def anisotropy_report(
     sources: Sources, built: Built, options: dict[str, str], progress: Progress
 ) -> AnisotropyReport:
+    """The report by ``method`` and ``alignment``.
+
+    Raises
+    ------
+    ProblemError
+        409 for too few trials, no failures, or an alignment that the object's geometry does not have.
+    """
     method, alignment = options["method"], options["alignment"]
-    frames = shapes.principal_axes(built.object_row) if alignment == "object" else None
+    frames = _frames(sources, built, alignment)
     successes = built.selected.successes
     if successes < LEAST_SUCCESSES:
         raise conflict(
@@ -60,41 +87,99 @@ def anisotropy_report(
         )
     everything = attempts_of(sources, built)
     need_failures(everything, "What a success tells about its vicinity", 1)
+    measure = _measure(sources, built, method, everything)
+    # The same grasps along the gripper's axes, for what alignment changes.
+    share = 1.0 if alignment == "gripper" else 0.5
+    found = said(lambda: measure(alignment, frames, lambda done: progress(share * done)))
+    expected = [] if alignment == "object" else wide_axes(found)
+    if alignment != "gripper":
+        blurred = said(lambda: measure("gripper", None, lambda done: progress(share * (1.0 + done))))
+        expected.append(sharpened(found, blurred))
+    pairs = sources.scenes.features.known_pairs(built.object_row, built.selected)
+    related = [] if pairs is None else relations.relations(everything, pairs)
+    tolerances, warnings = _told(found, built)
+    if found.aligned < found.grasps and alignment != "gripper":
+        what = (
+            "no edge lies within 30 mm of them, or two do" if alignment == "edge" else "they are at no pair"
+        )
+        warnings.append(
+            f"{found.grasps - found.aligned:,} of {found.grasps:,} grasps were displaced along the gripper's"
+            f" axes: {what}"
+        )
+    return AnisotropyReport.model_validate(
+        {
+            **head(built),
+            "text": _tolerances_text(tolerances, alignment)
+            + _hypotheses_text(expected)
+            + relations.in_words(related),
+            "warnings": warnings,
+            "method": method,
+            "alignment": alignment,
+            "level": LEVEL,
+            "grasps": found.grasps,
+            "attempts": len(everything),
+            "translation_pairs": found.translation_pairs,
+            "rotation_pairs": found.rotation_pairs,
+            "kernel": None if method == "empirical" else built.kernel,
+            "tolerances": tolerances,
+            "translations": [_histogram(item) for item in found.translations],
+            "rotations": [_histogram(item) for item in found.rotations],
+            "aligned": found.aligned,
+            "hypotheses": [_hypothesis(item) for item in expected],
+            "relations": related,
+        }
+    )
+
+
+def _frames(sources: Sources, built: Built, alignment: str) -> Frames | None:
+    if alignment == "gripper":
+        return None
+    if alignment == "object":
+        return shapes.principal_axes(built.object_row)
+    return sources.scenes.features.frames(alignment, built.object_row, built.selected)
+
+
+def _measure(
+    sources: Sources, built: Built, method: str, everything: AllTrials
+) -> Callable[[str, Frames | None, Progress], Anisotropy]:
+    """The method, ready for any alignment; the same grasps and resamples every time."""
+    if method == "density":
+        density = built.density
+        assert density is not None
+        local = _local_attempts(everything, density.kernel)
+        return lambda alignment, frames, progress: smoothed(
+            density,
+            local,
+            alignment=_alignment(alignment),
+            frames=frames,
+            level=LEVEL,
+            threads=sources.threads,
+            progress=progress,
+        )
     weights = None
     if not np.isnan(everything.proposal).all() and np.nanstd(everything.proposal[everything.success]) > 0.0:
         weights = importance_weights(everything.proposal)
-    density = built.density
-    if method == "empirical":
-        found = said(
-            lambda: empirical(
-                everything.position,
-                everything.quaternion,
-                everything.success,
-                rotation_keys=None if everything.keys is None else everything.keys[0],
-                position_keys=None if everything.keys is None else everything.keys[1],
-                alignment=_alignment(alignment),
-                frames=frames,
-                symmetric=bool(everything.symmetric.all()),
-                weights=weights,
-                level=LEVEL,
-                progress=progress,
-            )
-        )
-    else:
-        assert density is not None
-        found = said(
-            lambda: smoothed(
-                density,
-                _local_attempts(everything, density.kernel),
-                alignment=_alignment(alignment),
-                frames=frames,
-                level=LEVEL,
-                threads=sources.threads,
-                progress=progress,
-            )
-        )
+    keys = everything.keys
+    symmetric = bool(everything.symmetric.all())
+    return lambda alignment, frames, progress: empirical(
+        everything.position,
+        everything.quaternion,
+        everything.success,
+        rotation_keys=None if keys is None else keys[0],
+        position_keys=None if keys is None else keys[1],
+        alignment=_alignment(alignment),
+        frames=frames,
+        symmetric=symmetric,
+        weights=weights,
+        level=LEVEL,
+        progress=progress,
+    )
+
+
+def _told(found: Anisotropy, built: Built) -> tuple[list[AnisotropyTolerance], list[str]]:
+    """Tolerances, and what to mind of them."""
     tolerances = [_tolerance(item) for item in found.tolerances]
-    hidden = [item.axis for item in tolerances if item.within] if method == "density" else []
+    hidden = [item.axis for item in tolerances if item.within] if found.method == "density" else []
     if hidden:
         # Smoothed shares that start below one half bound nothing.
         tolerances = [
@@ -115,24 +200,7 @@ def anisotropy_report(
             f" smooths more than a grasp forgives along or about {', '.join(hidden)}: shares stay below one"
             " half even beside a success; method=empirical or a narrower kernel tells more"
         )
-    return AnisotropyReport.model_validate(
-        {
-            **head(built),
-            "text": _tolerances_text(tolerances, alignment),
-            "warnings": warnings,
-            "method": method,
-            "alignment": alignment,
-            "level": LEVEL,
-            "grasps": found.grasps,
-            "attempts": len(everything),
-            "translation_pairs": found.translation_pairs,
-            "rotation_pairs": found.rotation_pairs,
-            "kernel": None if method == "empirical" else built.kernel,
-            "tolerances": tolerances,
-            "translations": [_histogram(item) for item in found.translations],
-            "rotations": [_histogram(item) for item in found.rotations],
-        }
-    )
+    return tolerances, warnings
 
 
 def _alignment(name: str) -> Any:
@@ -208,9 +276,24 @@ def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> s
         parts.append(f"{more}{factor * item.half_width:.0f} {unit}{between} {way}")
     if not parts:
         return "No tolerance can be told from these trials; the warnings say why."
-    axes = (
-        "the gripper's axes"
-        if alignment == "gripper"
-        else "the object's principal axes, rotations the gripper's"
+    return f"A good grasp forgives {', '.join(parts)} ({_AXES[alignment]})."
+
+
+def _hypothesis(item: Hypothesis) -> AnisotropyHypothesis:
+    return AnisotropyHypothesis(
+        name=item.name,
+        ratio=finite(item.ratio),
+        low=finite(item.low),
+        high=finite(item.high),
+        verdict=item.verdict,
+        bound=item.bound,
     )
-    return f"A good grasp forgives {', '.join(parts)} ({axes})."
+
+
+def _hypotheses_text(found: list[Hypothesis]) -> str:
+    parts = []
+    for item in found:
+        if math.isfinite(item.ratio):
+            times = f"{item.ratio:.2g} times ({item.low:.2g} to {item.high:.2g})"
+            parts.append(f"{_EXPECTED[item.name].format(times)} ({item.verdict})")
+    return f" What grasps are expected to do: {'; '.join(parts)}." if parts else ""

@@ -27,7 +27,7 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import Question, RunRow
-from graspdb_service.usecases import reports, shapes
+from graspdb_service.usecases import reports
 from graspdb_service.usecases.densities import Densities, KernelChoice, kernel_of
 from graspdb_service.usecases.reportparts import Sources
 from graspdb_service.usecases.reports import Asked
@@ -89,9 +89,6 @@ class ReportRuns:
             404 and 409 as the selection; what the report itself was refused for; 429 where too many are
             under way.
         """
-        alignment = options.get("alignment")
-        if alignment is not None:
-            shapes.check_alignment(alignment)
         if options.get("matching") == "success":
             raise invalid(
                 "matching",

@@ -18,6 +18,7 @@ from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.compute import Compute
+from graspdb_service.usecases.features import Features
 from graspdb_service.usecases.selection import Selected
 
 Floats = NDArray[np.float64]
@@ -64,6 +65,7 @@ class Scenes:
     def __init__(self, database: Database, compute: Compute) -> None:
         self._database = database
         self._compute = compute
+        self.features = Features(database, compute)
         self._cache: SingleFlightCache[tuple[str, str], _Prepared] = SingleFlightCache(
             _MAX_BYTES, lambda p: p.nbytes
         )
