@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspdb_density import effective_sample_size, importance_weights, mixture_weights
+from graspdb_density.weights import pooled_density
 
 POSITIVE = st.lists(st.floats(1e-12, 1e12), min_size=1, max_size=30)
 
@@ -65,3 +66,16 @@ def test_effective_sample_size() -> None:
     assert effective_sample_size([2.0] * 7) == pytest.approx(7.0)
     assert effective_sample_size([1.0, 0.0]) == pytest.approx(1.0)
     assert effective_sample_size([]) == 0.0
+
+
+def test_pooled_strategies_weigh_as_the_mixture_does() -> None:
+    """Two grids, one over half of the other: in the overlap each trial counts for what both have tried."""
+    inside = np.array([False, False, True, True])
+    densities = np.stack([np.full(4, 1.0), np.where(inside, 2.0, 0.0)], axis=1)
+    pooled = pooled_density(densities, [100, 300])
+    np.testing.assert_allclose(pooled, np.where(inside, 1.75, 0.25))
+    np.testing.assert_allclose(importance_weights(pooled), mixture_weights(densities, [100, 300]))
+    # One strategy by itself is what it says, whatever it drew.
+    np.testing.assert_allclose(pooled_density(densities[:, :1], [7]), 1.0)
+    with pytest.raises(ValueError, match="at least one strategy"):
+        pooled_density(densities, [0, 0])

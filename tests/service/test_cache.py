@@ -135,14 +135,14 @@ def test_concurrent_first_requests_build_once(
     make_object(http)
     post(http, "thing", two_clusters)
     builds = []
-    build = densities_module._build
+    build = densities_module.builds.build
 
     def counted(*given: Any) -> Built:
         builds.append(1)
         time.sleep(0.05)
         return build(*given)
 
-    monkeypatch.setattr(densities_module, "_build", counted)
+    monkeypatch.setattr(densities_module.builds, "build", counted)
     with ThreadPoolExecutor(10) as pool:
         found = list(pool.map(lambda _: ctx.densities.get("thing", *PLAIN), range(10)))
     assert len(builds) == 1

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspdb_density import AnisotropicKernel, MixtureDensity, se3
+from graspdb_density import AnisotropicKernel, IsotropicKernel, MixtureDensity, SampledKernel, se3
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -239,3 +239,137 @@ def test_the_same_request_twice_makes_one_kernel(http: httpx.Client) -> None:
     first, again = (http.post("/kernels", json=GIVEN, headers=headers).json() for _ in range(2))
     assert first == again
     assert len(http.get("/kernels").json()["items"]) == 1
+
+
+# -- sampled kernels ---------------------------------------------------------------------------------------
+
+
+def as_sampled(kernel: dict[str, Any]) -> SampledKernel:
+    means = np.array([c["mean"] for c in kernel["components"]])
+    widths = kernel["provenance"]["component_widths"]
+    return SampledKernel(
+        means[:, :3],
+        se3.from_rotation_vector(means[:, 3:]),
+        IsotropicKernel(widths["sigma_position_m"], math.radians(widths["sigma_rotation_deg"])),
+        np.array([c["weight"] for c in kernel["components"]]),
+    )
+
+
+def test_a_sampled_kernel_is_drawn_and_used_in_every_query(
+    http: httpx.Client, make_object: Make, post: Post
+) -> None:
+    make_object(http)
+    poses = ridges()
+    g = np.random.default_rng(5).random(400) + 0.5
+    post(http, "thing", poses, gripper="pg70", proposal_density=g)
+    widths = {"sigma_position_m": 0.008, "sigma_rotation_deg": 12}
+    made = fit(http, object="thing", kind="sampled", components=60, component_widths=widths)
+    assert (made["kind"], made["gripper"], len(made["components"])) == ("sampled", "pg70", 60)
+    assert made["components"][0]["covariance"] is None
+    source = made["provenance"]
+    assert source["component_widths"] == widths
+    assert source["window"] == {"position_m": 0.03, "rotation_deg": 45}
+    assert 0.5 < source["similarity"] <= 1
+    assert http.get(f"/kernels/{made['id']}").json() == made
+    # It is none of those that the name anisotropic means.
+    assert problem(http.get("/objects/thing/density?kernel=anisotropic"), 409)
+
+    density = as_sampled(made).placed(*poses, weights=1.0 / g)
+    asked = poses[0][:50] + 0.003, poses[1][:50]
+    body = {"position": asked[0].tolist(), "quaternion_xyzw": asked[1].tolist()}
+    found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": made["id"]}).json()
+    np.testing.assert_allclose(found["log_density"], density.log_density(*asked), atol=2e-3)
+    assert max(found["relative"]) <= 1
+    info = http.get(f"/objects/thing/density?kernel={made['id']}").json()
+    assert (info["size"], info["kernel"]["kind"], info["kernel"]["id"]) == (400, "sampled", made["id"])
+    assert info["kernel"]["widths_m"] == pytest.approx(made["widths_m"])
+    assert info["kernel"]["widths_m"][0] > info["kernel"]["widths_m"][1]
+
+    best = http.get(f"/objects/thing/best-grasp?kernel={made['id']}&count=2").json()
+    top = best["grasps"][0]
+    assert top["relative"] == pytest.approx(1, abs=0.02)
+    exact = density.log_density([top["position"]], [top["quaternion_xyzw"]])[0]
+    assert top["log_density"] == pytest.approx(exact, abs=2e-3)
+    assert top["log_density"] >= max(found["log_density"]) - 1e-3
+    drawn = http.post("/objects/thing/samples", json={"count": 500, "seed": 3, "kernel": made["id"]}).json()
+    p, q = np.array(drawn["position"]), np.array(drawn["quaternion_xyzw"])
+    np.testing.assert_allclose(np.log(drawn["proposal_density"]), density.log_density(p, q), atol=2e-3)
+
+    # Trials that come later are in the next answer, extended or weighted anew.
+    more = ridges(50, seed=9)
+    post(http, "thing", more, gripper="pg70", proposal_density=np.ones(50))
+    every = np.concatenate([poses[0], more[0]]), np.concatenate([poses[1], more[1]])
+    grown = as_sampled(made).placed(*every, weights=np.concatenate([1.0 / g, np.ones(50)]))
+    found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": made["id"]}).json()
+    np.testing.assert_allclose(found["log_density"], grown.log_density(*asked), atol=2e-3)
+
+
+def test_a_sampled_kernel_given_by_its_displacements(
+    sqlite_http: httpx.Client, make_object: Make, post: Post
+) -> None:
+    http = sqlite_http
+    make_object(http)
+    poses = ridges(30)
+    post(http, "thing", poses)
+    parts = [{"mean": [0.01, 0.002, 0, 0, 0.2, 0.1]}, {"mean": [0.0] * 6, "weight": 3}]
+    named = fit(
+        http,
+        kind="sampled",
+        components=parts,
+        component_widths={"sigma_position_m": 0.01, "sigma_rotation_deg": 15},
+    )
+    # The same said with covariances.
+    covariance = diagonal(*[0.01] * 3, *[math.radians(15)] * 3)
+    spelled = fit(http, kind="sampled", components=[{**part, "covariance": covariance} for part in parts])
+    assert spelled["provenance"]["component_widths"] == pytest.approx(
+        {"sigma_position_m": 0.01, "sigma_rotation_deg": 15}
+    )
+    body = {"position": poses[0].tolist(), "quaternion_xyzw": poses[1].tolist()}
+    logs = [
+        http.post("/objects/thing/likelihood", json={"poses": body, "kernel": k["id"]}).json()["log_density"]
+        for k in (named, spelled)
+    ]
+    np.testing.assert_allclose(logs[0], logs[1], atol=1e-6)
+    density = as_sampled(named).placed(*poses)
+    np.testing.assert_allclose(logs[0], density.log_density(*poses), atol=2e-3)
+
+
+def test_sampled_kernels_are_bounded_and_checked(
+    sqlite_http: httpx.Client, make_object: Make, post: Post
+) -> None:
+    http = sqlite_http
+    make_object(http)
+    rng = np.random.default_rng(0)
+    post(http, "thing", (rng.normal(size=(1_200, 3)) * 0.1, se3.random_quaternions(1_200, rng)))
+    parts = [{"mean": [*(rng.normal(size=3) * 0.01), 0, 0, 0]} for _ in range(900)]
+    kernel = fit(http, kind="sampled", components=parts)["id"]
+    for answer in (
+        http.get(f"/objects/thing/density?kernel={kernel}"),
+        http.get(f"/objects/thing/best-grasp?kernel={kernel}"),
+        http.post("/objects/thing/samples", json={"count": 3, "kernel": kernel}),
+    ):
+        told = problem(answer, 413)
+        assert told["type"].endswith("too-many-components")
+        assert "kind anisotropic" in told["title"]
+        assert "at most 833 components" in told["title"]
+
+    def refused(**request: Any) -> list[str]:
+        told = problem(http.post("/kernels", json=request), 422)
+        return [error["field"] for error in told["errors"]]
+
+    one = {"mean": [0.0] * 6}
+    assert refused(kind="sampled", components=[one] * 5_001)
+    assert refused(kind="sampled", components=[one], alignment="object") == ["alignment"]
+    assert refused(kind="sampled", object="thing", components="auto") == ["components"]
+    assert refused(object="thing", components=5) == ["components"]
+    assert refused(components=[one]) == ["components.0.covariance"]
+    assert refused(components=[{"covariance": diagonal(*[0.01] * 3, *[0.1] * 3)}] * 33) == ["components"]
+    assert refused(kind="sampled", components=[{"mean": [5.0, 0, 0, 0, 0, 0]}]) == ["components.0.mean"]
+    tilted = diagonal(0.01, 0.02, 0.01, 0.1, 0.1, 0.1)
+    assert refused(kind="sampled", components=[{**one, "covariance": tilted}]) == ["components.0.covariance"]
+    alike = [diagonal(*[0.01] * 3, *[0.1] * 3), diagonal(*[0.02] * 3, *[0.1] * 3)]
+    assert refused(kind="sampled", components=[{**one, "covariance": c} for c in alike]) == [
+        "components.1.covariance"
+    ]
+    told = problem(http.get(f"/objects/thing/reports/convergence?kernel={kernel}"), 413)
+    assert told["type"].endswith("too-many-components")

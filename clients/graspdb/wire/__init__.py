@@ -66,6 +66,7 @@ from graspdb.wire.queries import (
     Samples,
     SamplesRequest,
     Selection,
+    WeightsInfo,
     WorldPose,
 )
 from graspdb.wire.sweeps import (
@@ -151,6 +152,7 @@ __all__ = [
     "TrialIn",
     "TrialOut",
     "TrialsIn",
+    "WeightsInfo",
     "WorkerInfo",
     "WorldPose",
 ]

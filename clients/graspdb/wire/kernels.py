@@ -13,16 +13,22 @@ Alignment = Literal["gripper", "object", "edge", "surface-pair"]
 """Axes that translations are measured along; rotations are always in the gripper's frame."""
 MAX_COMPONENTS = 32
 MAX_FITTED = 4
+MAX_SAMPLED, SAMPLED = 5_000, 900
+"""Most displacements of a sampled kernel, and how many are drawn by default (the paper's number)."""
 
 Six = Annotated[list[float], Field(min_length=6, max_length=6)]
 
 
 class KernelComponent(Request):
-    """A Gaussian over displacements (translation in metres first, then rotation vector in radians)."""
+    """A Gaussian over displacements (translation in metres first, then rotation vector in radians).
+
+    Of a sampled kernel ``mean`` is a displacement; the width of all of its components is the kernel's
+    ``component_widths``, and ``covariance`` is left out.
+    """
 
     weight: Annotated[float, Field(gt=0, le=1e12)] = 1.0
     mean: Six = [0.0] * 6
-    covariance: Annotated[list[Six], Field(min_length=6, max_length=6)]
+    covariance: Annotated[list[Six], Field(min_length=6, max_length=6)] | None = None
 
 
 class KernelWindow(Request):
@@ -42,34 +48,38 @@ class KernelWidths(Request):
 class KernelCreate(Request):
     """A kernel to fit on an object's successes, or one given by its components.
 
-    Fitted: ``components`` is how many Gaussians (1; a component off the jaw's plane of symmetry is a pair),
-    or ``auto`` for as many as held-out displacements favour; ``window`` says which displacements count and
-    ``component_widths`` are those of the sampled kernel it stands for. Given: ``components`` as a list; what
-    the jaw's turn would change is averaged with its mirror image.
+    ``anisotropic``, fitted: ``components`` is how many Gaussians (1; a component off the jaw's plane of
+    symmetry is a pair), or ``auto`` for as many as held-out displacements favour; ``window`` says which
+    displacements count and ``component_widths`` are those of the sampled kernel it stands for. Given:
+    ``components`` as a list; what the jaw's turn would change is averaged with its mirror image.
+
+    ``sampled`` (eq 5): isotropic components of ``component_widths`` at displacements, drawn from those
+    between the object's successes in the window (``components`` of them, 900 by default) or given. It costs
+    as much more than one Gaussian as it has components, so what queries make of it is limited.
     """
 
     object: Slug | None = None
     gripper: Slug | None = None
     protocol: Slug | None = None
     source: Source | None = None
-    kind: Literal["anisotropic"] = "anisotropic"
+    kind: Literal["anisotropic", "sampled"] = "anisotropic"
     alignment: Alignment = "gripper"
     window: KernelWindow | None = None
     component_widths: KernelWidths | None = None
     components: (
-        Annotated[int, Field(ge=1, le=MAX_FITTED)]
+        Annotated[int, Field(ge=1, le=MAX_SAMPLED)]
         | Literal["auto"]
-        | Annotated[list[KernelComponent], Field(min_length=1, max_length=MAX_COMPONENTS)]
-    ) = 1
+        | Annotated[list[KernelComponent], Field(min_length=1, max_length=MAX_SAMPLED)]
+        | None
+    ) = None
 
     @model_validator(mode="after")
     def _one_way(self) -> KernelCreate:
         if isinstance(self.components, list):
-            beside = [
-                name
-                for name in ("object", "protocol", "source", "window", "component_widths")
-                if getattr(self, name) is not None
-            ]
+            fitting = ["object", "protocol", "source", "window"]
+            if self.kind == "anisotropic":
+                fitting.append("component_widths")
+            beside = [name for name in fitting if getattr(self, name) is not None]
             if beside:
                 raise ValueError(
                     f"a kernel given by its components is fitted on nothing: {', '.join(beside)}"

@@ -68,6 +68,20 @@ class KernelInfo(Response):
     widths_deg: Triple | None = None
 
 
+class WeightsInfo(Response):
+    """How successes were weighted to undo how poses were chosen (eq 1); ``rule`` says it in words.
+
+    ``equal``; ``mixture``: 1 / sum n_k g_k(x) over grids of different regions or steps; ``own``: 1 / g of
+    each trial's own proposal density; ``mixture-and-own``: both, the grids as one strategy. ``poses_tried``
+    counts the grids' distinct poses, collisions included.
+    """
+
+    kind: Literal["equal", "mixture", "own", "mixture-and-own"]
+    rule: str
+    poses_tried: int | None = None
+    without_proposal_density: int = 0
+
+
 class DensityInfo(Response):
     """``size`` successes shape the density; twins by the jaw's symmetry are implicit and not counted."""
 
@@ -81,6 +95,7 @@ class DensityInfo(Response):
     size: int
     outcomes: dict[str, int]
     effective_sample_size: float
+    weights: WeightsInfo | None = None
     unit: str = "1/(m^3 rad^3)"
     bytes: int
     warnings: list[str] = Field(default_factory=list)

@@ -63,10 +63,14 @@ def find(tx: Tx, id: str) -> KernelRow | None:
 
 
 def newest(tx: Tx, object_id: int, gripper: str | None) -> str | None:
-    """Id of the kernel fitted last on this object's trials with this gripper."""
+    """Id of the anisotropic kernel fitted last on this object's trials with this gripper."""
     query = (
         select(kernels.c.id)
-        .where(kernels.c.object_id == object_id, kernels.c.gripper.is_not_distinct_from(gripper))
+        .where(
+            kernels.c.object_id == object_id,
+            kernels.c.gripper.is_not_distinct_from(gripper),
+            kernels.c.kind == "anisotropic",
+        )
         .order_by(kernels.c.number.desc())
         .limit(1)
     )

@@ -267,10 +267,11 @@ def _described(ctx: Context, question: Question, found: list[Maximum]) -> list[G
             _nearest_trials(question.built, density, p, q)
             for p, q in zip(positions, quaternions, strict=True)
         ]
-        if isinstance(asked, MixtureDensity):
-            # It was searched by score, from the density under an isotropic kernel.
+        if asked is not density:
+            # It may have been searched by score, from the density under an isotropic kernel.
             logs = asked.log_density(positions, quaternions, threads=question.threads)
             found[:] = [replace(item, log_density=float(log)) for item, log in zip(found, logs, strict=True)]
+        if isinstance(asked, MixtureDensity):
             return free, widths, nearest, asked.global_maximum().score
         return free, widths, nearest, asked.global_maximum(question.threads).log_density
 

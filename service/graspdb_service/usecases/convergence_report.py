@@ -49,6 +49,11 @@ def convergence_report(
     # Said before anything is computed.
     said(lambda: curve_sizes(0 if density is None else density.size))
     assert density is not None
+    if built.sampled is not None:
+        raise conflict(
+            "kernel-sampled",
+            "Convergence is measured under isotropic and anisotropic kernels, not under sampled ones",
+        )
     matching = options.get("matching") if built.shaped is None else options.get("matching", "determinants")
     if matching is not None and built.shaped is None:
         raise conflict(

@@ -2,63 +2,32 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graspdb.wire import KernelInfo, KernelSpec, Selection
-from graspdb_density import (
-    DEFAULT_KERNEL,
-    GraspDensity,
-    IsotropicKernel,
-    MixtureDensity,
-    choose_widths,
-    importance_weights,
-    widths_prefix,
-)
+from graspdb.wire import KernelSpec, Selection
 from graspdb_density.density import CUTOFF
 from graspdb_density.kernels import POSITION_LIMITS_M, ROTATION_LIMITS
-from graspdb_density.widths import FIRST_CHOICE
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import kernels, objects, trials
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.usecases import shapes
+from graspdb_service.usecases import builds, exposures
+from graspdb_service.usecases.builds import Built, KernelChoice
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.selection import Filters, Selected, resolve
 from graspdb_service.usecases.slugs import is_slug
 
-Floats = NDArray[np.float64]
+__all__ = ["Built", "Densities", "KernelChoice", "kernel_of", "require_object"]
 
-_DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
-_DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
-#: Weights are told apart in float32: a row that counts less than this share of the heaviest gets this share.
-_LEAST_SHARE = 1e-30
 _RESOLVED = 4_096
-
-
-@dataclass(frozen=True)
-class KernelChoice:
-    """The kernel a request asks for; all None: isotropic, widths by the default rule.
-
-    ``stored`` is a stored kernel's id, or ``anisotropic`` for the newest of the object and gripper.
-    """
-
-    sigma_position_m: float | None = None
-    sigma_rotation_deg: float | None = None
-    stored: str | None = None
-
-    @property
-    def by_default(self) -> bool:
-        return self.sigma_position_m is None and self.sigma_rotation_deg is None and self.stored is None
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
@@ -115,52 +84,6 @@ def _choice(request: Selection) -> tuple[KernelChoice, float | None]:
             errors=[(name, "only the isotropic kernel takes widths") for name in given],
         )
     return KernelChoice(stored=kernel), CUTOFF
-
-
-@dataclass(frozen=True, eq=False)
-class Built:
-    """A density and what it was built of, immutable.
-
-    Attributes
-    ----------
-    density
-        None where no trial of the selection succeeded. With a stored kernel the density under the isotropic
-        one of equal determinants.
-    shaped
-        The density under the stored kernel, where one was asked for.
-    seq
-        (N,) sequence numbers of its rows, ascending.
-    proposal_density
-        (N,) NaN where unknown; None where none is known.
-    weight_unit
-        Weight times proposal density, the same for every row that has one.
-    chosen_from
-        How many of the first rows the widths were chosen from.
-    """
-
-    revision: int
-    epoch: int
-    last_seq: int
-    object_row: ObjectRow
-    selected: Selected
-    kernel: KernelInfo
-    density: GraspDensity | None
-    seq: NDArray[np.int64]
-    proposal_density: Floats | None
-    weight_unit: float | None
-    chosen_from: int = 0
-    shaped: MixtureDensity | None = None
-
-    @property
-    def asked(self) -> GraspDensity | MixtureDensity | None:
-        """The density under the kernel that was asked for."""
-        return self.density if self.shaped is None else self.shaped
-
-    @property
-    def nbytes(self) -> int:
-        own = self.seq.nbytes + (0 if self.proposal_density is None else self.proposal_density.nbytes)
-        held = sum(part.nbytes for part in (self.density, self.shaped) if part is not None)
-        return own + held + 4_096
 
 
 @dataclass(frozen=True)
@@ -274,22 +197,28 @@ class Densities:
             selected = resolve(tx, row.id, key.filters)
             if before is not None and before.epoch != row.epoch:
                 before = None
+            exposure = exposures.read(tx, row.id, selected)
             rows = trials.read(
                 tx,
                 row.id,
                 provenance_ids=list(selected.provenances),
                 successes_only=True,
                 after_seq=0 if before is None else before.last_seq,
+                batches=True,
             )
-        if before is not None and not len(rows):
+        # Failures of one grid change no weight, those of several do.
+        if before is not None and not len(rows) and (exposure == before.exposure or not exposure.several):
             return replace(
-                before, revision=row.revision, last_seq=row.last_seq, object_row=row, selected=selected
+                before,
+                revision=row.revision,
+                last_seq=row.last_seq,
+                object_row=row,
+                selected=selected,
+                exposure=exposure,
             )
-        if stored is not None:
-            frame = shapes.frame_of(stored, row)
-            return self._compute.run(lambda: _build_shaped(stored, frame, row, selected, rows, before))
+        threads = self._compute.threads
         return self._compute.run(
-            lambda: _build(key.kernel, row, selected, rows, before, self._compute.threads)
+            lambda: builds.build(key.kernel, stored, row, selected, exposure, rows, before, threads)
         )
 
 
@@ -307,179 +236,3 @@ def require_object(tx: Tx, slug: str, object_id: int | None = None) -> ObjectRow
     if object_id is not None and row.id != object_id:
         raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
     return row
-
-
-def _build(
-    choice: KernelChoice,
-    row: ObjectRow,
-    selected: Selected,
-    rows: trials.Columns,
-    before: Built | None,
-    threads: int,
-) -> Built:
-    """Extend the density there was, or build it from all rows where that is not possible."""
-    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
-    proposal = None if np.isnan(rows.proposal_density).all() else rows.proposal_density
-    position, quaternion, seq = rows.position, rows.quaternion_xyzw, rows.seq
-    old = None if before is None else before.density
-    if before is not None and old is not None:
-        seq = np.concatenate([before.seq, seq])
-        proposal = _joined(before.proposal_density, len(before.seq), proposal, len(rows))
-    chosen_from = widths_prefix(len(seq)) if choice.by_default else 0
-    built = Built(
-        revision=row.revision,
-        epoch=row.epoch,
-        last_seq=row.last_seq,
-        object_row=row,
-        selected=selected,
-        kernel=_info(choice),
-        density=None,
-        seq=seq,
-        proposal_density=proposal,
-        weight_unit=None,
-        chosen_from=chosen_from,
-    )
-    if not len(seq):
-        return built
-    if before is not None and old is not None:
-        if before.chosen_from == chosen_from:
-            built = replace(built, kernel=before.kernel)
-            extended = _extended(before, old, rows, symmetric, proposal)
-            if extended is not None:
-                return replace(built, density=extended, weight_unit=before.weight_unit)
-        position = np.concatenate([old.positions, position])
-        quaternion = np.concatenate([old.quaternions_xyzw, quaternion])
-        symmetric = np.concatenate([old.symmetric, symmetric])
-    if chosen_from and (before is None or before.chosen_from != chosen_from):
-        first = slice(0, chosen_from)
-        widths = choose_widths(
-            position[first],
-            quaternion[first],
-            weights=_weights(None if proposal is None else proposal[first]),
-            symmetric=symmetric[first],
-            threads=threads,
-        )
-        built = replace(built, kernel=_chosen(widths.kernel, widths.rule, widths.rows))
-    weights = _weights(proposal)
-    unit = None
-    if weights is not None and proposal is not None:
-        known = int(np.flatnonzero(~np.isnan(proposal))[0])
-        unit = float(weights[known] * proposal[known])
-    density = GraspDensity.build(
-        position,
-        quaternion,
-        kernel=IsotropicKernel(built.kernel.sigma_position_m, math.radians(built.kernel.sigma_rotation_deg)),
-        weights=weights,
-        symmetric=symmetric,
-    )
-    return replace(built, density=density, weight_unit=unit)
-
-
-def _build_shaped(
-    stored: KernelRow,
-    frame: Floats | None,
-    row: ObjectRow,
-    selected: Selected,
-    rows: trials.Columns,
-    before: Built | None,
-) -> Built:
-    """The density under a stored kernel; extended where all weights are equal, else built anew."""
-    fresh = symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
-    proposal = None if np.isnan(rows.proposal_density).all() else rows.proposal_density
-    position, quaternion, seq = rows.position, rows.quaternion_xyzw, rows.seq
-    if before is not None and before.density is not None:
-        old = before.density
-        seq = np.concatenate([before.seq, seq])
-        proposal = _joined(before.proposal_density, len(before.seq), proposal, len(rows))
-        position = np.concatenate([old.positions, position])
-        quaternion = np.concatenate([old.quaternions_xyzw, quaternion])
-        symmetric = np.concatenate([old.symmetric, symmetric])
-    kernel = shapes.load(stored)
-    built = Built(
-        revision=row.revision,
-        epoch=row.epoch,
-        last_seq=row.last_seq,
-        object_row=row,
-        selected=selected,
-        kernel=shapes.info_of(stored, kernel),
-        density=None,
-        seq=seq,
-        proposal_density=proposal,
-        weight_unit=None,
-    )
-    if not len(seq):
-        return built
-    if before is not None and before.shaped is not None and proposal is None:
-        shaped = before.shaped.extend(rows.position, rows.quaternion_xyzw, symmetric=fresh, frames=frame)
-    else:
-        shaped = MixtureDensity(
-            position, quaternion, kernel=kernel, weights=_weights(proposal), symmetric=symmetric, frames=frame
-        )
-    return replace(built, density=shaped.isotropic, shaped=shaped)
-
-
-def _extended(
-    before: Built,
-    old: GraspDensity,
-    rows: trials.Columns,
-    symmetric: NDArray[np.bool_],
-    proposal: Floats | None,
-) -> GraspDensity | None:
-    """The density with further rows; None where they change the weights of the first ones."""
-    weights = None
-    if proposal is not None:
-        # A trial without a proposal density takes the mean weight of the rest, which the new rows move.
-        if before.weight_unit is None or np.isnan(proposal).any():
-            return None
-        with np.errstate(over="ignore"):
-            weights = before.weight_unit / rows.proposal_density
-        if not (np.isfinite(weights).all() and (weights > 0).all()):
-            return None
-    return old.extend(rows.position, rows.quaternion_xyzw, weights=weights, symmetric=symmetric)
-
-
-def _weights(proposal: Floats | None) -> Floats | None:
-    """Weights of eq 1, no row lost to rounding; None where all are equal."""
-    if proposal is None or np.isnan(proposal).all():
-        return None
-    weights = importance_weights(proposal)
-    return np.asarray(np.maximum(weights, weights.max() * _LEAST_SHARE), dtype=np.float64)
-
-
-def _joined(
-    first: Floats | None, first_count: int, second: Floats | None, second_count: int
-) -> Floats | None:
-    if first is None and second is None:
-        return None
-    return np.concatenate(
-        [
-            np.full(first_count, np.nan) if first is None else first,
-            np.full(second_count, np.nan) if second is None else second,
-        ]
-    )
-
-
-def _info(choice: KernelChoice) -> KernelInfo:
-    position, rotation = choice.sigma_position_m, choice.sigma_rotation_deg
-    default = f"{_DEFAULT_POSITION_M * 1000:g} mm and {_DEFAULT_ROTATION_DEG:g} degrees"
-    if choice.by_default:
-        rule = f"default: {default} until there are {FIRST_CHOICE} successes"
-    elif position is None or rotation is None:
-        rule = f"as asked; the width not named by default ({default})"
-    else:
-        rule = "as asked"
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=_DEFAULT_POSITION_M if position is None else position,
-        sigma_rotation_deg=_DEFAULT_ROTATION_DEG if rotation is None else rotation,
-        rule=rule,
-    )
-
-
-def _chosen(kernel: IsotropicKernel, rule: str, rows: int) -> KernelInfo:
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
-        rule=f"default: {rule} likelihood of the first {rows} successes",
-    )

@@ -85,10 +85,15 @@ class Exposure:
         boxes = {(plan.lower, plan.upper) for lattice in self.lattices for plan in lattice.plans}
         return len(boxes) > 1
 
+    @property
+    def uniform(self) -> float:
+        """The density where it is the same everywhere."""
+        plan = self.lattices[0].plans[0]
+        centre = 0.5 * (np.array([plan.lower]) + np.array([plan.upper]))
+        return float(self.density(centre)[0])
+
     def density(self, positions: Floats) -> Floats:
         """What trials (n, 3) of these grids were drawn with, all grids seen as one: 1/(m^3 rad^3)."""
-        if not self.several and len(positions) > 1:
-            return np.full(len(positions), self.density(positions[:1])[0])
         columns = np.stack([lattice.proposal(positions) for lattice in self.lattices], axis=1)
         return pooled_density(columns, [lattice.tried for lattice in self.lattices])
 

@@ -7,8 +7,13 @@ import uuid
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspdb.wire.kernels import (
+    MAX_COMPONENTS,
+    MAX_FITTED,
+    MAX_SAMPLED,
+    SAMPLED,
     KernelComponent,
     KernelCreate,
     KernelProvenance,
@@ -16,19 +21,26 @@ from graspdb.wire.kernels import (
     KernelWindow,
     StoredKernel,
 )
-from graspdb_density import AnisotropicKernel, IsotropicKernel
-from graspdb_density.fitting import fit_kernel
-from graspdb_density.similarity import DisplacementWindow
+from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
+from graspdb_density.fitting import LEAST_DISPLACEMENTS, displacements, fit_kernel
+from graspdb_density.similarity import DisplacementWindow, bhattacharyya, sampled_kernel_rows
 from graspdb_service.problems import conflict, invalid, not_found
 from graspdb_service.storage import grippers, kernels
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.usecases import shapes
 from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.densities import KernelChoice, require_object
+from graspdb_service.usecases.densities import Built, KernelChoice, require_object
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.idempotency import Created, replay_or
 from graspdb_service.usecases.selection import Filters
+
+Floats = NDArray[np.float64]
+
+#: Farther along an axis no displacement between grasps of one object reaches.
+_MOST_SHIFT_M = 1.0
+#: Displacements that stand for all of them where a sample is compared with them.
+_WHOLE = 20_000
 
 
 def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
@@ -41,6 +53,8 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
         409 where the trials don't suffice to fit one.
     """
     shapes.check_alignment(request.alignment)
+    if request.kind == "sampled" and request.alignment != "gripper":
+        raise invalid("alignment", "a sampled kernel lies along the gripper's axes: use alignment=gripper")
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
@@ -83,87 +97,207 @@ def _given(ctx: Context, request: KernelCreate) -> dict[str, Any]:
         with ctx.database.read() as tx:
             if grippers.find(tx, request.gripper) is None:
                 raise unknown("gripper", [request.gripper])
+    sampled = request.kind == "sampled"
+    components, widths = _checked_samples(request) if sampled else (_checked_gaussians(request), None)
+    provenance = KernelProvenance(origin="given", component_widths=widths)
+    return {
+        "kind": request.kind,
+        "alignment": request.alignment,
+        "gripper": request.gripper,
+        "object_id": None,
+        "components": components,
+        "provenance": provenance.model_dump(mode="json", exclude_none=True),
+    }
+
+
+def _checked_gaussians(request: KernelCreate) -> list[dict[str, Any]]:
+    """The components of an anisotropic kernel, invariant under the jaw's turn."""
+    assert isinstance(request.components, list)
+    if len(request.components) > MAX_COMPONENTS:
+        raise invalid(
+            "components", f"at most {MAX_COMPONENTS} Gaussians; a kernel of kind sampled takes {MAX_SAMPLED}"
+        )
+    covariances = []
+    for i, item in enumerate(request.components):
+        if item.covariance is None:
+            raise invalid(f"components.{i}.covariance", "a Gaussian needs its 6x6 covariance")
+        covariances.append(item.covariance)
     try:
         kernel = AnisotropicKernel.symmetrised(
             [item.weight for item in request.components],
             [item.mean for item in request.components],
-            [item.covariance for item in request.components],
+            covariances,
             frame="gripper" if request.alignment == "gripper" else "fixed",
         )
         # What no equivalent width can be told of has none.
         kernel.isotropic  # noqa: B018
     except ValueError as error:
         raise invalid("components", str(error), "These components make no kernel") from None
-    return {
-        "kind": request.kind,
-        "alignment": request.alignment,
-        "gripper": request.gripper,
-        "object_id": None,
-        "components": _components(kernel),
-        "provenance": KernelProvenance(origin="given").model_dump(mode="json", exclude_none=True),
-    }
+    return _components(kernel)
+
+
+def _checked_samples(request: KernelCreate) -> tuple[list[dict[str, Any]], KernelWidths]:
+    """The displacements of a sampled kernel, and the widths of its components."""
+    assert isinstance(request.components, list)
+    widths = request.component_widths
+    for i, item in enumerate(request.components):
+        if max(map(abs, item.mean[:3])) > _MOST_SHIFT_M or np.linalg.norm(item.mean[3:]) > math.pi:
+            raise invalid(
+                f"components.{i}.mean", f"at most {_MOST_SHIFT_M:g} m along an axis and a turn of at most pi"
+            )
+        if item.covariance is None:
+            continue
+        own = _isotropic_widths(np.array(item.covariance))
+        if own is None or own != (widths or own):
+            raise invalid(
+                f"components.{i}.covariance",
+                "components of a sampled kernel share one isotropic width: leave covariance out and give"
+                " component_widths {sigma_position_m, sigma_rotation_deg}",
+            )
+        widths = own
+    components = [{"weight": item.weight, "mean": item.mean} for item in request.components]
+    return components, widths or KernelWidths()
+
+
+def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
+    """The widths of a covariance that has one for all shifts and one for all turns; else None."""
+    shift, turn = covariance[0, 0], covariance[3, 3]
+    if not np.allclose(covariance, np.diag([shift] * 3 + [turn] * 3), rtol=1e-9, atol=0.0):
+        return None
+    try:
+        return KernelWidths(
+            sigma_position_m=round(math.sqrt(shift), 12),
+            sigma_rotation_deg=round(math.degrees(math.sqrt(turn)), 12),
+        )
+    except ValueError:
+        return None
 
 
 def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
     assert request.object is not None
-    count = request.components
+    sampled, count = request.kind == "sampled", request.components
     assert not isinstance(count, list)
-    if request.alignment == "object" and count not in (1, "auto"):
+    if sampled and count == "auto":
+        raise invalid(
+            "components", f"how many displacements to draw: 1 to {MAX_SAMPLED}, {SAMPLED} by default"
+        )
+    if not sampled and isinstance(count, int) and count > MAX_FITTED:
+        raise invalid(
+            "components", f"at most {MAX_FITTED} Gaussians, or auto; kind sampled takes {MAX_SAMPLED}"
+        )
+    if request.alignment == "object" and count not in (None, 1, "auto"):
         raise invalid("components", "the object's axes have no sign: a kernel aligned with them has 1")
     window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
     filters = Filters(request.gripper, request.protocol, request.source)
     with ctx.compute.admitted():
         built = ctx.densities.get(request.object, filters, KernelChoice())
-        density, selected = built.density, built.selected
-        frame = shapes.principal_axes(built.object_row) if request.alignment == "object" else None
-        if density is None:
+        if request.alignment == "object":
+            # Said first: without axes no number of trials helps.
+            shapes.principal_axes(built.object_row)
+        if built.density is None:
             raise conflict(
                 "too-few-trials",
                 "No trial of this selection succeeded, so there is nothing to fit a kernel on:"
                 f" post trials (POST /objects/{request.object}/trials) or sweep a grid first",
             )
+        fit = _sample if sampled else _fit
         try:
-            fit = ctx.compute.run(
-                lambda: fit_kernel(
-                    density.positions,
-                    density.quaternions_xyzw,
-                    window=DisplacementWindow(window.position_m, math.radians(window.rotation_deg)),
-                    widths=IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg)),
-                    compared=density.kernel,
-                    components=None if count == "auto" else count,
-                    weights=density.weights,
-                    symmetric=density.symmetric,
-                    frame=frame,
-                    threads=ctx.compute.threads,
-                )
-            )
+            components, told = ctx.compute.run(lambda: fit(ctx, request, built, window, widths))
         except ValueError as error:
-            text = str(error)
-            raise conflict("too-few-trials", f"No kernel can be fitted: {text}") from None
+            raise conflict("too-few-trials", f"No kernel can be fitted: {error}") from None
     provenance = KernelProvenance(
         origin="fitted",
         object=built.object_row.slug,
         revision=built.revision,
-        protocol=selected.protocol,
-        source=selected.source,
-        successes=fit.successes,
-        displacements=fit.displacements,
+        protocol=built.selected.protocol,
+        source=built.selected.source,
         window=window,
         component_widths=widths,
-        scale=fit.scale,
-        log_likelihood=_finite(fit.log_likelihood),
-        isotropic_log_likelihood=_finite(fit.isotropic_log_likelihood),
-        similarity=fit.similarity.value,
-        likelihood_by_components={str(k): v for k, v in fit.likelihoods.items()} or None,
+        **told,
     )
     return {
         "kind": request.kind,
         "alignment": request.alignment,
-        "gripper": selected.gripper,
+        "gripper": built.selected.gripper,
         "object_id": built.object_row.id,
-        "components": _components(fit.kernel),
+        "components": components,
         "provenance": provenance.model_dump(mode="json", exclude_none=True),
     }
+
+
+def _fit(
+    ctx: Context, request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """A Gaussian, or a mixture of a few: its components and what is told of the fit."""
+    density, count = built.density, request.components
+    assert density is not None
+    assert not isinstance(count, list)
+    fit = fit_kernel(
+        density.positions,
+        density.quaternions_xyzw,
+        window=_window(window),
+        widths=_isotropic(widths),
+        compared=density.kernel,
+        components=None if count == "auto" else count or 1,
+        weights=density.weights,
+        symmetric=density.symmetric,
+        frame=shapes.principal_axes(built.object_row) if request.alignment == "object" else None,
+        threads=ctx.compute.threads,
+    )
+    return _components(fit.kernel), {
+        "successes": fit.successes,
+        "displacements": fit.displacements,
+        "scale": fit.scale,
+        "log_likelihood": _finite(fit.log_likelihood),
+        "isotropic_log_likelihood": _finite(fit.isotropic_log_likelihood),
+        "similarity": fit.similarity.value,
+        "likelihood_by_components": {str(k): v for k, v in fit.likelihoods.items()} or None,
+    }
+
+
+def _sample(
+    ctx: Context, request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Displacements drawn from those between successes (eq 5), and their likeness to all of them."""
+    density, rng = built.density, np.random.default_rng(0)
+    assert density is not None
+    count = request.components if isinstance(request.components, int) else SAMPLED
+    found = displacements(
+        density.positions,
+        density.quaternions_xyzw,
+        window=_window(window),
+        rng=rng,
+        weights=density.weights,
+        symmetric=density.symmetric,
+    )
+    if len(found.vectors) < LEAST_DISPLACEMENTS:
+        raise ValueError(
+            f"the window holds {len(found.vectors)} displacements between successes, and a kernel is sampled"
+            f" from at least {LEAST_DISPLACEMENTS}: widen the window or add trials"
+        )
+    share = found.weights / found.weights.sum()
+    chosen = found.vectors[rng.choice(len(share), size=count, p=share)]
+    whole = found.vectors[rng.choice(len(share), size=min(_WHOLE, len(share)), p=share)]
+    one, every = (
+        sampled_kernel_rows(part[:, :3], se3.from_rotation_vector(part[:, 3:]), _isotropic(widths))
+        for part in (chosen, whole)
+    )
+    similarity = bhattacharyya(
+        one, every, rng, points=4_000, window=_window(window), threads=ctx.compute.threads
+    )
+    return [{"weight": 1.0, "mean": vector.tolist()} for vector in chosen], {
+        "successes": density.size,
+        "displacements": len(found.vectors),
+        "similarity": similarity.value,
+    }
+
+
+def _window(window: KernelWindow) -> DisplacementWindow:
+    return DisplacementWindow(window.position_m, math.radians(window.rotation_deg))
+
+
+def _isotropic(widths: KernelWidths) -> IsotropicKernel:
+    return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
 
 
 def _finite(value: float) -> float | None:
@@ -179,9 +313,9 @@ def _components(kernel: AnisotropicKernel) -> list[dict[str, Any]]:
 
 def info(row: KernelRow) -> StoredKernel:
     """As the wire has it."""
-    kernel = shapes.load(row)
-    used = shapes.info_of(row, kernel)
-    widths = np.sqrt(np.diag(kernel.overall_covariance))
+    used = shapes.info_of(row)
+    assert used.widths_m is not None
+    assert used.widths_deg is not None
     return StoredKernel(
         id=row.id,
         kind=row.kind,
@@ -189,12 +323,8 @@ def info(row: KernelRow) -> StoredKernel:
         gripper=row.gripper,
         sigma_position_m=used.sigma_position_m,
         sigma_rotation_deg=used.sigma_rotation_deg,
-        widths_m=(float(widths[0]), float(widths[1]), float(widths[2])),
-        widths_deg=(
-            math.degrees(widths[3]),
-            math.degrees(widths[4]),
-            math.degrees(widths[5]),
-        ),
+        widths_m=used.widths_m,
+        widths_deg=used.widths_deg,
         components=[KernelComponent.model_validate(item) for item in row.components],
         provenance=KernelProvenance.model_validate(row.provenance),
         created_at=row.created_at,

@@ -69,6 +69,7 @@ def density_info(ctx: Context, slug: str, request: Selection) -> tuple[DensityIn
         size=size,
         outcomes=dict(selected.outcomes),
         effective_sample_size=effective,
+        weights=built.weights_info,
         bytes=built.nbytes,
         warnings=warnings,
     )

@@ -44,7 +44,7 @@ _LEASE_S = 30.0
 _TICK_S = 2.0
 _POLL_S = 0.1
 #: What the request is to blame for, and would be again: kept as the run's answer.
-_KEPT_STATUSES = (404, 409, 422)
+_KEPT_STATUSES = (404, 409, 413, 422)
 
 
 class Cancelled(Exception):

@@ -57,7 +57,7 @@ class Question:
     @property
     def asked(self) -> GraspDensity | MixtureDensity:
         """The density under the kernel asked for, where ``density`` is under an isotropic one."""
-        return self.density if self.built.shaped is None else self.built.shaped
+        return self.built.asked or self.density
 
     @property
     def separation(self) -> tuple[float, float]:

@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import KernelInfo
-from graspdb_density import AnisotropicKernel
+from graspdb.wire import KernelInfo, KernelWidths
+from graspdb_density import AnisotropicKernel, IsotropicKernel, SampledKernel, se3
+from graspdb_density.anisotropic import mirror
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
@@ -37,23 +38,58 @@ def load(row: KernelRow) -> AnisotropicKernel:
     )
 
 
+def load_sampled(row: KernelRow) -> SampledKernel:
+    """The kernel of a stored row of the kind ``sampled``, which was checked when it came."""
+    means = np.array([item["mean"] for item in row.components])
+    return SampledKernel(
+        means[:, :3],
+        se3.from_rotation_vector(means[:, 3:]),
+        _component(row),
+        np.array([item["weight"] for item in row.components]),
+    )
+
+
+def _component(row: KernelRow) -> IsotropicKernel:
+    widths = KernelWidths.model_validate(row.provenance["component_widths"])
+    return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
+
+
 def frame_of(row: KernelRow, item: ObjectRow) -> Floats | None:
     """The axes (3, 3) that a kernel's translations are along on an object; None: each grasp's gripper."""
     return principal_axes(item) if row.alignment == "object" else None
 
 
-def info_of(row: KernelRow, kernel: AnisotropicKernel) -> KernelInfo:
+def covariance_of(row: KernelRow) -> Floats:
+    """(6, 6) of a kernel's displacements, the spread of its components' means included."""
+    if row.kind != "sampled":
+        return load(row).overall_covariance
+    means = np.array([item["mean"] for item in row.components])
+    weights = np.array([item["weight"] for item in row.components])
+    # With the mirror images, as it is used.
+    both = np.concatenate([means, means * mirror("gripper")])
+    share = np.concatenate([weights, weights]) / (2.0 * weights.sum())
+    off = both - share @ both
+    component = _component(row)
+    own = [component.sigma_position_m**2] * 3 + [component.sigma_rotation**2] * 3
+    return np.asarray(np.einsum("c,ci,cj->ij", share, off, off) + np.diag(own), dtype=np.float64)
+
+
+def info_of(row: KernelRow) -> KernelInfo:
     """What a query says of the kernel it used."""
-    widths = np.sqrt(np.diag(kernel.overall_covariance))
-    alike = kernel.isotropic
+    covariance = covariance_of(row)
+    widths = np.sqrt(np.diag(covariance))
+    # Of the isotropic kernel whose position and rotation blocks have the same determinants.
+    position, rotation = (
+        float(np.linalg.det(block) ** (1.0 / 6.0)) for block in (covariance[:3, :3], covariance[3:, 3:])
+    )
     fitted = row.provenance.get("object")
     origin = f"fitted on {fitted!r}" if fitted else "given by its components"
     return KernelInfo(
-        kind="anisotropic",
+        kind=row.kind,
         id=row.id,
         alignment=row.alignment,
-        sigma_position_m=alike.sigma_position_m,
-        sigma_rotation_deg=math.degrees(alike.sigma_rotation),
+        sigma_position_m=position,
+        sigma_rotation_deg=math.degrees(rotation),
         widths_m=_triple(widths[:3]),
         widths_deg=_triple(np.degrees(widths[3:])),
         rule=f"stored kernel, {origin}; success_probability uses the isotropic kernel of equal determinants",
