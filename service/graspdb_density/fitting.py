@@ -114,7 +114,7 @@ def displacements(
     positions, quaternions_xyzw : (N, 3) metres, (N, 4)
     weights : (N,) or None
         Importance (eq 1). Successes to start from are drawn by it, those arrived at count with it.
-    frame : (3, 3) or None
+    frame : (3, 3), (N, 3, 3) or None
         Columns are the axes of translations, object frame; None: each grasp's gripper.
     per_grasp : int
         At most this many from one success, drawn at random and weighted for the rest.
@@ -124,6 +124,7 @@ def displacements(
     flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p))
     reach = window.position_m * math.sqrt(3.0)
     tree = cKDTree(p)
+    frames = None if frame is None else np.asarray(frame, dtype=np.float64)
     starts = rng.choice(len(p), size=min(max_grasps, len(p)), replace=False, p=w / w.sum())
     vectors: list[Floats] = []
     shares: list[Floats] = []
@@ -133,7 +134,7 @@ def displacements(
         near = near[near != a]
         if not near.size:
             continue
-        axes = se3.to_matrix(q[a]) if frame is None else np.asarray(frame, dtype=np.float64)
+        axes = se3.to_matrix(q[a]) if frames is None else frames if frames.ndim == 2 else frames[a]
         shift = (p[near] - p[a]) @ axes
         turn = se3.canonical(se3.multiply(se3.conjugate(q[a]), q[near]))
         # The nearer twin: the other is the same displacement from the twin of the first.
@@ -181,15 +182,17 @@ def fit_kernel(
     components : int or None
         1: one Gaussian about no displacement. More: a mixture; a component off the mirror's plane is a pair.
         None: 1 to 3 by the likelihood of held-out displacements.
-    frame : (3, 3) or None
-        The object's principal axes, for a kernel aligned with them: those have no sign, so it is one Gaussian
-        without correlations between translations, nor of those with rotations.
+    frame : (3, 3), (N, 3, 3) or None
+        Axes that do not turn with the jaw, for a kernel aligned with them: the object's principal ones, or of
+        every grasp those of its edge or pair of surfaces, the gripper's where not finite. Their signs mean
+        nothing, so it is one Gaussian without correlations between translations, nor of those with
+        rotations.
 
     Raises
     ------
     ValueError
-        For too few successes or displacements (saying how many are needed), a mixture in the object's axes,
-        or a fit whose rotations are wider than a component may be.
+        For too few successes or displacements (saying how many are needed), a mixture in axes that do not
+        turn with the jaw, or a fit whose rotations are wider than a component may be.
     """
     p, q = se3.as_poses(positions, quaternions_xyzw)
     if len(p) < LEAST_SUCCESSES:
@@ -198,11 +201,14 @@ def fit_kernel(
             f"{LEAST_SUCCESSES - len(p)} more are needed"
         )
     if frame is not None and components not in (None, 1):
-        raise ValueError("the object's axes have no sign: a kernel aligned with them has 1 component")
+        raise ValueError(
+            "axes that do not turn with the jaw have no sign: a kernel aligned with them has 1 component"
+        )
+    frames = None if frame is None else _own_where_unknown(frame, q)
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     flags = np.array(np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p)))
     rng = np.random.default_rng(seed)
-    found = displacements(p, q, window=window, rng=rng, weights=w, symmetric=flags, frame=frame)
+    found = displacements(p, q, window=window, rng=rng, weights=w, symmetric=flags, frame=frames)
     if len(found.vectors) < LEAST_DISPLACEMENTS:
         raise ValueError(
             f"the window holds {len(found.vectors)} displacements between successes, and a kernel is fitted "
@@ -217,7 +223,7 @@ def fit_kernel(
     alone = KernelRows(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), shape, symmetric=False,
                        frames=None if frame is None else np.eye(3))  # fmt: skip
     similarity = bhattacharyya(sampled, alone, rng, points=4_000, window=window, threads=threads)
-    judge = _Judge(p, q, w, flags, frame, compared, rng, threads)
+    judge = _Judge(p, q, w, flags, frames, compared, rng, threads)
     # Where nothing can be held out, the size of the kernel compared with.
     fallback = compared.sigma_position_m / shape.isotropic.sigma_position_m
     candidates = [(f, k) for f in (*_FACTORS, fallback) if (k := _scaled(shape, f)) is not None]
@@ -240,6 +246,17 @@ def fit_kernel(
     )
 
 
+def _own_where_unknown(frame: ArrayLike, q: Floats) -> Floats:
+    """Axes (3, 3) or (N, 3, 3), the gripper's where a grasp has none of its own."""
+    f = np.asarray(frame, dtype=np.float64)
+    if f.shape not in ((3, 3), (len(q), 3, 3)):
+        raise ValueError(f"axes have shape (3, 3) or ({len(q)}, 3, 3), not {f.shape}")
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(f).all(axis=(-2, -1)))
+    if f.ndim == 2 and not known:
+        raise ValueError("the object's axes must be finite")
+    return f if f.ndim == 2 else np.where(known[:, None, None], f, se3.to_matrix(q))
+
+
 class _Judge:
     """Held-out likelihood of successes, the same blocks for every kernel."""
 
@@ -249,14 +266,14 @@ class _Judge:
         q: Floats,
         w: Floats,
         flags: NDArray[np.bool_],
-        frame: ArrayLike | None,
+        frame: Floats | None,
         compared: IsotropicKernel,
         rng: np.random.Generator,
         threads: int,
     ) -> None:
         rows = np.sort(rng.permutation(len(p))[:_SCALED_MOST])
         self._p, self._q, self._w, self._flags = p[rows], q[rows], w[rows], flags[rows]
-        self._frame = None if frame is None else np.asarray(frame, dtype=np.float64)
+        self._frame = frame if frame is None or frame.ndim == 2 else frame[rows]
         self._threads = threads
         self._judged = rng.permutation(len(rows))[:_JUDGED_MOST]
         try:
@@ -271,7 +288,7 @@ class _Judge:
         return self._mean(
             lambda train, p, q: MixtureDensity(
                 self._p[train], self._q[train], kernel=kernel, weights=self._w[train],
-                symmetric=self._flags[train], frames=self._frame,
+                symmetric=self._flags[train], frames=self._frames(train),
             ).density(p, q, threads=self._threads)
         )  # fmt: skip
 
@@ -282,6 +299,9 @@ class _Judge:
                 symmetric=self._flags[train],
             ).density(p, q, threads=self._threads)
         )  # fmt: skip
+
+    def _frames(self, train: NDArray[np.int64]) -> Floats | None:
+        return self._frame if self._frame is None or self._frame.ndim == 2 else self._frame[train]
 
     def _mean(self, density: Callable[[NDArray[np.int64], Floats, Floats], Floats]) -> float:
         total = weight = 0.0

@@ -89,6 +89,34 @@ def test_a_kernel_in_the_objects_axes_ignores_their_signs() -> None:
         fit_kernel(p, q, window=WINDOW, widths=NARROW, compared=COMPARED, components=2, frame=turn)
 
 
+def test_a_kernel_along_edges_is_wide_along_them() -> None:
+    """Places along three bars of the object, however the gripper is turned to them."""
+    rng = np.random.default_rng(5)
+    bars = se3.to_matrix(se3.random_quaternions(3, rng))
+    which = rng.integers(3, size=900)
+    shift = rng.uniform(-1.0, 1.0, (900, 3)) * [0.06, 0.004, 0.004]
+    p = rng.normal(size=(3, 3))[which] + np.einsum("nij,nj->ni", bars[which], shift)
+    q = se3.multiply(
+        se3.random_quaternions(6, rng)[rng.integers(6, size=900)],
+        se3.from_rotation_vector(rng.normal(size=(900, 3)) * 0.1),
+    )
+    frames = bars[which] * rng.choice([-1.0, 1.0], (900, 1, 1))
+    frames[:, :, 2] = np.cross(frames[:, :, 0], frames[:, :, 1])
+    along, own = (
+        fit_kernel(p, q, window=WINDOW, widths=NARROW, compared=COMPARED, components=1, frame=axes)
+        for axes in (frames, None)
+    )
+    widths = np.sqrt(np.diag(along.kernel.overall_covariance))
+    assert widths[0] > 2.0 * max(widths[1:3])
+    assert along.log_likelihood > own.log_likelihood + 0.3
+    # Where a grasp is at no edge the gripper's axes take their place.
+    frames[::2] = np.nan
+    half = fit_kernel(p, q, window=WINDOW, widths=NARROW, compared=COMPARED, frame=frames)
+    assert own.log_likelihood < half.log_likelihood < along.log_likelihood
+    with pytest.raises(ValueError, match=r"\(900, 3, 3\)"):
+        fit_kernel(p, q, window=WINDOW, widths=NARROW, compared=COMPARED, frame=frames[:5])
+
+
 def test_too_little_is_said_with_numbers() -> None:
     p, q = _ridges(40)
     with pytest.raises(ValueError, match="at least 50 successes; there are 40, so 10 more"):
