@@ -20,7 +20,7 @@ from . import compiled, projection
 from .compiler import exact, fast
 
 F32 = np.float32
-__all__ = ["climb", "score_centres", "thin"]
+__all__ = ["climb", "nearest_rows", "scatter", "score_centres", "thin"]
 
 
 #: Columns of a path: position, quaternion, kernel sum.
@@ -34,26 +34,26 @@ _GATHERED = 512
 
 
 @exact
-def score_centres(
-    positions, quaternions, twins, sums, planes, spheres, cones, sigma, kappa, reach_m, reach, scores, turned
-):
+def score_centres(landmarks, twins, planes, spheres, cones, sigma, kappa, reach_m, reach, scores, turned):
     """Optimistic log density at the feasible pose nearest to every kernel centre, -inf where that is out of
     reach.
 
     ``log(sum) - excess^2 / (2 sigma^2) - kappa (1 - cos(angle / 2))``: the density at the centre less what
     its own kernel loses on the way into the region. ``turned`` says where the jaw's twin is nearer to a
-    signed closing cone.
+    signed closing cone. ``landmarks`` (M, 8) are the centres' positions, quaternions and logs of their sums.
     """
     signed = cones[8] > 0.5 and cones[7] >= 0.0
     linear = planes.shape[0] + spheres.shape[0] > 0
     # Most centres are far outside a cone: a cosine tells without an arc cosine.
     least_approach = math.cos(min(cones[3] + reach, math.pi)) if cones[3] >= 0.0 else -2.0
     least_closing = math.cos(min(cones[7] + reach, math.pi)) if cones[7] >= 0.0 else -2.0
-    for j in range(positions.shape[0]):
+    p = np.empty(3)
+    for j in range(landmarks.shape[0]):
         scores[j] = -np.inf
         turned[j] = False
         away, angle = 0.0, 0.0
-        x, y, z, w = quaternions[j, 0], quaternions[j, 1], quaternions[j, 2], quaternions[j, 3]
+        row = landmarks[j]
+        x, y, z, w = float(row[3]), float(row[4]), float(row[5]), float(row[6])
         if cones[3] >= 0.0:
             dot = (
                 cones[0] * 2.0 * (x * z + y * w)
@@ -77,13 +77,14 @@ def score_centres(
                 continue
             angle = max(angle, math.acos(min(max(dot, -1.0), 1.0)) - cones[7])
         if linear:
-            away = max(projection.position_excess(planes, spheres, positions[j]), 0.0)
+            p[0], p[1], p[2] = row[0], row[1], row[2]
+            away = max(projection.position_excess(planes, spheres, p), 0.0)
             if away > reach_m:
                 continue
         loss = 0.5 * (away / sigma) ** 2
         if angle > 0.0:
             loss += kappa * (1.0 - math.cos(0.5 * angle))
-        scores[j] = math.log(max(sums[j], 1e-300)) - loss
+        scores[j] = row[7] - loss
 
 
 @exact
@@ -207,6 +208,22 @@ def _moments(near, begin, end, px, py, pz, qx, qy, qz, qw, kappa, sums):
     sums[5] += m1
     sums[6] += m2
     sums[7] += m3
+
+
+@fast
+def _sum(near, count, px, py, pz, qx, qy, qz, qw, kappa):
+    """Sum of gathered kernels at a pose; (qx..qw) is kappa times the quaternion."""
+    total = np.float64(0.0)
+    for begin in range(0, count, compiled.BLOCK):
+        s = F32(0.0)
+        for i in range(np.uint64(begin), np.uint64(min(begin + compiled.BLOCK, count))):
+            dx = near[0, i] - px
+            dy = near[1, i] - py
+            dz = near[2, i] - pz
+            a = near[3, i] * qx + near[4, i] * qy + near[5, i] * qz + near[6, i] * qw
+            s += near[7, i] * compiled._exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+        total += s
+    return total
 
 
 @exact
@@ -336,3 +353,103 @@ def climb(
                 held = path[j, top, i]
                 path[j, top, i] = path[j, lengths[j] - 1, i]
                 path[j, lengths[j] - 1, i] = held
+
+
+@exact
+def _times(q, x, y, z, w, out):
+    """The product of two quaternions."""
+    out[0] = q[3] * x + q[0] * w + q[1] * z - q[2] * y
+    out[1] = q[3] * y - q[0] * z + q[1] * w + q[2] * x
+    out[2] = q[3] * z + q[0] * y - q[1] * x + q[2] * w
+    out[3] = q[3] * w - q[0] * x - q[1] * y - q[2] * z
+
+
+@exact
+def scatter(
+    data, start, table, centre, scale, planes, spheres, cones, kappa, cut, positions, quaternions, moves,
+    turns, tried_p, tried_q, values,
+):  # fmt: skip
+    """Feasible poses around each of some poses, with their sums.
+
+    Around pose k, the tries are its position plus ``moves[k, t]`` (metres) and its quaternion turned by the
+    rotation vectors ``turns[k, t]`` (radians, tool frame), both the other way where that is uphill, projected
+    into the region. ``values`` (K, 1 + T)
+    gets the sum at the pose itself and at every try, -1 where the projection failed. They are sums over the
+    kernels with an exponent above ``-cut`` at the pose: right for comparisons around one pose.
+    """
+    runs = np.empty((compiled.MAX_RUNS, 2), dtype=np.int64)
+    buffer = np.empty(_GATHERED, dtype=np.float32)
+    near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
+    sums, k32 = np.empty(8), F32(kappa)
+    for j in range(positions.shape[0]):
+        p, q = positions[j], quaternions[j]
+        px, py, pz = (p[0] - centre[0]) * scale, (p[1] - centre[1]) * scale, (p[2] - centre[2]) * scale
+        count = _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near)
+        sums[:] = 0.0
+        for begin in range(0, count, compiled.BLOCK):
+            _moments(
+                near, begin, min(begin + compiled.BLOCK, count), F32(px), F32(py), F32(pz),
+                F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa), k32, sums,
+            )  # fmt: skip
+        values[j, 0] = sums[0]
+        for t in range(moves.shape[1]):
+            at, to, v = tried_p[j, t], tried_q[j, t], turns[j, t]
+            slope = 0.0
+            for i in range(3):
+                slope += 2.0 * scale * sums[1 + i] * moves[j, t, i]
+            # Half of q (v, 0), the change of q to first order.
+            _times(q, v[0], v[1], v[2], 0.0, to)
+            for i in range(4):
+                slope += 0.5 * kappa * sums[4 + i] * to[i]
+            sign = -1.0 if slope < 0.0 else 1.0
+            for i in range(3):
+                at[i] = p[i] + sign * moves[j, t, i]
+            angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+            s = sign * (0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle)
+            _times(q, s * v[0], s * v[1], s * v[2], math.cos(0.5 * angle), to)
+            if not _into(planes, spheres, cones, at, to):
+                values[j, 1 + t] = -1.0
+                continue
+            values[j, 1 + t] = _sum(
+                near, count, F32((at[0] - centre[0]) * scale), F32((at[1] - centre[1]) * scale),
+                F32((at[2] - centre[2]) * scale), F32(to[0] * kappa), F32(to[1] * kappa), F32(to[2] * kappa),
+                F32(to[3] * kappa), k32,
+            )  # fmt: skip
+
+
+@fast
+def _insert(value, index, best, rows):
+    """Put a value into a descending list that is full, where it belongs."""
+    k = best.shape[0] - 1
+    while k > 0 and best[k - 1] < value:
+        best[k], rows[k] = best[k - 1], rows[k - 1]
+        k -= 1
+    best[k], rows[k] = value, index
+
+
+@fast
+def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, best, rows):
+    """The kernels within ``radius`` with the highest exponents at a pose: ``best`` (C,), descending, and
+    their places among the sorted kernels, ``rows`` (C,); -1e30 and -1 where there are no more.
+    """
+    runs = np.empty((compiled.MAX_RUNS, 2), dtype=np.int64)
+    buffer = np.empty(_GATHERED, dtype=np.float32)
+    px, py = (position[0] - centre[0]) * scale, (position[1] - centre[1]) * scale
+    pz = (position[2] - centre[2]) * scale
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    best[:] = -1e30
+    rows[:] = -1
+    last = best.shape[0] - 1
+    for s in range(table.shape[0]):
+        twin = F32(table[s, compiled.TWIN])
+        for r in range(compiled._runs(start, table, s, px, py, pz, radius, runs)):
+            begin = runs[r, 0]
+            while begin < runs[r, 1]:
+                stop = min(begin + _GATHERED, runs[r, 1])
+                _exponents(
+                    data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, buffer
+                )
+                for i in range(stop - begin):
+                    if buffer[i] > best[last]:
+                        _insert(buffer[i], begin + i, best, rows)
+                begin = stop

@@ -25,7 +25,7 @@ from .threads import for_blocks
 if TYPE_CHECKING:
     from .density import GraspDensity
 
-__all__ = ["CentreSums", "centre_sums"]
+__all__ = ["CentreSums", "centre_sums", "drawn"]
 
 #: Three standard deviations rank centres well enough; refinement uses the full reach.
 _RADIUS = 3.0 / math.sqrt(2.0)
@@ -72,7 +72,7 @@ def centre_sums(density: GraspDensity, known: CentreSums | None, threads: int) -
         return CentreSums(_sums(density, density.cells, rows, threads))
     size = max(_LEAST_SAMPLE, density.size * MOST_PAIRS / pairs)
     rate = size / float(density.raw_weights.sum())
-    picked, weights = _drawn(density, density.cells.rows.astype(np.int64), rate)
+    picked, weights = drawn(density, density.cells.rows.astype(np.int64), rate)
     sample = Cells.build(
         density.positions[picked],
         density.quaternions_xyzw[picked],
@@ -92,7 +92,7 @@ def _extended(density: GraspDensity, known: CentreSums, threads: int) -> CentreS
     if sample is None:
         adding, weights, within = new, density.raw_weights[new], cells
     else:
-        adding, weights = _drawn(density, new, rate)
+        adding, weights = drawn(density, new, rate)
         if len(adding):
             sample = sample.extend(
                 density.positions[adding],
@@ -140,7 +140,7 @@ def _sums(density: GraspDensity, cells: Cells, rows: NDArray[np.int64], threads:
     return result
 
 
-def _drawn(density: GraspDensity, rows: NDArray[np.int64], rate: float) -> tuple[NDArray[np.int64], Floats]:
+def drawn(density: GraspDensity, rows: NDArray[np.int64], rate: float) -> tuple[NDArray[np.int64], Floats]:
     """Systematic sample of rows in the order given, with the weights that make its sums unbiased."""
     probability = np.minimum(rate * density.raw_weights[rows], 1.0)
     steps = np.floor(np.cumsum(probability) + 0.5)

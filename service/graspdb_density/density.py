@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import compiled, reference, se3
+from . import ascent, compiled, reference, se3
 from .cells import Cells
 from .centres import CentreSums, centre_sums
+from .guide import Guide, guide_for
 from .kernels import HAAR_VOLUME, IsotropicKernel
 from .se3 import Floats
 from .threads import for_blocks
@@ -65,6 +66,7 @@ class GraspDensity:
         self._total = float(weights.sum())
         self._lock = threading.Lock()
         self._ranking = ranking
+        self._guide: Guide | None = None
         self._global: Maximum | None = None
 
     # -- building
@@ -180,8 +182,8 @@ class GraspDensity:
     def nbytes(self) -> int:
         """Bytes of every array held, caches included."""
         own = (self._positions, self._quaternions, self._weights, self._symmetric)
-        cached = self._ranking
-        return sum(a.nbytes for a in own) + self._cells.nbytes + (0 if cached is None else cached.nbytes)
+        cached = [part for part in (self._ranking, self._guide) if part is not None]
+        return sum(a.nbytes for a in own) + self._cells.nbytes + sum(part.nbytes for part in cached)
 
     @property
     def cells(self) -> Cells:
@@ -321,6 +323,30 @@ class GraspDensity:
         for_blocks(work, len(positions), block=16, threads=threads)
         return out
 
+    def nearest_rows(self, position: Floats, quaternion: Floats, count: int) -> NDArray[np.intp]:
+        """The ``count`` rows, or all if there are fewer, whose kernels are highest at a pose (3,), (4,) with
+        weights left out: the nearest in the kernel's own measure, nearest first.
+        """
+        cells, kernel = self._cells, self._kernel
+        count = min(count, self.size)
+        best, places = np.empty(count), np.empty(count, dtype=np.int64)
+        radius = scaled_radius(CUTOFF)
+        ascent.nearest_rows(
+            cells.data, cells.start, cells.table, cells.centre, cells.scale, position, quaternion,
+            kernel.kappa, radius, best, places,
+        )  # fmt: skip
+        # Nothing outside the ball has an exponent above that of its surface.
+        if best[-1] > -radius * radius:
+            return np.asarray(cells.rows[places], dtype=np.intp)
+        twin = se3.jaw_twin(quaternion)
+        cosine = np.abs(np.einsum("ij,j->i", self._quaternions, quaternion))
+        turned = np.abs(np.einsum("ij,j->i", self._quaternions, twin))
+        cosine = np.where(self._symmetric, np.maximum(cosine, turned), cosine)
+        squared = np.sum((self._positions - position) ** 2, axis=1) / kernel.sigma_position_m**2
+        value = kernel.kappa * cosine - 0.5 * squared
+        nearest = np.argpartition(-value, count - 1)[:count]
+        return np.asarray(nearest[np.argsort(-value[nearest], kind="stable")])
+
     # -- sampling
     # ---------------------------------------------------------------------------------------------------
 
@@ -354,6 +380,14 @@ class GraspDensity:
         with self._lock:
             self._ranking = centre_sums(self, self._ranking, threads)
             return self._ranking
+
+    def guide(self, threads: int = 1) -> Guide:
+        """What searches go by; made at the first."""
+        ranking = self.ranking(threads)
+        with self._lock:
+            if self._guide is None:
+                self._guide = guide_for(self, ranking)
+            return self._guide
 
     def maximum(
         self,

@@ -1,15 +1,16 @@
 """The best grasps of a density inside a region.
 
 The density is cached at every kernel centre. Centres are scored by what they promise at the nearest feasible
-pose; well separated ones, projected into the region, start a projected mean shift (`ascent`). What was passed
-on the way is kept: from that pool come the distinct runners-up and, where a climb ends in a collision, the
-pose to go on from.
+pose; well separated ones, projected into the region, start a projected mean shift (`ascent`), first over a
+sample of the kernels where there is one, then, from the best ends, over all. Where the best climb ends in a
+collision, random steps from the best poses that do not look for the edge of the free space. What was passed
+on the way is kept: from that pool come the distinct runners-up.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ascent, se3
+from .cells import Cells
 from .region import Region
 from .se3 import Floats
 from .threads import for_blocks
@@ -39,20 +41,21 @@ _SPREAD = 1.0
 #: cuts are exponents, of 3 and 4 standard deviations.
 _FIRST_STEPS, _FIRST_CUT = 20, 4.5
 _STEPS, _CUT = 60, 8.0
-_PROMISING, _FINALISTS = 0.9, 8
+_PROMISING, _FINALISTS = 0.95, 8
 #: Share of starts without a near kernel from which on the second cut is used at once.
 _LOST = 0.2
 #: A climb ends where the next step promises no more than this in log density.
 _GAIN = 1e-5
-#: Where centres are ranked by a sample of kernels: so many times the starts.
-_ROUGH_STARTS = 2
-#: Kernel widths between the poses passed that are kept.
-_APART = 0.3
-#: Around blocked climbs: poses searched from, random steps at a time, how often.
-_EXPLORED = ((32, 8, 6), (8, 12, 10), (3, 16, 20))
-_SHORTLIST = 1024
-#: Poses shown to ``admissible`` at a time and in all while looking for starts.
-_BATCH = 64
+#: Where centres are ranked by a sample of kernels: so many times the starts for every level below the whole,
+#: steps of the first climbs, and how many times the finalists' ends go on among all kernels.
+_ROUGH, _ROUGH_STEPS, _DOUBTFUL = 2, 8, 6
+#: Kernel widths between the ends of climbs that go on, and between the poses passed that are kept.
+_MERGED, _APART = 0.5, 0.3
+#: Around blocked climbs: poses searched from, random steps at a time, how often; the cut there.
+_EXPLORED, _AROUND = ((32, 10, 4), (8, 16, 7), (3, 24, 14)), 6.0
+#: Landmarks scored at a time and looked at closer at a time, at first.
+_BLOCK, _SHORTLIST = 4096, 1024
+#: Poses shown to ``admissible`` in all while looking for starts.
 _MOST_CHECKS = 8192
 
 
@@ -155,131 +158,198 @@ class Search:
         self.threads = threads
         self.twins = bool(density.symmetric.all())
         self.checks = 0
-        self.ranking = density.ranking(threads)
+        self.guide = density.guide(threads)
 
     # -- steps
     # ------------------------------------------------------------------------------------------------------
 
     def run(self, count: int, separation_m: float, separation: float) -> list[Maximum]:
-        wanted = max(self.starts_wanted, 3 * count)
-        starts = self.starts(wanted if self.ranking.sample is None else _ROUGH_STARTS * wanted)
+        starts = self.starts(max(self.starts_wanted, 3 * count) * self.rough, *self.widths(_SPREAD))
+        if count > 1 and len(starts):
+            # Runners-up may have to be farther apart than the best starts are.
+            starts = starts.joined(self.starts(2 * count, separation_m, separation))
         if not len(starts):
             return []
-        pool, ends = self.climbed(starts, max(_FINALISTS, 2 * count))
-        pool = starts.joined(pool).sort()
-        chosen: list[int] = []
-        if self.admissible is not None and len(ends):
-            allowed = self.check(ends.positions, ends.quaternions)
-            if not allowed[int(np.argmax(ends.sums))]:
-                # The best climb ended where the gripper collides: look around the best poses that do not.
+        finalists = max(_FINALISTS, 2 * count)
+        passed, ends = self.climbed(starts, finalists)
+        found = ends.sort().take(np.arange(min(1, len(ends))))
+        good = len(found) > 0 and bool(self.region.contains(found.positions, found.quaternions)[0])
+        blocked = False
+        if good and self.admissible is not None:
+            # Where the gripper collides there, look around the best poses where it does not.
+            blocked = not self.check(found.positions, found.quaternions)[0]
+        if count > 1 or blocked or not good:
+            pool = self.pool(starts, passed, ends, 4 * finalists)
+            if blocked:
                 pool = pool.joined(self.explore(pool)).sort()
-        chosen = self.choose(pool, count, separation_m, separation)
-        if not chosen:
+            found = pool.take(self.choose(pool, count, separation_m, separation))
+        if not len(found):
             return []
-        found = pool.take(np.array(chosen))
         logs = self.density.log_density(found.positions, found.quaternions)
-        scores = self.values(found.positions, found.quaternions)
+        scores = self.values(found, logs)
         maxima = [
             Maximum(p, se3.canonical(q), float(log), self.region.active(p, q), float(score))
             for p, q, log, score in zip(found.positions, found.quaternions, logs, scores, strict=True)
         ]
         return sorted(maxima, key=lambda m: -m.score)
 
-    def values(self, positions: Floats, quaternions: Floats) -> Floats:
-        """The scores to report."""
-        return self.density.log_density(positions, quaternions)
+    @property
+    def rough(self) -> int:
+        """How many times the starts it takes where centres are ranked by a sample."""
+        return max(1, _ROUGH * (len(self.guide.levels) - 1))
 
-    def starts(self, wanted: int) -> Pool:
-        """Separated feasible poses to climb from, admissible ones only."""
-        density = self.density
-        kernel = density.kernel
-        scores, turned = self.scores()
-        pending = np.flatnonzero(scores > -np.inf)
+    def widths(self, count: float) -> tuple[float, float]:
+        """So many kernel widths, in metres and radians."""
+        kernel = self.density.kernel
+        return count * kernel.sigma_position_m, count * kernel.sigma_rotation
+
+    def values(self, found: Pool, logs: Floats) -> Floats:
+        """The scores to report of poses with these log densities."""
+        return logs
+
+    def starts(self, wanted: int, separation_m: float, separation: float) -> Pool:
+        """Distinct feasible poses to climb from, admissible ones only, the most promising first."""
+        density, reach = self.density, self.widths(REACH)
         found = Pool(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
-        size = _SHORTLIST
-        while pending.size and len(found) < wanted and self.checks < _MOST_CHECKS:
-            if pending.size > size:
-                split = np.argpartition(-scores[pending], size)
-                head, pending = pending[split[:size]], pending[split[size:]]
-            else:
-                head, pending = pending, pending[:0]
-            size *= 4
-            head = head[np.argsort(-scores[head], kind="stable")]
-            positions, quaternions = density.positions[head], density.quaternions_xyzw[head]
-            flip = turned[head]
-            quaternions = np.where(flip[:, None], se3.jaw_twin(quaternions), quaternions)
+        for rows, turned in self.candidates():
+            positions, quaternions = density.positions[rows], density.quaternions_xyzw[rows]
+            quaternions = np.where(turned[:, None], se3.jaw_twin(quaternions), quaternions)
             near_p, near_q, inside = self.region.project(positions, quaternions)
             # Scores were optimistic about how far the region is; now the distance is known.
-            inside &= np.linalg.norm(near_p - positions, axis=1) <= REACH * kernel.sigma_position_m
-            inside &= se3.angle_between(near_q, quaternions) <= REACH * kernel.sigma_rotation
-            near_p, near_q = near_p[inside], near_q[inside]
-            if not len(near_p):
-                continue
-            found = self.add_distinct(found, near_p, near_q, wanted)
+            inside &= np.linalg.norm(near_p - positions, axis=1) <= reach[0]
+            inside &= se3.angle_between(near_q, quaternions) <= reach[1]
+            fresh = self.valued(near_p[inside], near_q[inside])
+            found = self.add_distinct(found, fresh, wanted, separation_m, separation)
+            if len(found) >= wanted or self.checks >= _MOST_CHECKS:
+                break
         return found
 
-    def add_distinct(self, found: Pool, positions: Floats, quaternions: Floats, wanted: int) -> Pool:
-        """Join to ``found`` the poses distinct by one kernel width, in order, until there are ``wanted``."""
-        kernel = self.density.kernel
-        joined_p = np.concatenate([found.positions, positions])
-        joined_q = np.concatenate([found.quaternions, quaternions])
-        known = len(found)
-        usable = np.ones(len(joined_p), dtype=bool)
-        limit = wanted
+    def valued(self, positions: Floats, quaternions: Floats) -> Pool:
+        """Poses to start from, not compared yet: the first step of a climb takes their sums."""
+        return Pool(positions, quaternions, np.zeros(len(positions)))
+
+    def add_distinct(
+        self, found: Pool, fresh: Pool, wanted: int, separation_m: float, separation: float
+    ) -> Pool:
+        """Join to ``found`` the fresh poses distinct from all before, in order, up to ``wanted`` in all."""
+        both = found.joined(fresh)
+        return both.take(self.distinct(both, len(found), wanted, separation_m, separation, _MOST_CHECKS))
+
+    def candidates(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.bool_]]]:
+        """Rows whose feasible pose is in reach, the most promising first, in growing batches, and whether
+        the jaw's twin is nearer.
+
+        No row promises more than its own centre is worth, so rows are scored in the order of that and only
+        as far as needed.
+        """
+        guide, count = self.guide, self.density.size
+        places, scores = np.empty(0, dtype=np.intp), np.empty(0)
+        turned = np.empty(0, dtype=bool)
+        begin, block, size = 0, _BLOCK, _SHORTLIST
         while True:
-            rest = np.flatnonzero(usable[known:]) + known
-            order = np.concatenate([np.arange(known), rest])
-            kept = np.empty(max(limit, known), dtype=np.int64)
-            kept[:known] = np.arange(known)
-            total = ascent.thin(
-                np.ascontiguousarray(joined_p[order]), np.ascontiguousarray(joined_q[order]), known, limit,
-                _SPREAD * kernel.sigma_position_m, _SPREAD * kernel.sigma_rotation, self.twins, kept,
-            )  # fmt: skip
-            picked = order[kept[known:total]]
-            if self.admissible is None or not picked.size:
-                break
-            allowed = self.check(joined_p[picked], joined_q[picked])
-            usable[picked[~allowed]] = False
-            if allowed.all() or self.checks >= _MOST_CHECKS:
-                picked = picked[allowed]
-                break
-        if not picked.size:
-            return found
-        fresh = Pool(joined_p[picked], joined_q[picked], np.empty(len(picked)))
-        fresh.sums = self.sums(fresh.positions, fresh.quaternions)
-        return found.joined(fresh)
+            while True:
+                ahead = float(guide.landmarks[begin, 7]) if begin < count else -math.inf
+                certain = scores > ahead
+                if begin == count or np.count_nonzero(certain) >= size:
+                    break
+                end = min(begin + block, count)
+                fresh, flips = self.scores(begin, end)
+                known = np.flatnonzero(fresh > -np.inf)
+                places, scores = (
+                    np.concatenate([places, begin + known]),
+                    np.concatenate([scores, fresh[known]]),
+                )
+                turned = np.concatenate([turned, flips[known]])
+                begin, block = end, 2 * block
+            index = np.flatnonzero(certain)
+            if not len(index):
+                return
+            if len(index) > size:
+                index = index[np.argpartition(-scores[index], size)[:size]]
+            index = index[np.argsort(-scores[index], kind="stable")]
+            yield guide.order[places[index]], turned[index]
+            rest = np.ones(len(places), dtype=bool)
+            rest[index] = False
+            places, scores, turned = places[rest], scores[rest], turned[rest]
+            size *= 2
 
-    def scores(self) -> tuple[Floats, NDArray[np.bool_]]:
-        density, region = self.density, self.region
-        kernel = density.kernel
-        sums = self.ranking.values
-        scores, turned = np.empty(density.size), np.empty(density.size, dtype=bool)
+    def scores(self, begin: int, end: int) -> tuple[Floats, NDArray[np.bool_]]:
+        """Promises of some landmarks and whether the jaw's twin keeps them; see `ascent.score_centres`."""
+        guide, region, kernel = self.guide, self.region, self.density.kernel
+        scores, turned = np.empty(end - begin), np.empty(end - begin, dtype=bool)
 
-        def work(begin: int, end: int) -> None:
-            part = slice(begin, end)
+        def work(first: int, last: int) -> None:
+            part = slice(begin + first, begin + last)
             ascent.score_centres(
-                density.positions[part], density.quaternions_xyzw[part], density.symmetric[part], sums[part],
-                region.planes, region.balls, region.cones, kernel.sigma_position_m, kernel.kappa,
-                REACH * kernel.sigma_position_m, REACH * kernel.sigma_rotation, scores[part], turned[part],
+                guide.landmarks[part], guide.twins[part], region.planes, region.balls, region.cones,
+                kernel.sigma_position_m, kernel.kappa,
+                REACH * kernel.sigma_position_m, REACH * kernel.sigma_rotation,
+                scores[first:last], turned[first:last],
             )  # fmt: skip
 
-        for_blocks(work, density.size, block=16_384, threads=self.threads)
+        for_blocks(work, end - begin, block=16_384, threads=self.threads)
         return scores, turned
 
+    def distinct(
+        self, pool: Pool, known: int, limit: int, separation_m: float, separation: float, most_checks: int
+    ) -> NDArray[np.intp]:
+        """Indices of the first ``limit`` distinct admissible poses of a pool, after ``known`` that are."""
+        usable = np.ones(len(pool), dtype=bool)
+        confirmed = np.full(len(pool), self.admissible is None)
+        confirmed[:known] = True
+        kept = np.empty(max(limit, known), dtype=np.int64)
+        while True:
+            index = np.flatnonzero(usable)
+            kept[:known] = np.arange(known)
+            total = ascent.thin(
+                pool.positions[index], pool.quaternions[index], known, limit, separation_m, separation,
+                self.twins, kept,
+            )  # fmt: skip
+            picked = np.asarray(index[kept[:total]], dtype=np.intp)
+            doubtful = picked[~confirmed[picked]]
+            if not doubtful.size:
+                return picked
+            if self.checks >= most_checks:
+                return np.asarray(picked[confirmed[picked]], dtype=np.intp)
+            # The more were refused, the more of the next in line go along: what was too near to a refused
+            # one comes up next, and a call costs as much as ten poses.
+            line = index[~confirmed[index]][: len(pool) - len(index)]
+            batch = np.union1d(doubtful, line)
+            allowed = self.check(pool.positions[batch], pool.quaternions[batch])
+            confirmed[batch[allowed]] = True
+            usable[batch[~allowed]] = False
+
     def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
-        """Poses passed while climbing, and the ends."""
-        passed, ends = self.climb(starts, _FIRST_STEPS, _FIRST_CUT)
+        """Poses passed while climbing, with the climbs' own sums, and the best ends, with sums over all."""
+        levels, sampled = self.guide.levels, len(self.guide.levels) > 1
+        cut, steps = _FIRST_CUT, _ROUGH_STEPS if sampled else _FIRST_STEPS
+        passed, ends = self.climb(starts, steps, cut, levels[0])
         if np.mean(ends.sums == 0.0) > _LOST:
             # In the tails no kernel is that near.
-            passed, ends = self.climb(starts, _FIRST_STEPS)
-        ends = self.scored(ends)
+            cut = _CUT
+            passed, ends = self.climb(starts, steps, cut, levels[0])
+        for cells in levels[1:]:
+            # A sample has more and sharper peaks than the whole, and another one is the highest.
+            few = _DOUBTFUL * finalists if cells is levels[-1] else len(ends)
+            on, ends = self.climb(self.thinned(ends, few, _MERGED), _FIRST_STEPS, cut, cells)
+            passed = passed.joined(on)
+        ends = self.scored(self.thinned(ends, 2 * finalists, _MERGED))
         on, last = self.climb(best_of(ends, _PROMISING, finalists), _STEPS)
-        last = self.scored(last)
-        return self.scored(self.thinned(passed.joined(on), 4 * finalists)).joined(ends).joined(last), last
+        return passed.joined(on), self.scored(last)
 
-    def climb(self, starts: Pool, steps: int, cut: float = _CUT) -> tuple[Pool, Pool]:
-        """Poses passed from every start and the ends; their sums are those of `ascent.climb`."""
-        density, region, cells = self.density, self.region, self.density.cells
+    def pool(self, starts: Pool, passed: Pool, ends: Pool, most: int) -> Pool:
+        """The best feasible poses seen, those to choose from, best first; starts because all are admissible
+        and far from each other.
+        """
+        return self.scored(self.thinned(passed, most, _APART).joined(starts)).joined(ends).sort()
+
+    def climb(
+        self, starts: Pool, steps: int, cut: float = _CUT, cells: Cells | None = None
+    ) -> tuple[Pool, Pool]:
+        """Poses passed from every start and the ends; their sums, and those of the starts from then on, are
+        those of `ascent.climb`.
+        """
+        density, region, cells = self.density, self.region, cells or self.density.cells
         path = np.zeros((len(starts), steps, ascent.PATH))
         lengths = np.empty(len(starts), dtype=np.int64)
 
@@ -295,6 +365,7 @@ class Search:
         passed = path[np.arange(steps)[None, :] < lengths[:, None]]
         ends = pool_of(path[np.arange(len(starts)), np.maximum(lengths, 1) - 1])
         still = lengths == 0
+        starts.sums = np.where(still, 0.0, path[:, 0, 7])
         # Nothing near enough to climb on: the start is the end.
         ends.positions[still], ends.quaternions[still] = starts.positions[still], starts.quaternions[still]
         ends.sums[still] = 0.0
@@ -304,14 +375,11 @@ class Search:
         """With sums over all kernels."""
         return Pool(pool.positions, pool.quaternions, self.sums(pool.positions, pool.quaternions))
 
-    def thinned(self, pool: Pool, most: int) -> Pool:
-        """The best poses of a pool that are a few tenths of a kernel's width apart."""
-        kernel, pool = self.density.kernel, pool.sort()
+    def thinned(self, pool: Pool, most: int, apart: float) -> Pool:
+        """The best poses of a pool that are ``apart`` kernel widths from each other."""
+        pool = pool.sort()
         kept = np.empty(most, dtype=np.int64)
-        total = ascent.thin(
-            pool.positions, pool.quaternions, 0, most,
-            _APART * kernel.sigma_position_m, _APART * kernel.sigma_rotation, self.twins, kept,
-        )  # fmt: skip
+        total = ascent.thin(pool.positions, pool.quaternions, 0, most, *self.widths(apart), self.twins, kept)
         return pool.take(kept[:total])
 
     def check(self, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
@@ -325,84 +393,78 @@ class Search:
     def sums(self, positions: Floats, quaternions: Floats) -> Floats:
         return self.density.kernel_sums(positions, quaternions, cutoff=REACH, threads=self.threads)
 
-    def choose(self, pool: Pool, count: int, separation_m: float, separation: float) -> list[int]:
+    def choose(self, pool: Pool, count: int, separation_m: float, separation: float) -> NDArray[np.intp]:
         """Indices of the best distinct admissible poses of a sorted pool."""
-        usable = (
-            self.region.contains(pool.positions, pool.quaternions) if len(pool) else np.empty(0, dtype=bool)
-        )
-        confirmed = np.zeros(len(pool), dtype=bool)
+        if not len(pool):
+            return np.empty(0, dtype=np.intp)
+        index = np.flatnonzero(self.region.contains(pool.positions, pool.quaternions))
         budget = self.checks + _MOST_CHECKS
-        while True:
-            index = np.flatnonzero(usable)
-            kept = np.empty(count, dtype=np.int64)
-            total = ascent.thin(
-                np.ascontiguousarray(pool.positions[index]), np.ascontiguousarray(pool.quaternions[index]), 0,
-                count, separation_m, separation, self.twins, kept,
-            )  # fmt: skip
-            picked = index[kept[:total]]
-            if self.admissible is None:
-                return [int(i) for i in picked]
-            doubtful = picked[~confirmed[picked]]
-            if not doubtful.size:
-                return [int(i) for i in picked]
-            if self.checks >= budget:
-                return [int(i) for i in picked if confirmed[i]]
-            # The next in line go along: a call for one pose costs nearly as much as for a batch.
-            line = index[~confirmed[index]]
-            batch = np.union1d(doubtful, line[:_BATCH])
-            allowed = self.check(pool.positions[batch], pool.quaternions[batch])
-            confirmed[batch[allowed]] = True
-            usable[batch[~allowed]] = False
+        return index[self.distinct(pool.take(index), 0, count, separation_m, separation, budget)]
 
     def explore(self, pool: Pool) -> Pool:
         """Random search from the best admissible poses, where the climbs that ignored it ended in collisions:
         from many for a little, from the best of them further.
         """
-        kernel = self.density.kernel
         rng = np.random.default_rng(0)
-        first = self.choose(pool, _EXPLORED[0][0], kernel.sigma_position_m, kernel.sigma_rotation)
-        ends, step = pool.take(np.array(first, dtype=np.intp)), np.full(len(first), 0.5)
+        ends = pool.take(self.choose(pool, _EXPLORED[0][0], *self.widths(1.0)))
+        step = np.full(len(ends), 0.5)
         passed = ends.take(np.arange(0))
+        levels = self.guide.levels
         for climbs, tries, rounds in _EXPLORED:
             order = np.argsort(-ends.sums, kind="stable")[:climbs]
             ends, step = ends.take(order), step[order]
+            # First among the finest sample, if there is one.
+            cells = levels[-1] if len(passed) else levels[max(-2, -len(levels))]
             for _ in range(rounds):
-                ends, step, moved = self.stepped(ends, step, tries, rng)
-                passed = passed.joined(ends.take(moved))
+                ends, step = self.stepped(ends, step, tries, rng, cells)
+            # Sums so far told which step around one pose is better; now poses are compared.
+            ends = self.scored(ends)
+            passed = passed.joined(ends)
         return passed
 
     def stepped(
-        self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator, longer: float = 1.0
-    ) -> tuple[Pool, Floats, NDArray[np.bool_]]:
+        self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator, cells: Cells
+    ) -> tuple[Pool, Floats]:
         """From each of some poses, the best of random steps where that is better and admissible.
 
         Returns
         -------
         ends : Pool
+            The sums of those that moved are of the kernels near before.
         step : (K,)
-            Lengths to try next, in kernel widths: times ``longer`` after a success, shorter after a failure.
-        moved : (K,) bool
+            Lengths to try next, in kernel widths, shorter after a failure.
         """
-        kernel = self.density.kernel
-        scale = np.repeat(step, tries)[:, None]
-        at, to = np.repeat(ends.positions, tries, axis=0), np.repeat(ends.quaternions, tries, axis=0)
-        away = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
-        turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
-        p, q, inside = self.region.project(away, se3.multiply(to, turns))
-        scores = np.full(len(p), -np.inf)
-        scores[inside] = self.sums(p[inside], q[inside])
-        better = scores > np.repeat(ends.sums, tries)
+        kernel, region = self.density.kernel, self.region
+        count = len(ends)
+        scale = step[:, None, None]
+        moves = rng.standard_normal((count, tries, 3)) * (scale * kernel.sigma_position_m)
+        turns = rng.standard_normal((count, tries, 3)) * (scale * kernel.sigma_rotation)
+        p, q = np.empty((count, tries, 3)), np.empty((count, tries, 4))
+        values = np.empty((count, 1 + tries))
+
+        def work(begin: int, end: int) -> None:
+            part = slice(begin, end)
+            ascent.scatter(
+                cells.data, cells.start, cells.table, cells.centre, cells.scale,
+                region.planes, region.balls, region.cones, kernel.kappa, _AROUND,
+                ends.positions[part], ends.quaternions[part], moves[part], turns[part],
+                p[part], q[part], values[part],
+            )  # fmt: skip
+
+        for_blocks(work, count, block=8, threads=self.threads)
+        scores = values[:, 1:]
+        better = scores > values[:, :1]
         if self.admissible is not None and better.any():
             better[better] = self.check(p[better], q[better])
         scores[~better] = -np.inf
-        winner = scores.reshape(len(ends), tries).argmax(axis=1) + np.arange(len(ends)) * tries
-        moved: NDArray[np.bool_] = scores[winner] > -np.inf
+        each, winner = np.arange(count), scores.argmax(axis=1)
+        moved: NDArray[np.bool_] = scores[each, winner] > -np.inf
         there = Pool(
-            np.where(moved[:, None], p[winner], ends.positions),
-            np.where(moved[:, None], q[winner], ends.quaternions),
-            np.where(moved, scores[winner], ends.sums),
+            np.where(moved[:, None], p[each, winner], ends.positions),
+            np.where(moved[:, None], q[each, winner], ends.quaternions),
+            np.where(moved, scores[each, winner], ends.sums),
         )
-        return there, np.where(moved, np.minimum(longer * step, 1.0), 0.6 * step), moved
+        return there, np.where(moved, np.minimum(step, 1.0), 0.6 * step)
 
 
 def best_of(pool: Pool, share: float, most: int) -> Pool:
@@ -427,9 +489,9 @@ def nearest(
     kernel = density.kernel
     scores, turned = np.empty(density.size), np.empty(density.size, dtype=bool)
     ascent.score_centres(
-        density.positions, density.quaternions_xyzw, density.symmetric, np.ones(density.size),
-        region.planes, region.balls, region.cones, kernel.sigma_position_m, kernel.kappa, math.inf, math.inf,
-        scores, turned,
+        np.concatenate([density.positions, density.quaternions_xyzw, np.zeros((density.size, 1))], axis=1),
+        density.symmetric, region.planes, region.balls, region.cones, kernel.sigma_position_m, kernel.kappa,
+        math.inf, math.inf, scores, turned,
     )  # fmt: skip
     if density.size > candidates:
         best = np.argpartition(-scores, candidates)[:candidates]

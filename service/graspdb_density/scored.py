@@ -8,17 +8,17 @@ high.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from . import se3
-from .maximum import REACH, Admissible, Maximum, Pool, Search
+from .maximum import Admissible, Maximum, Pool, Search
 from .region import Region
 from .se3 import Floats
 
@@ -76,35 +76,35 @@ class _ScoredSearch(Search):
         super().__init__(density, region, admissible, threads)
         self.score = score
 
+    @property
+    def rough(self) -> int:
+        return 1
+
     def sums(self, positions: Floats, quaternions: Floats) -> Floats:
         values = np.asarray(self.score(positions, quaternions), dtype=np.float64)
         if values.shape != (len(positions),):
             raise ValueError(f"the score answered shape {values.shape} for {len(positions)} poses")
         return values
 
-    def values(self, positions: Floats, quaternions: Floats) -> Floats:
-        return self.sums(positions, quaternions)
+    def values(self, found: Pool, logs: Floats) -> Floats:
+        return self.sums(found.positions, found.quaternions)
 
-    def starts(self, wanted: int) -> Pool:
-        density, kernel = self.density, self.density.kernel
-        promise, turned = self.scores()
-        rows = np.flatnonzero(promise > -np.inf)
-        if len(rows) > _ASKED:
-            rows = rows[np.argsort(-promise[rows], kind="stable")]
-            others = np.random.default_rng(0).permutation(rows[_ASKED // 2 :])[: _ASKED // 2]
-            rows = np.concatenate([rows[: _ASKED // 2], others])
-        positions, quaternions = density.positions[rows], density.quaternions_xyzw[rows]
-        quaternions = np.where(turned[rows][:, None], se3.jaw_twin(quaternions), quaternions)
-        p, q, inside = self.region.project(positions, quaternions)
-        inside &= np.linalg.norm(p - positions, axis=1) <= REACH * kernel.sigma_position_m
-        inside &= se3.angle_between(q, quaternions) <= REACH * kernel.sigma_rotation
-        p, q = p[inside], q[inside]
-        found = Pool(np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
-        if len(p):
-            pool = Pool(p, q, self.sums(p, q)).sort()
-            found = self.add_distinct(found, pool.positions, pool.quaternions, wanted)
-        # Where none of these is admissible another may be.
-        return found if len(found) else super().starts(wanted)
+    def candidates(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.bool_]]]:
+        promise, turned = self.scores(0, self.density.size)
+        places = np.flatnonzero(promise > -np.inf)
+        rest = places[:0]
+        if len(places) > _ASKED:
+            places = places[np.argsort(-promise[places], kind="stable")]
+            others = np.random.default_rng(0).permutation(places[_ASKED // 2 :])
+            places = np.concatenate([places[: _ASKED // 2], others[: _ASKED // 2]])
+            rest = others[_ASKED // 2 :]
+        # Where none of the first is admissible another may be.
+        for part in (places, *np.array_split(rest, -(-len(rest) // _ASKED) or 1)):
+            if len(part):
+                yield self.guide.order[part], turned[part]
+
+    def valued(self, positions: Floats, quaternions: Floats) -> Pool:
+        return self.scored(Pool(positions, quaternions, np.zeros(len(positions)))).sort()
 
     def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
         rng = np.random.default_rng(0)
@@ -113,11 +113,51 @@ class _ScoredSearch(Search):
             order = np.argsort(-ends.sums, kind="stable")[: max(climbers, finalists)]
             ends, step = ends.take(order), step[order]
             for _ in range(rounds):
-                ends, step, moved = self.stepped(ends, step, tries, rng, longer=1.1)
+                ends, step, moved = self.tried(ends, step, tries, rng)
                 passed = passed.joined(ends.take(moved))
                 if step.max() < _LAST_STEP:
                     break
-        return starts.joined(passed), ends
+        return passed, ends
+
+    def pool(self, starts: Pool, passed: Pool, ends: Pool, most: int) -> Pool:
+        return starts.joined(passed).joined(ends).sort()
+
+    def explore(self, pool: Pool) -> Pool:
+        """Nothing: the climbs were of admissible steps."""
+        return pool.take(np.arange(0))
+
+    def tried(
+        self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator
+    ) -> tuple[Pool, Floats, NDArray[np.bool_]]:
+        """From each of some poses, the best of random steps where that is better and admissible.
+
+        Returns
+        -------
+        ends : Pool
+        step : (K,)
+            Lengths to try next, in kernel widths, longer after a success and shorter after a failure.
+        moved : (K,) bool
+        """
+        kernel = self.density.kernel
+        scale = np.repeat(step, tries)[:, None]
+        at, to = np.repeat(ends.positions, tries, axis=0), np.repeat(ends.quaternions, tries, axis=0)
+        away = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
+        turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
+        p, q, inside = self.region.project(away, se3.multiply(to, turns))
+        scores = np.full(len(p), -np.inf)
+        scores[inside] = self.sums(p[inside], q[inside])
+        better = scores > np.repeat(ends.sums, tries)
+        if self.admissible is not None and better.any():
+            better[better] = self.check(p[better], q[better])
+        scores[~better] = -np.inf
+        winner = scores.reshape(len(ends), tries).argmax(axis=1) + np.arange(len(ends)) * tries
+        moved: NDArray[np.bool_] = scores[winner] > -np.inf
+        there = Pool(
+            np.where(moved[:, None], p[winner], ends.positions),
+            np.where(moved[:, None], q[winner], ends.quaternions),
+            np.where(moved, scores[winner], ends.sums),
+        )
+        return there, np.where(moved, np.minimum(1.1 * step, 1.0), 0.6 * step), moved
 
 
 @dataclass(frozen=True, slots=True)
