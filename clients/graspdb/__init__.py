@@ -11,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from graspdb.asynchronous import AsyncClient as AsyncClient
     from graspdb.client import Client as Client
     from graspdb.errors import GraspDBError as GraspDBError
     from graspdb.errors import Infeasible as Infeasible
@@ -18,12 +19,13 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "AsyncClient": "graspdb.asynchronous",
     "Client": "graspdb.client",
     "GraspDBError": "graspdb.errors",
     "Infeasible": "graspdb.errors",
 }
 
-__all__ = ["Client", "GraspDBError", "Infeasible", "__version__"]
+__all__ = ["AsyncClient", "Client", "GraspDBError", "Infeasible", "__version__"]
 
 
 def __getattr__(name: str) -> Any:

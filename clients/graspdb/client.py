@@ -11,6 +11,7 @@ from graspdb.errors import GraspDBError
 from graspdb.kernels import Kernels
 from graspdb.objects import GraspObject, Objects
 from graspdb.pages import Listing, checked, segment
+from graspdb.reports import AllReports
 from graspdb.results import table_html
 from graspdb.sweeps import Sweeps
 from graspdb.transport import Transport
@@ -52,6 +53,7 @@ class Client:
         self.objects = Objects(self._transport)
         self.grippers = Grippers(self._transport)
         self.kernels = Kernels(self._transport)
+        self.reports = AllReports(self._transport)
         self.sweeps = Sweeps(self._transport)
 
     @property
@@ -130,7 +132,7 @@ class Grippers:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    def create(self, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
+    def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
         """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
         request = checked(wire.GripperCreate, {"id": id, "name": name, **profile})
         answer = self._transport.json("POST", "/grippers", body=request, idempotent=True)

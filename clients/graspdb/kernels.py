@@ -18,7 +18,7 @@ class Kernels:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    def fit(self, object: str, **options: Any) -> wire.StoredKernel:
+    def fit(self, /, object: str, **options: Any) -> wire.StoredKernel:
         """Fit a kernel on an object's successes.
 
         Options are those of :class:`graspdb.wire.KernelCreate`: ``gripper``, ``alignment``, ``components``
@@ -31,7 +31,7 @@ class Kernels:
         """
         return self._create({"object": object, **options})
 
-    def create(self, components: list[Any], **options: Any) -> wire.StoredKernel:
+    def create(self, /, components: list[Any], **options: Any) -> wire.StoredKernel:
         """Store a kernel given by its components: ``weight``, ``mean`` (6), ``covariance`` (6, 6)."""
         return self._create({"components": components, **options})
 

@@ -56,7 +56,7 @@ class GraspObject:
         """Ask the service for its present state."""
         return self._update(self._transport.json("GET", self._path))
 
-    def patch(self, **changes: Any) -> GraspObject:
+    def patch(self, /, **changes: Any) -> GraspObject:
         """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
         answer = self._transport.json("PATCH", self._path, body=_patch(changes))
         return self._update(answer)
@@ -208,7 +208,7 @@ class GraspObject:
                 break
         return LikelihoodArrays.from_wire(answers)
 
-    def best_grasp(self, **constraints: Any) -> Grasp:
+    def best_grasp(self, /, **constraints: Any) -> Grasp:
         """The best grasp within constraints; those of :meth:`best_grasps`, without ``count``.
 
         Raises

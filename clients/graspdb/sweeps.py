@@ -126,6 +126,14 @@ class Sweep:
         TimeoutError
             If it has not finished in time; it goes on all the same.
         """
+        for pause in self.pauses(progress=progress, timeout=timeout):
+            time.sleep(pause)
+        return self
+
+    def pauses(
+        self, *, progress: bool | ProgressCallback = False, timeout: float | None = None
+    ) -> Iterator[float]:
+        """:meth:`wait` for those who sleep by other means: asks, and gives the seconds until the next."""
         deadline = None if timeout is None else time.monotonic() + timeout
         bar: AbstractContextManager[ProgressCallback]
         if progress is True:
@@ -144,7 +152,7 @@ class Sweep:
                         f"sweep {self.id} is still {self.state} after {timeout:g} s"
                         f" ({self.info.poses_done} of {self.info.poses} poses done); it goes on"
                     )
-                time.sleep(poll)
+                yield poll
                 poll = min(poll * 1.5, _LAST_POLL_S)
         if self.info.state == "failed":
             first = self.info.failed_chunks[0].error if self.info.failed_chunks else "no reason given"
@@ -153,7 +161,6 @@ class Sweep:
                 f"{first}. `retry` queues them again.",
                 failed_chunks=list(self.info.failed_chunks),
             )
-        return self
 
     def hint(self) -> str | None:
         """Why nothing happens, if that is for want of a worker."""

@@ -157,6 +157,7 @@ class Trials:
 
     def add_records(
         self,
+        /,
         records: Iterable[Mapping[str, Any]],
         *,
         chunk: int = CHUNK_TRIALS,
@@ -243,7 +244,7 @@ class Trials:
     def __iter__(self) -> Iterator[wire.TrialOut]:
         return iter(self.list())
 
-    def to_pandas(self, **filters: Any) -> Any:
+    def to_pandas(self, /, **filters: Any) -> Any:
         """The stored trials as a DataFrame (extra ``pandas``); filters as in :meth:`list`."""
         return self.list(**filters).to_pandas()
 

@@ -1,0 +1,350 @@
+"""The asynchronous client: ``async with AsyncClient() as db: best = await db.objects.get("mug")``.
+
+Every class mirrors one of the synchronous client under the same names: what asks the service is awaited,
+what lists is iterated with ``async for``. The work is the synchronous client's, in a bounded number of
+threads, so that there is one SDK to trust. A task that is cancelled returns at once; the request it waited
+for ends by itself.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from itertools import islice
+from types import TracebackType
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+
+import anyio
+import anyio.to_thread
+
+from graspdb import wire
+from graspdb.client import Client, Grippers
+from graspdb.kernels import Kernels
+from graspdb.objects import GraspObject, Objects
+from graspdb.pages import PAGE, Item, Listing
+from graspdb.reports import Reports
+from graspdb.sweeps import ProgressCallback, Sweep, Sweeps
+from graspdb.trials import Batches, TrialListing, Trials
+
+__all__ = [
+    "AsyncBatches",
+    "AsyncClient",
+    "AsyncGraspObject",
+    "AsyncGrippers",
+    "AsyncKernels",
+    "AsyncListing",
+    "AsyncObjects",
+    "AsyncReports",
+    "AsyncSweep",
+    "AsyncSweeps",
+    "AsyncTrialListing",
+    "AsyncTrials",
+]
+
+S = TypeVar("S")
+R = TypeVar("R")
+M = TypeVar("M")
+P = ParamSpec("P")
+_END = object()
+
+
+async def _in_thread(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    return await anyio.to_thread.run_sync(functools.partial(call, *args, **kwargs), abandon_on_cancel=True)
+
+
+async def _each(items: Iterable[R]) -> AsyncIterator[R]:
+    """A page at a time, so that a thread is entered once a request and not once an item."""
+    iterator: Iterator[R] = iter(items)
+    while page := await _in_thread(lambda: list(islice(iterator, PAGE))):
+        for item in page:
+            yield item
+
+
+class Mirror(Generic[S]):
+    """The asynchronous side of ``sync``, an object of the synchronous client."""
+
+    def __init__(self, sync: S) -> None:
+        self.sync = sync
+
+    def __repr__(self) -> str:
+        return f"Async{self.sync!r}"
+
+
+def _awaited(
+    method: Callable[Concatenate[S, P], R],
+) -> Callable[Concatenate[Mirror[S], P], Awaitable[R]]:
+    """The method in a thread."""
+
+    async def call(self: Mirror[S], /, *args: P.args, **kwargs: P.kwargs) -> R:
+        return await _in_thread(method, self.sync, *args, **kwargs)
+
+    functools.update_wrapper(call, method)
+    return call
+
+
+def _mirrored(
+    method: Callable[Concatenate[S, P], R], mirror: Callable[[R], M]
+) -> Callable[Concatenate[Mirror[S], P], Awaitable[M]]:
+    """The method in a thread, its answer mirrored."""
+
+    async def call(self: Mirror[S], /, *args: P.args, **kwargs: P.kwargs) -> M:
+        return mirror(await _in_thread(method, self.sync, *args, **kwargs))
+
+    functools.update_wrapper(call, method)
+    return call
+
+
+def _iterated(
+    method: Callable[Concatenate[S, P], Iterable[R]], mirror: Callable[[R], M]
+) -> Callable[Concatenate[Mirror[S], P], AsyncIterator[M]]:
+    """What the method lists, each item mirrored."""
+
+    async def call(self: Mirror[S], /, *args: P.args, **kwargs: P.kwargs) -> AsyncIterator[M]:
+        async for item in _each(await _in_thread(method, self.sync, *args, **kwargs)):
+            yield mirror(item)
+
+    functools.update_wrapper(call, method)
+    return call
+
+
+def _same(item: R) -> R:
+    return item
+
+
+class AsyncSweep(Mirror[Sweep]):
+    """:class:`graspdb.sweeps.Sweep`."""
+
+    @property
+    def info(self) -> wire.SweepInfo:
+        """Its state when last heard of."""
+        return self.sync.info
+
+    @property
+    def id(self) -> str:
+        """The sweep's identifier."""
+        return self.sync.id
+
+    @property
+    def state(self) -> str:
+        """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``, when last heard of."""
+        return self.sync.state
+
+    @property
+    def finished(self) -> bool:
+        """True if nothing more will happen to it by itself."""
+        return self.sync.finished
+
+    async def refresh(self) -> AsyncSweep:
+        """Ask the service how far it is."""
+        await _in_thread(self.sync.refresh)
+        return self
+
+    async def cancel(self) -> AsyncSweep:
+        """Stop it; what is already stored stays."""
+        await _in_thread(self.sync.cancel)
+        return self
+
+    async def retry(self) -> AsyncSweep:
+        """Queue the failed and cancelled chunks again."""
+        await _in_thread(self.sync.retry)
+        return self
+
+    async def wait(
+        self, *, progress: bool | ProgressCallback = False, timeout: float | None = None
+    ) -> AsyncSweep:
+        """As :meth:`graspdb.sweeps.Sweep.wait`; no thread waits meanwhile."""
+        pauses = self.sync.pauses(progress=progress, timeout=timeout)
+        while (pause := await _in_thread(next, pauses, None)) is not None:
+            await anyio.sleep(pause)
+        return self
+
+    hint = _awaited(Sweep.hint)
+    outcomes = _awaited(Sweep.outcomes)
+
+
+class AsyncSweeps(Mirror[Sweeps]):
+    """:class:`graspdb.sweeps.Sweeps`."""
+
+    get = _mirrored(Sweeps.get, AsyncSweep)
+    list = _iterated(Sweeps.list, AsyncSweep)
+
+
+class AsyncListing(Mirror[Listing[Item]], Generic[Item]):
+    """:class:`graspdb.pages.Listing`: ``async for``, or :meth:`first`."""
+
+    def __aiter__(self) -> AsyncIterator[Item]:
+        return _each(self.sync)
+
+    async def first(self, count: int) -> list[Item]:
+        """At most the first ``count`` items."""
+        return await _in_thread(self.sync.first, count)
+
+
+class AsyncTrialListing(AsyncListing[wire.TrialOut]):
+    """:class:`graspdb.trials.TrialListing`."""
+
+    sync: TrialListing
+
+    arrays = _awaited(TrialListing.arrays)
+    to_pandas = _awaited(TrialListing.to_pandas)
+
+
+class AsyncTrials(Mirror[Trials]):
+    """:class:`graspdb.trials.Trials`."""
+
+    add = _awaited(Trials.add)
+    add_records = _awaited(Trials.add_records)
+    to_pandas = _awaited(Trials.to_pandas)
+
+    def list(self, **filters: Any) -> AsyncTrialListing:
+        """The stored trials that match; filters as in :meth:`graspdb.trials.Trials.list`."""
+        return AsyncTrialListing(self.sync.list(**filters))
+
+    def __aiter__(self) -> AsyncIterator[wire.TrialOut]:
+        return aiter(self.list())
+
+
+class AsyncBatches(Mirror[Batches]):
+    """:class:`graspdb.trials.Batches`."""
+
+    get = _awaited(Batches.get)
+    delete = _awaited(Batches.delete)
+
+    def list(self) -> AsyncListing[wire.BatchInfo]:
+        """All batches, read page by page."""
+        return AsyncListing(self.sync.list())
+
+    def __aiter__(self) -> AsyncIterator[wire.BatchInfo]:
+        return aiter(self.list())
+
+
+class AsyncReports(Mirror[Reports]):
+    """:class:`graspdb.reports.Reports`."""
+
+    convergence = _awaited(Reports.convergence)
+    anisotropy = _awaited(Reports.anisotropy)
+    calibration = _awaited(Reports.calibration)
+
+
+class AsyncGraspObject(Mirror[GraspObject]):
+    """:class:`graspdb.objects.GraspObject`."""
+
+    def __init__(self, sync: GraspObject) -> None:
+        super().__init__(sync)
+        self.trials = AsyncTrials(sync.trials)
+        self.batches = AsyncBatches(sync.batches)
+        self.reports = AsyncReports(sync.reports)
+
+    @property
+    def info(self) -> wire.ObjectInfo:
+        """What the service said last."""
+        return self.sync.info
+
+    @property
+    def id(self) -> str:
+        """The object's identifier."""
+        return self.sync.id
+
+    async def refresh(self) -> AsyncGraspObject:
+        """Ask the service for its present state."""
+        await _in_thread(self.sync.refresh)
+        return self
+
+    async def patch(self, **changes: Any) -> AsyncGraspObject:
+        """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
+        await _in_thread(self.sync.patch, **changes)
+        return self
+
+    delete = _awaited(GraspObject.delete)
+    upload_mesh = _awaited(GraspObject.upload_mesh)
+    download_mesh = _awaited(GraspObject.download_mesh)
+    upload_convex_parts = _awaited(GraspObject.upload_convex_parts)
+    download_convex_parts = _awaited(GraspObject.download_convex_parts)
+    density = _awaited(GraspObject.density)
+    likelihood = _awaited(GraspObject.likelihood)
+    best_grasp = _awaited(GraspObject.best_grasp)
+    best_grasps = _awaited(GraspObject.best_grasps)
+    samples = _awaited(GraspObject.samples)
+    proposals = _awaited(GraspObject.proposals)
+    sweep = _mirrored(GraspObject.sweep, AsyncSweep)
+    sweeps = _iterated(GraspObject.sweeps, AsyncSweep)
+
+    def summary(self) -> dict[str, str]:
+        """What a person wants to know of it, in words."""
+        return self.sync.summary()
+
+
+class AsyncObjects(Mirror[Objects]):
+    """:class:`graspdb.objects.Objects`."""
+
+    create = _mirrored(Objects.create, AsyncGraspObject)
+    get = _mirrored(Objects.get, AsyncGraspObject)
+    list = _iterated(Objects.list, AsyncGraspObject)
+    delete = _awaited(Objects.delete)
+
+    def __aiter__(self) -> AsyncIterator[AsyncGraspObject]:
+        return self.list()
+
+
+class AsyncGrippers(Mirror[Grippers]):
+    """:class:`graspdb.client.Grippers`."""
+
+    create = _awaited(Grippers.create)
+    get = _awaited(Grippers.get)
+    list = _iterated(Grippers.list, _same)
+
+    def __aiter__(self) -> AsyncIterator[wire.GripperInfo]:
+        return self.list()
+
+
+class AsyncKernels(Mirror[Kernels]):
+    """:class:`graspdb.kernels.Kernels`."""
+
+    fit = _awaited(Kernels.fit)
+    create = _awaited(Kernels.create)
+    get = _awaited(Kernels.get)
+    list = _iterated(Kernels.list, _same)
+    delete = _awaited(Kernels.delete)
+
+    def __aiter__(self) -> AsyncIterator[wire.StoredKernel]:
+        return self.list()
+
+
+class AsyncClient(Mirror[Client]):
+    """:class:`graspdb.client.Client` for asynchronous programs; takes the same parameters."""
+
+    def __init__(
+        self,
+        url: str | None = None,
+        *,
+        api_key: str | None = None,
+        timeout_s: float = 120.0,
+        retries: int = 5,
+    ) -> None:
+        super().__init__(Client(url, api_key=api_key, timeout_s=timeout_s, retries=retries))
+        self.objects = AsyncObjects(self.sync.objects)
+        self.grippers = AsyncGrippers(self.sync.grippers)
+        self.kernels = AsyncKernels(self.sync.kernels)
+        self.sweeps = AsyncSweeps(self.sync.sweeps)
+
+    @property
+    def url(self) -> str:
+        """The service's base address."""
+        return self.sync.url
+
+    info = _awaited(Client.info)
+    ready = _awaited(Client.ready)
+    workers = _awaited(Client.workers)
+    add_example = _mirrored(Client.add_example, AsyncGraspObject)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await _in_thread(self.sync.close)
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.sync.close()
