@@ -327,14 +327,5 @@ def _place(limits: Constraints, item: Maximum) -> int | None:
 
 def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quaternion: Floats) -> list[int]:
     """Sequence numbers of the successes nearest to a pose in the kernel's own measure."""
-    kernel = density.kernel
-    centres, rotations = density.positions, density.quaternions_xyzw
-    cosine = np.abs(rotations @ quaternion)
-    turned = np.abs(rotations @ se3.jaw_twin(quaternion))
-    cosine = np.where(density.symmetric, np.maximum(cosine, turned), cosine)
-    squared = np.sum((centres - position) ** 2, axis=1) / kernel.sigma_position_m**2
-    value = kernel.kappa * cosine - 0.5 * squared
-    count = min(_NEAREST_TRIALS, len(value))
-    best = np.argpartition(-value, count - 1)[:count]
-    best = best[np.argsort(-value[best], kind="stable")]
-    return [int(seq) for seq in built.seq[best]]
+    rows = density.nearest_rows(position, quaternion, _NEAREST_TRIALS)
+    return [int(seq) for seq in built.seq[rows]]
