@@ -264,6 +264,21 @@ def test_a_failed_attempt_is_repeated_and_the_last_one_fails_the_sweeps(bell: ht
     assert "PUT /objects/bell/convex-parts" in refused.json()["title"]
 
 
+def test_the_same_request_is_answered_the_same_whatever_became_of_it(bell: httpx.Client) -> None:
+    """Its first answer having been lost, a client must learn which sweep it made, not that none can be."""
+    key = {"Idempotency-Key": "one"}
+    first = bell.post("/objects/bell/sweeps", json={"grid": GRID}, headers=key)
+    assert first.status_code == 202
+    fail(bell, claim(bell)[0], permanent=True)
+    assert kind_of(bell.post("/objects/bell/sweeps", json={"grid": GRID})) == (409, "convex-parts-missing")
+    again = bell.post("/objects/bell/sweeps", json={"grid": GRID}, headers=key)
+    assert (again.status_code, again.json()) == (202, first.json())
+    assert again.headers["location"] == first.headers["location"]
+    other = bell.post("/objects/bell/sweeps", json={"grid": {**GRID, "seed": 2}}, headers=key)
+    assert kind_of(other) == (422, "idempotency-key-reused")
+    assert len(bell.get("/sweeps").json()["items"]) == 1
+
+
 def test_a_permanent_failure_is_not_repeated(bell: httpx.Client) -> None:
     made = start(bell)
     assert fail(bell, claim(bell)[0], permanent=True).json()["state"] == "failed"

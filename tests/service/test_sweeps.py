@@ -531,6 +531,43 @@ def test_repeats_of_a_pose_count_once(http: httpx.Client, plans: list[dict[str, 
     assert counted(http) == expected_counts(*grids[:-1])
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (0, 2, 1)])
+def test_deleting_a_sweep_leaves_what_others_repeated(http: httpx.Client, order: tuple[int, ...]) -> None:
+    """Stored once by whoever finished a pose first, and left while anybody who has simulated it stays."""
+    add_box(http)
+    region = {"lower": [-1, -1, -1], "upper": [1, 1, 0]}
+    plans: list[dict[str, Any]] = [{"max_poses": 400, "seed": 3}, {}, {"region": region}]
+    infos, grids = [], []
+    for plan in plans:
+        infos.append(start(http, grid={**GRID, **plan}, chunk_poses=130))
+        work(http)
+        box = (tuple(region["lower"]), tuple(region["upper"])) if "region" in plan else None
+        grids.append(PoseGrid(**BOX, **GRID, **{**plan, "region": box}))
+    left = [0, 1, 2]
+    for number in order:
+        assert http.delete(f"/objects/box/batches/{infos[number]['batch']}").status_code == 204
+        left.remove(number)
+        remaining = [grids[i] for i in left]
+        assert counted(http) == (expected_counts(*remaining) if left else {})
+        rows = trials(http)
+        index = [trial["pose_index"] for trial in rows]
+        assert len(index) == len(set(index))
+        own = {infos[i]["id"] for i in left}
+        assert {trial["sweep"] for trial in rows} <= own
+        # Batches hold what is left between them, and a row keeps what was measured.
+        held = [http.get(f"/objects/box/batches/{infos[i]['batch']}").json() for i in left]
+        assert sum(batch["inserted"] for batch in held) == len(rows)
+        assert sum(sum(batch["outcomes"].values()) for batch in held) == sum(counted(http).values())
+        assert sum(batch["inserted"] + batch["packed"] for batch in held) == sum(counted(http).values())
+        assert {trial["quality"] for trial in rows} <= {0.5}
+        for batch in held:
+            assert len(
+                http.get(f"/objects/box/trials?batch={batch['batch']}&limit=1000").json()["items"]
+            ) == (min(batch["inserted"], 1_000))
+        size = http.get("/objects/box/density").json()["size"]
+        assert size == counted(http).get("success", 0)
+
+
 def test_two_sweeps_over_one_grid_at_once_store_each_pose_once(http: httpx.Client) -> None:
     add_box(http)
     for _ in range(2):

@@ -44,6 +44,34 @@ def packed_chunks(
 
 
 @dataclass(frozen=True)
+class DoneChunk:
+    """A finished chunk of a sweep: the places of its plan, and the revision that stored it."""
+
+    job_id: str
+    sweep_id: str
+    start: int
+    stop: int
+    revision: int
+
+
+def done_chunks(tx: Tx, sweep_ids: Collection[str]) -> list[DoneChunk]:
+    """Finished chunks of these sweeps in commit order, their outcomes left unread."""
+    query = (
+        select(jobs.c.id, jobs.c.sweep_id, jobs.c.start, jobs.c.stop, packed_outcomes.c.revision)
+        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
+        .where(jobs.c.sweep_id.in_(sorted(sweep_ids)), jobs.c.state == "done")
+        .order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
+    )
+    return [DoneChunk(i, s, int(a), int(b), int(r)) for i, s, a, b, r in tx.execute(query)]
+
+
+def outcomes_of(tx: Tx, job_id: str) -> bytes:
+    """The outcome codes (uint8) of a finished chunk."""
+    query = select(packed_outcomes.c.outcomes).where(packed_outcomes.c.job_id == job_id)
+    return bytes(tx.execute(query).scalar_one())
+
+
+@dataclass(frozen=True)
 class TriedGrid:
     """How much of a collecting grid sweep is done.
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Row, Select, delete, func, insert, select, update
+from sqlalchemy import Row, Select, case, delete, func, insert, or_, select, update
 
 from graspdb_service.storage import sweeps as sweep_rows
 from graspdb_service.storage import trials as trial_rows
@@ -84,6 +84,21 @@ def grow(
         values["last_seq"] = last_seq
     if revision is not None:
         values["revision"] = revision
+    tx.execute(update(batches).where(batches.c.id == batch_id).values(values))
+
+
+def inherit(
+    tx: Tx, batch_id: int, *, first_seq: int | None, last_seq: int | None, inserted: int, packed: int
+) -> None:
+    """Count rows, wherever they lie, and packed outcomes that another batch had stored before."""
+    values: dict[str, Any] = {"inserted": batches.c.inserted + inserted, "packed": batches.c.packed + packed}
+    if first_seq is not None and last_seq is not None:
+        for name, given, better in (
+            ("first_seq", first_seq, batches.c.first_seq > first_seq),
+            ("last_seq", last_seq, batches.c.last_seq < last_seq),
+        ):
+            column = batches.c[name]
+            values[name] = case((or_(column.is_(None), better), given), else_=column)
     tx.execute(update(batches).where(batches.c.id == batch_id).values(values))
 
 

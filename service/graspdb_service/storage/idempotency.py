@@ -46,6 +46,13 @@ def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | Non
     )
     if tx.execute(statement).first() is not None:
         return None
+    found = find(tx, scope, key)
+    assert found is not None
+    return found
+
+
+def find(tx: Tx, scope: str, key: str) -> Remembered | None:
+    """The request that has a key."""
     query = select(
         idempotency_keys.c.request_sha256,
         idempotency_keys.c.status,
@@ -53,7 +60,8 @@ def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | Non
         idempotency_keys.c.answer,
         idempotency_keys.c.revoked,
     ).where(idempotency_keys.c.scope == scope, idempotency_keys.c.key == key)
-    return Remembered(**tx.execute(query).one()._mapping)
+    row = tx.execute(query).first()
+    return None if row is None else Remembered(**row._mapping)
 
 
 def remember(

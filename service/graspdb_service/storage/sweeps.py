@@ -427,6 +427,16 @@ def count_done(tx: Tx, sweep_ids: Sequence[str]) -> int:
     return int(tx.scalar(query) or 0)
 
 
+def add_packed_counts(tx: Tx, job_id: str, counts: Mapping[int, int]) -> None:
+    """Count further packed outcomes of a finished chunk as added to the tallies by it; under the object's
+    lock."""
+    stored = dict(tx.execute(select(jobs.c.counts).where(jobs.c.id == job_id)).scalar_one())
+    packed = dict(stored["packed"])
+    for code, number in counts.items():
+        packed[str(code)] = packed.get(str(code), 0) + number
+    tx.execute(update(jobs).where(jobs.c.id == job_id).values(counts={**stored, "packed": packed}))
+
+
 def packed_counts(tx: Tx, sweep_id: str) -> tuple[int, dict[int, int]]:
     """The provenance and, by outcome code, the packed outcomes that this sweep added to its tallies.
 

@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import and_, func, select
+from sqlalchemy import and_, bindparam, func, select, update
 from sqlalchemy import insert as plain_insert
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import provenances as provenance_table
 from graspdb_service.storage.tables import tallies as tally_table
+from graspdb_service.storage.tables import trials as trial_table
 from graspdb_service.storage.upsert import insert as upsert
 
 FloatArray = npt.NDArray[np.float64]
@@ -178,6 +179,36 @@ def outcome_counts(tx: Tx, object_ids: Sequence[int]) -> dict[int, dict[int, int
         if number:
             found[int(object_id)][int(outcome)] = int(number)
     return found
+
+
+def swept_rows(tx: Tx, object_id: int, batch_id: int, first: int, last: int) -> tuple[IntArray, IntArray]:
+    """Sequence numbers and pose indices of the trials a sweep's batch stored, ascending ``seq``."""
+    cursor = tx.connection.cursor()
+    try:
+        cursor.execute(
+            f"SELECT seq, pose_index FROM trials WHERE object_id = {int(object_id)}"
+            f" AND seq BETWEEN {int(first)} AND {int(last)} AND batch_id = {int(batch_id)} ORDER BY seq"
+        )
+        table = np.array(cursor.fetchall(), dtype=np.int64).reshape(-1, 2)
+    finally:
+        cursor.close()
+    return table[:, 0], table[:, 1]
+
+
+def move(
+    tx: Tx, object_id: int, *, from_batch: int, to_batch: int, ranges: Sequence[tuple[int, int]]
+) -> None:
+    """Give the trials of a batch in these ranges of sequence numbers to another; under the object's lock."""
+    statement = (
+        update(trial_table)
+        .where(
+            trial_table.c.object_id == object_id,
+            trial_table.c.batch_id == from_batch,
+            trial_table.c.seq.between(bindparam("first"), bindparam("last")),
+        )
+        .values(batch_id=to_batch)
+    )
+    tx.execute(statement, [{"first": first, "last": last} for first, last in ranges])
 
 
 # --- reading columns ------------------------------------------------------------------------------------

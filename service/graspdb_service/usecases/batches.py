@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, BatchInfo
-from graspdb_service.problems import conflict, not_found
+from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.storage import batches, objects
 from graspdb_service.storage.batches import BatchRow
 from graspdb_service.storage.database import Tx
+from graspdb_service.usecases import inheritance
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.objects import require as require_object
 from graspdb_service.usecases.slugs import is_uuid
+
+#: Sweeps over one grid that finish chunks meanwhile make a deletion look again.
+_MAX_LOOKS = 20
 
 
 def get(ctx: Context, slug: str, key: str) -> BatchInfo:
@@ -29,20 +33,37 @@ def page(ctx: Context, slug: str, *, after: int, limit: int) -> tuple[list[Batch
 
 
 def remove(ctx: Context, slug: str, key: str) -> None:
-    """Delete a batch with its trials and packed outcomes; 409 while its sweep runs, which would write on."""
-    with ctx.database.write() as tx:
-        row = require_object(tx, slug, lock=True)
-        batch = _require(tx, row.id, key)
-        if batch.sweep_id is not None and objects.has_running_sweep(tx, row.id, sweep_id=batch.sweep_id):
-            raise conflict(
-                "sweep-running",
-                f"The batch is being written by sweep {batch.sweep_id}:"
-                f" cancel it (POST /sweeps/{batch.sweep_id}/cancel) or wait for its end",
-            )
-        if batch.purpose != "check":
-            # The outcomes of a check never entered anything that a revision stands for.
-            objects.advance(tx, row.id, append=False)
-        batches.remove(tx, batch)
+    """Delete a batch with its trials and packed outcomes; 409 while its sweep runs, which would write on.
+
+    Poses that another sweep over the same grid has simulated as well stay, as that sweep's.
+    """
+    for _ in range(_MAX_LOOKS):
+        with ctx.database.read() as tx:
+            left = inheritance.of(tx, _require(tx, require_object(tx, slug).id, key))
+        with ctx.database.write() as tx:
+            row = require_object(tx, slug, lock=True)
+            batch = _require(tx, row.id, key)
+            if batch.sweep_id is not None and objects.has_running_sweep(tx, row.id, sweep_id=batch.sweep_id):
+                raise conflict(
+                    "sweep-running",
+                    f"The batch is being written by sweep {batch.sweep_id}:"
+                    f" cancel it (POST /sweeps/{batch.sweep_id}/cancel) or wait for its end",
+                )
+            if left is not None and not left.holds(tx):
+                continue
+            if batch.purpose != "check":
+                # The outcomes of a check never entered anything that a revision stands for.
+                objects.advance(tx, row.id, append=False)
+            if left is not None:
+                left.hand_over(tx, batch)
+            batches.remove(tx, batch)
+            return
+    raise ProblemError(
+        503,
+        "busy",
+        "Sweeps over the same grid keep finishing chunks meanwhile; send it again",
+        headers={"Retry-After": "1"},
+    )
 
 
 def _require(tx: Tx, object_id: int, key: str) -> BatchRow:

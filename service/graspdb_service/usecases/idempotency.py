@@ -10,6 +10,7 @@ from typing import Any
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage import idempotency
 from graspdb_service.storage.database import Tx
+from graspdb_service.storage.idempotency import Remembered
 from graspdb_service.usecases.context import Context
 
 
@@ -69,6 +70,28 @@ def replay_or(
                 batch_key=made.batch_key,
             )
             return made
+    return _answer(earlier, digest)
+
+
+def replayed(ctx: Context, *, scope: str, key: str | None, request: bytes) -> Created | None:
+    """What the same request was answered before, or None.
+
+    For requests whose checks may turn out otherwise the second time, or whose work is long: looked up before
+    both. Only :func:`replay_or` takes the key.
+
+    Raises
+    ------
+    ProblemError
+        As :func:`replay_or`.
+    """
+    if key is None:
+        return None
+    with ctx.database.read() as tx:
+        earlier = idempotency.find(tx, scope, key)
+    return None if earlier is None else _answer(earlier, hashlib.sha256(request).hexdigest())
+
+
+def _answer(earlier: Remembered, digest: str) -> Created:
     if earlier.request_sha256 != digest:
         raise ProblemError(
             422,

@@ -32,7 +32,7 @@ from graspdb_service.usecases import shapes
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.densities import Built, KernelChoice, require_object
 from graspdb_service.usecases.grippers import unknown
-from graspdb_service.usecases.idempotency import Created, replay_or
+from graspdb_service.usecases.idempotency import Created, replay_or, replayed
 from graspdb_service.usecases.selection import Filters
 
 Floats = NDArray[np.float64]
@@ -55,13 +55,18 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
     shapes.check_alignment(request.alignment)
     if request.kind == "sampled" and request.alignment != "gripper":
         raise invalid("alignment", "a sampled kernel lies along the gripper's axes: use alignment=gripper")
+    scope = "POST /kernels"
+    # A fit takes a while, and the trials may have gone since.
+    earlier = replayed(ctx, scope=scope, key=key, request=body)
+    if earlier is not None:
+        return earlier
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
         row = kernels.create(tx, str(uuid.uuid4()), **made)
         return Created(info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
-    return replay_or(ctx, scope="POST /kernels", key=key, request=body, create=make)
+    return replay_or(ctx, scope=scope, key=key, request=body, create=make)
 
 
 def get(ctx: Context, id: str) -> StoredKernel:

@@ -31,7 +31,7 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
 from graspdb_service.usecases import decompositions, plans, queries, simulability
 from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.idempotency import Created, replay_or
+from graspdb_service.usecases.idempotency import Created, replay_or, replayed
 from graspdb_service.usecases.objects import require
 
 #: More chunks than this are bookkeeping without a use: no lab has so many workers.
@@ -81,6 +81,10 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
     ProblemError
         404 without the object, 409 while it lacks its mesh, 422 for what can't be simulated.
     """
+    scope = f"POST /objects/{slug}/sweeps"
+    earlier = replayed(ctx, scope=scope, key=key, request=request)
+    if earlier is not None:
+        return earlier
     with ctx.database.read() as tx:
         row = require(tx, slug)
         gripper = grippers.find(tx, spec.gripper)
@@ -138,7 +142,7 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
         info = _info(tx, _require(tx, sweep_id))
         return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
 
-    return replay_or(ctx, scope=f"POST /objects/{slug}/sweeps", key=key, request=request, create=store)
+    return replay_or(ctx, scope=scope, key=key, request=request, create=store)
 
 
 def _new_id(created_ms: int) -> str:
