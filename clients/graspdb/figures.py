@@ -16,6 +16,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb import figures_projection
+from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, told
+from graspdb.figures_style import plain as _plain
+from graspdb.figures_style import title as _title
 from graspdb.wire.reports import (
     AnisotropyHistogram,
     AnisotropyReport,
@@ -23,6 +27,7 @@ from graspdb.wire.reports import (
     AnyReport,
     CalibrationReport,
     ConvergenceReport,
+    ProjectionReport,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +38,6 @@ __all__ = ["draw", "rendered"]
 
 Floats = NDArray[np.float64]
 
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
 _COLOURS = (BLUE, ORANGE, GREEN)
 _DPI = 120
 # Matplotlib shares its font cache and text paths between figures.
@@ -69,31 +73,15 @@ def draw(report: AnyReport) -> Figure:
     elif isinstance(report, AnisotropyReport):
         figure = NewFigure(figsize=(14.0, 11.5))
         _anisotropy(figure, report)
-    else:
+    elif isinstance(report, ProjectionReport):
+        figure = NewFigure()
+        figures_projection.projection(figure, report)
+    elif isinstance(report, CalibrationReport):
         figure = NewFigure(figsize=(6.6, 7.2), layout="constrained")
         _calibration(figure, report)
+    else:
+        raise TypeError(f"there is no figure of {type(report).__name__}")
     return figure
-
-
-def _title(figure: Figure, report: AnyReport, kind: str) -> None:
-    of = ", ".join(x for x in (report.gripper, report.protocol, report.source) if x)
-    title = f"{report.object}: {kind}" + (f" ({of})" if of else "") + f", revision {report.revision}"
-    figure.suptitle(f"{title}\n{_wrapped(report.text, round(11 * figure.get_figwidth()))}", fontsize=10)
-
-
-def _wrapped(text: str, width: int) -> str:
-    lines = [""]
-    for word in text.split():
-        if len(lines[-1]) + len(word) + 1 > width and lines[-1]:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines)
-
-
-def _plain(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="0.9", linewidth=0.6)
-    axes.set_axisbelow(True)
 
 
 # -- convergence
@@ -284,13 +272,13 @@ def _calibration(figure: Figure, report: CalibrationReport) -> None:
     top.set_ylim(0, 1.02)
     top.legend(fontsize=8, loc="upper left", framealpha=0.9)
     scores = [
-        f"Brier skill {_told(report.skill.value)} ({_told(report.skill.low)} to {_told(report.skill.high)})"
+        f"Brier skill {told(report.skill.value)} ({told(report.skill.low)} to {told(report.skill.high)})"
     ]
     if report.free_skill is not None:
-        scores.append(f"not colliding {_told(report.free_skill.value)}")
+        scores.append(f"not colliding {told(report.free_skill.value)}")
     scores += [
-        f"ECE above 0.1: {_told(report.ece)}",
-        f"AUC: probability {_told(report.auc_probability)}, density {_told(report.auc_density)}",
+        f"ECE above 0.1: {told(report.ece)}",
+        f"AUC: probability {told(report.auc_probability)}, density {told(report.auc_density)}",
     ]
     top.text(
         0.98, 0.03, "\n".join(scores), transform=top.transAxes, ha="right", va="bottom", fontsize=8,
@@ -314,7 +302,3 @@ def _calibration(figure: Figure, report: CalibrationReport) -> None:
     bottom.set_xlabel("predicted success probability")
     for axes in (top, bottom):
         _plain(axes)
-
-
-def _told(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f}"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.errors import GraspDBError, error_for
@@ -18,9 +18,16 @@ from graspdb.wire.reports import (
     REPORTS,
     AnisotropyReport,
     AnisotropyTolerance,
+    BandwidthReport,
     CalibrationReport,
+    CheckCall,
     ConvergenceReport,
+    KernelSimilarityReport,
+    ProjectionReport,
     ReportRun,
+    SourceComparison,
+    SourcesReport,
+    SummaryReport,
     Verdict,
 )
 from graspdb.wire.reports import Report as ReportModel
@@ -28,10 +35,23 @@ from graspdb.wire.reports import Report as ReportModel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Anisotropy", "Calibration", "Convergence", "Report", "Reports"]
+__all__ = [
+    "AllReports",
+    "Anisotropy",
+    "Bandwidth",
+    "Calibration",
+    "Convergence",
+    "KernelSimilarity",
+    "Projection",
+    "Report",
+    "Reports",
+    "Sources",
+    "Summary",
+]
 
 Floats = NDArray[np.float64]
-R = TypeVar("R", bound=ReportModel)
+R = TypeVar("R", bound=ReportModel | SummaryReport)
+M = TypeVar("M", bound=ReportModel)
 Progress = Callable[[ReportRun], None]
 
 _POLL_S = 0.5
@@ -65,16 +85,20 @@ class Report(Generic[R]):
         """Write the figure to a ``.png`` or ``.svg`` file."""
         Path(path).write_bytes(_rendered(self.raw, path))
 
+    @property
+    def _of(self) -> str:
+        raw: Any = self.raw
+        return f"{type(self).__name__} of {raw.object}, revision {raw.revision}"
+
     def __repr__(self) -> str:
         told = "".join(f"\n  mind: {warning}" for warning in self.warnings)
-        return (
-            f"<{type(self).__name__} of {self.raw.object}, revision {self.raw.revision}: {self.text}{told}>"
-        )
+        return f"<{self._of}: {self.text}{told}>"
 
     def _repr_html_(self) -> str:
         mind = "".join(f"<li>{html.escape(warning)}</li>" for warning in self.warnings)
-        title = html.escape(f"{type(self).__name__} of {self.raw.object}, revision {self.raw.revision}")
-        return f"<p><b>{title}</b><br>{html.escape(self.text)}</p>" + (f"<ul>{mind}</ul>" if mind else "")
+        return f"<p><b>{html.escape(self._of)}</b><br>{html.escape(self.text)}</p>" + (
+            f"<ul>{mind}</ul>" if mind else ""
+        )
 
 
 def _rendered(raw: Any, path: str | Path) -> bytes:
@@ -148,6 +172,91 @@ class Calibration(Report[CalibrationReport]):
     def observed(self) -> Floats:
         """(B,) share that came true."""
         return _column(item.observed for item in self.raw.bins)
+
+
+class Projection(Report[ProjectionReport]):
+    """Where grasps succeed, on a plane."""
+
+    @property
+    def share(self) -> float | None:
+        """Share of the density that points the way asked for."""
+        return self.raw.share.value
+
+    @property
+    def values(self) -> Floats:
+        """(n, m) density on the plane over its two axes, 1 at the highest cell."""
+        return np.array(self.raw.values)
+
+    @property
+    def across_m(self) -> Floats:
+        """(n + 1,) edges of the cells along the plane's first axis."""
+        return np.array(self.raw.across_m)
+
+    @property
+    def upward_m(self) -> Floats:
+        """(m + 1,) edges of the cells along the plane's second axis."""
+        return np.array(self.raw.upward_m)
+
+
+class Bandwidth(Report[BandwidthReport]):
+    """Which widths the kernel should have."""
+
+    @property
+    def recommended(self) -> tuple[float, float]:
+        """``sigma_position_m`` and ``sigma_rotation_deg``."""
+        return self.raw.recommended.sigma_position_m, self.raw.recommended.sigma_rotation_deg
+
+    @property
+    def calls(self) -> list[CheckCall]:
+        """Sweeps that would make what is missing: draws at several widths, simulated as checks."""
+        return self.raw.calls
+
+
+class KernelSimilarity(Report[KernelSimilarityReport]):
+    """How many samples, or Gaussians, a kernel needs to be like the statistics it comes from (figure 13)."""
+
+    @property
+    def samples(self) -> tuple[NDArray[np.int64], Floats]:
+        """(K,) numbers of samples and their similarity."""
+        return _curve(self.raw.samples)
+
+    @property
+    def mixtures(self) -> tuple[NDArray[np.int64], Floats]:
+        """(K,) numbers of Gaussians and their similarity."""
+        return _curve(self.raw.mixtures)
+
+
+class Sources(Report[SourcesReport]):
+    """Simulation against real trials."""
+
+    @property
+    def by_source(self) -> dict[str, SourceComparison]:
+        """``robot``, ``human`` and ``import``, those there are."""
+        return {item.source: item for item in self.raw.sources}
+
+
+class Summary(Report[SummaryReport]):
+    """Every object's trials by outcome, and success rates by each way of counting."""
+
+    @property
+    def _of(self) -> str:
+        return "Summary of all objects"
+
+    def rates(self, rule: str) -> dict[str, float | None]:
+        """Success rate of every row by object (with gripper, protocol and source where it has several)."""
+        names = [row.object for row in self.raw.rows]
+        found: dict[str, float | None] = {}
+        for row in self.raw.rows:
+            parts = [row.gripper, row.protocol, row.source]
+            alone = names.count(row.object) == 1
+            name = row.object if alone else " ".join([row.object, *(part for part in parts if part)])
+            found[name] = next(item.rate.value for item in row.rates if item.rule == rule)
+        return found
+
+
+def _curve(points: Any) -> tuple[NDArray[np.int64], Floats]:
+    counts = np.array([point.count for point in points], dtype=np.int64)
+    return counts, np.array([point.similarity for point in points], dtype=np.float64)
 
 
 def _column(values: Any) -> Floats:
@@ -243,14 +352,127 @@ class Reports:
         params = _selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg)
         return Calibration(self._get("calibration", CalibrationReport, params, progress, timeout_s))
 
+    def projection(
+        self,
+        *,
+        plane: str | ArrayLike | None = None,
+        approach: str | ArrayLike | None = None,
+        approach_cone_deg: float | None = None,
+        direction: str | ArrayLike | None = None,
+        direction_cone_deg: float | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        kernel: str | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> Projection:
+        """The density on a plane: where grasps succeed.
+
+        Parameters
+        ----------
+        plane
+            ``xy``, ``xz``, ``yz`` or a normal (3,); None: the one that shows most of the grasps.
+        approach, direction
+            Only grasps whose tool z (``approach``) or tool x (``direction``, with either sign) points along
+            this vector or axis (``"-z"``), within the cone.
+        """
+        params = {
+            "plane": _axis(plane),
+            "approach": _axis(approach),
+            "approach_cone_deg": approach_cone_deg,
+            "direction": _axis(direction),
+            "direction_cone_deg": direction_cone_deg,
+            **_selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg),
+        }
+        return Projection(self._get("projection", ProjectionReport, params, progress, timeout_s))
+
+    def bandwidth(
+        self,
+        *,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> Bandwidth:
+        """Which widths the kernel should have, and how often draws at several widths succeed.
+
+        Those are simulated by sweeps of purpose ``check``; ``calls`` says which are missing.
+        """
+        params = {"gripper": gripper, "protocol": protocol, "source": source}
+        return Bandwidth(self._get("bandwidth", BandwidthReport, params, progress, timeout_s))
+
+    def kernel_similarity(
+        self,
+        *,
+        window_position_m: float | None = None,
+        window_rotation_deg: float | None = None,
+        component_position_m: float | None = None,
+        component_rotation_deg: float | None = None,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        source: str | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> KernelSimilarity:
+        """How many samples, or Gaussians, a kernel needs (figure 13).
+
+        Parameters
+        ----------
+        window_position_m, window_rotation_deg
+            Displacements that count: a cube's half edge and the largest turn.
+        component_position_m, component_rotation_deg
+            Widths of every sample's component.
+        """
+        params = {
+            "window_position_m": window_position_m,
+            "window_rotation_deg": window_rotation_deg,
+            "component_position_m": component_position_m,
+            "component_rotation_deg": component_rotation_deg,
+            "gripper": gripper,
+            "protocol": protocol,
+            "source": source,
+        }
+        return KernelSimilarity(
+            self._get("kernel-similarity", KernelSimilarityReport, params, progress, timeout_s)
+        )
+
+    def sources(
+        self,
+        *,
+        gripper: str | None = None,
+        protocol: str | None = None,
+        sigma_position_m: float | None = None,
+        sigma_rotation_deg: float | None = None,
+        progress: Progress | None = None,
+        timeout_s: float | None = None,
+    ) -> Sources:
+        """Whether simulation tells what robots find.
+
+        Parameters
+        ----------
+        protocol
+            Of the simulated trials; real ones of that protocol are taken where there are any, else all.
+        """
+        params = {
+            "gripper": gripper,
+            "protocol": protocol,
+            "sigma_position_m": sigma_position_m,
+            "sigma_rotation_deg": sigma_rotation_deg,
+        }
+        return Sources(self._get("sources", SourcesReport, params, progress, timeout_s))
+
     def _get(
         self,
         name: str,
-        model: type[R],
+        model: type[M],
         params: Mapping[str, Any],
         progress: Progress | None,
         timeout_s: float | None,
-    ) -> R:
+    ) -> M:
         began = time.monotonic()
         answer = self._transport.request(
             "GET", f"{self._path}/reports/{name}", params=params, headers={"Accept": "application/json"}
@@ -276,6 +498,31 @@ class Reports:
 
     def __repr__(self) -> str:
         return f"<reports: {', '.join(REPORTS)}>"
+
+
+class AllReports:
+    """``db.reports``: what there is to say of all objects together."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def summary(self) -> Summary:
+        """Every object's trials by outcome, and success rates by each way of counting (table I)."""
+        answer = self._transport.json("GET", "/reports/summary")
+        return Summary(SummaryReport.model_validate(answer))
+
+    def __repr__(self) -> str:
+        return "<reports: summary>"
+
+
+def _axis(value: str | ArrayLike | None) -> str | None:
+    """An axis's or plane's name as it is, a vector as a query takes it."""
+    if value is None or isinstance(value, str):
+        return value
+    numbers = np.asarray(value, dtype=np.float64)
+    if numbers.shape != (3,):
+        raise ValueError(f"a direction has three components; this one has the shape {numbers.shape}")
+    return ",".join(repr(float(x)) for x in numbers)
 
 
 def _selection(

@@ -288,3 +288,8 @@ class MixtureDensity:
     def symmetric(self) -> NDArray[np.bool_]:
         """(N,) whether a row has a twin."""
         return self._rows.symmetric
+
+    @property
+    def frames(self) -> Floats:
+        """(N, 3, 3) columns are the axes along which a row's translations are measured, object frame."""
+        return np.broadcast_to(self._rows.frames, (self.size, 3, 3))

@@ -13,6 +13,7 @@ import pytest
 from graspdb import Client, cli
 from graspdb.errors import Conflict, NotFound
 from graspdb.objects import GraspObject
+from graspdb.reports import Report
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -89,6 +90,35 @@ def test_reports_have_words_arrays_and_figures(thing: GraspObject, tmp_path: Pat
     assert b"<svg" in svg.read_bytes()
     with pytest.raises(ValueError, match=r"\.pdf"):
         convergence.save(tmp_path / "a.pdf")
+
+
+def drawn_on_the_page(report: Report, words: str) -> None:
+    """The figure says what it is of, and everything drawn lies on the page."""
+    figure = report.plot()
+    texts = " ".join(text.get_text() for text in figure.findobj(lambda a: hasattr(a, "get_text")))
+    assert words in texts
+    box = figure.get_tightbbox()
+    assert box.x0 >= -0.01
+    assert box.y0 >= -0.01
+    assert box.x1 <= figure.get_figwidth() + 0.01
+    assert box.y1 <= figure.get_figheight() + 0.01
+
+
+def test_projections(thing: GraspObject, run: Run) -> None:
+    found = thing.reports.projection(plane=(0, -1, 0), approach="z", approach_cone_deg=20)
+    assert found.values.shape == (len(found.across_m) - 1, len(found.upward_m) - 1)
+    assert found.values.max() == 1
+    assert found.share is not None
+    assert 0.2 < found.share < 1
+    drawn_on_the_page(found, thing.id)
+    drawn_on_the_page(thing.reports.projection(), "all grasps")
+    with pytest.raises(ValueError, match="three components"):
+        thing.reports.projection(approach=[1, 2])
+    code, out, err = run("report", thing.id, "projection", "--plane", "xz", "--approach", "z")
+    assert (code, "of the density approaches within 30 deg of z" in out) == (0, True), err
+    code, _, err = run("report", thing.id, "calibration", "--plane", "xz")
+    assert (code, "no such option" in err) == (2, True)
+    assert run("report", thing.id)[0] == 2
 
 
 def test_too_few_trials_raise_what_is_needed(db: Client, fresh_id: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,71 +18,137 @@ from graspdb.cli.common import (
     SigmaPosition,
     SigmaRotation,
     Source,
+    State,
     out,
     show_rows,
     show_table,
     state_of,
 )
-from graspdb.reports import Anisotropy, Calibration, Convergence
+from graspdb.reports import (
+    Bandwidth,
+    Calibration,
+    Convergence,
+    KernelSimilarity,
+    Sources,
+    Summary,
+)
+from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import REPORTS, ReportRange, ReportRun
 
 kernels = typer.Typer(help="Stored kernels.", no_args_is_help=True)
 
 
+#: What each report takes, by the names of the SDK.
+_SELECTION = ("gripper", "protocol", "source")
+_KERNEL = ("kernel", "sigma_position_m", "sigma_rotation_deg")
+OPTIONS: dict[str, tuple[str, ...]] = {
+    "convergence": ("matching", *_SELECTION, *_KERNEL),
+    "anisotropy": ("method", "alignment", *_SELECTION, *_KERNEL),
+    "calibration": (*_SELECTION, *_KERNEL),
+    "projection": (
+        "plane",
+        "approach",
+        "approach_cone_deg",
+        "direction",
+        "direction_cone_deg",
+        *_SELECTION,
+        *_KERNEL,
+    ),
+    "bandwidth": _SELECTION,
+    "kernel-similarity": (
+        "window_position_m",
+        "window_rotation_deg",
+        "component_position_m",
+        "component_rotation_deg",
+        *_SELECTION,
+    ),
+    "sources": ("gripper", "protocol", "sigma_position_m", "sigma_rotation_deg"),
+    "summary": (),
+}
+
+
 def report(
     context: typer.Context,
     id: ObjectId,
-    name: Annotated[str, typer.Argument(metavar="REPORT", help=f"One of: {', '.join(REPORTS)}.")],
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[REPORT]",
+            help=f"One of: {', '.join(REPORTS)}. Instead of both, `graspdb report summary`: all objects.",
+            show_default=False,
+        ),
+    ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="Write the figure to this .png or .svg file.", dir_okay=False)
     ] = None,
     kernel: Kernel = None,
     matching: Annotated[
-        str | None, typer.Option(help="convergence: determinants or likelihood, beside a stored kernel.")
+        str | None,
+        typer.Option(help="convergence: determinants, likelihood or success, beside a stored kernel."),
     ] = None,
     method: Annotated[str | None, typer.Option(help="anisotropy: empirical or density.")] = None,
-    alignment: Annotated[str | None, typer.Option(help="anisotropy: gripper or object.")] = None,
+    alignment: Annotated[
+        str | None, typer.Option(help="anisotropy: gripper, object, edge or surface-pair.")
+    ] = None,
+    plane: Annotated[
+        str | None, typer.Option(help="projection: xy, xz, yz or the plane's normal x,y,z.")
+    ] = None,
+    approach: Annotated[
+        str | None, typer.Option(help="projection: only grasps whose tool z points along x,y,z (or -z ...).")
+    ] = None,
+    approach_cone_deg: Annotated[
+        float | None, typer.Option("--approach-cone-deg", help="projection: half angle, 30 by default.")
+    ] = None,
+    direction: Annotated[
+        str | None, typer.Option(help="projection: only grasps whose tool x lies along x,y,z (or z ...).")
+    ] = None,
+    direction_cone_deg: Annotated[
+        float | None, typer.Option("--direction-cone-deg", help="projection: half angle, 30 by default.")
+    ] = None,
+    window_position_m: Annotated[
+        float | None, typer.Option("--window-position-m", help="kernel-similarity: half edge of the window.")
+    ] = None,
+    window_rotation_deg: Annotated[
+        float | None, typer.Option("--window-rotation-deg", help="kernel-similarity: largest turn.")
+    ] = None,
+    component_position_m: Annotated[
+        float | None, typer.Option("--component-position-m", help="kernel-similarity: width of a sample.")
+    ] = None,
+    component_rotation_deg: Annotated[
+        float | None, typer.Option("--component-rotation-deg", help="kernel-similarity: width of a sample.")
+    ] = None,
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
     sigma_position_m: SigmaPosition = None,
     sigma_rotation_deg: SigmaRotation = None,
 ) -> None:
-    """Report on an object's trials: enough of them, tolerances, calibration."""
-    if name not in REPORTS:
-        raise typer.BadParameter(f"{name!r} is none of: {', '.join(REPORTS)}", param_hint="REPORT")
+    """Report on an object's trials: where grasps succeed, tolerances, enough of them, calibration, sources.
+
+    `graspdb report summary` counts the trials of all objects.
+    """
+    if name is None and id == "summary":
+        name = "summary"
+    if name is None or (name not in REPORTS and name != "summary"):
+        raise typer.BadParameter(
+            f"{name or 'nothing'!r} is none of: {', '.join(REPORTS)}", param_hint="REPORT"
+        )
     if figure is not None and figure.suffix.lower() not in (".png", ".svg"):
         raise typer.BadParameter("figures are .png or .svg files", param_hint="--figure")
-    options = {
-        "convergence": {"matching": matching},
-        "anisotropy": {"method": method, "alignment": alignment},
-        "calibration": {},
-    }[name]
-    for other, value in {"matching": matching, "method": method, "alignment": alignment}.items():
-        if value is not None and other not in options:
-            raise typer.BadParameter(f"the {name} report has no such option", param_hint=f"--{other}")
+    named = [option for options in OPTIONS.values() for option in options]
+    given = {option: value for option in named if (value := context.params.get(option)) is not None}
+    for option in given:
+        if option not in OPTIONS[name]:
+            raise typer.BadParameter(
+                f"the {name} report has no such option", param_hint=f"--{option.replace('_', '-')}"
+            )
     state = state_of(context)
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
-    )
-    with state.client() as db, bar:
-        task: Any = None
-
-        def show(run: ReportRun) -> None:
-            nonlocal task
-            task = bar.add_task(f"{name} of {id}", total=1.0) if task is None else task
-            bar.update(task, completed=run.progress)
-
-        found: Convergence | Anisotropy | Calibration = getattr(db.objects.get(id).reports, name)(
-            **options,
-            gripper=gripper,
-            protocol=protocol,
-            source=source,
-            kernel=kernel,
-            sigma_position_m=sigma_position_m,
-            sigma_rotation_deg=sigma_rotation_deg,
-            progress=show,
-        )
+    found: Any
+    if name == "summary":
+        with state.client() as db:
+            found = db.reports.summary()
+    else:
+        found = _computed(state, id, name, given)
     if figure is not None:
         found.save(figure)
     if state.json:
@@ -94,37 +161,180 @@ def report(
         ERRORS.print(f"Figure: {figure}")
 
 
-def _show(found: Convergence | Anisotropy | Calibration) -> None:
-    rows: dict[str, Any] = {"object": f"{found.raw.object}, revision {found.raw.revision}", "": found.text}
+def _computed(state: State, id: str, name: str, options: dict[str, Any]) -> Any:
+    """The report, with a bar while the service computes it."""
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
+    )
+    with state.client() as db, bar:
+        task: Any = None
+
+        def show(run: ReportRun) -> None:
+            nonlocal task
+            task = bar.add_task(f"{name} of {id}", total=1.0) if task is None else task
+            bar.update(task, completed=run.progress)
+
+        ask = getattr(db.objects.get(id).reports, name.replace("-", "_"))
+        return ask(**options, progress=show)
+
+
+def _show(found: Any) -> None:
+    raw = found.raw
+    rows: dict[str, Any] = {"": found.text}
+    if not isinstance(found, Summary):
+        rows = {"object": f"{raw.object}, revision {raw.revision}", **rows}
     if isinstance(found, Calibration):
-        raw = found.raw
         rows |= {
             "Brier skill": _range(raw.skill),
             "over attempts that did not collide": _range(raw.free_skill),
             "calibration error above 0.1": _number(raw.ece),
             "AUC of probability and density": f"{_number(raw.auc_probability)}, {_number(raw.auc_density)}",
         }
+        if raw.checked is not None:
+            rows["simulated again"] = (
+                f"{raw.checked.successes:,} of {raw.checked.grasps:,} succeeded: {_range(raw.checked.rate)},"
+                f" predicted {_number(raw.checked.predicted)}"
+            )
     show_rows(rows)
+    for table in _tables(found):
+        show_table(table[0], table[1], empty="Nothing.")
+    for call in getattr(raw, "calls", []):
+        ERRORS.print(
+            f"Missing: {call.method} {call.path} {json.dumps(call.body)}", soft_wrap=True, markup=False
+        )
+
+
+Table = tuple[tuple[str, ...], list[tuple[Any, ...]]]
+
+
+def _tables(found: Any) -> list[Table]:
+    """What is shown below the words, by kind of report."""
+    raw = found.raw
     if isinstance(found, Convergence):
-        for curve in found.raw.curves:
-            show_table(
+        return [
+            (
                 (f"grasps ({curve.label})", "similarity", "deviation", "held-out log density"),
                 [
                     (p.grasps, f"{p.similarity:.4f}", f"{p.deviation:.4f}", f"{p.log_likelihood:.3f}")
                     for p in curve.points
                 ],
-                empty="No points.",
             )
-    elif isinstance(found, Calibration):
-        show_table(
-            ("predicted", "came true", "interval", "attempts"),
-            [
-                (_number(b.predicted), _number(b.observed), f"{_number(b.low)} to {_number(b.high)}", b.count)
-                for b in found.raw.bins
-                if b.count
-            ],
-            empty="No predictions.",
-        )
+            for curve in raw.curves
+        ]
+    if isinstance(found, Calibration):
+        return [
+            (
+                ("predicted", "came true", "interval", "attempts"),
+                [
+                    (
+                        _number(b.predicted),
+                        _number(b.observed),
+                        f"{_number(b.low)} to {_number(b.high)}",
+                        b.count,
+                    )
+                    for b in raw.bins
+                    if b.count
+                ],
+            )
+        ]
+    if isinstance(found, Bandwidth):
+        best = sorted(raw.grid, key=lambda p: -(p.log_likelihood or -1e99))[:8]
+        tables: list[Table] = [
+            (
+                ("position [mm]", "rotation [°]", "held-out log density", "below the best"),
+                [
+                    (
+                        f"{1e3 * p.sigma_position_m:.1f}",
+                        f"{p.sigma_rotation_deg:.1f}",
+                        _number(p.log_likelihood),
+                        f"{_number(p.below_best)} ± {_number(p.below_best_error)}",
+                    )
+                    for p in best
+                ],
+            )
+        ]
+        if raw.draws:
+            tables.append(
+                (
+                    ("draws at", "protocol", "simulated", "succeed", "collide", "succeed of the rest"),
+                    [
+                        (
+                            f"{1e3 * d.kernel.sigma_position_m:.1f} mm, {d.kernel.sigma_rotation_deg:.1f}°",
+                            d.protocol,
+                            d.draws,
+                            _range(d.success),
+                            _range(d.collision),
+                            _range(d.free_success),
+                        )
+                        for d in raw.draws
+                    ],
+                )
+            )
+        return tables
+    if isinstance(found, KernelSimilarity):
+        return [
+            (
+                (what, "similarity", "error"),
+                [(p.count, f"{p.similarity:.3f}", f"{p.error:.3f}") for p in points],
+            )
+            for what, points in (("samples", raw.samples), ("Gaussians", raw.mixtures))
+        ]
+    if isinstance(found, Sources):
+        return [
+            (
+                (
+                    "source",
+                    "trials",
+                    "succeeded",
+                    "predicted",
+                    "agreement",
+                    "Brier skill",
+                    "density similarity",
+                ),
+                [
+                    (
+                        item.source,
+                        item.trials,
+                        _range(item.share),
+                        _number(item.predicted),
+                        _range(item.agreement),
+                        _range(item.skill),
+                        "unknown"
+                        if item.similarity is None
+                        else f"{item.similarity.value:.2f} (chance alone {_range(item.similarity.expected)})",
+                    )
+                    for item in raw.sources
+                ],
+            )
+        ]
+    if isinstance(found, Summary):
+        outcomes = [name for name in OUTCOMES if any(name in row.outcomes for row in raw.rows)]
+        return [
+            (
+                ("object", "gripper", "protocol", "source", *outcomes),
+                [
+                    (
+                        row.object,
+                        row.gripper,
+                        row.protocol,
+                        row.source,
+                        *(row.outcomes.get(name, 0) for name in outcomes),
+                    )
+                    for row in raw.rows
+                ],
+            ),
+            (
+                ("object", "source", *raw.rules),
+                [(row.object, row.source, *(_percent(item.rate) for item in row.rates)) for row in raw.rows],
+            ),
+        ]
+    return []
+
+
+def _percent(value: ReportRange) -> str:
+    if value.value is None or value.low is None or value.high is None:
+        return "unknown"
+    return f"{100 * value.value:.2f} % ({100 * value.low:.2f} to {100 * value.high:.2f})"
 
 
 def _range(value: ReportRange | None) -> str:

@@ -7,10 +7,18 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from graspdb.wire.base import Response
+from graspdb.wire.base import Response, Triple
 from graspdb.wire.queries import KernelInfo
 
-ReportName = Literal["convergence", "anisotropy", "calibration"]
+ReportName = Literal[
+    "convergence",
+    "anisotropy",
+    "calibration",
+    "projection",
+    "bandwidth",
+    "kernel-similarity",
+    "sources",
+]
 Method = Literal["empirical", "density"]
 Matching = Literal["determinants", "likelihood", "success"]
 RunState = Literal["running", "done", "failed", "cancelled"]
@@ -205,12 +213,36 @@ class CalibrationBin(Response):
     high: float | None
 
 
+class CheckCall(Response):
+    """A request that makes what a report lacks: it has workers simulate, which no GET does."""
+
+    method: str
+    path: str
+    body: dict[str, Any]
+
+
+class CheckedGrasps(Response):
+    """Grasps that were simulated again as checks, which no prediction rests on.
+
+    ``rate`` is the share that succeeded, ``predicted`` what the mean prediction for them is now; ``bins`` by
+    prediction.
+    """
+
+    grasps: int
+    successes: int
+    rate: ReportRange
+    predicted: float
+    outcomes: dict[str, int]
+    bins: list[CalibrationBin] = Field(default_factory=list)
+
+
 class CalibrationReport(Report):
     """Whether ``success_probability`` can be believed, on outcomes it has not seen (blocks left out).
 
     ``skill`` is Brier's: 1 perfect, 0 no better than the share of successes. ``ece`` is over predictions
     above 0.1. ``auc_*`` is the chance that a success ranks above a failure. ``free_skill`` is the skill over
-    attempts that did not collide.
+    attempts that did not collide. ``checked`` are grasps whose poses were given to checks, as
+    best grasps are that are verified; where there are none, ``calls`` says how to make some.
     """
 
     report: Literal["calibration"] = "calibration"
@@ -231,13 +263,237 @@ class CalibrationReport(Report):
     auc_probability: float | None
     auc_density: float | None
     bins: list[CalibrationBin]
+    checked: CheckedGrasps | None = None
+    calls: list[CheckCall] = Field(default_factory=list)
 
 
-AnyReport = ConvergenceReport | AnisotropyReport | CalibrationReport
-REPORTS: dict[str, type[ConvergenceReport] | type[AnisotropyReport] | type[CalibrationReport]] = {
+class ProjectionProfile(Response):
+    """The projected density on one axis of the plane: share of all grasps a metre, with its interval."""
+
+    axis: str
+    at_m: list[float]
+    density_per_m: list[float]
+    low: list[float]
+    high: list[float]
+
+
+class ProjectionReport(Report):
+    """The density on a plane, depth and rotation integrated out; of grasps that point a given way, or of all.
+
+    ``values[i][j]`` over ``across_m[i]`` and ``upward_m[j]`` (edges) is 1 at the highest cell, which is
+    ``peak_per_m2`` (share of all grasps a square metre). ``share`` of the density points the way asked for,
+    ``passing`` of the ``grasps`` do. ``approach`` is the way tool z points, ``direction`` that of tool x,
+    across the jaw, with either sign. ``outline``: the object's silhouette as polygons (metres), one for each
+    convex part, or the hull of its mesh. ``drawn`` grasps were drawn where it could not be computed.
+    """
+
+    report: Literal["projection"] = "projection"
+    level: float
+    kernel: KernelInfo
+    grasps: int
+    passing: int
+    share: ReportRange
+    plane: str
+    normal: Triple
+    across: Triple
+    upward: Triple
+    approach: Triple | None = None
+    approach_cone_deg: float | None = None
+    direction: Triple | None = None
+    direction_cone_deg: float | None = None
+    across_m: list[float]
+    upward_m: list[float]
+    values: list[list[float]]
+    peak_per_m2: float
+    profiles: list[ProjectionProfile]
+    outline: list[list[tuple[float, float]]] = Field(default_factory=list)
+    drawn: int = 0
+
+
+class BandwidthPoint(Response):
+    """How likely left-out grasps are under a pair of widths: mean log density, nats of 1/(m^3 rad^3), and how
+    far below the best pair's it is (standard errors over blocks).
+    """
+
+    sigma_position_m: float
+    sigma_rotation_deg: float
+    log_likelihood: float | None
+    error: float | None
+    below_best: float | None
+    below_best_error: float | None
+
+
+class SimulatedDraws(Response):
+    """What became of draws from the density under a kernel, simulated as checks; collisions apart.
+
+    ``success`` is the share of all draws that succeeded, ``free_success`` of those that did not collide.
+    """
+
+    kernel: KernelInfo
+    protocol: str
+    draws: int
+    outcomes: dict[str, int]
+    success: ReportRange
+    collision: ReportRange
+    free_success: ReportRange
+
+
+class BandwidthReport(Report):
+    """Which widths the kernel should have: those left-out blocks are likeliest under. How often draws
+    succeed.
+
+    ``range_m`` and ``range_deg``: widths of which the trials can't say that they are worse.
+    """
+
+    report: Literal["bandwidth"] = "bandwidth"
+    level: float
+    kernel: KernelInfo
+    rows: int
+    held_out: int
+    grid: list[BandwidthPoint]
+    recommended: KernelInfo
+    range_m: tuple[float, float]
+    range_deg: tuple[float, float]
+    draws: list[SimulatedDraws] = Field(default_factory=list)
+    calls: list[CheckCall] = Field(default_factory=list)
+
+
+class SimilarityPoint(Response):
+    """Similarity (Bhattacharyya) of a kernel with so many samples, or of a mixture with so many Gaussians, to
+    the full statistics, with its standard error. Gaussians off the jaw's plane of symmetry come in pairs.
+    """
+
+    count: int
+    similarity: float
+    error: float
+
+
+class KernelSimilarityReport(Report):
+    """Figure 13: how many samples, or Gaussians, the kernel needs to be like the statistics it comes from.
+
+    It has a meaning only with its window and with the width of the components. ``reference`` displacements
+    stand for the full statistics.
+    """
+
+    report: Literal["kernel-similarity"] = "kernel-similarity"
+    level: float
+    window_position_m: float
+    window_rotation_deg: float
+    component_position_m: float
+    component_rotation_deg: float
+    successes: int
+    displacements: int
+    reference: int
+    samples: list[SimilarityPoint]
+    mixtures: list[SimilarityPoint]
+
+
+class SourceSimilarity(Response):
+    """Similarity (Bhattacharyya) of two sources' densities under one kernel, and what as many grasps drawn
+    from simulation would have had: below that range, the sources differ by more than chance.
+    """
+
+    kernel: KernelInfo
+    value: float
+    error: float
+    expected: ReportRange
+
+
+class SourceComparison(Response):
+    """One source of real trials against simulation.
+
+    ``successes`` over ``trials`` is its own share, ``predicted`` the mean of what simulation predicts at its
+    poses. ``agreement`` is the share of trials where simulation says more than one half and it held, or less
+    and it did not; ``confusion`` counts those by (simulation, trial). Null where the source posts successes
+    only, or has too few.
+    """
+
+    source: str
+    protocols: list[str]
+    trials: int
+    successes: int
+    outcomes: dict[str, int]
+    share: ReportRange
+    predicted: float | None
+    predicted_at_successes: float | None
+    within_reach: int
+    agreement: ReportRange | None = None
+    confusion: dict[str, int] | None = None
+    brier: float | None = None
+    skill: ReportRange | None = None
+    auc: float | None = None
+    bins: list[CalibrationBin] = Field(default_factory=list)
+    similarity: SourceSimilarity | None = None
+
+
+class SourcesReport(Report):
+    """Does simulation tell what real trials find?"""
+
+    report: Literal["sources"] = "sources"
+    level: float
+    kernel: KernelInfo
+    attempts: int
+    successes: int
+    simulation_outcomes: dict[str, int]
+    collisions_known: bool
+    sources: list[SourceComparison]
+
+
+class SummaryRate(Response):
+    """Successes as a share of what ``rule`` counts as a trial, with its interval."""
+
+    rule: str
+    trials: int
+    rate: ReportRange
+
+
+class SummaryRow(Response):
+    """The trials of an object with one gripper, protocol and source, by outcome.
+
+    ``doubled_*``: successes and failures with each trial's twin under the jaw's half turn counted, too.
+    """
+
+    object: str
+    revision: int
+    gripper: str | None
+    protocol: str | None
+    source: str | None
+    outcomes: dict[str, int]
+    trials: int
+    successes: int
+    rates: list[SummaryRate]
+    doubled_successes: int
+    doubled_failures: int
+
+
+class SummaryReport(Response):
+    """Every object's trials by outcome, and success rates by each way of counting (table I)."""
+
+    report: Literal["summary"] = "summary"
+    text: str
+    level: float
+    rules: dict[str, str]
+    rows: list[SummaryRow]
+    warnings: list[str] = Field(default_factory=list)
+
+
+AnyReport = (
+    ConvergenceReport
+    | AnisotropyReport
+    | CalibrationReport
+    | ProjectionReport
+    | BandwidthReport
+    | KernelSimilarityReport
+    | SourcesReport
+)
+REPORTS: dict[str, type[AnyReport]] = {
     "convergence": ConvergenceReport,
     "anisotropy": AnisotropyReport,
     "calibration": CalibrationReport,
+    "projection": ProjectionReport,
+    "bandwidth": BandwidthReport,
+    "kernel-similarity": KernelSimilarityReport,
+    "sources": SourcesReport,
 }
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
+from pydantic import BeforeValidator
 
+from graspdb.wire.base import Direction
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.reports import (
     REPORTS,
@@ -16,6 +19,7 @@ from graspdb.wire.reports import (
     ConvergenceReport,
     Matching,
     Method,
+    ProjectionReport,
     ReportRun,
 )
 from graspdb_service import __version__
@@ -55,6 +59,61 @@ class AnisotropyQuery(SelectionQuery):
 
     method: Method = "empirical"
     alignment: Alignment = "gripper"
+
+
+def _alone(value: Any) -> Any:
+    """The text in a list of one, as a query string gives it."""
+    if isinstance(value, (list, tuple)) and len(value) == 1 and isinstance(value[0], str):
+        return value[0].strip()
+    return value
+
+
+def _axis(value: Any) -> Any:
+    """``x``, ``-z`` ... for a unit vector."""
+    value = _alone(value)
+    text = value.strip() if isinstance(value, str) else ""
+    letter = text.removeprefix("-").removeprefix("+")
+    if letter not in ("x", "y", "z"):
+        return value
+    sign = -1.0 if text.startswith("-") else 1.0
+    return [sign if letter == name else 0.0 for name in "xyz"]
+
+
+Axis = Annotated[Direction, BeforeValidator(_axis)]
+ConeDeg = Annotated[float, Query(gt=0, le=180)]
+
+
+class ProjectionQuery(SelectionQuery):
+    """The plane, ``xy``, ``xz`` or ``yz`` or its normal ``nx,ny,nz`` (none: the one that shows most), and
+    which way grasps point: ``approach`` is that of tool z, ``direction`` that of tool x, across the jaw, with
+    either sign; each ``x,y,z`` or an axis such as ``-z``, within a cone whose half angle follows.
+    """
+
+    plane: Annotated[Literal["xy", "xz", "yz"] | Axis | None, BeforeValidator(_alone)] = None
+    approach: Axis | None = None
+    approach_cone_deg: ConeDeg = 30.0
+    direction: Axis | None = None
+    direction_cone_deg: Annotated[float, Query(gt=0, le=90)] = 30.0
+
+
+@router.get(
+    "/objects/{id}/reports/projection",
+    response_model=ProjectionReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_projection(
+    ctx: Ctx, id: str, request: Request, query: Annotated[ProjectionQuery, Query()]
+) -> Response:
+    """Where do grasps succeed? The density on a plane, of all grasps or of those that point one way."""
+    vectors = {"plane": query.plane, "approach": query.approach, "direction": query.direction}
+    options: dict[str, str | None] = {
+        name: value if value is None or isinstance(value, str) else json.dumps(value)
+        for name, value in vectors.items()
+    }
+    for name in ("approach_cone_deg", "direction_cone_deg"):
+        options[name] = str(getattr(query, name))
+    return _answer(ctx, id, "projection", request, query, options)
 
 
 @router.get(

@@ -37,7 +37,9 @@ LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
 
 
-def calibration_report(sources: Sources, built: Built, progress: Progress) -> CalibrationReport:
+def calibration_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> CalibrationReport:
     everything = attempts_of(sources, built)
     successes = int(everything.success.sum())
     if len(everything) < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:

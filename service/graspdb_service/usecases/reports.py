@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from graspdb.wire.reports import (
-    AnyReport,
-)
+from graspdb.wire.reports import AnyReport
 from graspdb_density.rows import Progress
 from graspdb_service.usecases.anisotropy_report import anisotropy_report
 from graspdb_service.usecases.calibration_report import calibration_report
 from graspdb_service.usecases.convergence_report import convergence_report
-from graspdb_service.usecases.densities import KernelChoice
+from graspdb_service.usecases.densities import Built, KernelChoice
+from graspdb_service.usecases.projection_report import projection_report
 from graspdb_service.usecases.reportparts import Sources
 from graspdb_service.usecases.selection import Filters
 
@@ -54,8 +54,12 @@ def compute(sources: Sources, slug: str, asked: Asked, progress: Progress) -> An
         409 where the trials don't suffice, saying what is missing and how much of it.
     """
     built = sources.densities.get(slug, asked.filters, asked.kernel)
-    if asked.report == "convergence":
-        return convergence_report(sources, built, asked.options, progress)
-    if asked.report == "anisotropy":
-        return anisotropy_report(sources, built, asked.options, progress)
-    return calibration_report(sources, built, progress)
+    return _REPORTS[asked.report](sources, built, asked.options, progress)
+
+
+_REPORTS: dict[str, Callable[[Sources, Built, dict[str, str], Progress], AnyReport]] = {
+    "anisotropy": anisotropy_report,
+    "calibration": calibration_report,
+    "convergence": convergence_report,
+    "projection": projection_report,
+}

@@ -1,0 +1,73 @@
+"""What the figures of reports look like: colours, titles, grids, and how numbers are written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from graspdb.wire.reports import ReportRange
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "BLUE",
+    "COLOURS",
+    "GREEN",
+    "GREY",
+    "ORANGE",
+    "YELLOW",
+    "bars",
+    "heading",
+    "plain",
+    "title",
+    "told",
+]
+
+#: Okabe and Ito's, which colour-blind readers tell apart.
+BLUE, ORANGE, GREEN, YELLOW, GREY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#666666"
+COLOURS = (BLUE, ORANGE, GREEN, YELLOW, "#CC79A7", "#56B4E9", GREY)
+
+
+def title(figure: Figure, report: Any, kind: str) -> None:
+    """The object, of which trials the report is, and its answer in words."""
+    of = ", ".join(x for x in (report.gripper, report.protocol, report.source) if x)
+    first = f"{report.object}: {kind}" + (f" ({of})" if of else "") + f", revision {report.revision}"
+    heading(figure, first, report.text)
+
+
+def heading(figure: Figure, first: str, text: str) -> None:
+    """A title line and words below it, wrapped to the figure's width."""
+    figure.suptitle(f"{first}\n{_wrapped(text, round(11 * figure.get_figwidth()))}", fontsize=10)
+
+
+def _wrapped(text: str, width: int) -> str:
+    lines = [""]
+    for word in text.split():
+        if len(lines[-1]) + len(word) + 1 > width and lines[-1]:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return "\n".join(lines)
+
+
+def plain(axes: Axes) -> None:
+    """A grid behind, and no frame above and to the right."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def told(value: float | None) -> str:
+    """Two decimals, or that it is not known."""
+    return "unknown" if value is None else f"{value:.2f}"
+
+
+def bars(ranges: Sequence[ReportRange]) -> list[list[float]]:
+    """Lengths of error bars below and above, as matplotlib wants them."""
+    below, above = [], []
+    for item in ranges:
+        value = item.value or 0.0
+        below.append(max(value - (value if item.low is None else item.low), 0.0))
+        above.append(max((value if item.high is None else item.high) - value, 0.0))
+    return [below, above]
