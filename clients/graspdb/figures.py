@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb import figures_projection
+from graspdb import figures_projection, figures_widths
 from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, told
 from graspdb.figures_style import plain as _plain
 from graspdb.figures_style import title as _title
@@ -25,8 +25,10 @@ from graspdb.wire.reports import (
     AnisotropyReport,
     AnisotropyTolerance,
     AnyReport,
+    BandwidthReport,
     CalibrationReport,
     ConvergenceReport,
+    KernelSimilarityReport,
     ProjectionReport,
 )
 
@@ -76,6 +78,12 @@ def draw(report: AnyReport) -> Figure:
     elif isinstance(report, ProjectionReport):
         figure = NewFigure()
         figures_projection.projection(figure, report)
+    elif isinstance(report, BandwidthReport):
+        figure = NewFigure(figsize=(11.0, 5.6), layout="constrained")
+        figures_widths.bandwidth(figure, report)
+    elif isinstance(report, KernelSimilarityReport):
+        figure = NewFigure(figsize=(10.0, 5.4), layout="constrained")
+        figures_widths.kernel_similarity(figure, report)
     elif isinstance(report, CalibrationReport):
         figure = NewFigure(figsize=(6.6, 7.2), layout="constrained")
         _calibration(figure, report)

@@ -11,10 +11,11 @@ there in commit order: so rows that arrive one by one and all at once lead to th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from . import compiled, se3
 from .cells import Cells
@@ -23,10 +24,18 @@ from .kernels import HAAR_VOLUME, IsotropicKernel
 from .se3 import Floats
 from .threads import for_blocks
 
-__all__ = ["DEFAULT_KERNEL", "WidthChoice", "choose_widths", "widths_prefix"]
+__all__ = [
+    "DEFAULT_KERNEL",
+    "LEAST_ROWS",
+    "WidthChoice",
+    "WidthScore",
+    "choose_widths",
+    "score_widths",
+    "widths_prefix",
+]
 
 DEFAULT_KERNEL = IsotropicKernel(0.015, math.radians(15.0))
-FIRST_CHOICE = 200
+FIRST_CHOICE = LEAST_ROWS = 200
 MOST_ROWS = 20_000
 #: Held-out rows evaluated for one pair of widths: their mean's standard error is then below 0.05 nats.
 MOST_HELD_OUT = 2_000
@@ -86,20 +95,111 @@ def choose_widths(
     flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(p),))[:count]
     p, q, w = p[:count], q[:count], w / w.mean()
     best: tuple[float, IsotropicKernel] | None = None
+    for kernel, held, values in _tried(p, q, w, flags, threads):
+        value = float(np.average(values, weights=w[held])) if held.size else -math.inf
+        if best is None or value > best[0]:
+            best = value, kernel
+    assert best is not None
+    return WidthChoice(best[1], "leave-one-block-out", count, best[0])
+
+
+@dataclass(frozen=True, slots=True)
+class WidthScore:
+    """How likely left-out rows are under a pair of widths.
+
+    Attributes
+    ----------
+    log_likelihood, error : float
+        Weighted mean log density, nats of 1/(m^3 rad^3), and its standard error over cubes of space; nan
+        where no row has another outside its block.
+    below_best, below_best_error : float
+        How far it is below the best pair's mean, and the standard error of that difference over the same
+        rows.
+    """
+
+    kernel: IsotropicKernel
+    log_likelihood: float
+    error: float
+    below_best: float
+    below_best_error: float
+
+
+def score_widths(
+    positions: ArrayLike,
+    quaternions_xyzw: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    symmetric: ArrayLike | bool = True,
+    threads: int = 1,
+    progress: Callable[[float], None] | None = None,
+) -> list[WidthScore]:
+    """Every pair of widths that `choose_widths` tries, by the likelihood it chooses by.
+
+    More than `MOST_ROWS` rows are thinned evenly.
+
+    Raises
+    ------
+    ValueError
+        For fewer than `LEAST_ROWS` rows, saying how many more are needed.
+    """
+    p, q = se3.as_poses(positions, quaternions_xyzw)
+    if len(p) < LEAST_ROWS:
+        raise ValueError(
+            f"widths are told apart from {LEAST_ROWS} successes on; there are {len(p)}, so"
+            f" {LEAST_ROWS - len(p)} more are needed"
+        )
+    w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
+    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(p),))
+    rows = np.unique(np.linspace(0, len(p) - 1, min(len(p), MOST_ROWS)).astype(np.int64))
+    p, q, w, flags = p[rows], q[rows], w[rows] / w[rows].mean(), flags[rows]
+    # Neighbours are alike: errors count cubes as wide as the widest block, not rows.
+    edge = BLOCK_WIDTHS * DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * _STEPS_POSITION[-1])
+    _, cube = np.unique(np.floor((p - p.min(axis=0)) / edge).astype(np.int64), axis=0, return_inverse=True)
+    cube = cube.reshape(-1)
+    tables = []
+    for kernel, held, values in _tried(p, q, w, flags, threads):
+        full = np.full(len(p), np.nan)
+        full[held] = values
+        tables.append((kernel, full))
+        if progress is not None:
+            progress(len(tables) / (len(_STEPS_POSITION) * len(_STEPS_ROTATION)))
+    means = [_mean_and_error(full, w, cube)[0] for _, full in tables]
+    if not np.isfinite(means).any():
+        raise ValueError("all grasps lie in one block, so that none can be left out: add trials elsewhere")
+    best = tables[int(np.nanargmax(means))][1]
+    return [
+        WidthScore(kernel, *_mean_and_error(full, w, cube), *_mean_and_error(best - full, w, cube))
+        for kernel, full in tables
+    ]
+
+
+def _mean_and_error(values: Floats, weights: Floats, cube: NDArray[np.int64]) -> tuple[float, float]:
+    """Weighted mean of what is known, and its standard error over cubes."""
+    known = np.isfinite(values)
+    if not known.any():
+        return math.nan, math.nan
+    v, w = values[known], weights[known]
+    mean = float(np.average(v, weights=w))
+    sums = np.bincount(cube[known], weights=w * (v - mean))
+    return mean, float(np.linalg.norm(sums) / w.sum())
+
+
+def _tried(
+    p: Floats, q: Floats, w: Floats, flags: NDArray[np.bool_], threads: int
+) -> Iterator[tuple[IsotropicKernel, NDArray[np.int64], Floats]]:
+    """Every pair of widths with the rows left out and their log density under it."""
     for step in _STEPS_POSITION:
         sigma = DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * step)
         cells = Cells.build(p, q, w, flags, sigma)
         for turn in _STEPS_ROTATION:
             kernel = IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
-            value = _held_out(kernel, cells, p, q, w, threads)
-            if best is None or value > best[0]:
-                best = value, kernel
-    assert best is not None
-    return WidthChoice(best[1], "leave-one-block-out", count, best[0])
+            yield kernel, *_held_out(kernel, cells, p, q, w, threads)
 
 
-def _held_out(kernel: IsotropicKernel, cells: Cells, p: Floats, q: Floats, w: Floats, threads: int) -> float:
-    """Weighted mean log density of rows given those outside their block."""
+def _held_out(
+    kernel: IsotropicKernel, cells: Cells, p: Floats, q: Floats, w: Floats, threads: int
+) -> tuple[NDArray[np.int64], Floats]:
+    """Rows, and their log density given those outside their block."""
     edge = BLOCK_WIDTHS * kernel.sigma_position_m
     low = p.min(axis=0)
     cell = np.floor((p - low) / edge).astype(np.int64)
@@ -110,7 +210,7 @@ def _held_out(kernel: IsotropicKernel, cells: Cells, p: Floats, q: Floats, w: Fl
     held = np.unique(np.linspace(0, len(p) - 1, min(len(p), MOST_HELD_OUT)).astype(np.int64))
     held = held[outside[held] > 0.0]
     if not held.size:
-        return -math.inf
+        return held, np.empty(0)
     out = np.empty(len(held))
     sorted_block = block[cells.rows]
 
@@ -125,5 +225,4 @@ def _held_out(kernel: IsotropicKernel, cells: Cells, p: Floats, q: Floats, w: Fl
     density = out / outside[held] * math.exp(kernel.log_peak)
     spread = np.maximum(p.max(axis=0) - low, 1e-3)
     uniform = 1.0 / (float(np.prod(spread)) * HAAR_VOLUME)
-    values = np.log((1.0 - _UNIFORM_SHARE) * density + _UNIFORM_SHARE * uniform)
-    return float(np.average(values, weights=w[held]))
+    return held, np.log((1.0 - _UNIFORM_SHARE) * density + _UNIFORM_SHARE * uniform)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from graspdb_density import DEFAULT_KERNEL, GraspDensity, IsotropicKernel, choose_widths, se3, widths_prefix
+from graspdb_density.widths import score_widths
 
 Poses = tuple[se3.Floats, se3.Floats]
 Shell = Callable[[int, np.random.Generator], Poses]
@@ -76,3 +77,30 @@ def test_weights_count(shell: Shell) -> None:
     assert with_noise.kernel.sigma_position_m == pytest.approx(
         choose_widths(*rows).kernel.sigma_position_m, rel=0.5
     )
+
+
+def test_scores_are_those_the_choice_is_made_by(shell: Shell) -> None:
+    rows = shell(800, np.random.default_rng(3))
+    weights = np.random.default_rng(4).uniform(0.5, 2.0, 800)
+    choice = choose_widths(*rows, weights=weights)
+    done: list[float] = []
+    scores = score_widths(*rows, weights=weights, progress=done.append)
+    best = max(scores, key=lambda item: item.log_likelihood)
+    assert best.kernel == choice.kernel
+    assert best.log_likelihood == pytest.approx(choice.log_likelihood, abs=1e-9)
+    assert (best.below_best, best.below_best_error) == (0.0, 0.0)
+    assert len({item.kernel for item in scores}) == len(scores) == len(done) == 35
+    for item in scores:
+        assert item.below_best == pytest.approx(best.log_likelihood - item.log_likelihood, abs=1e-6)
+        assert 0.0 < item.error < 1.0
+    # Far from the best, the difference is many times its error.
+    far = max(scores, key=lambda item: item.below_best)
+    assert far.below_best > 5.0 * far.below_best_error
+    with pytest.raises(ValueError, match="there are 199, so 1 more are needed"):
+        score_widths(rows[0][:199], rows[1][:199])
+
+
+def test_errors_fall_with_the_number_of_grasps(shell: Shell) -> None:
+    rows = shell(3_200, np.random.default_rng(5))
+    few, many = score_widths(rows[0][:400], rows[1][:400]), score_widths(*rows)
+    assert np.mean([item.error for item in many]) < np.mean([item.error for item in few])

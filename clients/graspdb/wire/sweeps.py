@@ -43,9 +43,9 @@ class GridSpec(Request):
 
 class SampleSpec(Request):
     """Draws from the object's density for the sweep's gripper; ``protocol`` names whose trials it is built
-    from, where there are several."""
+    from, where there are several. ``kernel``: by its widths, ``anisotropic``, or a stored kernel's id."""
 
-    kernel: KernelSpec | None = None
+    kernel: KernelSpec | Slug | None = None
     protocol: Slug | None = None
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 100
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0

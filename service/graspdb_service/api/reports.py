@@ -10,11 +10,14 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BeforeValidator
 
-from graspdb.wire.base import Direction
+from graspdb.wire import Selection
+from graspdb.wire.base import Direction, Slug, Source
+from graspdb.wire.base import Request as StrictRequest
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.reports import (
     REPORTS,
     AnisotropyReport,
+    BandwidthReport,
     CalibrationReport,
     ConvergenceReport,
     Matching,
@@ -156,6 +159,30 @@ def get_calibration(
     return _answer(ctx, id, "calibration", request, query, {})
 
 
+class TrialsQuery(StrictRequest):
+    """Which trials: those with this gripper, protocol and source."""
+
+    gripper: Slug | None = None
+    protocol: Slug | None = None
+    source: Source | None = None
+
+    @property
+    def selection(self) -> Selection:
+        """With the kernel by default."""
+        return Selection(gripper=self.gripper, protocol=self.protocol, source=self.source)
+
+
+@router.get(
+    "/objects/{id}/reports/bandwidth",
+    response_model=BandwidthReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_bandwidth(ctx: Ctx, id: str, request: Request, query: Annotated[TrialsQuery, Query()]) -> Response:
+    """How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks."""
+    return _answer(ctx, id, "bandwidth", request, query.selection, {})
+
+
 @router.get("/report-runs/{id}", **scope("read"))
 def get_run(ctx: Ctx, id: str) -> ReportRun:
     """A report's computation: state, progress, and the report once it is done."""
@@ -173,7 +200,7 @@ def _answer(
     slug: str,
     report: str,
     request: Request,
-    query: SelectionQuery,
+    query: Selection,
     options: Mapping[str, str | None],
 ) -> Response:
     wanted = _wanted(request.headers.get("accept", ""))

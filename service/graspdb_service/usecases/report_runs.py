@@ -24,7 +24,7 @@ from graspdb.wire.reports import ReportRun
 from graspdb_service import __version__
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.settings import Settings
-from graspdb_service.storage import report_runs
+from graspdb_service.storage import checks, report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import Question, RunRow
 from graspdb_service.usecases import reports
@@ -45,6 +45,10 @@ _TICK_S = 2.0
 _POLL_S = 0.1
 #: What the request is to blame for, and would be again: kept as the run's answer.
 _KEPT_STATUSES = (404, 409, 413, 422)
+
+
+#: Reports that say what became of simulated checks.
+_OF_CHECKS = ("bandwidth", "calibration", "convergence")
 
 
 class Cancelled(Exception):
@@ -101,6 +105,10 @@ class ReportRuns:
         if choice.stored is not None:
             choice = KernelChoice(stored=self._densities.stored(row, selected, choice.stored).id)
         given = {name: value for name, value in options.items() if value is not None}
+        if report in _OF_CHECKS:
+            # Checks change no revision: what of them there is belongs to the question.
+            with self._database.read() as tx:
+                given["checks"] = checks.stamp(tx, row.id)
         asked = Asked(report, selected.filters, choice, given)
         document = asked.document()
         digest = hashlib.sha256(json.dumps([document, __version__], sort_keys=True).encode()).hexdigest()

@@ -9,6 +9,7 @@ from typing import Any
 from graspdb.wire.reports import AnyReport
 from graspdb_density.rows import Progress
 from graspdb_service.usecases.anisotropy_report import anisotropy_report
+from graspdb_service.usecases.bandwidth_report import bandwidth_report
 from graspdb_service.usecases.calibration_report import calibration_report
 from graspdb_service.usecases.convergence_report import convergence_report
 from graspdb_service.usecases.densities import Built, KernelChoice
@@ -59,6 +60,7 @@ def compute(sources: Sources, slug: str, asked: Asked, progress: Progress) -> An
 
 _REPORTS: dict[str, Callable[[Sources, Built, dict[str, str], Progress], AnyReport]] = {
     "anisotropy": anisotropy_report,
+    "bandwidth": bandwidth_report,
     "calibration": calibration_report,
     "convergence": convergence_report,
     "projection": projection_report,

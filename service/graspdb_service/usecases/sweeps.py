@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from graspdb.wire import (
     GridPlan,
     GridSpec,
     GripperProfile,
+    KernelInfo,
     PoseColumns,
     SampleSpec,
     Selection,
@@ -29,7 +30,7 @@ from graspdb_service.storage import batches, grippers, jobs, sweeps, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
-from graspdb_service.usecases import decompositions, plans, queries, simulability
+from graspdb_service.usecases import arrow, decompositions, plans, queries, simulability
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.idempotency import Created, replay_or, replayed
 from graspdb_service.usecases.objects import require
@@ -40,6 +41,9 @@ MAX_CHUNKS = 100_000
 WANTED_CHUNKS = 16
 #: ... down to these many poses. Given and drawn poses lie at the object, where each needs physics.
 MIN_GRID_CHUNK, MIN_POSES_CHUNK, MAX_POSES_CHUNK = 1_000, 10, 2_000
+
+#: Poses read at a time for a stream of outcomes.
+STREAM_POSES = 100_000
 
 _CURSOR = re.compile(r"(\d{1,9})\.(\d{1,9})")
 
@@ -66,6 +70,7 @@ class _Plan:
     grid: GridPlan | None = None
     full_count: int | None = None
     poses: npt.NDArray[np.float64] | None = None
+    kernel: KernelInfo | None = None
 
 
 def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
@@ -102,6 +107,9 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
     if plan.grid is not None:
         snapshot["grid"] = plan.grid.model_dump(mode="json")
         snapshot["repeat_key"] = plans.repeat_key(world.snapshot, spec.protocol, spec.fidelity, plan.grid)
+    if plan.kernel is not None:
+        # A sample may name no widths, and those of a density change as it grows.
+        snapshot["drawn_with"] = plan.kernel.model_dump(mode="json")
     wish = spec.model_dump(mode="json", exclude={"poses"}, exclude_none=True)
     if plan.grid is not None:
         wish["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
@@ -241,7 +249,7 @@ def _drawn(ctx: Context, slug: str, spec: SweepCreate, sample: SampleSpec) -> _P
     selection = Selection(gripper=spec.gripper, protocol=sample.protocol, kernel=sample.kernel)
     drawn = queries.draw(ctx, slug, selection, sample.count, sample.seed)
     table = np.column_stack([drawn.position, drawn.quaternion_xyzw, drawn.proposal_density])
-    return _Plan("sample", len(table), poses=table)
+    return _Plan("sample", len(table), poses=table, kernel=drawn.kernel)
 
 
 def _chunk_size(ctx: Context, spec: SweepCreate, plan: _Plan) -> int:
@@ -369,8 +377,20 @@ def _rate(row: SweepRow, done: Progress) -> float | None:
     return done.recent_poses / done.window_s if done.recent_poses else None
 
 
-def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> Mapping[str, Any]:
-    """Columns of every pose of finished chunks, in the plan's order; arrays, for orjson.
+@dataclass(frozen=True, eq=False)
+class OutcomePage:
+    """Poses (n,) of a sweep's plan with their outcome codes (uint8), and where the next page starts."""
+
+    sweep: str
+    pose_index: npt.NDArray[np.int64]
+    position: npt.NDArray[np.float64]
+    quaternion_xyzw: npt.NDArray[np.float64]
+    codes: npt.NDArray[np.uint8]
+    next: str | None
+
+
+def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> OutcomePage:
+    """Every pose of finished chunks, in the plan's order.
 
     While a sweep runs, a page has the chunks that are finished by then: read it again at the end.
     """
@@ -386,10 +406,8 @@ def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> 
         chunks = sweeps.outcome_chunks(tx, sweep_id, first_number=number, poses=limit + skip + 1)
         stored = {chunk.number: plans.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
     grid = plans.grid_of(row) if row.plan == "grid" else None
-    columns: dict[str, list[npt.NDArray[Any]]] = {
-        "pose_index": [], "position": [], "quaternion_xyzw": [], "outcome": []
-    }  # fmt: skip
-    names = np.array(OUTCOMES)
+    index, position = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
+    quaternion, codes = [np.empty((0, 4))], [np.empty(0, dtype=np.uint8)]
     following = None
     for chunk in chunks:
         first = skip if chunk.number == number else 0
@@ -403,18 +421,74 @@ def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> 
         if poses is None:
             assert grid is not None
             poses = plans.grid_poses(grid, chunk.start, chunk.stop)
-        codes = np.frombuffer(chunk.outcomes, dtype=np.uint8)
         part = slice(first, last)
-        columns["pose_index"].append(poses.pose_index[part])
-        columns["position"].append(poses.position[part])
-        columns["quaternion_xyzw"].append(poses.quaternion_xyzw[part])
-        columns["outcome"].append(names[codes[part]])
+        index.append(poses.pose_index[part])
+        position.append(poses.position[part])
+        quaternion.append(poses.quaternion_xyzw[part])
+        codes.append(np.frombuffer(chunk.outcomes, dtype=np.uint8)[part])
         limit -= last - first
         if last < chunk.stop - chunk.start:
             following = f"{chunk.number}.{last}"
             break
-    joined = {
-        name: np.ascontiguousarray(np.concatenate(parts)) if parts else np.empty(0)
-        for name, parts in columns.items()
-    }
-    return {"sweep": sweep_id, **joined, "outcome": joined["outcome"].tolist(), "next": following}
+    return OutcomePage(
+        sweep_id,
+        np.concatenate(index),
+        np.concatenate(position),
+        np.concatenate(quaternion),
+        np.concatenate(codes),
+        following,
+    )
+
+
+def stream_outcomes(ctx: Context, sweep_id: str, *, cursor: str | None) -> Iterator[bytes]:
+    """All poses of finished chunks from a cursor on, as an Arrow IPC stream.
+
+    Raises
+    ------
+    ProblemError
+        404 without the sweep, 406 without pyarrow.
+    """
+    page = outcomes(ctx, sweep_id, limit=STREAM_POSES, cursor=cursor)
+
+    def batches(page: OutcomePage) -> Iterator[Any]:
+        while True:
+            if len(page.codes):
+                yield _arrow_batch(page)
+            if page.next is None:
+                return
+            page = outcomes(ctx, sweep_id, limit=STREAM_POSES, cursor=page.next)
+
+    return arrow.stream(_arrow_schema({"sweep": sweep_id, "next": None}), batches(page))
+
+
+def arrow_page(page: OutcomePage, following: str | None) -> Iterator[bytes]:
+    """One page as an Arrow IPC stream; its cursor is in the schema's metadata."""
+    schema = _arrow_schema({"sweep": page.sweep, "next": following})
+    return arrow.stream(schema, [_arrow_batch(page)])
+
+
+def _arrow_schema(told: dict[str, Any]) -> Any:
+    pa = arrow.library()
+    return arrow.schema_of(
+        [
+            ("pose_index", pa.int64()),
+            ("position", arrow.vector_type(3)),
+            ("quaternion_xyzw", arrow.vector_type(4)),
+            ("outcome", arrow.outcome_type()),
+        ],
+        told,
+    )
+
+
+def _arrow_batch(page: OutcomePage) -> Any:
+    """A page as a record batch."""
+    pa = arrow.library()
+    return pa.record_batch(
+        [
+            pa.array(page.pose_index),
+            arrow.vectors(page.position, 3),
+            arrow.vectors(page.quaternion_xyzw, 4),
+            arrow.outcome_names(page.codes),
+        ],
+        schema=_arrow_schema({}),
+    )

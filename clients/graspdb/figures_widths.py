@@ -1,0 +1,133 @@
+"""Figures of the reports on kernels' widths and on sampled kernels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graspdb.figures_style import BLUE, COLOURS, GREEN, GREY, ORANGE, bars, plain, title
+from graspdb.wire.reports import BandwidthReport, KernelSimilarityReport, SimulatedDraws
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["bandwidth", "kernel_similarity"]
+
+_MARKERS = "osD^v"
+
+
+def bandwidth(figure: Figure, report: BandwidthReport) -> None:
+    """Draw the likelihood of left-out grasps by width, and what became of simulated draws."""
+    title(figure, report, "how wide should the kernel be?")
+    left, right = figure.subplots(1, 2)
+    turns = sorted({point.sigma_rotation_deg for point in report.grid})
+    for turn, colour, marker in zip(turns, COLOURS, _MARKERS, strict=False):
+        points = [p for p in report.grid if p.sigma_rotation_deg == turn and p.log_likelihood is not None]
+        left.errorbar(
+            [1e3 * p.sigma_position_m for p in points],
+            [p.log_likelihood or 0.0 for p in points],
+            yerr=[p.below_best_error or 0.0 for p in points],
+            color=colour,
+            marker=marker,
+            markersize=4,
+            capsize=2,
+            linewidth=1.3,
+            label=f"{turn:.1f}°",
+        )
+    best = report.recommended
+    left.axvspan(1e3 * report.range_m[0], 1e3 * report.range_m[1], color=GREY, alpha=0.12, linewidth=0)
+    left.axvline(1e3 * best.sigma_position_m, color=GREY, linestyle=":", linewidth=1.2)
+    left.set_xscale("log")
+    left.set_xlabel(f"position width [mm] ({report.rows:,} grasps, {report.held_out:,} left out)")
+    left.set_ylabel("log density of left-out grasps\n[nats of 1/(m³ rad³)]")
+    left.set_title("bars: error of the difference to the best;\nband: not told from the best", fontsize=8)
+    left.legend(title="rotation width", fontsize=7, title_fontsize=7, loc="lower left", framealpha=0.9)
+    _ticks(left, sorted({1e3 * p.sigma_position_m for p in report.grid}))
+    _draws(right, report.draws, report.level)
+    for axes in (left, right):
+        plain(axes)
+
+
+def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
+    if not draws:
+        axes.text(
+            0.5, 0.5, "No draws were simulated yet:\nthe report's `calls` are\nthe sweeps that do it",
+            transform=axes.transAxes, ha="center", va="center", fontsize=9, color=GREY,
+        )  # fmt: skip
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return
+    at = np.arange(len(draws))
+    for ranges, colour, marker, label, shift in (
+        ([d.success for d in draws], BLUE, "o", "succeed", -0.12),
+        ([d.free_success for d in draws], GREEN, "s", "succeed, of those free of collision", 0.0),
+        ([d.collision for d in draws], ORANGE, "^", "collide", 0.12),
+    ):
+        known = [i for i, item in enumerate(ranges) if item.value is not None]
+        shown = [ranges[i] for i in known]
+        axes.errorbar(
+            at[known] + shift,
+            [item.value or 0.0 for item in shown],
+            yerr=bars(shown),
+            color=colour,
+            marker=marker,
+            markersize=5,
+            capsize=3,
+            linestyle="none",
+            label=label,
+        )
+    axes.set_xticks(at)
+    axes.set_xticklabels(
+        [
+            f"{1e3 * d.kernel.sigma_position_m:.1f} mm\n{d.kernel.sigma_rotation_deg:.1f}°"
+            + ("" if d.kernel.id is None else f"\n{d.kernel.kind}")
+            + f"\n{d.protocol}\nn = {d.draws:,}"
+            for d in draws
+        ],
+        fontsize=7,
+    )
+    axes.set_xlim(-0.5, len(draws) - 0.5)
+    axes.set_ylim(0.0, 1.02)
+    axes.set_ylabel("share of simulated draws")
+    axes.set_title(f"draws simulated as checks, {level:.0%} intervals", fontsize=8)
+    axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+
+
+def kernel_similarity(figure: Figure, report: KernelSimilarityReport) -> None:
+    """Draw figure 13: similarity to the full statistics by number of samples, and of Gaussians."""
+    title(figure, report, "how many samples does a kernel need?")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    for axes, points, colour, marker in (
+        (left, report.samples, BLUE, "o"),
+        (right, report.mixtures, ORANGE, "s"),
+    ):
+        axes.errorbar(
+            [point.count for point in points],
+            [point.similarity for point in points],
+            yerr=[1.64 * point.error for point in points],
+            color=colour,
+            marker=marker,
+            markersize=4,
+            capsize=3,
+            linewidth=1.5,
+        )
+        axes.set_ylim(0.0, 1.02)
+        axes.set_xscale("log")
+        _ticks(axes, [float(point.count) for point in points])
+        plain(axes)
+    left.axvline(900, color=GREY, linestyle=":", linewidth=1.2)
+    left.annotate("900: the paper", (900, 0.03), fontsize=7, color=GREY, ha="right", rotation=90)
+    left.set_xlabel(f"samples, of {report.reference:,} displacements")
+    right.set_xlabel("Gaussians of a mixture")
+    left.set_ylabel(f"similarity to the full statistics\n(Bhattacharyya; {report.level:.0%} intervals)")
+    window = f"{1e3 * report.window_position_m:.0f} mm, {report.window_rotation_deg:.0f}°"
+    widths = f"{1e3 * report.component_position_m:.0f} mm, {report.component_rotation_deg:.0f}°"
+    left.set_title(f"window {window}; components {widths}", fontsize=8)
+
+
+def _ticks(axes: Axes, values: list[float]) -> None:
+    axes.set_xticks(values)
+    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values], fontsize=7)
+    axes.minorticks_off()
