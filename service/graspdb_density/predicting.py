@@ -2,7 +2,9 @@
 
 What predicts success is not what shapes the density: closing fingers centre a free object, so attempts apart
 along the closing axis fare alike, while a few millimetres along the approach decide. Widths are chosen by the
-log loss of attempts whose block of space is left out; one half of them chooses, the other judges.
+log loss of attempts whose block of space is left out; one half of them chooses, the other judges. Blocks are
+small: large ones would hide from the choice whatever changes within them, and blur. They hold what was tried
+at one position, so that repeated grasps and a grid's rotations do not predict themselves.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ __all__ = ["LEAST_OF_EACH", "FittedWidths", "ShapedSuccessModel", "fit_widths"]
 LEAST_OF_EACH = 50
 #: Widths asked for, metres and radians.
 _POSITION_M, _ROTATION = (0.002, 0.04), (math.radians(3.0), math.radians(40.0))
-_BLOCK_M = 0.045
+_BLOCK_M = 0.005
 _TRAINED_MOST, _JUDGED_MOST, _PAIRS_MOST = 20_000, 1_500, 5_000_000
 _CUT = 0.5 * 3.5**2
 #: Steps of the search, as factors of a width.

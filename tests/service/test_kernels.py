@@ -216,7 +216,7 @@ def test_bad_kernels_are_refused_with_reasons(
     post(http, "thing", ridges(40))
     assert "at least 50 successes; there are 40, so 10 more" in refused(409, object="thing")
     assert "at most" not in refused(404, object="nothing")
-    assert "alignment edge" in refused(422, object="thing", alignment="edge")
+    assert "has no mesh" in refused(409, object="thing", alignment="edge")
     assert "name the object" in refused(422)
     assert "fitted on nothing: object" in refused(422, object="thing", **GIVEN)
     singular = np.diag([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.0]).tolist()

@@ -56,13 +56,17 @@ class KernelCreate(Request):
     ``sampled`` (eq 5): isotropic components of ``component_widths`` at displacements, drawn from those
     between the object's successes in the window (``components`` of them, 900 by default) or given. It costs
     as much more than one Gaussian as it has components, so what queries make of it is limited.
+
+    ``probability``: a width for every axis of the gripper, chosen by the log loss of attempts in blocks of
+    space left out. A query with it estimates ``success_probability`` by these widths; its density is the
+    default one. Given: one component, centred, without correlations.
     """
 
     object: Slug | None = None
     gripper: Slug | None = None
     protocol: Slug | None = None
     source: Source | None = None
-    kind: Literal["anisotropic", "sampled"] = "anisotropic"
+    kind: Literal["anisotropic", "sampled", "probability"] = "anisotropic"
     alignment: Alignment = "gripper"
     window: KernelWindow | None = None
     component_widths: KernelWidths | None = None
@@ -75,6 +79,11 @@ class KernelCreate(Request):
 
     @model_validator(mode="after")
     def _one_way(self) -> KernelCreate:
+        if self.kind == "probability":
+            if self.window is not None or self.component_widths is not None:
+                raise ValueError("widths that predict success take no window and no component_widths")
+            if self.components not in (None, 1) and not isinstance(self.components, list):
+                raise ValueError("a kernel that predicts success has one component")
         if isinstance(self.components, list):
             fitting = ["object", "protocol", "source", "window"]
             if self.kind == "anisotropic":
@@ -96,6 +105,8 @@ class KernelProvenance(Response):
     space given; ``log_likelihood`` is that likelihood (nats of 1/(m^3 rad^3)), and
     ``isotropic_log_likelihood`` the isotropic kernel's on the same blocks. ``similarity`` is the
     Bhattacharyya coefficient of the unscaled shape and a sampled kernel of 900 displacements in the window.
+    ``attempts`` chose the widths that predict success, and ``judged`` others tell how well they do: the log
+    loss (nats an attempt) and Brier's skill, ``isotropic_*`` those of the best isotropic kernel.
     """
 
     origin: Literal["fitted", "given"]
@@ -112,6 +123,13 @@ class KernelProvenance(Response):
     isotropic_log_likelihood: float | None = None
     similarity: float | None = None
     likelihood_by_components: dict[str, float] | None = None
+    attempts: int | None = None
+    judged: int | None = None
+    log_loss: float | None = None
+    isotropic_log_loss: float | None = None
+    brier_skill: float | None = None
+    isotropic_brier_skill: float | None = None
+    isotropic_widths: KernelWidths | None = None
 
 
 class StoredKernel(Response):

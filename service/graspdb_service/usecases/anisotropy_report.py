@@ -132,11 +132,7 @@ def anisotropy_report(
 
 
 def _frames(sources: Sources, built: Built, alignment: str) -> Frames | None:
-    if alignment == "gripper":
-        return None
-    if alignment == "object":
-        return shapes.principal_axes(built.object_row)
-    return sources.scenes.features.frames(alignment, built.object_row, built.selected)
+    return shapes.axes(alignment, built.object_row, built.selected, sources.scenes.features)
 
 
 def _measure(

@@ -34,6 +34,7 @@ from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases import shapes
 from graspdb_service.usecases.exposures import Exposure
+from graspdb_service.usecases.features import Axes
 from graspdb_service.usecases.selection import Selected
 
 Floats = NDArray[np.float64]
@@ -84,6 +85,8 @@ class Built:
         (N,) whether a grid tried it.
     chosen_from
         How many of the first rows the widths were chosen from.
+    predicting
+        Widths (6) that success probabilities are estimated with, where a kernel for those was asked for.
     """
 
     revision: int
@@ -100,6 +103,7 @@ class Built:
     chosen_from: int = 0
     shaped: MixtureDensity | None = None
     sampled: GraspDensity | None = None
+    predicting: tuple[float, ...] | None = None
 
     @property
     def asked(self) -> GraspDensity | MixtureDensity | None:
@@ -147,6 +151,7 @@ class Built:
 def build(
     choice: KernelChoice,
     stored: KernelRow | None,
+    axes: Axes,
     row: ObjectRow,
     selected: Selected,
     exposure: Exposure,
@@ -154,12 +159,12 @@ def build(
     before: Built | None,
     threads: int,
 ) -> Built:
-    """The density of the rows there were and those that came since.
+    """The density of the rows there were and those that came since; ``axes`` are those of a stored kernel.
 
     Raises
     ------
     ProblemError
-        409 where a kernel's axes are not known; 413 for more components than a density may have.
+        413 for more components than a density may have.
     """
     assert rows.batch is not None
     symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
@@ -171,6 +176,8 @@ def build(
         seq = np.concatenate([before.seq, seq])
         proposal = np.concatenate([before.proposal_density, proposal])
         swept = np.concatenate([before.swept, swept])
+    # A kernel that predicts success shapes no density: that one is as if none was asked for.
+    predicting = stored is not None and stored.kind == "probability"
     built = Built(
         revision=row.revision,
         epoch=row.epoch,
@@ -178,12 +185,13 @@ def build(
         object_row=row,
         selected=selected,
         exposure=exposure,
-        kernel=_info(choice) if stored is None else shapes.info_of(stored),
+        kernel=_info(choice) if stored is None else shapes.info_of(stored, _info(KernelChoice())),
         density=None,
         seq=seq,
         proposal_density=proposal,
         swept=swept,
-        chosen_from=widths_prefix(len(seq)) if choice.by_default else 0,
+        chosen_from=widths_prefix(len(seq)) if choice.by_default or predicting else 0,
+        predicting=shapes.widths_of(stored) if stored is not None and predicting else None,
     )
     if not len(seq):
         return built
@@ -197,14 +205,15 @@ def build(
 
     weights = _weights(built, everything)
     added = None if old is None else _in_units_of(old, weights, len(rows))
-    if stored is not None:
-        return _shaped(stored, built, before, everything, fresh, weights, added)
+    if stored is not None and not predicting:
+        return _shaped(stored, axes, built, before, everything, fresh, weights, added)
     if before is not None and before.chosen_from == built.chosen_from:
         built = replace(built, kernel=before.kernel)
         if old is not None and added is not None:
             return replace(built, density=old.extend(*fresh[:2], weights=added, symmetric=symmetric))
     elif built.chosen_from:
-        built = replace(built, kernel=_choose(everything(), proposal, built.chosen_from, threads))
+        chosen = _choose(everything(), proposal, built.chosen_from, threads)
+        built = replace(built, kernel=chosen if stored is None else shapes.info_of(stored, chosen))
     return replace(built, density=_isotropic(built.kernel, everything(), weights))
 
 
@@ -221,6 +230,7 @@ def _isotropic(kernel: KernelInfo, poses: Poses, weights: Floats | None) -> Gras
 
 def _shaped(
     stored: KernelRow,
+    axes: Axes,
     built: Built,
     before: Built | None,
     everything: Callable[[], Poses],
@@ -229,7 +239,6 @@ def _shaped(
     added: Floats | None,
 ) -> Built:
     """The density under a stored kernel."""
-    row = built.object_row
     if stored.kind == "sampled":
         kernel = shapes.load_sampled(stored)
         position, quaternion, symmetric = everything()
@@ -243,9 +252,9 @@ def _shaped(
             density=_isotropic(built.kernel, (position, quaternion, symmetric), weights),
             sampled=kernel.placed(position, quaternion, weights=weights, symmetric=symmetric),
         )
-    frame = shapes.frame_of(stored, row)
     if before is not None and before.shaped is not None and added is not None:
-        shaped = before.shaped.extend(*fresh[:2], weights=added, symmetric=fresh[2], frames=frame)
+        frames = shapes.axes_at(axes, *fresh[:2])
+        shaped = before.shaped.extend(*fresh[:2], weights=added, symmetric=fresh[2], frames=frames)
     else:
         position, quaternion, symmetric = everything()
         shaped = MixtureDensity(
@@ -254,7 +263,7 @@ def _shaped(
             kernel=shapes.load(stored),
             weights=weights,
             symmetric=symmetric,
-            frames=frame,
+            frames=shapes.axes_at(axes, position, quaternion),
         )
     return replace(built, density=shaped.isotropic, shaped=shaped)
 

@@ -9,6 +9,7 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.densities import Densities
+from graspdb_service.usecases.features import Features
 from graspdb_service.usecases.report_runs import ReportRuns
 from graspdb_service.usecases.scenes import Scenes
 from graspdb_service.usecases.success import Successes
@@ -30,8 +31,9 @@ class Context:
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
         compute = Compute(settings.threads)
-        densities = Densities(database, compute, settings.max_density_cache_bytes)
-        scenes = Scenes(database, compute)
+        features = Features(database, compute)
+        densities = Densities(database, compute, features, settings.max_density_cache_bytes)
+        scenes = Scenes(database, compute, features)
         return cls(
             settings=settings,
             database=database,

@@ -62,8 +62,9 @@ def convergence_report(
     share = 1.0 if built.shaped is None else 0.5
     kernel: Kernel = density.kernel if built.shaped is None else built.shaped.kernel
     frames = None
-    if built.shaped is not None and built.shaped.kernel.frame == "fixed":
-        frames = shapes.principal_axes(built.object_row)
+    if built.shaped is not None and built.kernel.alignment is not None:
+        axes = shapes.axes(built.kernel.alignment, built.object_row, built.selected, sources.scenes.features)
+        frames = shapes.axes_at(axes, density.positions, density.quaternions_xyzw)
     curve = _curve(sources, density, kernel, frames, lambda done: progress(share * done))
     curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
     extra: dict[str, Any] = {}
@@ -121,6 +122,8 @@ def _matched(
         order[max(1, min(2_000, density.size // 10)) :],
     )
     p, q, w = density.positions, density.quaternions_xyzw, density.weights
+    if frames is not None and frames.ndim == 3:
+        frames = frames[train]
 
     def likelihood(used: Kernel) -> float:
         rows = KernelRows(

@@ -16,10 +16,11 @@ from graspdb_service.storage import kernels, objects, trials
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.usecases import builds, exposures
+from graspdb_service.usecases import builds, exposures, shapes
 from graspdb_service.usecases.builds import Built, KernelChoice
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.compute import Compute
+from graspdb_service.usecases.features import Features
 from graspdb_service.usecases.selection import Filters, Selected, resolve
 from graspdb_service.usecases.slugs import is_slug
 
@@ -101,9 +102,10 @@ class Densities:
     the next answer of this one. Nothing is computed inside a transaction.
     """
 
-    def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
+    def __init__(self, database: Database, compute: Compute, features: Features, max_bytes: int) -> None:
         self._database = database
         self._compute = compute
+        self._features = features
         self._cache: SingleFlightCache[_Key, Built] = SingleFlightCache(max_bytes, lambda b: b.nbytes)
         self._resolved: OrderedDict[tuple[int, Filters], tuple[int, Selected]] = OrderedDict()
         self._lock = threading.Lock()
@@ -217,8 +219,9 @@ class Densities:
                 exposure=exposure,
             )
         threads = self._compute.threads
+        axes = None if stored is None else shapes.axes(stored.alignment, row, selected, self._features)
         return self._compute.run(
-            lambda: builds.build(key.kernel, stored, row, selected, exposure, rows, before, threads)
+            lambda: builds.build(key.kernel, stored, axes, row, selected, exposure, rows, before, threads)
         )
 
 

@@ -22,6 +22,8 @@ from graspdb_service.usecases.selection import Selected
 Floats = NDArray[np.float64]
 #: Axes (n, 3, 3) of grasps at positions (n, 3) and rotations (n, 4); NaN where a grasp has the gripper's own.
 FramesOf = Callable[[Floats, Floats], Floats]
+#: Axes that translations are along: one set (3, 3) for all grasps, each grasp's own, or None: its gripper's.
+Axes = Floats | FramesOf | None
 
 _MAX_BYTES = 32 * 2**20
 

@@ -28,9 +28,10 @@ from graspdb_service.problems import conflict, invalid, not_found
 from graspdb_service.storage import grippers, kernels
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.kernels import KernelRow
-from graspdb_service.usecases import shapes
+from graspdb_service.usecases import predictors, shapes
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.densities import Built, KernelChoice, require_object
+from graspdb_service.usecases.features import Axes
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.idempotency import Created, replay_or, replayed
 from graspdb_service.usecases.selection import Filters
@@ -41,6 +42,8 @@ Floats = NDArray[np.float64]
 _MOST_SHIFT_M = 1.0
 #: Displacements that stand for all of them where a sample is compared with them.
 _WHOLE = 20_000
+#: Shares of a covariance's scale, and metres, below which an entry is none.
+_SAME = 1e-9
 
 
 def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
@@ -49,12 +52,14 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
     Raises
     ------
     ProblemError
-        404 for the object, 422 for components that make no kernel or an alignment that can't be measured,
-        409 where the trials don't suffice to fit one.
+        404 for the object, 422 for components that make no kernel, 409 where the trials don't suffice to fit
+        one or the object's geometry does not have what it is to be aligned with.
     """
-    shapes.check_alignment(request.alignment)
-    if request.kind == "sampled" and request.alignment != "gripper":
-        raise invalid("alignment", "a sampled kernel lies along the gripper's axes: use alignment=gripper")
+    if request.kind != "anisotropic" and request.alignment != "gripper":
+        raise invalid(
+            "alignment",
+            f"a kernel of kind {request.kind} lies along the gripper's axes: use alignment=gripper",
+        )
     scope = "POST /kernels"
     # A fit takes a while, and the trials may have gone since.
     earlier = replayed(ctx, scope=scope, key=key, request=body)
@@ -103,7 +108,10 @@ def _given(ctx: Context, request: KernelCreate) -> dict[str, Any]:
             if grippers.find(tx, request.gripper) is None:
                 raise unknown("gripper", [request.gripper])
     sampled = request.kind == "sampled"
-    components, widths = _checked_samples(request) if sampled else (_checked_gaussians(request), None)
+    if request.kind == "probability":
+        components, widths = predictors.checked(request), None
+    else:
+        components, widths = _checked_samples(request) if sampled else (_checked_gaussians(request), None)
     provenance = KernelProvenance(origin="given", component_widths=widths)
     return {
         "kind": request.kind,
@@ -136,9 +144,23 @@ def _checked_gaussians(request: KernelCreate) -> list[dict[str, Any]]:
         )
         # What no equivalent width can be told of has none.
         kernel.isotropic  # noqa: B018
+        if request.alignment in ("edge", "surface-pair"):
+            _check_signs(kernel)
     except ValueError as error:
         raise invalid("components", str(error), "These components make no kernel") from None
     return _components(kernel)
+
+
+def _check_signs(kernel: AnisotropicKernel) -> None:
+    """Refuse what an edge's tangent or a pair's axes, whose signs mean nothing, would make ambiguous."""
+    sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    off = kernel.covariances - sign[:, None] * kernel.covariances * sign
+    scale = np.sqrt(np.einsum("cii->ci", kernel.covariances))
+    turned = np.abs(off) > _SAME * scale[:, :, None] * scale[:, None, :]
+    if turned.any() or np.any(np.abs(kernel.means[:, :2]) > _SAME):
+        raise ValueError(
+            "x and y of an edge or a pair have no sign: no mean along them, no correlation with others"
+        )
 
 
 def _checked_samples(request: KernelCreate) -> tuple[list[dict[str, Any]], KernelWidths]:
@@ -180,6 +202,8 @@ def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
 
 def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
     assert request.object is not None
+    if request.kind == "probability":
+        return predictors.fitted(ctx, request)
     sampled, count = request.kind == "sampled", request.components
     assert not isinstance(count, list)
     if sampled and count == "auto":
@@ -190,24 +214,32 @@ def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
         raise invalid(
             "components", f"at most {MAX_FITTED} Gaussians, or auto; kind sampled takes {MAX_SAMPLED}"
         )
-    if request.alignment == "object" and count not in (None, 1, "auto"):
-        raise invalid("components", "the object's axes have no sign: a kernel aligned with them has 1")
+    if request.alignment != "gripper" and count not in (None, 1, "auto"):
+        raise invalid(
+            "components",
+            "axes that do not turn with the jaw have no sign: a kernel aligned with them has 1",
+        )
     window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
     filters = Filters(request.gripper, request.protocol, request.source)
     with ctx.compute.admitted():
         built = ctx.densities.get(request.object, filters, KernelChoice())
-        if request.alignment == "object":
-            # Said first: without axes no number of trials helps.
-            shapes.principal_axes(built.object_row)
+        # Said first: without axes no number of trials helps.
+        axes = shapes.axes(request.alignment, built.object_row, built.selected, ctx.scenes.features)
         if built.density is None:
             raise conflict(
                 "too-few-trials",
                 "No trial of this selection succeeded, so there is nothing to fit a kernel on:"
                 f" post trials (POST /objects/{request.object}/trials) or sweep a grid first",
             )
-        fit = _sample if sampled else _fit
+        threads = ctx.compute.threads
         try:
-            components, told = ctx.compute.run(lambda: fit(ctx, request, built, window, widths))
+            components, told = ctx.compute.run(
+                lambda: (
+                    _sample(request, built, window, widths, threads)
+                    if sampled
+                    else _fit(request, built, axes, window, widths, threads)
+                )
+            )
         except ValueError as error:
             raise conflict("too-few-trials", f"No kernel can be fitted: {error}") from None
     provenance = KernelProvenance(
@@ -231,7 +263,12 @@ def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
 
 
 def _fit(
-    ctx: Context, request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths
+    request: KernelCreate,
+    built: Built,
+    axes: Axes,
+    window: KernelWindow,
+    widths: KernelWidths,
+    threads: int,
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """A Gaussian, or a mixture of a few: its components and what is told of the fit."""
     density, count = built.density, request.components
@@ -246,8 +283,8 @@ def _fit(
         components=None if count == "auto" else count or 1,
         weights=density.weights,
         symmetric=density.symmetric,
-        frame=shapes.principal_axes(built.object_row) if request.alignment == "object" else None,
-        threads=ctx.compute.threads,
+        frame=shapes.axes_at(axes, density.positions, density.quaternions_xyzw),
+        threads=threads,
     )
     return _components(fit.kernel), {
         "successes": fit.successes,
@@ -261,7 +298,7 @@ def _fit(
 
 
 def _sample(
-    ctx: Context, request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths
+    request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths, threads: int
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Displacements drawn from those between successes (eq 5), and their likeness to all of them."""
     density, rng = built.density, np.random.default_rng(0)
@@ -287,9 +324,7 @@ def _sample(
         sampled_kernel_rows(part[:, :3], se3.from_rotation_vector(part[:, 3:]), _isotropic(widths))
         for part in (chosen, whole)
     )
-    similarity = bhattacharyya(
-        one, every, rng, points=4_000, window=_window(window), threads=ctx.compute.threads
-    )
+    similarity = bhattacharyya(one, every, rng, points=4_000, window=_window(window), threads=threads)
     return [{"weight": 1.0, "mean": vector.tolist()} for vector in chosen], {
         "successes": density.size,
         "displacements": len(found.vectors),

@@ -62,10 +62,10 @@ class CollisionTest:
 class Scenes:
     """Prepared geometry, by content: the same parts are prepared once, whichever object they belong to."""
 
-    def __init__(self, database: Database, compute: Compute) -> None:
+    def __init__(self, database: Database, compute: Compute, features: Features) -> None:
         self._database = database
         self._compute = compute
-        self.features = Features(database, compute)
+        self.features = features
         self._cache: SingleFlightCache[tuple[str, str], _Prepared] = SingleFlightCache(
             _MAX_BYTES, lambda p: p.nbytes
         )

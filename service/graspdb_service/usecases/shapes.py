@@ -10,22 +10,13 @@ from numpy.typing import NDArray
 from graspdb.wire import KernelInfo, KernelWidths
 from graspdb_density import AnisotropicKernel, IsotropicKernel, SampledKernel, se3
 from graspdb_density.anisotropic import mirror
-from graspdb_service.problems import conflict, invalid
+from graspdb_service.problems import conflict
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.features import Axes, Features
+from graspdb_service.usecases.selection import Selected
 
 Floats = NDArray[np.float64]
-
-#: Alignments that there is geometry for.
-ALIGNMENTS = ("gripper", "object")
-
-
-def check_alignment(alignment: str) -> None:
-    """422 for an alignment that can't be measured yet."""
-    if alignment not in ALIGNMENTS:
-        raise invalid(
-            "alignment", f"{alignment} is not measured yet: alignments there are: {', '.join(ALIGNMENTS)}"
-        )
 
 
 def load(row: KernelRow) -> AnisotropicKernel:
@@ -54,9 +45,28 @@ def _component(row: KernelRow) -> IsotropicKernel:
     return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
 
 
-def frame_of(row: KernelRow, item: ObjectRow) -> Floats | None:
-    """The axes (3, 3) that a kernel's translations are along on an object; None: each grasp's gripper."""
-    return principal_axes(item) if row.alignment == "object" else None
+def axes(alignment: str, row: ObjectRow, selected: Selected, features: Features) -> Axes:
+    """The axes that translations are along on an object.
+
+    Raises
+    ------
+    ProblemError
+        409 where the object's geometry does not tell them, or has none to tell.
+    """
+    if alignment == "gripper":
+        return None
+    if alignment == "object":
+        return principal_axes(row)
+    return features.frames(alignment, row, selected)
+
+
+def axes_at(found: Axes, positions: Floats, quaternions: Floats) -> Floats | None:
+    """Those of grasps (n, 3), (n, 4): (3, 3) or (n, 3, 3), the gripper's where one has none of its own."""
+    if not callable(found):
+        return found
+    own = found(positions, quaternions)
+    known = np.asarray(np.isfinite(own).all(axis=(1, 2)), dtype=bool)
+    return np.where(known[:, None, None], own, se3.to_matrix(quaternions))
 
 
 def covariance_of(row: KernelRow) -> Floats:
@@ -74,8 +84,19 @@ def covariance_of(row: KernelRow) -> Floats:
     return np.asarray(np.einsum("c,ci,cj->ij", share, off, off) + np.diag(own), dtype=np.float64)
 
 
-def info_of(row: KernelRow) -> KernelInfo:
-    """What a query says of the kernel it used."""
+def widths_of(row: KernelRow) -> tuple[float, ...]:
+    """Standard deviations (6) along (metres) and about (radians) x, y and z."""
+    return tuple(float(width) for width in np.sqrt(np.diag(covariance_of(row))))
+
+
+def info_of(row: KernelRow, plain: KernelInfo | None = None) -> KernelInfo:
+    """What a query says of the kernel it used.
+
+    Parameters
+    ----------
+    plain
+        The isotropic kernel that the density has where the stored one is for success probabilities only.
+    """
     covariance = covariance_of(row)
     widths = np.sqrt(np.diag(covariance))
     # Of the isotropic kernel whose position and rotation blocks have the same determinants.
@@ -84,6 +105,12 @@ def info_of(row: KernelRow) -> KernelInfo:
     )
     fitted = row.provenance.get("object")
     origin = f"fitted on {fitted!r}" if fitted else "given by its components"
+    rule = f"stored kernel, {origin}; success_probability uses the isotropic kernel of equal determinants"
+    if row.kind == "probability":
+        rule = f"success_probability by the stored kernel's widths, {origin}"
+        if plain is not None:
+            position, rotation = plain.sigma_position_m, math.radians(plain.sigma_rotation_deg)
+            rule += f"; the density's isotropic kernel by {plain.rule}"
     return KernelInfo(
         kind=row.kind,
         id=row.id,
@@ -92,7 +119,7 @@ def info_of(row: KernelRow) -> KernelInfo:
         sigma_rotation_deg=math.degrees(rotation),
         widths_m=_triple(widths[:3]),
         widths_deg=_triple(np.degrees(widths[3:])),
-        rule=f"stored kernel, {origin}; success_probability uses the isotropic kernel of equal determinants",
+        rule=rule,
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, SuccessModel
+from graspdb_density.predicting import ShapedSuccessModel
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases import alltrials
 from graspdb_service.usecases.alltrials import AllTrials, Stored
@@ -78,6 +79,7 @@ class _Key:
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool
+    widths: tuple[float, ...] | None
 
 
 class Successes:
@@ -102,6 +104,7 @@ class Successes:
             built.kernel.sigma_position_m,
             built.kernel.sigma_rotation_deg,
             collisions_known,
+            built.predicting,
         )
         found = self._cache.get(
             key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
@@ -169,11 +172,11 @@ class Successes:
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
             return self._refresh(key, slug, None)
-        model = self._compute.run(lambda: _extended(old, new, kernel))
+        model = self._compute.run(lambda: _extended(old, new, kernel, key.widths))
         if size > _LARGE:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
             chosen = np.random.default_rng(row.revision).random(len(new.success)) < share
-            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel))
+            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel, key.widths))
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
@@ -190,12 +193,16 @@ def _fetch(
     )
 
 
-def _extended(old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel) -> SuccessModel | None:
+def _extended(
+    old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel, widths: tuple[float, ...] | None
+) -> SuccessModel | None:
     if not len(new.success):
         return old
     columns = new.position, new.quaternion, new.success
     if old is not None:
         return old.extend(*columns, symmetric=new.symmetric)
+    if widths is not None:
+        return ShapedSuccessModel.shaped(*columns, widths=widths, symmetric=new.symmetric)
     return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
 
 
