@@ -214,6 +214,12 @@ def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     assert asked(at, kernel=kernel["id"])["success_probability"][0] < by["success_probability"][0]
     best = ok(http.get(f"/objects/thing/best-grasp?objective=success_probability&kernel={kernel['id']}"))
     assert math.sin(2 * math.pi * best["grasps"][0]["position"][0] / 0.048) > 0.5
+    # Calibration judges what it predicts.
+    judged = ok(http.get(f"/objects/thing/reports/calibration?kernel={kernel['id']}"))
+    every = ok(http.get("/objects/thing/reports/calibration"))
+    assert judged["kernel"]["id"] == kernel["id"]
+    assert judged["auc_density"] == pytest.approx(every["auc_density"])
+    assert judged["brier"] != pytest.approx(every["brier"], rel=1e-3)
     # It shapes no density, so it is not what anisotropic means.
     assert problem(http.get("/objects/thing/density?kernel=anisotropic"), 409)
 

@@ -9,11 +9,12 @@ from graspdb.wire.reports import (
     CalibrationBin,
     CalibrationReport,
 )
-from graspdb_density import GraspDensity, SuccessModel, importance_weights
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, importance_weights
 from graspdb_density.anisotropy import (
     LEAST_SUCCESSES,
 )
 from graspdb_density.calibration import area_under_curve, assign_blocks, calibrate
+from graspdb_density.predicting import ShapedSuccessModel
 from graspdb_density.rows import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.alltrials import AllTrials
@@ -35,6 +36,17 @@ Floats = NDArray[np.float64]
 _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
 LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
+
+
+def _model(
+    everything: AllTrials, rows: NDArray[np.int64], kernel: IsotropicKernel, widths: tuple[float, ...] | None
+) -> SuccessModel:
+    """Of some attempts, under the widths that predict success where a kernel of that kind was asked for."""
+    attempts = everything.position[rows], everything.quaternion[rows], everything.success[rows]
+    symmetric = everything.symmetric[rows]
+    if widths is not None:
+        return ShapedSuccessModel.shaped(*attempts, widths=widths, symmetric=symmetric)
+    return SuccessModel.build(*attempts, kernel=kernel, symmetric=symmetric)
 
 
 def calibration_report(
@@ -68,13 +80,7 @@ def calibration_report(
         progress(fold / blocks.folds)
         if not held.size or not train.size:
             continue
-        model = SuccessModel.build(
-            everything.position[train],
-            everything.quaternion[train],
-            everything.success[train],
-            kernel=kernel,
-            symmetric=everything.symmetric[train],
-        )
+        model = _model(everything, train, kernel, built.predicting)
         progress((fold + 0.5) / blocks.folds)
         predicted[held] = model.evaluate(p[held], q[held], threads=sources.threads).probability
         kept = train[everything.success[train]]
