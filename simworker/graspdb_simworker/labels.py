@@ -17,8 +17,8 @@ minimum of its support function over unit directions d
     h(d) = sum_i f_i max(0, n_i . d + mu sqrt(1 - (n_i . d)^2)).
 
 Where the forces ring because the object still moves, several instants of the stalled jaw are rated and
-the median counts. ``f_i`` is scaled by the gripper's force over the force the jaw was simulated with, see
-:func:`graspdb_simworker.bodies.closing_force`.
+the median of the last five counts. ``f_i`` is scaled by the gripper's force over the force the jaw was
+simulated with, see :func:`graspdb_simworker.bodies.closing_force`.
 
 **lift**: is the object still held, and where it was, after the jaw lifted and shook it
 (:mod:`graspdb_simworker.lifting`)? A grasp on two points may well hold the object and let it swing; so the
@@ -43,6 +43,8 @@ GRAVITY_M_S2 = 9.80665
 MOVED_M = 0.010
 TURNED_RAD = math.radians(15.0)
 WORST_QUALITY = -1000.0
+RATED = 5
+"""So many of the last instants of a stalled jaw are rated at most."""
 MERGE_COSINE = 1.0 - 1e-8
 """Contacts whose normals differ less than this (0.008 degrees) act as one: their cones add up to one cone."""
 _COARSE = 96
@@ -357,7 +359,7 @@ def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float
         return SIMULATION_ERROR
     if closing.carried is not None:
         return _carried_label(closing.carried, width)
-    quality = statistics.median(rating(now, gripper, mass_kg, friction) for now in closing.contacts)
+    quality = statistics.median(rating(now, gripper, mass_kg, friction) for now in closing.contacts[-RATED:])
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
 
 
