@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import orjson
-from fastapi import Response
+from fastapi import Request, Response
 from fastapi.exceptions import RequestValidationError
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -21,10 +21,32 @@ from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 from graspdb_density import se3
 from graspdb_service.api.jsonpieces import LongArray, loads
 from graspdb_service.problems import ProblemError, invalid
+from graspdb_service.usecases import arrow
 
 Floats = NDArray[np.float64]
 
 _ROWS = 16_384
+
+BINARY = {"type": "string", "format": "binary"}
+"""The schema of a binary body."""
+
+
+def accepted(request: Request, *kinds: str) -> str:
+    """The first of the media types in Accept that there is an answer in; the first of ``kinds`` for any.
+
+    Raises
+    ------
+    ProblemError
+        406 where none is.
+    """
+    for item in request.headers.get("accept", "*/*").split(","):
+        kind = item.partition(";")[0].strip().lower()
+        if kind in kinds:
+            return kind
+        if kind in ("application/*", "*/*", ""):
+            return kinds[0]
+    told = f"{', '.join(kinds[:-1])} or {kinds[-1]}"
+    raise ProblemError(406, "not-acceptable", f"This comes as {told}: say which by Accept")
 
 
 # -- out -----------------------------------------------------------------------------------------------------
@@ -56,6 +78,29 @@ def _value(value: Any) -> bytes:
         piece = np.ascontiguousarray(value[start : start + _ROWS])
         pieces.append(orjson.dumps(piece, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1])
     return b"[" + b",".join(pieces) + b"]"
+
+
+def columns_arrow(
+    head: Mapping[str, Any], columns: Mapping[str, Any], headers: Mapping[str, str] | None = None
+) -> Response:
+    """The same as an Arrow IPC stream: ``head`` as JSON in the schema's metadata, null for infinity and NaN.
+
+    Members of a mapping become columns of their own, ``interval_low`` of ``interval.low``; those that are no
+    arrays join the head.
+    """
+    pa, arrays, told = arrow.library(), {}, dict(head)
+    for name, value in columns.items():
+        parts = value.items() if isinstance(value, Mapping) else [(None, value)]
+        for part, column in parts:
+            full = name if part is None else f"{name}_{part}"
+            if not isinstance(column, np.ndarray):
+                told[full] = column
+            else:
+                arrays[full] = pa.array(column) if column.dtype == np.bool_ else arrow.numbers(column)
+    schema = arrow.schema_of([(name, array.type) for name, array in arrays.items()], told)
+    batch = pa.record_batch(list(arrays.values()), schema=schema)
+    content = b"".join(arrow.stream(schema, [batch]))
+    return Response(content, media_type=arrow.ARROW, headers=dict(headers or {}))
 
 
 # -- in ------------------------------------------------------------------------------------------------------
@@ -103,6 +148,22 @@ def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:
         raise _no_json(error) from None
 
 
+def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Floats, Floats]:
+    """What a request says beside its poses, positions (n, 3) and unit quaternions (n, 4) of an Arrow stream.
+
+    Raises
+    ------
+    ProblemError
+        415 without pyarrow; 422 naming what is wrong.
+    """
+    table = arrow.Table(body, ("position", "quaternion_xyzw"), prefix="poses")
+    if not table.count:
+        raise invalid("poses", "at least one pose")
+    names = ("poses.position.{}", "poses.quaternion_xyzw.{}")
+    poses = table.vectors("position", 3), table.vectors("quaternion_xyzw", 4)
+    return table.options, *_checked(*poses, names)
+
+
 def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
     """Positions (n, 3) and unit quaternions (n, 4) of a list of poses or of pose columns.
 
@@ -130,6 +191,11 @@ def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
         raise invalid(field, "a list of poses, or columns {position, quaternion_xyzw}")
     if not len(position):
         raise invalid(field, "at least one pose")
+    return _checked(position, quaternion, names)
+
+
+def _checked(position: Floats, quaternion: Floats, names: tuple[str, str]) -> tuple[Floats, Floats]:
+    """Poses with unit quaternions, near enough; ``names`` are those of a row's fields."""
     far = np.flatnonzero(~(np.abs(position) <= MAX_COORDINATE_M).all(axis=1))
     if far.size:
         raise invalid(

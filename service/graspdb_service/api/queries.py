@@ -27,14 +27,24 @@ from graspdb.wire import (
 from graspdb.wire.base import Position, Quaternion
 from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn
 from graspdb_service import __version__
-from graspdb_service.api.columns import columns_json, read_object, read_poses
+from graspdb_service.api.columns import (
+    BINARY,
+    accepted,
+    columns_arrow,
+    columns_json,
+    read_arrow_poses,
+    read_object,
+    read_poses,
+)
 from graspdb_service.api.jsonpieces import LongArray
 from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
 from graspdb_service.problems import ProblemError
 from graspdb_service.usecases import bestgrasp, proposals, queries
+from graspdb_service.usecases.arrow import ARROW
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.selection import Filters
 from graspdb_service.usecases.success import LEVEL
+from graspdb_service.usecases.trial_bodies import JSON
 
 router = APIRouter(tags=["queries"])
 
@@ -108,16 +118,27 @@ def get_likelihood(
 @router.post(
     "/objects/{id}/likelihood",
     response_model=Likelihoods,
-    **scope("read", body={"application/json": LikelihoodRequest}),
+    responses={200: {"content": {ARROW: {"schema": BINARY}}}},
+    **scope("read", body={"application/json": LikelihoodRequest, ARROW: BINARY}),
 )
 def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
-    """How likely each of many grasps is: columns in the poses' order."""
-    content = _json_body(request, body)
-    poses = content.pop("poses", None)
-    options = _validated(LikelihoodOptions, content)
-    positions, quaternions = read_poses(poses)
+    """How likely each of many grasps is: columns in the poses' order.
+
+    As an Arrow stream (`application/vnd.apache.arrow.stream`, by Content-Type and by Accept) the poses are
+    the columns `position` and `quaternion_xyzw`, and the rest of the request JSON in the schema's metadata
+    (key `graspdb`), as is the rest of the answer.
+    """
+    kind = accepted(request, JSON, ARROW)
+    if media_type(request) == ARROW:
+        content, positions, quaternions = read_arrow_poses(body)
+        options = _validated(LikelihoodOptions, content)
+    else:
+        content = _json_body(request, body)
+        poses = content.pop("poses", None)
+        options = _validated(LikelihoodOptions, content)
+        positions, quaternions = read_poses(poses)
     answer = queries.likelihood(ctx, id, options, positions, quaternions, options.include)
-    return _likelihoods(answer)
+    return _likelihoods(answer, {"Vary": "Accept"}, arrow=kind == ARROW)
 
 
 @router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
@@ -170,7 +191,9 @@ def _drawn(drawn: queries.Draw, more: dict[str, Any]) -> Response:
     )
 
 
-def _likelihoods(answer: queries.LikelihoodAnswer, headers: dict[str, str] | None = None) -> Response:
+def _likelihoods(
+    answer: queries.LikelihoodAnswer, headers: dict[str, str] | None = None, *, arrow: bool = False
+) -> Response:
     columns: dict[str, Any] = {
         name: getattr(answer, name)
         for name in (
@@ -186,7 +209,8 @@ def _likelihoods(answer: queries.LikelihoodAnswer, headers: dict[str, str] | Non
     if answer.interval is not None:
         low, high = answer.interval
         columns["interval"] = {"level": LEVEL, "low": low, "high": high}
-    return columns_json({"revision": answer.revision, "kernel": answer.kernel.model_dump()}, columns, headers)
+    head = {"revision": answer.revision, "kernel": answer.kernel.model_dump()}
+    return (columns_arrow if arrow else columns_json)(head, columns, headers)
 
 
 def _json_body(request: Request, body: bytes) -> dict[str, Any]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import orjson
+import numpy as np
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import StreamingResponse
 
-from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
+from graspdb.wire import OUTCOMES, Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.sweeps import SweepState
+from graspdb_service.api.columns import BINARY, accepted, columns_json
 from graspdb_service.api.jobs import parse
 from graspdb_service.api.routing import (
     Ctx,
@@ -21,10 +23,15 @@ from graspdb_service.api.routing import (
     scope,
 )
 from graspdb_service.usecases import sweeps
+from graspdb_service.usecases.arrow import ARROW
+from graspdb_service.usecases.trial_bodies import JSON
 
 router = APIRouter(tags=["sweeps"])
 
-PosesLimit = Annotated[int, Query(ge=1, le=100_000, description="At most this many poses.")]
+PosesLimit = Annotated[
+    int | None,
+    Query(ge=1, le=100_000, description="At most this many poses; 10,000, or all in Arrow, if not given."),
+]
 
 
 @router.post(
@@ -77,12 +84,34 @@ def retry_sweep(ctx: Ctx, id: str) -> SweepInfo:
     return sweeps.retry(ctx, id)
 
 
-@router.get("/sweeps/{id}/outcomes", response_model=SweepOutcomes, **scope("read"))
-def get_outcomes(ctx: Ctx, id: str, limit: PosesLimit = 10_000, cursor: Cursor = None) -> Response:
+@router.get(
+    "/sweeps/{id}/outcomes",
+    response_model=SweepOutcomes,
+    responses={200: {"content": {ARROW: {"schema": BINARY}}}},
+    **scope("read"),
+)
+def get_outcomes(
+    ctx: Ctx, id: str, request: Request, limit: PosesLimit = None, cursor: Cursor = None
+) -> Response:
     """Every pose of the finished chunks with its outcome, collisions included, in columns.
 
     Pages are stable once the sweep has finished; while it runs, chunks join between those already read.
+    As an Arrow stream (`Accept: application/vnd.apache.arrow.stream`) all of them come at once.
     """
-    columns = sweeps.outcomes(ctx, id, limit=limit, cursor=name_cursor(cursor) or None)
-    content = {**columns, "next": encode_cursor(columns["next"])}
-    return Response(orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY), media_type="application/json")
+    kind, start = accepted(request, JSON, ARROW), name_cursor(cursor) or None
+    headers = {"Vary": "Accept"}
+    if kind == ARROW and limit is None:
+        stream = sweeps.stream_outcomes(ctx, id, cursor=start)
+        return StreamingResponse(stream, media_type=ARROW, headers=headers)
+    page = sweeps.outcomes(ctx, id, limit=limit or 10_000, cursor=start)
+    following = encode_cursor(page.next)
+    if kind == ARROW:
+        return Response(b"".join(sweeps.arrow_page(page, following)), media_type=ARROW, headers=headers)
+    names = np.array(OUTCOMES, dtype=object)[page.codes].tolist()
+    columns = {
+        "pose_index": page.pose_index,
+        "position": page.position,
+        "quaternion_xyzw": page.quaternion_xyzw,
+    }
+    head = {"sweep": page.sweep, "outcome": names, "next": following}
+    return columns_json(head, columns, headers)

@@ -10,6 +10,7 @@ from fastapi.responses import StreamingResponse
 
 from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, TrialIn, TrialOut, TrialsIn
 from graspdb.wire.trials import TrialColumnsIn
+from graspdb_service.api.columns import BINARY, accepted
 from graspdb_service.api.routing import (
     Ctx,
     Cursor,
@@ -24,8 +25,8 @@ from graspdb_service.api.routing import (
     scope,
     tagged_json,
 )
-from graspdb_service.problems import ProblemError
 from graspdb_service.usecases import batches, objects, trials
+from graspdb_service.usecases.arrow import ARROW
 from graspdb_service.usecases.trial_bodies import JSON, NDJSON
 
 router = APIRouter(tags=["trials"])
@@ -33,6 +34,7 @@ router = APIRouter(tags=["trials"])
 BODY = {
     JSON: (TrialIn, TrialsIn, TrialColumnsIn),
     NDJSON: {"type": "string", "description": "One trial as JSON a line"},
+    ARROW: {**BINARY, "description": "Columns as in TrialColumns; the rest as JSON in the schema's metadata"},
 }
 
 
@@ -45,7 +47,7 @@ BODY = {
 def add_trials(
     ctx: Ctx, id: str, request: Request, response: Response, body: RawBody, key: IdempotencyKey
 ) -> object:
-    """Store one trial, a list, columns or lines as one batch: whole, or not at all."""
+    """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all."""
     made = trials.add(ctx, id, body=body, media=media_type(request), key=key)
     response.headers["Location"] = made.location
     return made.body
@@ -54,7 +56,7 @@ def add_trials(
 @router.get(
     "/objects/{id}/trials",
     response_model=Page[TrialOut],
-    responses={200: {"content": {NDJSON: {"schema": {"type": "string"}}}}},
+    responses={200: {"content": {NDJSON: {"schema": {"type": "string"}}, ARROW: {"schema": BINARY}}}},
     **scope("read"),
 )
 def list_trials(
@@ -71,13 +73,14 @@ def list_trials(
     ] = None,
     limit: Annotated[
         int | None,
-        Query(ge=1, le=1_000, description="At most this many; 100, or all of them as lines, if not given."),
+        Query(ge=1, le=1_000, description="At most this many; 100, or all as lines or Arrow, if not given."),
     ] = None,
     cursor: Cursor = None,
 ) -> Response:
-    """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) all of them."""
+    """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) or an Arrow
+    stream (`Accept: application/vnd.apache.arrow.stream`) all of them."""
     chosen = trials.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
-    kind = _accepted(request)
+    kind = accepted(request, JSON, NDJSON, ARROW)
     after = number_cursor(cursor)
     row, _ = objects.get(ctx, id)
     tag = etag(row.id, row.revision, kind.rpartition("/")[2], request.url.query)
@@ -88,23 +91,17 @@ def list_trials(
     if kind == NDJSON and limit is None:
         lines = trials.stream(ctx, id, chosen, after=after)
         return StreamingResponse(lines, media_type=NDJSON, headers=headers)
+    if kind == ARROW and limit is None:
+        stream = trials.stream_arrow(ctx, id, chosen, after=after)
+        return StreamingResponse(stream, media_type=ARROW, headers=headers)
     items, last = trials.page(ctx, id, chosen, after=after, limit=limit or 100)
-    if kind == NDJSON:
+    if kind == ARROW:
+        body = trials.page_arrow(items, encode_cursor(last))
+    elif kind == NDJSON:
         body = b"".join(orjson.dumps(item, option=orjson.OPT_APPEND_NEWLINE) for item in items)
     else:
         body = orjson.dumps({"items": items, "next": encode_cursor(last)})
     return Response(body, media_type=kind, headers=headers)
-
-
-def _accepted(request: Request) -> str:
-    """The first of the media types in Accept that trials come in."""
-    for item in request.headers.get("accept", "*/*").split(","):
-        kind = item.partition(";")[0].strip().lower()
-        if kind == NDJSON:
-            return NDJSON
-        if kind in (JSON, "application/*", "*/*", ""):
-            return JSON
-    raise ProblemError(406, "not-acceptable", f"Trials come as {JSON} or {NDJSON}: say which by Accept")
 
 
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))

@@ -23,6 +23,7 @@ from graspdb.wire import OUTCOME_CODES, OUTCOMES, SOURCES
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE, Metadata, expand_matrix
 from graspdb.wire.trials import TrialDefaults
 from graspdb_service.problems import ProblemError
+from graspdb_service.usecases.arrow import ARROW
 
 FloatArray = npt.NDArray[np.float64]
 Combination = tuple[str | None, str | None, str | None]
@@ -34,7 +35,7 @@ _DEFAULTS = frozenset(TrialDefaults.model_fields)
 _REQUIRED = ("position", "quaternion_xyzw", "outcome")
 _OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at")
 _TRIAL = frozenset(_REQUIRED) | frozenset(_OPTIONAL) | _DEFAULTS
-_COLUMNS = _TRIAL
+COLUMNS = _TRIAL
 _SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SLUG_RULE = "letters, digits, '.', '_', '-'; at most 64 characters, the first a letter or digit"
 _METADATA: TypeAdapter[Any] = TypeAdapter(Metadata)
@@ -87,10 +88,13 @@ class _Faults:
 
 
 @dataclass
-class _Fields:
-    """Trials as one list a field, and how a field of a trial is called in the request."""
+class Fields:
+    """Trials as one list a field, and how a field of a trial is called in the request.
 
-    lists: Mapping[str, Sequence[Any]]
+    Numbers and outcome codes may be arrays already, finite, with NaN for null.
+    """
+
+    lists: Mapping[str, Sequence[Any] | npt.NDArray[Any]]
     count: int
     place: Callable[[int, str], str]
 
@@ -110,7 +114,7 @@ def parse(body: bytes, media: str, *, limit: int) -> TrialBatch:
     raise ProblemError(
         415,
         "unsupported-media-type",
-        f"Trials come as {JSON} or {NDJSON}: say which by Content-Type",
+        f"Trials come as {JSON}, {NDJSON} or {ARROW}: say which by Content-Type",
         detail=f"Content-Type was {media}",
     )
 
@@ -137,7 +141,7 @@ def _parse_json(body: bytes, limit: int) -> TrialBatch:
 
 def _parse_lines(body: bytes, limit: int) -> TrialBatch:
     lines = [line for line in body.split(b"\n") if line.strip()]
-    _refuse_too_many(len(lines), limit)
+    refuse_too_many(len(lines), limit)
     rows, faults, flaws = [], _Faults(), _Faults()
     for number, line in enumerate(lines):
         row, flaw = _loads(line)
@@ -173,7 +177,7 @@ def _body_problem(message: str) -> ProblemError:
     return ProblemError(422, "invalid-request", "The request is not valid", errors=[("body", message)])
 
 
-def _refuse_too_many(count: int, limit: int) -> None:
+def refuse_too_many(count: int, limit: int) -> None:
     if count > limit:
         raise ProblemError(
             413,
@@ -196,14 +200,14 @@ def _defaults(given: dict[str, Any], faults: _Faults) -> TrialDefaults:
 # --- the three forms to one list a field ----------------------------------------------------------------
 
 
-def _from_columns(columns: Any, faults: _Faults, limit: int) -> _Fields:
+def _from_columns(columns: Any, faults: _Faults, limit: int) -> Fields:
     if not isinstance(columns, dict):
         faults.add("columns", "an object of lists, one a field")
         faults.raise_if_any()
-    for name in sorted(set(columns) - _COLUMNS):
-        faults.add(f"columns.{name}", f"unknown column; there are {', '.join(sorted(_COLUMNS))}")
+    for name in sorted(set(columns) - COLUMNS):
+        faults.add(f"columns.{name}", f"unknown column; there are {', '.join(sorted(COLUMNS))}")
     lists: dict[str, Sequence[Any]] = {}
-    for name in sorted(set(columns) & _COLUMNS):
+    for name in sorted(set(columns) & COLUMNS):
         if isinstance(columns[name], list):
             lists[name] = columns[name]
         elif columns[name] is not None or name in _REQUIRED:
@@ -213,25 +217,25 @@ def _from_columns(columns: Any, faults: _Faults, limit: int) -> _Fields:
             faults.add(f"columns.{name}", "required")
     faults.raise_if_any()
     count = len(lists["position"])
-    _refuse_too_many(count, limit)
+    refuse_too_many(count, limit)
     for name, values in lists.items():
         if len(values) != count:
             faults.add(f"columns.{name}", f"has {len(values)} rows and position {count}")
     if count == 0:
         faults.add("columns.position", "at least one trial")
     faults.raise_if_any()
-    return _Fields(lists, count, lambda i, name: f"columns.{name}.{i}")
+    return Fields(lists, count, lambda i, name: f"columns.{name}.{i}")
 
 
-def _from_trials(trials: Any, faults: _Faults, limit: int) -> _Fields:
+def _from_trials(trials: Any, faults: _Faults, limit: int) -> Fields:
     if not isinstance(trials, list) or not trials:
         faults.add("trials", "a list of at least one trial")
         faults.raise_if_any()
-    _refuse_too_many(len(trials), limit)
+    refuse_too_many(len(trials), limit)
     return _from_rows(trials, faults, lambda i, name: f"trials.{i}.{name}" if name else f"trials.{i}")
 
 
-def _from_rows(rows: list[Any], faults: _Faults, place: Callable[[int, str], str]) -> _Fields:
+def _from_rows(rows: list[Any], faults: _Faults, place: Callable[[int, str], str]) -> Fields:
     if set(map(type, rows)) != {dict}:
         for i, row in enumerate(rows):
             if not isinstance(row, dict):
@@ -252,7 +256,7 @@ def _from_rows(rows: list[Any], faults: _Faults, place: Callable[[int, str], str
             faults.add(place(i, name), "required")
     faults.raise_if_any()
     lists = {name: [row.get(name) for row in rows] for name in sorted(names & _TRIAL)}
-    return _Fields(lists, len(rows), place)
+    return Fields(lists, len(rows), place)
 
 
 def _expanded(
@@ -270,7 +274,16 @@ def _expanded(
 # --- one list a field to arrays -------------------------------------------------------------------------
 
 
-def _check(fields: _Fields, defaults: TrialDefaults, faults: _Faults) -> TrialBatch:
+def check(fields: Fields, beside: dict[str, Any]) -> TrialBatch:
+    """Fields with what stands once beside them for the whole batch."""
+    faults = _Faults()
+    for name in sorted(set(beside) - _DEFAULTS):
+        faults.add(name[:80], "unknown field beside columns")
+    defaults = _defaults({name: beside[name] for name in _DEFAULTS & set(beside)}, faults)
+    return _check(fields, defaults, faults)
+
+
+def _check(fields: Fields, defaults: TrialDefaults, faults: _Faults) -> TrialBatch:
     position = _vectors(fields, "position", 3, faults)
     quaternion = _vectors(fields, "quaternion_xyzw", 4, faults)
     outcome = _outcomes(fields, faults)
@@ -323,9 +336,11 @@ def _check(fields: _Fields, defaults: TrialDefaults, faults: _Faults) -> TrialBa
     )
 
 
-def _vectors(fields: _Fields, name: str, width: int, faults: _Faults) -> FloatArray | None:
+def _vectors(fields: Fields, name: str, width: int, faults: _Faults) -> FloatArray | None:
     """(n, width) finite numbers, or None with the faults."""
     values = fields.lists[name]
+    if isinstance(values, np.ndarray):
+        return values
     if set(map(type, values)) == {list} and set(map(len, values)) == {width}:
         flat = chain.from_iterable(values)
         if set(map(type, flat)) <= {int, float}:
@@ -355,22 +370,25 @@ def _float(number: float) -> float:
 
 
 def _scalars(
-    fields: _Fields, name: str, faults: _Faults, lower: float, upper: float, *, above: bool = False
+    fields: Fields, name: str, faults: _Faults, lower: float, upper: float, *, above: bool = False
 ) -> FloatArray | None:
     """(n,) numbers between the bounds with NaN for null; None where the field is absent throughout."""
     values = fields.lists.get(name)
     if values is None:
         return None
-    kinds = set(map(type, values))
-    if kinds <= {type(None)}:
-        return None
-    if not kinds <= {int, float, type(None)}:
-        for i, value in enumerate(values):
-            if type(value) not in (int, float, type(None)):
-                faults.add(fields.place(i, name), "a number or null")
-        return None
-    given = np.array([value is not None for value in values])
-    table = np.array([np.nan if value is None else _float(value) for value in values])
+    if isinstance(values, np.ndarray):
+        table, given = values.copy(), ~np.isnan(values)
+    else:
+        kinds = set(map(type, values))
+        if kinds <= {type(None)}:
+            return None
+        if not kinds <= {int, float, type(None)}:
+            for i, value in enumerate(values):
+                if type(value) not in (int, float, type(None)):
+                    faults.add(fields.place(i, name), "a number or null")
+            return None
+        given = np.array([value is not None for value in values])
+        table = np.array([np.nan if value is None else _float(value) for value in values])
     inside = (table > lower if above else table >= lower) & (table <= upper)
     bounds = f"above {lower:g} and at most {upper:g}" if above else f"from {lower:g} to {upper:g}"
     for row in np.flatnonzero(given & ~inside):
@@ -378,8 +396,10 @@ def _scalars(
     return table
 
 
-def _outcomes(fields: _Fields, faults: _Faults) -> npt.NDArray[np.uint8] | None:
+def _outcomes(fields: Fields, faults: _Faults) -> npt.NDArray[np.uint8] | None:
     values = fields.lists["outcome"]
+    if isinstance(values, np.ndarray):
+        return values
     if set(map(type, values)) <= {str, bool}:
         codes = [int(v) if v is True or v is False else OUTCOME_CODES.get(v, -1) for v in values]
         if min(codes) >= 0:
@@ -391,7 +411,7 @@ def _outcomes(fields: _Fields, faults: _Faults) -> npt.NDArray[np.uint8] | None:
 
 
 def _combinations(
-    fields: _Fields, defaults: TrialDefaults, faults: _Faults
+    fields: Fields, defaults: TrialDefaults, faults: _Faults
 ) -> tuple[list[Combination], npt.NDArray[np.int64]]:
     columns: list[list[str | None]] = []
     for name in ("gripper", "source", "protocol"):
@@ -425,14 +445,14 @@ def _named(name: str, value: str) -> bool:
     return value in SOURCES if name == "source" else _SLUG.fullmatch(value) is not None
 
 
-def _field_of_gripper(fields: _Fields, gripper: str) -> str:
+def _field_of_gripper(fields: Fields, gripper: str) -> str:
     for i, value in enumerate(fields.lists.get("gripper", ())):
         if value == gripper:
             return fields.place(i, "gripper")
     return "gripper"
 
 
-def _each(fields: _Fields, name: str, faults: _Faults, check: Callable[[Any], Any]) -> list[Any] | None:
+def _each(fields: Fields, name: str, faults: _Faults, check: Callable[[Any], Any]) -> list[Any] | None:
     """Values of a field that has no array form, each checked; None where it is absent throughout."""
     values = fields.lists.get(name)
     if values is None or set(map(type, values)) <= {type(None)}:
@@ -450,7 +470,7 @@ def _each(fields: _Fields, name: str, faults: _Faults, check: Callable[[Any], An
 
 
 def _time(value: Any) -> datetime:
-    if not isinstance(value, str):
+    if not isinstance(value, str | datetime):
         raise ValueError("a time as text, such as 2026-01-31T12:00:00Z")
     time = _TIME.validate_python(value)
     if not 1900 <= time.year <= 2500:

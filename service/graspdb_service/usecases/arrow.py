@@ -1,0 +1,389 @@
+"""Arrow IPC streams: columns in and out without a Python object a value.
+
+Reading trusts nothing: a stream is checked message by message before its arrays are touched, and compressed
+buffers are refused, for a few bytes of them may claim any amount of memory.
+"""
+
+from __future__ import annotations
+
+import importlib
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from graspdb.wire import OUTCOMES
+from graspdb_service.problems import ProblemError, invalid
+
+Floats = NDArray[np.float64]
+
+ARROW = "application/vnd.apache.arrow.stream"
+#: Key of the schema's metadata that holds, as JSON, what else a request or an answer says.
+METADATA = b"graspdb"
+
+_INSTALL = "pip install 'graspdb[service,arrow]' where the service runs"
+
+
+def library() -> Any:
+    """The pyarrow package, which is an extra.
+
+    Raises
+    ------
+    ProblemError
+        406 where it is not installed.
+    """
+    try:
+        return importlib.import_module("pyarrow")
+    except ImportError:
+        raise ProblemError(
+            406,
+            "arrow-not-installed",
+            f"This service was installed without Arrow: use JSON, or install it ({_INSTALL})",
+        ) from None
+
+
+# -- in ------------------------------------------------------------------------------------------------------
+
+
+class Table:
+    """The columns of a stream from a request.
+
+    Parameters
+    ----------
+    body
+        The stream.
+    columns
+        Those that it may have.
+    prefix
+        How the columns are called in errors.
+
+    Raises
+    ------
+    ProblemError
+        415 without pyarrow; 422 for what is no stream, or for other columns.
+    """
+
+    def __init__(self, body: bytes, columns: Iterable[str], *, prefix: str = "columns") -> None:
+        self._prefix = prefix
+        try:
+            pa = library()
+        except ProblemError as error:
+            raise ProblemError(415, error.kind, error.title) from None
+        try:
+            _check_messages(pa, body)
+            with pa.ipc.open_stream(pa.py_buffer(body)) as stream:
+                table = stream.read_all()
+            table.validate(full=True)
+        except (
+            pa.ArrowException,
+            ValueError,
+            TypeError,
+            LookupError,
+            EOFError,
+            OSError,
+            struct.error,
+        ) as error:
+            raise invalid("body", f"not a valid Arrow IPC stream: {str(error)[:200]}") from None
+        self._pa, self._table = pa, table
+        self.count: int = table.num_rows
+        self.names: list[str] = list(table.column_names)
+        known = set(columns)
+        wrong = [name for name in self.names if name not in known]
+        wrong += [name for name in known if self.names.count(name) > 1]
+        if wrong:
+            raise ProblemError(
+                422,
+                "invalid-request",
+                "The stream has columns that are not known, or one twice",
+                errors=[
+                    (f"{prefix}.{name[:80]}", f"unknown or repeated; there are {', '.join(sorted(known))}")
+                    for name in sorted(set(wrong))[:20]
+                ],
+            )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What stands beside the columns: the JSON object in the schema's metadata."""
+        text = (self._table.schema.metadata or {}).get(METADATA, b"{}")
+        try:
+            options = orjson.loads(text)
+        except orjson.JSONDecodeError as error:
+            raise invalid("metadata.graspdb", f"not valid JSON: {error}") from None
+        if not isinstance(options, dict):
+            raise invalid("metadata.graspdb", "must be a JSON object")
+        return options
+
+    def column(self, name: str) -> Any:
+        """A column as one array; None where the stream has none, or only nulls."""
+        if name not in self.names:
+            return None
+        column = self._table[name]
+        if column.null_count == len(column):
+            return None
+        # Dictionaries are never decoded: many rows may share one huge value.
+        return self._pa.concat_arrays(column.unify_dictionaries().chunks)
+
+    def required(self, name: str) -> Any:
+        """As :meth:`column`, without nulls.
+
+        Raises
+        ------
+        ProblemError
+            422 where the column is missing, or naming the first null.
+        """
+        column = self.column(name)
+        if column is None:
+            raise invalid(f"{self._prefix}.{name}", "required")
+        if column.null_count:
+            self.fault(
+                name, int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]), "required"
+            )
+        return column
+
+    def vectors(self, name: str, width: int) -> Floats:
+        """(n, width) finite numbers of a column of lists.
+
+        Raises
+        ------
+        ProblemError
+            422 naming the first row that is none.
+        """
+        pa, column = self._pa, self.required(name)
+        kind = column.type
+        fixed = pa.types.is_fixed_size_list(kind)
+        lists = fixed or pa.types.is_list(kind) or pa.types.is_large_list(kind)
+        if not lists or not (pa.types.is_floating(kind.value_type) or pa.types.is_integer(kind.value_type)):
+            raise invalid(f"{self._prefix}.{name}", f"lists of {width} numbers; this column is {kind}")
+        if fixed and kind.list_size != width:
+            raise invalid(f"{self._prefix}.{name}", f"lists of {width} numbers, not of {kind.list_size}")
+        if not fixed:
+            sizes = column.value_lengths().to_numpy()
+            wrong = np.flatnonzero(sizes != width)
+            if wrong.size:
+                self.fault(name, int(wrong[0]), f"a list of {width} numbers")
+        flat = column.flatten()
+        if flat.null_count:
+            null = np.flatnonzero(flat.is_null().to_numpy(zero_copy_only=False))[0]
+            self.fault(name, int(null) // width, f"a list of {width} numbers")
+        values = flat.to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, width)
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            self.fault(name, int(bad[0]), "every number must be finite")
+        return np.asarray(values)
+
+    def scalars(self, name: str) -> Floats | None:
+        """(n,) numbers, NaN for null; None where the column is absent.
+
+        Raises
+        ------
+        ProblemError
+            422 for a column of another kind, or naming the first value that is not finite.
+        """
+        pa, column = self._pa, self.column(name)
+        if column is None:
+            return None
+        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+            raise invalid(f"{self._prefix}.{name}", f"numbers or nulls; this column is {column.type}")
+        null = column.is_null().to_numpy(zero_copy_only=False)
+        values = column.to_numpy(zero_copy_only=False).astype(np.float64)
+        bad = np.flatnonzero(~null & ~np.isfinite(values))
+        if bad.size:
+            self.fault(name, int(bad[0]), "a finite number or null")
+        return np.asarray(np.where(null, np.nan, values))
+
+    def texts(self, name: str) -> tuple[list[str], NDArray[np.int64]] | None:
+        """Distinct texts of a column, and which of them each row has (-1: null); None where it is absent."""
+        pa, column = self._pa, self.column(name)
+        if column is None:
+            return None
+        coded = pa.types.is_dictionary(column.type)
+        kind = column.type.value_type if coded else column.type
+        if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+            raise invalid(f"{self._prefix}.{name}", f"text; this column is {column.type}")
+        encoded = column if coded else column.dictionary_encode()
+        indices = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+        return encoded.dictionary.to_pylist(), indices
+
+    def objects(self, name: str) -> list[Any] | None:
+        """A column as Python objects, None for null; None where it is absent.
+
+        Raises
+        ------
+        ProblemError
+            422 for a type of which a few bytes may stand for much: dictionaries, views, runs.
+        """
+        pa, column = self._pa, self.column(name)
+        if column is None:
+            return None
+        if not _plain(pa, column.type):
+            raise invalid(
+                f"{self._prefix}.{name}", f"plain lists, structs, text or times; it is {column.type}"
+            )
+        if pa.types.is_timestamp(column.type):
+            column = column.cast(pa.timestamp("us", column.type.tz), safe=False)
+        try:
+            found: list[Any] = column.to_pylist()
+        except (ValueError, OverflowError) as error:
+            raise invalid(f"{self._prefix}.{name}", str(error)[:200]) from None
+        return found
+
+    def booleans(self, name: str) -> NDArray[np.bool_] | None:
+        """(n,) where a column holds true and false; None where it holds something else."""
+        column = self.required(name)
+        if not self._pa.types.is_boolean(column.type):
+            return None
+        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.bool_)
+
+    def fault(self, name: str, row: int, message: str) -> None:
+        """Raise a 422 that names a row of a column."""
+        raise invalid(f"{self._prefix}.{name}.{row}", message)
+
+
+def _plain(pa: Any, kind: Any) -> bool:
+    """Whether values of a type take about as much memory as they do in a stream."""
+    types = pa.types
+    if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):
+        return _plain(pa, kind.value_type)
+    if types.is_struct(kind):
+        return all(_plain(pa, field.type) for field in kind)
+    return bool(
+        types.is_string(kind)
+        or types.is_large_string(kind)
+        or types.is_floating(kind)
+        or types.is_integer(kind)
+        or types.is_boolean(kind)
+        or types.is_timestamp(kind)
+    )
+
+
+def _check_messages(pa: Any, body: bytes) -> None:
+    """Refuse a stream with compressed buffers.
+
+    Raises
+    ------
+    ValueError
+        For those; whatever pyarrow or struct say of what is no stream.
+    """
+    messages = pa.ipc.MessageReader.open_stream(pa.py_buffer(body))
+    while True:
+        try:
+            message = messages.read_next_message()
+        except StopIteration:
+            return
+        if message.type in ("record batch", "dictionary") and _compressed(message.metadata.to_pybytes()):
+            raise ValueError("its buffers are compressed: write it without compression")
+
+
+def _compressed(metadata: bytes) -> bool:
+    """Whether a message's record batch names a compression (Message.fbs of the Arrow format, version 5)."""
+    message = _u32(metadata, 0)
+    header = _field(metadata, message, 2)
+    batch = header + _u32(metadata, header)
+    if metadata[_field(metadata, message, 1)] == 2:
+        data = _field(metadata, batch, 1)
+        batch = data + _u32(metadata, data)
+    return _field(metadata, batch, 3) != 0
+
+
+def _field(content: bytes, table: int, number: int) -> int:
+    """Where a field of a flatbuffer's table lies; 0 where the table has none."""
+    (back,) = struct.unpack_from("<i", content, table)
+    vtable = table - back
+    (size,) = struct.unpack_from("<H", content, vtable)
+    at = 4 + 2 * number
+    if at >= size:
+        return 0
+    (offset,) = struct.unpack_from("<H", content, vtable + at)
+    return table + offset if offset else 0
+
+
+def _u32(content: bytes, at: int) -> int:
+    (value,) = struct.unpack_from("<I", content, at)
+    return int(value)
+
+
+# -- out -----------------------------------------------------------------------------------------------------
+
+
+class _Pieces:
+    """A file whose content is taken as it is written."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self.closed = False
+
+    def write(self, part: Any) -> int:
+        content = bytes(part)
+        self._parts.append(content)
+        return len(content)
+
+    def flush(self) -> None:
+        pass
+
+    def writable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return False
+
+    def seekable(self) -> bool:
+        return False
+
+    def close(self) -> None:
+        self.closed = True
+
+    def take(self) -> bytes:
+        content, self._parts = b"".join(self._parts), []
+        return content
+
+
+def stream(schema: Any, batches: Iterable[Any]) -> Iterator[bytes]:
+    """An IPC stream piece by piece, for however many batches."""
+    pa = library()
+    sink = _Pieces()
+    with pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schema) as writer:
+        yield sink.take()
+        for batch in batches:
+            writer.write_batch(batch)
+            yield sink.take()
+    yield sink.take()
+
+
+def schema_of(fields: Sequence[tuple[str, Any]], told: Mapping[str, Any] | None = None) -> Any:
+    """A schema of named types, with what else is said in its metadata."""
+    metadata = None if told is None else {METADATA: orjson.dumps(told)}
+    return library().schema(fields, metadata=metadata)
+
+
+def vectors(values: Floats, width: int) -> Any:
+    """A column of fixed-size lists from (n, width)."""
+    pa = library()
+    flat = pa.array(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, width)
+
+
+def vector_type(width: int) -> Any:
+    """The type of :func:`vectors`."""
+    pa = library()
+    return pa.list_(pa.float64(), width)
+
+
+def numbers(values: Any) -> Any:
+    """A column of numbers, null where one is not finite."""
+    column = np.ascontiguousarray(values, dtype=np.float64)
+    return library().array(column, mask=~np.isfinite(column))
+
+
+def outcome_names(codes: NDArray[np.uint8]) -> Any:
+    """A column of outcomes' names, each stored once."""
+    pa = library()
+    return pa.DictionaryArray.from_arrays(pa.array(codes.astype(np.int8)), pa.array(OUTCOMES))
+
+
+def outcome_type() -> Any:
+    """The type of :func:`outcome_names`."""
+    pa = library()
+    return pa.dictionary(pa.int8(), pa.string())
