@@ -62,8 +62,12 @@ _LOG2E = F32(1.44269504088896341)
 _P0, _P1, _P2 = F32(1.00000007), F32(0.69314697), F32(0.2402212)
 _P3, _P4, _P5 = F32(0.05550713), F32(0.00967554), F32(0.00132765)
 _ZERO = F32(0.0)
-#: e^-75 times a weight is still a normal number: results that are not cost a hundred cycles each.
-_FLOOR = F32(-75.0)
+#: 2^-108 times a weight is still a normal number: results that are not cost a hundred cycles each.
+_FLOOR = F32(-108.0)
+#: Kernels in a block that every pose of a call passes over: its columns stay in the first-level cache.
+_TILE = 1024
+#: No sum is as large.
+_NEVER = 1e300
 
 
 @intrinsic
@@ -79,9 +83,9 @@ def _times_power_of_two(typing_context: Any, value: Any, power: Any) -> Any:
 
 
 @inlined
-def _exp(x: Any) -> Any:
-    """e^x in float32 for -75 <= x <= 80, relative error below 3e-7 + 6e-8 |x|; smaller x give e^-75."""
-    t = max(x, _FLOOR) * _LOG2E
+def _exp2(t: Any) -> Any:
+    """2^t in float32 for -108 <= t <= 115, relative error below 3e-7 + 6e-8 |t|; smaller t give 2^-108."""
+    t = max(t, _FLOOR)
     k = np.rint(t)
     r = t - k
     y = _P5 * r + _P4
@@ -92,13 +96,21 @@ def _exp(x: Any) -> Any:
     return _times_power_of_two(y, np.int32(k))  # type: ignore[call-arg]
 
 
+@inlined
+def _exp(x: Any) -> Any:
+    """e^x in float32 for -75 <= x <= 80, relative error below 3e-7 + 1e-7 |x|; smaller x give 3e-33."""
+    return _exp2(x * _LOG2E)
+
+
 @fast
 def _run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
     """Sums of k and k r^2 over rows with a twin, where the antipode's and the farther twin's share is
     negligible.
 
-    (qx..qw) is kappa times the quaternion.
+    (qx..qw) is kappa times the quaternion. Here and below both are taken to base 2 once, so that no kernel
+    has to.
     """
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
@@ -107,15 +119,32 @@ def _run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
         b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
         r2 = dx * dx + dy * dy + dz * dz
-        k = data[7, i] * _exp(max(abs(a), abs(b)) - kappa - r2)
+        k = data[7, i] * _exp2((max(abs(a), abs(b)) - kappa) - r2 * _LOG2E)
         total += k
         spread += k * r2
     return total, spread
 
 
 @fast
+def _total_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
+    """As `_run_narrow` without k r^2, which only a cut-off needs to know: a sixth less work."""
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
+    total = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        r2 = dx * dx + dy * dy + dz * dz
+        total += data[7, i] * _exp2((max(abs(a), abs(b)) - kappa) - r2 * _LOG2E)
+    return total
+
+
+@fast
 def _run_single(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
-    """The same over rows without a twin."""
+    """As `_run_narrow` over rows without a twin."""
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
@@ -123,7 +152,7 @@ def _run_single(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
         dz = data[2, i] - pz
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
         r2 = dx * dx + dy * dy + dz * dz
-        k = data[7, i] * _exp(abs(a) - kappa - r2)
+        k = data[7, i] * _exp2((abs(a) - kappa) - r2 * _LOG2E)
         total += k
         spread += k * r2
     return total, spread
@@ -132,16 +161,17 @@ def _run_single(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
 @fast
 def _run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
     """Sums of k and k r^2 over both twins, each by its nearer end."""
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
         dy = data[1, i] - py
         dz = data[2, i] - pz
         r2 = dx * dx + dy * dy + dz * dz
-        base = -kappa - r2
+        base = -kappa - r2 * _LOG2E
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
         b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
-        k = data[7, i] * (_exp(base + abs(a)) + twin * _exp(base + abs(b)))
+        k = data[7, i] * (_exp2(base + abs(a)) + twin * _exp2(base + abs(b)))
         total += k
         spread += k * r2
     return total, spread
@@ -150,17 +180,18 @@ def _run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
 @fast
 def _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
     """Sums of k and k r^2 with every term: both twins, each with its antipode."""
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
         dy = data[1, i] - py
         dz = data[2, i] - pz
         r2 = dx * dx + dy * dy + dz * dz
-        base = -kappa - r2
+        base = -kappa - r2 * _LOG2E
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
         b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
-        own = _exp(base + a) + _exp(base - a)
-        other = _exp(base + b) + _exp(base - b)
+        own = _exp2(base + a) + _exp2(base - a)
+        other = _exp2(base + b) + _exp2(base - b)
         k = data[7, i] * (own + twin * other)
         total += k
         spread += k * r2
@@ -170,6 +201,7 @@ def _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
 @fast
 def _moments_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sums):
     """As `_moments_wide` with the nearest of twins and antipodes standing for all."""
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
     s = _ZERO
     sx, sy, sz = _ZERO, _ZERO, _ZERO
     m0, m1, m2, m3 = _ZERO, _ZERO, _ZERO, _ZERO
@@ -184,7 +216,7 @@ def _moments_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, s
         b = (u0 * qy - u1 * qx + u2 * qw - u3 * qz) * twin
         own = abs(a) >= abs(b)
         near = a if own else b
-        k = data[7, i] * _exp(abs(near) - kappa - r2)
+        k = data[7, i] * _exp2((abs(near) - kappa) - r2 * _LOG2E)
         g = k if near >= _ZERO else -k
         ga = g if own else _ZERO
         gb = _ZERO if own else g
@@ -213,6 +245,7 @@ def _moments_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sum
     """Add to ``sums`` (9,): k, k (p_i - p), the signed pull k mu_i of the quaternion, and k r^2, scaled
     units.
     """
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
     s = _ZERO
     sx, sy, sz = _ZERO, _ZERO, _ZERO
     m0, m1, m2, m3 = _ZERO, _ZERO, _ZERO, _ZERO
@@ -225,13 +258,13 @@ def _moments_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sum
         u0, u1, u2, u3 = data[3, i], data[4, i], data[5, i], data[6, i]
         a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
         b = (u0 * qy - u1 * qx + u2 * qw - u3 * qz) * twin
-        base = -kappa - r2
+        base = -kappa - r2 * _LOG2E
         w = data[7, i]
         large, small = max(abs(a), abs(b)), min(abs(a), abs(b))
-        k1 = w * _exp(base + large)
-        k2 = w * twin * _exp(base + small)
-        k3 = w * _exp(base - large)
-        k4 = w * twin * _exp(base - small)
+        k1 = w * _exp2(base + large)
+        k2 = w * twin * _exp2(base + small)
+        k3 = w * _exp2(base - large)
+        k4 = w * twin * _exp2(base - small)
         own_near = abs(a) >= abs(b)
         ga = (k1 - k3) if own_near else (k2 - k4)
         gb = (k2 - k4) if own_near else (k1 - k3)
@@ -309,6 +342,26 @@ def _runs(start, table, s, px, py, pz, radius, runs):
 
 
 @fast
+def _run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide):
+    """Sums of k and k r^2 over rows that all have a twin or have none; `_sum_at` says what ``wide`` is."""
+    if wide == 2:
+        return _run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin)
+    if wide == 1:
+        return _run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin)
+    if twin > _ZERO:
+        return _run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa)
+    return _run_single(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa)
+
+
+@fast
+def _total(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide):
+    """The first of what `_run` gives."""
+    if wide == 0 and twin > _ZERO:
+        return _total_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa)
+    return _run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide)[0]
+
+
+@fast
 def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
     """Sum of weights times kernels (1 at a centre) within ``radius``, their k r^2, and how many were visited.
 
@@ -326,14 +379,7 @@ def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
             visited += end - begin
             while begin < end:
                 stop = min(begin + BLOCK, end)
-                if wide == 2:
-                    part = _run_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
-                elif wide == 1:
-                    part = _run_twins(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin)
-                elif twin > _ZERO:
-                    part = _run_narrow(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k)
-                else:
-                    part = _run_single(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k)
+                part = _run(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, wide)
                 total += part[0]
                 spread += part[1]
                 begin = stop
@@ -442,8 +488,8 @@ def log_sums(
     ----------
     stages : (T, 3)
         Radii to try in turn, each with the largest mean exponent of position and the least mean kernel at
-        which what lies outside is too little to matter (see `density.stages`). A pose that passes none, or
-        where there are none, is summed without a cut-off.
+        which what lies outside is too little to matter (see `density.stages`). A pose that passes none is
+        summed without a cut-off.
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     for j in range(positions.shape[0]):
@@ -464,14 +510,70 @@ def log_sums(
 
 
 @fast
+def all_sums(data, table, centre, scale, positions, quaternions, kappa, wide, out):
+    """The weighted sum over all kernels at every pose into ``out`` (M,), as brute force has it."""
+    k = F32(kappa)
+    out[:] = 0.0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, TWIN])
+        begin = int(table[s, OFFSET])
+        end = begin + int(table[s, COUNT])
+        while begin < end:
+            stop = min(begin + _TILE, end)
+            for j in range(positions.shape[0]):
+                px = F32((positions[j, 0] - centre[0]) * scale)
+                py = F32((positions[j, 1] - centre[1]) * scale)
+                pz = F32((positions[j, 2] - centre[2]) * scale)
+                q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+                q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+                out[j] += _total(data, begin, stop, px, py, pz, q0, q1, q2, q3, k, twin, wide)
+            begin = stop
+
+
+@fast
+def all_log_sums(
+    data, table, blocks, boxes, centre, scale, positions, quaternions, kappa, wide, least, margin, out
+):
+    """Log of the weighted sum over all kernels at every pose into ``out`` (M,), without a cut-off.
+
+    By brute force, and where that gives less than ``least`` by `exact_log_sum`.
+    """
+    if least < _NEVER:
+        all_sums(data, table, centre, scale, positions, quaternions, kappa, wide, out)
+    else:
+        out[:] = 0.0
+    for j in range(positions.shape[0]):
+        if out[j] >= least:
+            out[j] = math.log(out[j])
+        else:
+            px = (positions[j, 0] - centre[0]) * scale
+            py = (positions[j, 1] - centre[1]) * scale
+            pz = (positions[j, 2] - centre[2]) * scale
+            out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
+
+
+@fast
 def sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
     """The weighted kernel sum within ``radius`` at every pose, zero where nothing is in reach."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    k = F32(kappa)
     for j in range(positions.shape[0]):
         px = (positions[j, 0] - centre[0]) * scale
         py = (positions[j, 1] - centre[1]) * scale
         pz = (positions[j, 2] - centre[2]) * scale
-        out[j] = _sum_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs)[0]
+        fx, fy, fz = F32(px), F32(py), F32(pz)
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        total = 0.0
+        for s in range(table.shape[0]):
+            twin = F32(table[s, TWIN])
+            for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    stop = min(begin + BLOCK, end)
+                    total += _total(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, wide)
+                    begin = stop
+        out[j] = total
 
 
 @fast
@@ -543,18 +645,20 @@ def _squares_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide
 
     ``wide`` asks for twins and antipodes; without it, the nearest stands for all.
     """
+    qx, qy, qz, qw, kappa = qx * _LOG2E, qy * _LOG2E, qz * _LOG2E, qw * _LOG2E, kappa * _LOG2E
+    cut = cut * _LOG2E
     total, squares = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         dx = data[0, i] - px
         dy = data[1, i] - py
         dz = data[2, i] - pz
-        base = -kappa - (dx * dx + dy * dy + dz * dz)
+        base = -kappa - (dx * dx + dy * dy + dz * dz) * _LOG2E
         a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
         b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
         large, small = max(a, b), min(a, b)
-        k = _exp(base + large)
+        k = _exp2(base + large)
         if wide:
-            k += _exp(base - large) + twin * (_exp(base + small) + _exp(base - small))
+            k += _exp2(base - large) + twin * (_exp2(base + small) + _exp2(base - small))
         k = data[7, i] * k if base + large >= -cut else _ZERO
         total += k
         squares += k * k

@@ -50,6 +50,22 @@ def test_fast_path_equals_the_reference(
     assert np.median(finer) < 3e-5
 
 
+@pytest.mark.parametrize("width_deg", [4.0, 10.5, 15.4, 24.9, 35.0])
+def test_without_a_cut_off_every_term_counts(width_deg: float, shell: Shell, moved: Moved) -> None:
+    """Brute force in float32 where that is fine, whatever is near: twins, antipodes, or nothing."""
+    rng = np.random.default_rng(30)
+    kernel = IsotropicKernel(0.015, math.radians(width_deg))
+    rows = shell(2_500, rng)
+    extra = mixed(rng, rows)
+    density = GraspDensity.build(*rows, kernel=kernel, **extra)
+    p, q = moved(rows, 150, 0.04, 1.0, rng)
+    p[:20] += 0.5
+    expected = reference.log_density(kernel, *rows, p, q, **extra)
+    got = density.log_density(p, q, cutoff=None, threads=2)
+    assert (np.abs(got - expected) < 2e-5 + 1e-6 * (kernel.log_peak - expected)).all()
+    np.testing.assert_array_equal(density.log_density(p[:1], q[:1], cutoff=None), got[:1])
+
+
 @pytest.mark.parametrize("kernel", KERNELS[:3], ids=str)
 def test_log_density_is_right_far_from_data(kernel: IsotropicKernel, shell: Shell) -> None:
     rng = np.random.default_rng(1)
