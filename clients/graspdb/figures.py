@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb import figures_projection, figures_widths
+from graspdb import figures_projection, figures_sources, figures_widths
 from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, told
 from graspdb.figures_style import plain as _plain
 from graspdb.figures_style import title as _title
@@ -30,6 +30,8 @@ from graspdb.wire.reports import (
     ConvergenceReport,
     KernelSimilarityReport,
     ProjectionReport,
+    SourcesReport,
+    SummaryReport,
 )
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ _DPI = 120
 _LOCK = threading.Lock()
 
 
-def rendered(report: AnyReport, format: Literal["png", "svg"]) -> bytes:
+def rendered(report: AnyReport | SummaryReport, format: Literal["png", "svg"]) -> bytes:
     """The figure of a report as a file's bytes."""
     with _LOCK:
         figure = draw(report)
@@ -57,7 +59,7 @@ def rendered(report: AnyReport, format: Literal["png", "svg"]) -> bytes:
         return target.getvalue()
 
 
-def draw(report: AnyReport) -> Figure:
+def draw(report: AnyReport | SummaryReport) -> Figure:
     """The figure of a report.
 
     Raises
@@ -84,6 +86,12 @@ def draw(report: AnyReport) -> Figure:
     elif isinstance(report, KernelSimilarityReport):
         figure = NewFigure(figsize=(10.0, 5.4), layout="constrained")
         figures_widths.kernel_similarity(figure, report)
+    elif isinstance(report, SourcesReport):
+        figure = NewFigure(figsize=(12.0, 2.2 + 3.4 * max(len(report.sources), 1)), layout="constrained")
+        figures_sources.sources(figure, report)
+    elif isinstance(report, SummaryReport):
+        figure = NewFigure(figsize=(12.0, 2.8 + 0.62 * max(len(report.rows), 2)), layout="constrained")
+        figures_sources.summary(figure, report)
     elif isinstance(report, CalibrationReport):
         figure = NewFigure(figsize=(6.6, 7.2), layout="constrained")
         _calibration(figure, report)

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,9 +93,10 @@ def test_reports_have_words_arrays_and_figures(thing: GraspObject, tmp_path: Pat
         convergence.save(tmp_path / "a.pdf")
 
 
-def drawn_on_the_page(report: Report, words: str) -> None:
+def drawn_on_the_page(report: Report[Any], words: str) -> None:
     """The figure says what it is of, and everything drawn lies on the page."""
     figure = report.plot()
+    figure.draw_without_rendering()
     texts = " ".join(text.get_text() for text in figure.findobj(lambda a: hasattr(a, "get_text")))
     assert words in texts
     box = figure.get_tightbbox()
@@ -119,6 +121,30 @@ def test_projections(thing: GraspObject, run: Run) -> None:
     code, _, err = run("report", thing.id, "calibration", "--plane", "xz")
     assert (code, "no such option" in err) == (2, True)
     assert run("report", thing.id)[0] == 2
+
+
+def test_widths_and_the_summary_of_all_objects(
+    thing: GraspObject, db: Client, run: Run, tmp_path: Path
+) -> None:
+    found = thing.reports.bandwidth()
+    assert found.recommended[0] in {point.sigma_position_m for point in found.raw.grid}
+    assert {call.path for call in found.calls} == {f"/objects/{thing.id}/sweeps"}
+    drawn_on_the_page(found, "No draws were simulated yet")
+    code, out, err = run("report", thing.id, "bandwidth")
+    assert (code, "Recommended" in out, "Missing: POST" in err) == (0, True, True)
+
+    every = db.reports.summary()
+    (row,) = (row for row in every.raw.rows if row.object == thing.id)
+    won = int(field()[1].sum())
+    assert row.outcomes == {"failure": 2_000 - won, "success": won}
+    assert every.rates("attempts")[thing.id] == won / 2_000
+    assert "Summary of all objects" in repr(every)
+    drawn_on_the_page(every, "what was tried")
+    code, out, _ = run("report", "summary", "--figure", str(tmp_path / "all.svg"))
+    assert (code, thing.id[:12] in out) == (0, True)
+    assert b"<svg" in (tmp_path / "all.svg").read_bytes()
+    code, out, _ = run("--json", "report", "summary")
+    assert json.loads(out)["report"] == "summary"
 
 
 def test_too_few_trials_raise_what_is_needed(db: Client, fresh_id: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 from collections.abc import Mapping
@@ -14,9 +15,11 @@ from graspdb.wire import Selection
 from graspdb.wire.base import Direction, Slug, Source
 from graspdb.wire.base import Request as StrictRequest
 from graspdb.wire.kernels import Alignment
+from graspdb.wire.queries import WidthDeg, WidthM
 from graspdb.wire.reports import (
     REPORTS,
     AnisotropyReport,
+    AnyReport,
     BandwidthReport,
     CalibrationReport,
     ConvergenceReport,
@@ -24,13 +27,15 @@ from graspdb.wire.reports import (
     Method,
     ProjectionReport,
     ReportRun,
+    SourcesReport,
+    SummaryReport,
 )
 from graspdb_service import __version__
 from graspdb_service.api.queries import SelectionQuery
 from graspdb_service.api.routing import Ctx, etag, not_modified, scope
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.report_runs import RunRow
-from graspdb_service.usecases import report_runs
+from graspdb_service.usecases import report_runs, summary_report
 from graspdb_service.usecases.context import Context
 
 router = APIRouter(tags=["reports"])
@@ -183,6 +188,44 @@ def get_bandwidth(ctx: Ctx, id: str, request: Request, query: Annotated[TrialsQu
     return _answer(ctx, id, "bandwidth", request, query.selection, {})
 
 
+class SourcesQuery(StrictRequest):
+    """The gripper, the protocol of the simulated trials, and the widths of the kernel that predicts."""
+
+    gripper: Slug | None = None
+    protocol: Slug | None = None
+    sigma_position_m: WidthM | None = None
+    sigma_rotation_deg: WidthDeg | None = None
+
+
+@router.get(
+    "/objects/{id}/reports/sources",
+    response_model=SourcesReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_sources(ctx: Ctx, id: str, request: Request, query: Annotated[SourcesQuery, Query()]) -> Response:
+    """Does simulation tell what robots find? Predictions at real poses, and how alike densities are."""
+    selection = Selection(**query.model_dump(), source="simulation")
+    return _answer(ctx, id, "sources", request, selection, {})
+
+
+@router.get(
+    "/reports/summary", response_model=SummaryReport, responses={200: _RESPONSES[200]}, **scope("read")
+)
+def get_summary(ctx: Ctx, request: Request) -> Response:
+    """What was tried on every object, by outcome, with the success rate by each way of counting (table I)."""
+    wanted = _format(request)
+    found = summary_report.summary(ctx.database)
+    content = found.model_dump_json().encode()
+    tag = etag(hashlib.sha256(content).hexdigest()[:24], wanted, __version__)
+    headers = {"ETag": tag, "Vary": "Accept"}
+    known = not_modified(request, tag)
+    if known is not None:
+        return known
+    body = content if wanted == "json" else _drawn(found, wanted)
+    return Response(body, media_type=_TYPES[wanted], headers=headers)
+
+
 @router.get("/report-runs/{id}", **scope("read"))
 def get_run(ctx: Ctx, id: str) -> ReportRun:
     """A report's computation: state, progress, and the report once it is done."""
@@ -203,13 +246,7 @@ def _answer(
     query: Selection,
     options: Mapping[str, str | None],
 ) -> Response:
-    wanted = _wanted(request.headers.get("accept", ""))
-    if wanted != "json" and importlib.util.find_spec("matplotlib") is None:
-        raise ProblemError(
-            406,
-            "not-acceptable",
-            "Figures need matplotlib on the server: pip install 'graspdb[plot]'; take JSON",
-        )
+    wanted = _format(request)
     run = ctx.reports.report(slug, report, query, options)
     if run.state == "running":
         return Response(
@@ -226,6 +263,24 @@ def _answer(
     assert run.result is not None
     body = run.result.encode() if wanted == "json" else _figure(run, wanted)
     return Response(body, media_type=_TYPES[wanted], headers=headers)
+
+
+def _format(request: Request) -> Format:
+    """The format to answer in.
+
+    Raises
+    ------
+    ProblemError
+        406 where none of ours is accepted, or a figure where nothing can draw it.
+    """
+    wanted = _wanted(request.headers.get("accept", ""))
+    if wanted != "json" and importlib.util.find_spec("matplotlib") is None:
+        raise ProblemError(
+            406,
+            "not-acceptable",
+            "Figures need matplotlib on the server: pip install 'graspdb[plot]'; take JSON",
+        )
+    return wanted
 
 
 def _wanted(accept: str) -> Format:
@@ -258,6 +313,10 @@ def _wanted(accept: str) -> Format:
 
 
 def _figure(run: RunRow, wanted: Literal["png", "svg"]) -> bytes:
+    return _drawn(REPORTS[run.report].model_validate_json(run.result or ""), wanted)
+
+
+def _drawn(report: AnyReport | SummaryReport, wanted: Literal["png", "svg"]) -> bytes:
     from graspdb import figures
 
-    return figures.rendered(REPORTS[run.report].model_validate_json(run.result or ""), wanted)
+    return figures.rendered(report, wanted)

@@ -16,6 +16,7 @@ from graspdb_service.usecases.densities import Built, KernelChoice
 from graspdb_service.usecases.projection_report import projection_report
 from graspdb_service.usecases.reportparts import Sources
 from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.sources_report import sources_report
 
 
 @dataclass(frozen=True)
@@ -64,4 +65,5 @@ _REPORTS: dict[str, Callable[[Sources, Built, dict[str, str], Progress], AnyRepo
     "calibration": calibration_report,
     "convergence": convergence_report,
     "projection": projection_report,
+    "sources": sources_report,
 }
