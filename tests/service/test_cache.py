@@ -276,6 +276,34 @@ def test_what_one_process_commits_is_in_the_others_next_answer(
             np.testing.assert_allclose(answer["log_density"], exact, atol=2e-3)
 
 
+def test_attempts_through_one_process_are_in_the_others_next_chance(
+    database_url: str, serve: Callable[..., str], make_object: Make, post: Post, two_clusters: Poses
+) -> None:
+    """Successes and failures alike: what either stores lowers or raises what both answer."""
+    with (
+        httpx.Client(base_url=serve(database_url), timeout=60) as one,
+        httpx.Client(base_url=serve(database_url), timeout=60) as two,
+    ):
+        make_object(one)
+        body = {
+            "poses": {"position": [[0.0, 0.0, 0.06]], "quaternion_xyzw": [[1.0, 0.0, 0.0, 0.0]]},
+            "kernel": {"sigma_position_m": 0.015, "sigma_rotation_deg": 15},
+            "include": ["success_probability", "effective_trials"],
+        }
+        seen = []
+        steps = [(one, "success"), (two, "failure"), (one, "slipped"), (two, "success"), (one, "collision")]
+        for step, (writer, outcome) in enumerate(steps):
+            post(writer, "thing", part(two_clusters, 50 * step, 50 * step + 50), outcome)
+            answers = [client.post("/objects/thing/likelihood", json=body).json() for client in (two, one)]
+            for name in ("success_probability", "effective_trials"):
+                assert answers[0][name] == pytest.approx(answers[1][name], abs=1e-6)
+            seen.append((answers[0]["success_probability"][0], answers[0]["effective_trials"][0]))
+        chances = [chance for chance, _ in seen]
+        assert chances[0] is None  # Only successes so far: no chance.
+        assert chances[1] > chances[2] < chances[3] > chances[4]
+        assert seen[1][1] < seen[2][1] < seen[3][1] < seen[4][1]
+
+
 def test_a_new_object_of_the_same_name_has_nothing_of_the_old(
     http: httpx.Client, ctx: Context, make_object: Make, post: Post, two_clusters: Poses
 ) -> None:
@@ -341,5 +369,11 @@ def test_the_cache_is_bounded_by_bytes(
         assert 1 <= len(context.densities) < len(widths)
         again = context.densities.get("thing", Filters(), KernelChoice(widths[-1], 15.0))
         assert again is built
+        # Models of success have a bound of their own, of the same kind.
+        post(http, "thing", clusters([((0, 0, 0), (0, 0, 0, 1.0))], 2000, seed=1), "failure")
+        for width in widths[:6]:
+            built = context.densities.get("thing", Filters(), KernelChoice(width, 15.0))
+            assert context.successes.model("thing", built, collisions_known=False) is not None
+            assert context.successes.nbytes <= settings.max_density_cache_bytes
     finally:
         context.close()

@@ -113,6 +113,11 @@ class Successes:
             return None
         return Model(found.model, found.sample or found.model)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all models kept."""
+        return self._cache.nbytes
+
     def estimate(
         self, slug: str, built: Built, positions: Floats, quaternions: Floats, free: NDArray[np.bool_] | None
     ) -> Estimates:
