@@ -1,4 +1,4 @@
-"""Closing a parallel jaw on a free-floating object in pybullet. The only module that imports pybullet.
+"""Closing a parallel jaw on a free-floating object in pybullet.
 
 The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at
 the origin, its tool frame is the world frame; for every grasp the *object* is moved instead. Nothing
@@ -14,19 +14,15 @@ both, and results become bitwise independent of the order of grasps, of the proc
 from __future__ import annotations
 
 import math
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from graspdb_simworker import lifting, urdf
+from graspdb_simworker import lifting
 from graspdb_simworker.bodies import (
     HEAVY_KG,
     Carried,
@@ -34,24 +30,19 @@ from graspdb_simworker.bodies import (
     Contacts,
     End,
     Gripper,
-    MassProperties,
     Part,
     Quaternion,
     Vector,
-    mass_properties,
     multiply,
-    obj_of_parts,
     rotate,
 )
+from graspdb_simworker.bullet import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
 from graspdb_simworker.labels import rating
 
 Fidelity = Literal["standard", "fine"]
 
 APPROACH_GAP_M = 0.0005
 """The fingers start this far before their first contact: nothing can happen on the way there."""
-COLLISION_MARGIN_M = 0.0005
-"""Bullet inflates convex hulls by this much; boxes keep their size."""
-CONTACT_BREAKING_M = 0.002
 STALL_PROGRESS_M = 5e-5
 """The jaw has stalled once it closed less than this by the ages below: 5 mm at full speed by the first."""
 READING_AGES_S = (0.040, 0.060, 0.080, 0.100, 0.120, 0.200, 0.280)
@@ -69,8 +60,6 @@ finger to finger, and whether it stays depends on the time step more than on the
 docs/experiments.md."""
 SLACK_S = 1.0
 """A closing may last this much longer than the fingers need to meet at full speed."""
-_PARKED: Vector = (0.0, 0.0, -1000.0)
-_IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 _EMPTY_CHECK_STEPS = 10
 _GEAR_FORCES = 100.0
 """The coupling of the fingers may exert so many times the closing force: as good as rigid."""
@@ -99,7 +88,7 @@ def stepping_for(fidelity: Fidelity, mass_kg: float, *, lifts: bool = False) -> 
     return _HEAVY if mass_kg >= HEAVY_KG and not lifts else _LIGHT
 
 
-class GraspWorld:
+class GraspWorld(BulletWorld):
     """One object and one gripper in a headless Bullet world.
 
     Parameters
@@ -131,231 +120,32 @@ class GraspWorld:
         visible: bool = False,
         film_every_s: float = math.inf,
     ) -> None:
-        self.gripper = gripper
-        self.friction = friction
-        self.stepping = stepping_for(fidelity, mass_kg, lifts=lifts)
+        stepping = stepping_for(fidelity, mass_kg, lifts=lifts)
+        # What is lifted must not turn where faces hold it.
+        super().__init__(
+            parts,
+            mass_kg,
+            friction,
+            gripper,
+            solver_iterations=stepping.solver_iterations,
+            by_faces=lifts,
+            visible=visible,
+        )
+        self.stepping = stepping
         self._damping = DAMPING * math.sqrt(gripper.closing_force_n / mass_kg)
-        self.mass = mass_properties(parts, mass_kg)
-        self._visible = visible
-        # What is lifted must not turn where faces hold it: contact by faces, see urdf.py. It takes longer.
         self._lifts = lifts
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing from two sides, each (480, 1280, 3), drawn by pybullet's CPU renderer; the end
         is last. Empty unless the world is visible."""
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError("pybullet could not open a DIRECT world")
         self._to_body = self.mass.inverse_rotation()
         try:
-            self._configure()
-            if lifts:
-                self._jaw, self._object = self._load_bodies(parts)
-            else:
-                self._jaw = self._build_gripper()
-                self._object = self._build_object(parts, self.mass)
-            self._column = self._build_column()
-            self._gear = self._build_gear() if lifts else -1
-            self._finish_bodies(math.sqrt(friction))
+            self._damp(self._damping)
             self._park()
         except BaseException:
             self.close_world()
             raise
-
-    def __enter__(self) -> GraspWorld:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close_world()
-
-    def close_world(self) -> None:
-        """Free Bullet's memory; the world can't be used afterwards."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
-
-    # -- building ------------------------------------------------------------------------------------------
-
-    def _configure(self) -> None:
-        pybullet.resetSimulation(physicsClientId=self._client)
-        pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=self._client)
-        pybullet.setPhysicsEngineParameter(
-            numSolverIterations=self.stepping.solver_iterations,
-            contactBreakingThreshold=CONTACT_BREAKING_M,
-            deterministicOverlappingPairs=1,
-            numSubSteps=0,
-            enableSAT=int(self._lifts),
-            physicsClientId=self._client,
-        )
-
-    def _build_gripper(self) -> int:
-        gripper = self.gripper
-        finger_half, palm_half = gripper.finger_half_extents, gripper.palm_half_extents
-        finger, palm = self._box(finger_half), self._box(palm_half)
-        finger_look = self._look(halfExtents=finger_half, rgbaColor=(0.25, 0.30, 0.38, 1.0))
-        palm_look = self._look(halfExtents=palm_half, rgbaColor=(0.55, 0.58, 0.62, 1.0))
-        closed = gripper.tip_offset_m - finger_half[2]
-        frames = [(0.0, side * finger_half[1], closed) for side in (-1.0, 1.0)]
-        return int(
-            pybullet.createMultiBody(
-                baseMass=0.0,
-                # The base frame is the tool frame; the palm hangs behind it, so that links count from
-                # the tool.
-                baseCollisionShapeIndex=palm,
-                baseVisualShapeIndex=palm_look,
-                basePosition=(0.0, 0.0, gripper.palm_centre_z),
-                linkMasses=[gripper.finger_mass_kg] * 2,
-                linkCollisionShapeIndices=[finger, finger],
-                linkVisualShapeIndices=[finger_look, finger_look],
-                linkPositions=[(x, y, z - gripper.palm_centre_z) for x, y, z in frames],
-                linkOrientations=[_IDENTITY] * 2,
-                linkInertialFramePositions=[(0.0, 0.0, 0.0)] * 2,
-                linkInertialFrameOrientations=[_IDENTITY] * 2,
-                linkParentIndices=[0, 0],
-                linkJointTypes=[pybullet.JOINT_PRISMATIC] * 2,
-                linkJointAxis=[(0.0, -1.0, 0.0), (0.0, 1.0, 0.0)],
-                physicsClientId=self._client,
-            )
-        )
-
-    def _box(self, half_extents: Vector) -> int:
-        return int(
-            pybullet.createCollisionShape(
-                pybullet.GEOM_BOX, halfExtents=half_extents, physicsClientId=self._client
-            )
-        )
-
-    def _look(self, **shape: Any) -> int:
-        """A visual shape; none unless the world is to be seen."""
-        if not self._visible:
-            return -1
-        kind = pybullet.GEOM_MESH if "fileName" in shape else pybullet.GEOM_BOX
-        return int(pybullet.createVisualShape(kind, physicsClientId=self._client, **shape))
-
-    def _build_object(self, parts: Sequence[Part], mass: MassProperties) -> int:
-        # pybullet takes several hulls in one body only from an OBJ file, a group a part. In it the body
-        # frame is the principal frame of inertia, so that no inertial offset is left to go wrong.
-        with tempfile.TemporaryDirectory(prefix="graspdb-parts-") as folder:
-            path = Path(folder) / "parts.obj"
-            path.write_text(obj_of_parts(parts, mass), encoding="ascii")
-            shape = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=os.fspath(path), physicsClientId=self._client
-            )
-            body = int(
-                pybullet.createMultiBody(
-                    baseMass=mass.mass_kg,
-                    baseCollisionShapeIndex=shape,
-                    baseVisualShapeIndex=self._look(
-                        fileName=os.fspath(path), rgbaColor=(0.93, 0.62, 0.25, 1.0)
-                    ),
-                    basePosition=_PARKED,
-                    physicsClientId=self._client,
-                )
-            )
-        if shape < 0 or body < 0:
-            raise RuntimeError("pybullet refused the object's convex parts")
-        return body
-
-    def _load_bodies(self, parts: Sequence[Part]) -> tuple[int, int]:
-        """Gripper and object with contact by faces."""
-        flags = pybullet.URDF_INITIALIZE_SAT_FEATURES | pybullet.URDF_USE_INERTIA_FROM_FILE
-        with tempfile.TemporaryDirectory(prefix="graspdb-bodies-") as name:
-            folder = Path(name)
-            jaw = pybullet.loadURDF(
-                os.fspath(urdf.write_gripper(folder, self.gripper)),
-                basePosition=(0.0, 0.0, self.gripper.palm_centre_z),
-                useFixedBase=1,
-                flags=flags,
-                physicsClientId=self._client,
-            )
-            body = pybullet.loadURDF(
-                os.fspath(urdf.write_object(folder, parts, self.mass)),
-                basePosition=_PARKED,
-                flags=flags,
-                physicsClientId=self._client,
-            )
-        return int(jaw), int(body)
-
-    def _build_column(self) -> int:
-        """A ghost as large as the space between the open fingers: it collides with nothing and answers
-        one question."""
-        half = self.gripper.finger_half_extents
-        shape = self._box((half[0], 0.5 * self.gripper.max_opening_m, half[2]))
-        body = int(
-            pybullet.createMultiBody(
-                baseMass=0.0,
-                baseCollisionShapeIndex=shape,
-                basePosition=(0.0, 0.0, self.gripper.tip_offset_m - half[2]),
-                physicsClientId=self._client,
-            )
-        )
-        pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
-        return body
-
-    def _build_gear(self) -> int:
-        """What couples the fingers while they carry: both joints move alike. Idle until then."""
-        gear = pybullet.createConstraint(
-            self._jaw,
-            0,
-            self._jaw,
-            1,
-            pybullet.JOINT_GEAR,
-            jointAxis=(0.0, 1.0, 0.0),
-            parentFramePosition=(0.0, 0.0, 0.0),
-            childFramePosition=(0.0, 0.0, 0.0),
-            physicsClientId=self._client,
-        )
-        self._couple(gear, 0.0)
-        return int(gear)
-
-    def _couple(self, gear: int, force_n: float) -> None:
-        pybullet.changeConstraint(gear, gearRatio=-1, maxForce=force_n, physicsClientId=self._client)
-
-    def _finish_bodies(self, friction_root: float) -> None:
-        # Bullet multiplies the coefficients of the two bodies, hence the root.
-        surface = {
-            "lateralFriction": friction_root,
-            "spinningFriction": 0.0,
-            "rollingFriction": 0.0,
-            "restitution": 0.0,
-        }
-        for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
-            for link in links:
-                # In a call of its own: beside a setting that only a base has, such as a damping or a
-                # margin, pybullet drops all others of a link without a word.
-                pybullet.changeDynamics(body, link, physicsClientId=self._client, **surface)
-            pybullet.changeDynamics(
-                body,
-                -1,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                jointDamping=0.0,
-                collisionMargin=COLLISION_MARGIN_M,
-                activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=self._client,
-            )
-        for link in (0, 1):
-            pybullet.changeDynamics(self._jaw, link, jointDamping=0.0, physicsClientId=self._client)
-        pybullet.changeDynamics(
-            self._object, -1, localInertiaDiagonal=self.mass.inertia, physicsClientId=self._client
-        )
-        self._damp(self._damping)
-
-    def _damp(self, rate: float) -> None:
-        pybullet.changeDynamics(
-            self._object, -1, linearDamping=rate, angularDamping=rate, physicsClientId=self._client
-        )
-
-    def frictions(self) -> list[float]:
-        """Coefficients between the object and palm, first and second finger, as Bullet multiplies them."""
-        roots = [
-            pybullet.getDynamicsInfo(body, link, physicsClientId=self._client)[1]
-            for body, link in ((self._object, -1), (self._jaw, -1), (self._jaw, 0), (self._jaw, 1))
-        ]
-        return [roots[0] * root for root in roots[1:]]
 
     # -- one grasp -----------------------------------------------------------------------------------------
 
@@ -387,32 +177,6 @@ class GraspWorld:
         if self._visible and self._filmed_s >= self._film_every_s:
             self._filmed_s = 0.0
             self.pictures.append(self._render())
-
-    def _render(self) -> NDArray[np.uint8]:
-        width, height = 640, 480
-        # The ghost column would be drawn: out of sight meanwhile.
-        column = pybullet.getBasePositionAndOrientation(self._column, physicsClientId=self._client)
-        pybullet.resetBasePositionAndOrientation(
-            self._column, _PARKED, _IDENTITY, physicsClientId=self._client
-        )
-        lens = pybullet.computeProjectionMatrixFOV(fov=32.0, aspect=width / height, nearVal=0.02, farVal=4.0)
-        views = []
-        # Along the fingers' width, and obliquely from the tips; the approach points down.
-        for eye in ((0.45, 0.0, 0.05), (0.28, -0.30, 0.25)):
-            view = pybullet.computeViewMatrix(eye, (0.0, 0.0, -0.02), (0.0, 0.0, -1.0))
-            _, _, pixels, _, _ = pybullet.getCameraImage(
-                width,
-                height,
-                view,
-                lens,
-                lightDirection=(0.6, -0.4, -0.8),
-                shadow=0,
-                renderer=pybullet.ER_TINY_RENDERER,
-                physicsClientId=self._client,
-            )
-            views.append(np.asarray(pixels, dtype=np.uint8).reshape(height, width, 4)[:, :, :3])
-        pybullet.resetBasePositionAndOrientation(self._column, *column, physicsClientId=self._client)
-        return np.concatenate(views, axis=1)
 
     def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
         client, jaw, body = self._client, self._jaw, self._object
@@ -598,7 +362,7 @@ class GraspWorld:
         if self._lifts:
             self._couple(self._gear, 0.0)
             self._damp(self._damping)
-        pybullet.resetBasePositionAndOrientation(self._object, _PARKED, _IDENTITY, physicsClientId=client)
+        pybullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY, physicsClientId=client)
         pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
         for joint in (0, 1):
             pybullet.resetJointState(
