@@ -31,10 +31,11 @@ LEAST_OF_EACH = 50
 #: Widths asked for, metres and radians.
 _POSITION_M, _ROTATION = (0.002, 0.04), (math.radians(3.0), math.radians(40.0))
 _BLOCK_M = 0.005
-_TRAINED_MOST, _JUDGED_MOST, _PAIRS_MOST = 20_000, 1_500, 5_000_000
-_CUT = 0.5 * 3.5**2
+_TRAINED_MOST, _JUDGED_MOST, _PAIRS_MOST = 20_000, 1_500, 2_500_000
+#: Pairs farther apart than this many of these widths are left out of the choice.
+_CUT, _REACH = 0.5 * 3.5**2, np.array([0.025, math.radians(30.0)])
 #: Steps of the search, as factors of a width.
-_STEPS = (1.6, 1.25, 1.1)
+_STEPS = (1.6, 1.25)
 _ENOUGH = 1e-4
 _CLIP = 1e-3
 _QUERY_BLOCK = 128
@@ -228,8 +229,10 @@ class _HeldOut:
         block: NDArray[np.int64],
         rng: np.random.Generator,
     ) -> None:
-        judged = rng.permutation(len(p))[:_JUDGED_MOST]
-        widest = np.array([_POSITION_M[1], _ROTATION[1]])
+        # Successes are few: half of what is judged, each class weighted by what it stands for.
+        classes = [rng.permutation(np.flatnonzero(won == y))[: _JUDGED_MOST // 2] for y in (True, False)]
+        judged = rng.permutation(np.concatenate(classes))
+        widest = _REACH
         # Counted on a few first, so that what is kept fits.
         few = judged[: max(1, len(judged) // 20)]
         nothing = np.empty(0, dtype=np.int32), np.empty((0, 6), dtype=np.float32)
@@ -244,6 +247,8 @@ class _HeldOut:
         self.squared, self.won = squared[:count], won[row[:count]]
         self.outcome = won[judged]
         self.share = float(won.mean())
+        shares = {y: np.mean(won == y) / max(np.mean(self.outcome == y), 1e-9) for y in (True, False)}
+        self.weight = np.where(self.outcome, shares[True], shares[False])
         names = np.unique(block)
         first_half = rng.permutation(names)[: (len(names) + 1) // 2]
         self.choosing = np.isin(block[judged], first_half)
@@ -263,19 +268,25 @@ class _HeldOut:
 
     def loss(self, widths: Floats) -> float:
         """Log loss of the attempts that choose."""
-        return _log_loss(self.predicted(widths)[self.choosing], self.outcome[self.choosing])
+        chosen = self.choosing
+        return _log_loss(self.predicted(widths)[chosen], self.outcome[chosen], self.weight[chosen])
 
     def judged(self, widths: Floats) -> tuple[float, float]:
         """Log loss and Brier skill of the attempts that judge."""
-        p, y = self.predicted(widths)[~self.choosing], self.outcome[~self.choosing]
-        spread = float(y.mean() * (1.0 - y.mean()))
-        skill = 1.0 - float(np.mean((p - y) ** 2)) / spread if spread > 0.0 else math.nan
-        return _log_loss(p, y), skill
+        p, y, w = (
+            self.predicted(widths)[~self.choosing],
+            self.outcome[~self.choosing],
+            self.weight[~self.choosing],
+        )
+        mean = float(np.average(y, weights=w))
+        spread = mean * (1.0 - mean)
+        skill = 1.0 - float(np.average((p - y) ** 2, weights=w)) / spread if spread > 0.0 else math.nan
+        return _log_loss(p, y, w), skill
 
 
-def _log_loss(p: Floats, y: NDArray[np.bool_]) -> float:
+def _log_loss(p: Floats, y: NDArray[np.bool_], w: Floats) -> float:
     clipped = np.clip(p, _CLIP, 1.0 - _CLIP)
-    return float(-np.mean(np.where(y, np.log(clipped), np.log1p(-clipped))))
+    return float(-np.average(np.where(y, np.log(clipped), np.log1p(-clipped)), weights=w))
 
 
 def _searched(held: _HeldOut, start: Floats, groups: tuple[tuple[int, ...], ...]) -> Floats:

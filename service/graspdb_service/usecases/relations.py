@@ -76,16 +76,23 @@ def _rows(
 
 
 def in_words(found: list[AnisotropyRelation]) -> str:
-    """The squarest grasps at each kind of pair, beside those at none; empty where that says nothing."""
+    """The squarest grasps at each kind of pair, beside those at none; empty where that says nothing.
+
+    Of attempts that did not collide: whether the open gripper fits is told without trials.
+    """
     told, alone = [], ""
     for item in found:
-        if item.attempts < _LEAST_TOLD or item.probability is None or item.low is None or item.high is None:
+        chance, low, high = item.free_probability, item.free_low, item.free_high
+        if item.attempts - item.collisions < _LEAST_TOLD or chance is None or low is None or high is None:
             continue
-        share = f"{100 * item.probability:.3g} % ({100 * item.low:.2g} to {100 * item.high:.2g})"
+        share = f"{100 * chance:.3g} % ({100 * low:.3g} to {100 * high:.3g})"
         if item.angle_deg is None:
             alone = f"; at none of these {share}"
         elif item.angle_deg[0] == 0.0:
             told.append(f"on {_WORDS[item.relation]} {share}")
     if not told:
         return ""
-    return f" Of attempts that close within {ANGLES_DEG[1]:g} deg of square {', '.join(told)} succeed{alone}."
+    return (
+        f" Of attempts that do not collide and close within {ANGLES_DEG[1]:g} deg of square"
+        f" {', '.join(told)} succeed{alone}."
+    )
