@@ -1,6 +1,7 @@
 """Grasp densities: kernel density estimation on R^3 x SO(3). Arrays in, arrays out; no IO."""
 
 from . import reference, se3
+from .analytic import AnalyticKernel
 from .anisotropic import AnisotropicKernel
 from .density import GraspDensity
 from .kernels import HAAR_VOLUME, IsotropicKernel
@@ -16,6 +17,7 @@ from .widths import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
 __all__ = [
     "DEFAULT_KERNEL",
     "HAAR_VOLUME",
+    "AnalyticKernel",
     "AnisotropicKernel",
     "GraspDensity",
     "IsotropicKernel",

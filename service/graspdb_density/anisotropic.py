@@ -18,14 +18,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import quad
 from scipy.special import logsumexp
 
 from .kernels import POSITION_LIMITS_M, IsotropicKernel
 from .rows import rotation_normaliser
 from .se3 import Floats
 
-__all__ = ["MOST_ROTATION", "AnisotropicKernel", "Frame", "analytic_log_kernel", "mirror"]
+__all__ = ["MOST_ROTATION", "AnisotropicKernel", "Frame", "mirror"]
 
 #: Axes a row's translations are measured along: the gripper's, which turn with the jaw, or others, which do
 #: not.
@@ -230,45 +229,3 @@ def _check_covariance(cov: Floats, index: int) -> None:
 
 def _close(a: Floats, b: Floats) -> bool:
     return bool(np.allclose(a, b, rtol=1e-6, atol=1e-10))
-
-
-def analytic_log_kernel(widths: ArrayLike, beta: float, sigma_r: float, rotations: ArrayLike) -> Floats:
-    """The paper's closed form for rotations (eq 7 and 8), as a reference; nats of 1/rad^3.
-
-    The von Mises-Fisher pair with the angle replaced by a Mahalanobis-like one: ``exp(sigma_r cos(w beta))``
-    and its antipode, ``w = sqrt(theta^T S^-1 theta)`` with theta the relative quaternion's vector part, S =
-    diag(widths^2). ``w beta`` is held at pi / 2: beyond, the cosine would rise again into lobes of no
-    meaning. The normaliser is numerical: the paper's is that of the isotropic case.
-
-    Parameters
-    ----------
-    widths : (3,) about x, y, z, relative
-    beta : radians per unit of w
-    sigma_r : concentration
-    rotations : (..., 4) relative quaternions ``mu^-1 q``
-    """
-    s = np.asarray(widths, dtype=np.float64)
-    if s.shape != (3,) or not np.isfinite(s).all() or np.any(s <= 0.0) or beta <= 0.0 or sigma_r <= 0.0:
-        raise ValueError("widths, beta and sigma_r must be positive and finite")
-
-    def raw(q: Floats) -> Floats:
-        w = np.sqrt(np.sum((q[..., :3] / s) ** 2, axis=-1))
-        cosine = np.cos(np.minimum(w * beta, 0.5 * math.pi))
-        return np.asarray(sigma_r * (cosine - 1.0) + np.log1p(np.exp(-2.0 * sigma_r * cosine)))
-
-    # Directions by a product rule, angles by adaptive quadrature: volume element 4 sin^2(angle / 2).
-    node, weight = np.polynomial.legendre.leggauss(48)
-    phi = (np.arange(96) + 0.5) * _TWO_PI / 96
-    ring = np.sqrt(1.0 - node**2)[:, None]
-    height = np.broadcast_to(node[:, None], (48, 96))
-    axes = np.stack([ring * np.cos(phi), ring * np.sin(phi), height], axis=-1)
-
-    def shell(angle: float) -> float:
-        upright = np.full((48, 96, 1), math.cos(0.5 * angle))
-        q = np.concatenate([axes * math.sin(0.5 * angle), upright], axis=-1)
-        mean = float(weight @ np.exp(raw(q)).mean(axis=1)) * _TWO_PI
-        return mean * 4.0 * math.sin(0.5 * angle) ** 2
-
-    total, _ = quad(shell, 0.0, math.pi, epsrel=1e-9, limit=200)
-    q = np.asarray(rotations, dtype=np.float64)
-    return raw(np.where(q[..., 3:] < 0.0, -q, q)) - math.log(total)

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from graspdb_density import HAAR_VOLUME, IsotropicKernel, Region, reference, se3
-from graspdb_density.anisotropic import AnisotropicKernel, analytic_log_kernel, mirror
+from graspdb_density import IsotropicKernel, Region, reference, se3
+from graspdb_density.anisotropic import AnisotropicKernel, mirror
 from graspdb_density.mixture import MixtureDensity
 
 Poses = tuple[se3.Floats, se3.Floats]
@@ -170,26 +170,6 @@ def test_maximum_is_feasible_and_no_worse_than_rows_and_samples(shell: Shell) ->
     assert density.global_maximum().score >= best.score - 1e-6
 
 
-def test_analytic_form_integrates_to_one_and_keeps_its_axes() -> None:
-    rng = np.random.default_rng(8)
-    q = se3.random_quaternions(300_000, rng)
-    values = np.exp(analytic_log_kernel([0.2, 0.5, 0.3], 0.6, 15.0, q)) * HAAR_VOLUME
-    assert abs(values.mean() - 1.0) < 4.5 * values.std() / math.sqrt(len(q))
-    turns = [se3.from_rotation_vector(0.4 * np.eye(3)[axis]) for axis in range(3)]
-    about_x, about_y, about_z = (float(analytic_log_kernel([0.2, 0.5, 0.3], 0.6, 15.0, t)) for t in turns)
-    assert about_y > about_z > about_x
-    # Clamped: no lobe where the weighted angle passes half a turn.
-    angles = np.linspace(0.0, math.pi, 50)
-    about = se3.from_rotation_vector(angles[:, None] * np.array([1.0, 0.0, 0.0]))
-    assert (np.diff(analytic_log_kernel([0.2, 0.5, 0.3], 0.6, 15.0, about)) <= 1e-12).all()
-    # Small angles, equal widths: w beta is half the angle, and the form is von Mises-Fisher's.
-    kernel = IsotropicKernel(1.0, 8 * DEG)
-    near = se3.from_rotation_vector(rng.standard_normal((20, 3)) * 0.05)
-    same = analytic_log_kernel([1.0, 1.0, 1.0], 1.0, kernel.kappa, near)
-    own = reference.kernel_log_density(kernel, np.zeros(3), near, np.zeros(3), se3.IDENTITY)
-    np.testing.assert_allclose(same - own - 1.5 * math.log(2 * math.pi), 0.0, atol=0.02)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -206,7 +186,6 @@ def test_analytic_form_integrates_to_one_and_keeps_its_axes() -> None:
         (lambda: AnisotropicKernel(np.ones(2), np.zeros((1, 6)), 1e-4 * np.eye(6)[None]), "have shapes"),
         (lambda: AnisotropicKernel.gaussian(SMALL, frame="world"), "frame is"),  # type: ignore[arg-type]
         (lambda: AnisotropicKernel.gaussian(1e-4 * (np.eye(6) + np.eye(6, k=2))), "not symmetric"),
-        (lambda: analytic_log_kernel([1.0, 1.0, 0.0], 1.0, 1.0, se3.IDENTITY), "positive"),
     ],
 )
 def test_bad_kernels_are_refused(make: Callable[[], object], message: str) -> None:
