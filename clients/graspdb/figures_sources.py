@@ -96,7 +96,7 @@ def sources(figure: Figure, report: SourcesReport) -> None:
     for row, item in zip(table, report.sources, strict=True):
         _calibrated(row[0], item, report.level)
         _shares(row[1], item, report)
-        _similar(row[2], item, report.level)
+        _similar(row[2], item)
         for axes in row:
             plain(axes)
 
@@ -165,7 +165,7 @@ def _shares(axes: Axes, item: SourceComparison, report: SourcesReport) -> None:
     axes.set_title(f"simulation: {report.successes:,} of {report.attempts:,} succeeded", fontsize=8)
 
 
-def _similar(axes: Axes, item: SourceComparison, level: float) -> None:
+def _similar(axes: Axes, item: SourceComparison) -> None:
     found = item.similarity
     axes.set_ylim(0.0, 1.02)
     axes.set_ylabel("density similarity (Bhattacharyya)", fontsize=8)
@@ -187,6 +187,7 @@ def _similar(axes: Axes, item: SourceComparison, level: float) -> None:
     axes.set_xlim(-0.6, 1.6)
     kernel = found.kernel
     axes.set_title(
-        f"kernel {1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°; {level:.0%}",
+        f"kernel {1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°;\n"
+        "green: range of 10 draws of simulation",
         fontsize=8,
     )

@@ -114,9 +114,10 @@ def kernel_similarity(figure: Figure, report: KernelSimilarityReport) -> None:
             linewidth=1.5,
         )
         axes.set_ylim(0.0, 1.02)
-        axes.set_xscale("log")
-        _ticks(axes, [float(point.count) for point in points])
         plain(axes)
+    left.set_xscale("log")
+    _ticks(left, [float(point.count) for point in report.samples])
+    right.set_xticks([point.count for point in report.mixtures if point.count % 2 == 0 or point.count == 1])
     left.axvline(900, color=GREY, linestyle=":", linewidth=1.2)
     left.annotate("900: the paper", (900, 0.03), fontsize=7, color=GREY, ha="right", rotation=90)
     left.set_xlabel(f"samples, of {report.reference:,} displacements")

@@ -35,12 +35,13 @@ __all__ = [
     "FittedKernel",
     "displacements",
     "fit_kernel",
+    "mixture_parts",
 ]
 
 #: Fewer successes or displacements than this shape no kernel.
 LEAST_SUCCESSES, LEAST_DISPLACEMENTS = 50, 200
-#: Numbers of components tried where none is asked for.
-_TRIED_COMPONENTS = (1, 2, 3)
+#: Numbers of components tried where none is asked for, until so many in a row have not raised the likelihood.
+_TRIED_COMPONENTS, _GIVEN_UP = (1, 2, 3, 4, 6, 8, 12, 16), 2
 _FACTORS = tuple(float(f) for f in np.geomspace(0.3, 1.7, 9))
 _ITERATIONS, _ENOUGH = 60, 1e-5
 _FITTED_MOST, _SCALED_MOST, _JUDGED_MOST = 8_000, 5_000, 600
@@ -181,7 +182,7 @@ def fit_kernel(
         The isotropic kernel whose held-out likelihood is told beside the fitted one's.
     components : int or None
         1: one Gaussian about no displacement. More: a mixture; a component off the mirror's plane is a pair.
-        None: 1 to 3 by the likelihood of held-out displacements.
+        None: 1 to 16 by the likelihood of held-out displacements.
     frame : (3, 3), (N, 3, 3) or None
         Axes that do not turn with the jaw, for a kernel aligned with them: the object's principal ones, or of
         every grasp those of its edge or pair of surfaces, the gripper's where not finite. Their signs mean
@@ -339,10 +340,18 @@ def _shape(
     if held.all() or not held.any():
         return _fitted(x, w, tried[0], added, plain), {}
     likelihoods = {}
+    best, failed = tried[0], 0
     for count in tried:
-        kernel = _fitted(x[~held], w[~held], count, added, plain)
+        try:
+            kernel = _fitted(x[~held], w[~held], count, added, plain)
+        except ValueError:
+            # A component wider than one may be: more of them may not be.
+            continue
         likelihoods[count] = float(np.average(kernel.log_kernel(x[held]), weights=w[held]))
-    best = max(likelihoods, key=lambda count: likelihoods[count])
+        failed = 0 if likelihoods[count] > likelihoods.get(best, -math.inf) else failed + 1
+        best = count if not failed else best
+        if failed >= _GIVEN_UP and count != best:
+            break
     return _fitted(x, w, best, added, plain), likelihoods
 
 
@@ -358,6 +367,18 @@ def _fitted(x: Floats, w: Floats, count: int, added: Floats, plain: bool) -> Ani
         return AnisotropicKernel.gaussian(second + added, frame="fixed" if plain else "gripper")
     weights, means, covariances = _expectation_maximisation(x, v, count, second)
     return AnisotropicKernel.symmetrised(weights, means, covariances + added)
+
+
+def mixture_parts(vectors: Floats, count: int) -> tuple[Floats, Floats, Floats]:
+    """Weights (C,), means (C, 6) and covariances (C, 6, 6) of mirrored pairs of Gaussians, fitted to
+    displacements (n, 6) that count alike.
+    """
+    half = 0.5 * np.linalg.norm(vectors[:, 3:], axis=1)
+    v = 1.0 / np.maximum(np.sinc(half / np.pi) ** 2, 1e-3)
+    second = np.einsum("n,ni,nj->ij", v / v.sum(), vectors, vectors)
+    if count == 1:
+        return np.ones(1), np.zeros((1, 6)), second[None]
+    return _expectation_maximisation(vectors, v, count, second)
 
 
 def _expectation_maximisation(

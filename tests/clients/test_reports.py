@@ -147,6 +147,28 @@ def test_widths_and_the_summary_of_all_objects(
     assert json.loads(out)["report"] == "summary"
 
 
+def test_similarity_of_kernels_and_sources(thing: GraspObject, run: Run) -> None:
+    asked = {"window_position_m": 0.03, "window_rotation_deg": 60}
+    found = thing.reports.kernel_similarity(**asked, timeout_s=240)
+    counts, similarity = found.samples
+    assert counts[0] == 50
+    assert similarity[-1] > similarity[0]
+    assert found.mixtures[0].tolist() == list(range(1, 17))
+    drawn_on_the_page(found, "900: the paper")
+    code, out, _ = run(
+        "report", thing.id, "kernel-similarity", "--window-position-m", "0.03", "--window-rotation-deg", "60"
+    )
+    assert (code, "Gaussians" in out) == (0, True)
+    poses, won = field(seed=1)
+    thing.trials.add(poses, won, source="simulation")
+    thing.trials.add(poses[:200], won[:200], source="robot")
+    compared = thing.reports.sources()
+    assert set(compared.by_source) == {"robot"}
+    drawn_on_the_page(compared, "agreement with")
+    code, out, _ = run("report", thing.id, "sources")
+    assert (code, "agreement" in out) == (0, True)
+
+
 def test_too_few_trials_raise_what_is_needed(db: Client, fresh_id: str) -> None:
     item = db.objects.create(fresh_id)
     with pytest.raises(Conflict, match="at least 200 successful grasps"):

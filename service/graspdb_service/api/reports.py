@@ -23,6 +23,7 @@ from graspdb.wire.reports import (
     BandwidthReport,
     CalibrationReport,
     ConvergenceReport,
+    KernelSimilarityReport,
     Matching,
     Method,
     ProjectionReport,
@@ -186,6 +187,35 @@ class TrialsQuery(StrictRequest):
 def get_bandwidth(ctx: Ctx, id: str, request: Request, query: Annotated[TrialsQuery, Query()]) -> Response:
     """How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks."""
     return _answer(ctx, id, "bandwidth", request, query.selection, {})
+
+
+class KernelSimilarityQuery(TrialsQuery):
+    """Which displacements count (a cube's half edge, the largest turn), and the width of a component."""
+
+    window_position_m: Annotated[float, Query(gt=0, le=1.0)] = 0.04
+    window_rotation_deg: Annotated[float, Query(gt=0, le=180.0)] = 180.0
+    component_position_m: Annotated[float, Query(ge=0.001, le=0.2)] = 0.01
+    component_rotation_deg: Annotated[float, Query(ge=1.0, le=40.0)] = 10.0
+
+
+@router.get(
+    "/objects/{id}/reports/kernel-similarity",
+    response_model=KernelSimilarityReport,
+    responses=_RESPONSES,
+    **scope("read"),
+)
+def get_kernel_similarity(
+    ctx: Ctx, id: str, request: Request, query: Annotated[KernelSimilarityQuery, Query()]
+) -> Response:
+    """How many samples, or Gaussians, does a kernel need to be like its statistics? (figure 13)"""
+    names = (
+        "window_position_m",
+        "window_rotation_deg",
+        "component_position_m",
+        "component_rotation_deg",
+    )
+    options: dict[str, str | None] = {name: str(getattr(query, name)) for name in names}
+    return _answer(ctx, id, "kernel-similarity", request, query.selection, options)
 
 
 class SourcesQuery(StrictRequest):

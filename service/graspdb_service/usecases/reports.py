@@ -16,6 +16,7 @@ from graspdb_service.usecases.densities import Built, KernelChoice
 from graspdb_service.usecases.projection_report import projection_report
 from graspdb_service.usecases.reportparts import Sources
 from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.similarity_report import kernel_similarity_report
 from graspdb_service.usecases.sources_report import sources_report
 
 
@@ -64,6 +65,7 @@ _REPORTS: dict[str, Callable[[Sources, Built, dict[str, str], Progress], AnyRepo
     "bandwidth": bandwidth_report,
     "calibration": calibration_report,
     "convergence": convergence_report,
+    "kernel-similarity": kernel_similarity_report,
     "projection": projection_report,
     "sources": sources_report,
 }
