@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb import figures_projection, figures_sources, figures_widths
-from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, told
+from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, bars, told
 from graspdb.figures_style import plain as _plain
 from graspdb.figures_style import title as _title
 from graspdb.wire.reports import (
@@ -283,6 +283,13 @@ def _calibration(figure: Figure, report: CalibrationReport) -> None:
         linewidth=1.5,
         label=f"held-out attempts, {report.level:.0%} intervals over {report.blocks} blocks",
     )
+    again = report.checked
+    if again is not None:
+        top.errorbar(
+            [again.predicted], [again.rate.value or 0.0], yerr=bars([again.rate]), color=ORANGE, marker="D",
+            markersize=6, capsize=4, linestyle="none",
+            label=f"{again.grasps:,} given grasps simulated again ({again.successes:,} succeed)",
+        )  # fmt: skip
     top.set_ylabel("share that succeeded")
     top.set_xlim(0, 1)
     top.set_ylim(0, 1.02)

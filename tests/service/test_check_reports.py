@@ -150,3 +150,47 @@ def test_bandwidth_of_too_few(sqlite_http: httpx.Client, make_object: Make, post
     alike = http.get(PATH + "bandwidth")
     assert (alike.status_code, "one block" in alike.json()["title"]) == (409, True)
     assert http.get(PATH + "bandwidth?sigma_position_m=0.01").status_code == 422
+
+
+def test_calibration_judges_grasps_that_were_simulated_again(filled: httpx.Client) -> None:
+    http = filled
+    before = ok(http.get(PATH + "calibration"))
+    assert before["checked"] is None
+    assert any("POST /objects/thing/sweeps" in warning for warning in before["warnings"])
+    rng = np.random.default_rng(5)
+    p = rng.normal(size=(200, 3)) * 0.012
+    q = se3.random_quaternions(200, rng)
+    made = http.post(
+        "/objects/thing/sweeps",
+        json={
+            "poses": {"position": p.tolist(), "quaternion_xyzw": q.tolist()},
+            "gripper": "pg70",
+            "purpose": "check",
+        },
+    )
+    assert made.status_code == 202, made.text
+    assert simulate(http) == 200
+    body = ok(http.get(PATH + "calibration"))
+    # Nothing but the check is new: no prediction rests on it.
+    assert body["skill"] == before["skill"]
+    assert body["revision"] == before["revision"]
+    again = body["checked"]
+    codes = physics(p)
+    won = int((codes == OUTCOME_CODES["success"]).sum())
+    assert (again["grasps"], again["successes"]) == (200, won)
+    assert again["rate"]["low"] < won / 200 < again["rate"]["high"]
+    assert sum(item["count"] for item in again["bins"]) == 200
+    # Predictions are those that queries answer.
+    answer = ok(
+        http.post(
+            "/objects/thing/likelihood",
+            json={
+                "poses": {"position": p.tolist(), "quaternion_xyzw": q.tolist()},
+                "include": ["success_probability"],
+            },
+        )
+    )
+    assert again["predicted"] == pytest.approx(np.mean(answer["success_probability"]), abs=2e-3)
+    assert f"Simulated again, {won} of 200 given grasps succeed" in body["text"]
+    png = http.get(PATH + "calibration", headers={"Accept": "image/png"})
+    assert png.content.startswith(b"\x89PNG")

@@ -242,7 +242,7 @@ class CalibrationReport(Report):
     ``skill`` is Brier's: 1 perfect, 0 no better than the share of successes. ``ece`` is over predictions
     above 0.1. ``auc_*`` is the chance that a success ranks above a failure. ``free_skill`` is the skill over
     attempts that did not collide. ``checked`` are grasps whose poses were given to checks, as
-    best grasps are that are verified; where there are none, ``calls`` says how to make some.
+    best grasps are that are verified; where there are none, a warning says how to make some.
     """
 
     report: Literal["calibration"] = "calibration"
@@ -264,7 +264,6 @@ class CalibrationReport(Report):
     auc_density: float | None
     bins: list[CalibrationBin]
     checked: CheckedGrasps | None = None
-    calls: list[CheckCall] = Field(default_factory=list)
 
 
 class ProjectionProfile(Response):

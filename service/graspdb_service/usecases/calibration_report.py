@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from graspdb.wire import OUTCOME_CODES
 from graspdb.wire.reports import (
     CalibrationBin,
     CalibrationReport,
+    CheckedGrasps,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, importance_weights
 from graspdb_density.anisotropy import (
     LEAST_SUCCESSES,
 )
-from graspdb_density.calibration import area_under_curve, assign_blocks, calibrate
+from graspdb_density.calibration import (
+    ReliabilityBin,
+    area_under_curve,
+    assign_blocks,
+    calibrate,
+    reliability,
+)
 from graspdb_density.predicting import ShapedSuccessModel
 from graspdb_density.rows import Progress
 from graspdb_service.problems import conflict
+from graspdb_service.usecases import checks
 from graspdb_service.usecases.alltrials import AllTrials
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.reportparts import (
@@ -29,6 +39,7 @@ from graspdb_service.usecases.reportparts import (
     need_failures,
     said,
 )
+from graspdb_service.usecases.scenes import CollisionTest
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +47,10 @@ Floats = NDArray[np.float64]
 _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
 LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
+#: Kernels end at this many standard deviations of position.
+_REACH = 5.0
+#: Bins of grasps that were simulated again: there are few of them.
+_CHECKED_BINS = 5
 
 
 def _model(
@@ -108,6 +123,20 @@ def calibration_report(
         )
         apart = interval(alone.skill, alone.skill_low, alone.skill_high)
     share = float(np.average(won, weights=weights))
+    checked = _checked(sources, built, everything, test)
+    warnings = []
+    if test is None:
+        warnings.append(
+            "mesh or gripper is not known: collisions count as ordinary failures, which costs much skill"
+        )
+    if checked is None:
+        slug = built.object_row.slug
+        warnings.append(
+            "no best grasps have been simulated again: ask for some and simulate them with"
+            f' POST /objects/{slug}/best-grasp {{"count": 25}} and POST /objects/{slug}/sweeps'
+            ' {"poses": [...], "fidelity": "fine", "purpose": "check"}, as best_grasps(count=25, verify=True)'
+            f" and `graspdb best-grasp {slug} --count 25 --verify` do"
+        )
     report = CalibrationReport(
         **head(built),
         text="",
@@ -127,24 +156,63 @@ def calibration_report(
         ece=finite(whole.ece),
         auc_probability=finite(whole.auc),
         auc_density=finite(area_under_curve(ranked, won, weights=weights)),
-        bins=[
-            CalibrationBin(
-                lower=item.lower,
-                upper=item.upper,
-                count=item.count,
-                weight=item.weight,
-                predicted=finite(item.predicted),
-                observed=finite(item.observed),
-                low=finite(item.low),
-                high=finite(item.high),
-            )
-            for item in whole.bins
-        ],
-        warnings=[]
-        if test is not None
-        else ["mesh or gripper is not known: collisions count as ordinary failures, which costs much skill"],
+        bins=[_bin(item) for item in whole.bins],
+        checked=checked,
+        warnings=warnings,
     )
     return report.model_copy(update={"text": _calibration_text(report)})
+
+
+def _bin(item: ReliabilityBin) -> CalibrationBin:
+    return CalibrationBin(
+        lower=item.lower,
+        upper=item.upper,
+        count=item.count,
+        weight=item.weight,
+        predicted=finite(item.predicted),
+        observed=finite(item.observed),
+        low=finite(item.low),
+        high=finite(item.high),
+    )
+
+
+def _checked(
+    sources: Sources, built: Built, everything: AllTrials, test: CollisionTest | None
+) -> CheckedGrasps | None:
+    """Grasps given to checks against what is predicted of them: no prediction rests on a check's outcome."""
+    found = [
+        item for item in checks.read(sources.database, built) if item.plan == "poses" and len(item.codes)
+    ]
+    if not found:
+        return None
+    p = np.concatenate([item.position for item in found])
+    q = np.concatenate([item.quaternion for item in found])
+    codes = np.concatenate([item.codes for item in found])
+    assert built.density is not None
+    kernel, widths = built.density.kernel, built.predicting
+    reach = max([kernel.sigma_position_m, *(() if widths is None else widths[:3])])
+    distance, _ = cKDTree(p).query(everything.position, distance_upper_bound=_REACH * reach)
+    near = np.isfinite(distance)
+    if test is not None:
+        # Those that collided tell nothing of the others.
+        near &= ~everything.collided
+    predicted = np.zeros(len(p))
+    if near.any():
+        model = _model(everything, np.flatnonzero(near), kernel, widths)
+        predicted = model.evaluate(p, q, threads=sources.threads).probability.copy()
+    if test is not None:
+        predicted[~test.free(p, q, threads=sources.threads)] = 0.0
+    outcomes = checks.tally(codes)
+    won = outcomes.get("success", 0)
+    success = np.isin(codes, [OUTCOME_CODES["success"]])
+    return CheckedGrasps(
+        grasps=len(codes),
+        successes=won,
+        rate=checks.share(won, len(codes)),
+        predicted=float(predicted.mean()),
+        outcomes=outcomes,
+        bins=[_bin(item) for item in reliability(predicted, success, bins=_CHECKED_BINS, level=LEVEL)],
+    )
 
 
 def _judged(everything: AllTrials) -> tuple[NDArray[np.int64], Floats]:
@@ -175,5 +243,12 @@ def _calibration_text(report: CalibrationReport) -> str:
         text += (
             f" A success ranks above a failure with {report.auc_probability:.2f} by probability, with"
             f" {report.auc_density:.2f} by density."
+        )
+    again = report.checked
+    if again is not None and again.rate.low is not None and again.rate.high is not None:
+        text += (
+            f" Simulated again, {again.successes:,} of {again.grasps:,} given grasps succeed"
+            f" ({100.0 * again.rate.low:.0f} to {100.0 * again.rate.high:.0f} %, predicted"
+            f" {100.0 * again.predicted:.0f} %)."
         )
     return text
