@@ -20,7 +20,7 @@ from . import compiled, projection
 from .compiler import exact, fast
 
 F32 = np.float32
-__all__ = ["climb", "nearest_rows", "scatter", "score_centres", "thin"]
+__all__ = ["climb", "nearest_each", "nearest_rows", "scatter", "score_centres", "thin"]
 
 
 #: Columns of a path: position, quaternion, kernel sum.
@@ -453,3 +453,13 @@ def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, 
                     if buffer[i] > best[last]:
                         _insert(buffer[i], begin + i, best, rows)
                 begin = stop
+
+
+@fast
+def nearest_each(data, start, table, centre, scale, positions, quaternions, kappa, radius, best, rows):
+    """Of every pose, the highest exponent (M,) within ``radius`` and whose it is, as `nearest_rows`."""
+    for j in range(positions.shape[0]):
+        nearest_rows(
+            data, start, table, centre, scale, positions[j], quaternions[j], kappa, radius, best[j : j + 1],
+            rows[j : j + 1],
+        )  # fmt: skip

@@ -25,17 +25,22 @@ from .se3 import Floats
 if TYPE_CHECKING:
     from .density import GraspDensity
 
-__all__ = ["PoseNoise", "Score", "expected", "search_scored"]
+__all__ = ["PoseNoise", "Pull", "Score", "expected", "search_scored"]
 
 #: Scores poses (K, 3), (K, 4): (K,), higher is better.
 Score = Callable[[Floats, Floats], Floats]
+#: Moves poses (K, 3), (K, 4).
+Pull = Callable[[Floats, Floats], tuple[Floats, Floats]]
 
 _CANDIDATES = 192
 #: Centres whose score is asked for before any is climbed from: a density tells little of where another score
 #: is high.
 _ASKED = 4096
 #: Climbs, random steps a climb tries at a time, and how often: many for a little, the best of them further.
-_PHASES = ((64, 8, 12), (12, 12, 24))
+_PHASES = ((64, 8, 12), (12, 12, 24), (3, 24, 20))
+#: Draws around centres in reach, and how many of them may join the starts: where the nearest poses of centres
+#: are refused, others may not be.
+_DRAWN, _JOINING = 2048, 64
 #: Steps in kernel widths.
 _FIRST_STEP, _LAST_STEP = 0.6, 5e-3
 
@@ -49,6 +54,7 @@ def search_scored(
     min_separation_m: float = 0.01,
     min_separation: float = math.radians(20.0),
     admissible: Admissible | None = None,
+    pull: Pull | None = None,
     threads: int = 1,
 ) -> list[Maximum]:
     """The ``count`` best distinct grasps by ``score``, best first; arguments as in `maximum.search`.
@@ -56,9 +62,9 @@ def search_scored(
     Candidates are well separated centres of the density, projected into the region, those of the highest
     score among at most 4,096 centres: half of them where the density is highest, half drawn at random. The
     best climb by random steps, drawn from a fixed seed, that shrink as they fail. ``Maximum.score`` is the
-    score.
+    score. ``pull`` brings poses nearer to where they are admissible; random steps end where it puts them.
     """
-    found = _ScoredSearch(density, region or Region(), admissible, threads, score)
+    found = _ScoredSearch(density, region or Region(), admissible, threads, score, pull)
     return found.run(count, min_separation_m, min_separation)
 
 
@@ -72,9 +78,11 @@ class _ScoredSearch(Search):
         admissible: Admissible | None,
         threads: int,
         score: Score,
+        pull: Pull | None,
     ) -> None:
         super().__init__(density, region, admissible, threads)
         self.score = score
+        self.pull = pull
 
     @property
     def rough(self) -> int:
@@ -102,6 +110,29 @@ class _ScoredSearch(Search):
         for part in (places, *np.array_split(rest, -(-len(rest) // _ASKED) or 1)):
             if len(part):
                 yield self.guide.order[part], turned[part]
+
+    def starts(self, wanted: int, separation_m: float, separation: float) -> Pool:
+        found = super().starts(wanted, separation_m, separation)
+        rows, turned = next(self.candidates(), (np.empty(0, dtype=np.intp), np.empty(0, dtype=bool)))
+        if not len(rows):
+            return found
+        rng = np.random.default_rng(0)
+        some = rng.integers(0, len(rows), _DRAWN)
+        rows, turned = rows[some], turned[some]
+        quaternions = self.density.quaternions_xyzw[rows]
+        quaternions = np.where(turned[:, None], se3.jaw_twin(quaternions), quaternions)
+        away, turns = self.density.kernel.sample_displacements(_DRAWN, rng)
+        p, q, inside = self.landed(self.density.positions[rows] + away, se3.multiply(quaternions, turns))
+        drawn = self.valued(p[inside], q[inside])
+        return self.add_distinct(found, drawn, len(found) + _JOINING, separation_m, separation)
+
+    def landed(self, positions: Floats, quaternions: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Poses brought into the region, pulled to where they are admissible, and which are inside then."""
+        p, q, inside = self.region.project(positions, quaternions)
+        if self.pull is not None:
+            p, q = self.pull(p, q)
+            inside &= self.region.contains(p, q)
+        return p, q, inside
 
     def valued(self, positions: Floats, quaternions: Floats) -> Pool:
         return self.scored(Pool(positions, quaternions, np.zeros(len(positions)))).sort()
@@ -143,7 +174,7 @@ class _ScoredSearch(Search):
         at, to = np.repeat(ends.positions, tries, axis=0), np.repeat(ends.quaternions, tries, axis=0)
         away = at + rng.standard_normal(at.shape) * scale * kernel.sigma_position_m
         turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
-        p, q, inside = self.region.project(away, se3.multiply(to, turns))
+        p, q, inside = self.landed(away, se3.multiply(to, turns))
         scores = np.full(len(p), -np.inf)
         scores[inside] = self.sums(p[inside], q[inside])
         better = scores > np.repeat(ends.sums, tries)

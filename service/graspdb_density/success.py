@@ -165,10 +165,44 @@ class SuccessModel:
         ValueError
             Without any attempt, for a level outside (0, 1) or a cut-off outside 2 to 10.
         """
-        if not self.size:
-            raise ValueError("a success probability needs at least one attempt")
         if not 0.0 < level < 1.0:
             raise ValueError(f"level must be between 0 and 1, not {level!r}")
+        probability, trials, alpha, beta = self._beta(positions, quaternions_xyzw, cutoff, threads)
+        tail = 0.5 * (1.0 - level)
+        low = _quantiles(alpha, beta, tail, threads)
+        high = _quantiles(alpha, beta, 1.0 - tail, threads)
+        return SuccessEstimate(probability, low, high, trials, level)
+
+    def probability(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        cutoff: float = SUCCESS_CUTOFF,
+        threads: int = 1,
+    ) -> Floats:
+        """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""
+        return self._beta(positions, quaternions_xyzw, cutoff, threads)[0]
+
+    def lower_end(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        level: float = 0.9,
+        cutoff: float = SUCCESS_CUTOFF,
+        threads: int = 1,
+    ) -> Floats:
+        """The lower end of `evaluate` alone, (M,)."""
+        _, _, alpha, beta = self._beta(positions, quaternions_xyzw, cutoff, threads)
+        return _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
+
+    def _beta(
+        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, cutoff: float, threads: int
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
+        if not self.size:
+            raise ValueError("a success probability needs at least one attempt")
         p, q = se3.as_poses(positions, quaternions_xyzw)
         won = self._sums(self._succeeded, p, q, cutoff, threads)
         lost = self._sums(self._failed, p, q, cutoff, threads)
@@ -187,17 +221,7 @@ class SuccessModel:
         if prior in (0.0, 1.0):
             softened = (self._counts[0] + 0.5) / (self.size + 1.0)
             alpha, beta = alpha + (softened - prior), beta - (softened - prior)
-        tail = 0.5 * (1.0 - level)
-
-        low, high = np.empty(len(p)), np.empty(len(p))
-
-        def quantiles(begin: int, end: int) -> None:
-            part = slice(begin, end)
-            low[part] = betaincinv(alpha[part], beta[part], tail)
-            high[part] = betaincinv(alpha[part], beta[part], 1.0 - tail)
-
-        for_blocks(quantiles, len(p), block=4_096, threads=threads)
-        return SuccessEstimate(probability, low, high, trials, level)
+        return probability, trials, alpha, beta
 
     def smoothing_bias(
         self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
@@ -232,6 +256,17 @@ class SuccessModel:
         result = np.empty_like(out)
         result[order] = out
         return result
+
+
+def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Floats:
+    """Quantiles (M,) of Beta distributions."""
+    out = np.empty(len(alpha))
+
+    def work(begin: int, end: int) -> None:
+        out[begin:end] = betaincinv(alpha[begin:end], beta[begin:end], level)
+
+    for_blocks(work, len(alpha), block=4_096, threads=threads)
+    return out
 
 
 def _attempts(

@@ -20,7 +20,7 @@ from graspdb_geometry.grippers import PG70
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
-from graspdb_service.usecases import bestgrasp, success
+from graspdb_service.usecases import bestgrasp, searches, success
 from graspdb_service.usecases.context import Context
 
 Floats = NDArray[np.float64]
@@ -349,6 +349,146 @@ def test_against_exhaustive_search(
     sqlite_url: str, sqlite_http: httpx.Client, put_box: Callable[..., Scene], post: Post
 ) -> None:
     compare(sqlite_url, sqlite_http, put_box, post, 1_000, range(12))
+
+
+class Field:
+    """Attempts in clusters, each with its own share of successes, about a bar; the chance as the contract
+    defines it.
+    """
+
+    def __init__(self, kernels: int, scene: Scene) -> None:
+        rng = np.random.default_rng(0)
+        centres = rng.uniform([-0.2, -0.1, -0.1], [0.2, 0.1, 0.1], (kernels // 40, 3))
+        turns, shares = se3.random_quaternions(len(centres), rng), rng.uniform(0.3, 0.95, len(centres))
+        rows = rng.integers(0, len(centres), round(2.5 * kernels))
+        p = centres[rows] + rng.normal(size=(len(rows), 3)) * 0.012
+        q = se3.multiply(turns[rows], se3.from_rotation_vector(rng.normal(size=(len(rows), 3)) * 0.2))
+        # Where the gripper collides nothing can be tried.
+        free = ~scene.collides(p, q, PG70, threads=2)
+        rows, self.positions, self.quaternions = rows[free], p[free], q[free]
+        self.won = rng.random(len(rows)) < shares[rows]
+        self.scene = scene
+        self.model = SuccessModel.build(self.positions, self.quaternions, self.won, kernel=KERNEL)
+        self.density = GraspDensity.build(self.positions[self.won], self.quaternions[self.won], kernel=KERNEL)
+        self.near = searches.near_successes(self.density, 2.0, 2)
+
+    def chance(self, column: str) -> Callable[[Floats, Floats], Floats]:
+        def score(p: Floats, q: Floats) -> Floats:
+            values = np.zeros(len(p))
+            free = np.flatnonzero(~self.scene.collides(p, q, PG70, threads=2))
+            if len(free):
+                found = self.model.evaluate(p[free], q[free], level=0.9, threads=2)
+                values[free] = getattr(found, column)
+            return values
+
+        return score
+
+    def best(
+        self,
+        rough: Callable[[Floats, Floats], Floats],
+        score: Callable[[Floats, Floats], Floats],
+        region: Region,
+        free: bool,
+        climbers: int,
+        rng: np.random.Generator,
+    ) -> float:
+        """Highest score near a success: from every success's nearest feasible pose and samples around them
+        the most promising by ``rough``, and from those random steps uphill.
+        """
+        p, q, inside = region.project(
+            *(
+                np.concatenate(pair)
+                for pair in zip(self.successes, self.density.sample(5_000, rng), strict=True)
+            )
+        )
+        p, q = p[inside], q[inside]
+
+        def allowed(p: Floats, q: Floats) -> Bools:
+            ok = self.near(p, q)
+            return ok & ~self.scene.collides(p, q, PG70, threads=2) if free else ok
+
+        ok = allowed(p, q) if len(p) else np.zeros(0, dtype=bool)
+        p, q = p[ok], q[ok]
+        if not len(p):
+            return -math.inf
+        top = np.argsort(-rough(p, q))[:climbers]
+        p, q, values = p[top], q[top], score(p[top], q[top])
+        for step in np.repeat([0.5, 0.25, 0.12, 0.06, 0.03], 12):
+            moved = p + rng.standard_normal(p.shape) * step * KERNEL.sigma_position_m
+            turned = se3.from_rotation_vector(rng.standard_normal(p.shape) * step * KERNEL.sigma_rotation)
+            new_p, new_q, inside = region.project(moved, se3.multiply(q, turned))
+            new = score(new_p, new_q)
+            better = np.flatnonzero(inside & (new > values))
+            better = better[allowed(new_p[better], new_q[better])]
+            p[better], q[better], values[better] = new_p[better], new_q[better], new[better]
+        return float(values.max())
+
+    @property
+    def successes(self) -> Poses:
+        return self.density.positions, self.density.quaternions_xyzw
+
+
+def compare_scores(
+    url: str,
+    http: httpx.Client,
+    put_box: Callable[..., Scene],
+    post: Post,
+    kernels: int,
+    seeds: range,
+    share: float,
+) -> None:
+    """By the chance's lower end and, each second time, by its mean under noise."""
+    http.post("/objects", json={"id": "thing"}).raise_for_status()
+    field = Field(kernels, put_box(http, "thing", (0.3, 0.03, 0.03)))
+    told = ["success" if won else "slipped" for won in field.won]
+    for part in np.array_split(np.arange(len(told)), max(1, len(told) // 10_000)):
+        poses = field.positions[part], field.quaternions[part]
+        post(http, "thing", poses, [told[i] for i in part], gripper="pg70")
+    with use_case(url) as ctx:
+        for seed in seeds:
+            rng = np.random.default_rng(seed)
+            query, region = random_request(rng, scene=seed % 3 != 2)
+            if seed % 2:
+                query |= {"objective": "robust", "pose_noise_m": 0.004, "pose_noise_deg": 2.0}
+                noise = PoseNoise(0.004, math.radians(2.0))
+                rough, score = (
+                    expected(field.chance("probability"), object_noise=noise, samples=draws)
+                    for draws in (16, 256)
+                )
+            else:
+                query["objective"] = "success_probability"
+                rough = score = field.chance("low")
+            try:
+                answer, _ = bestgrasp.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+            except ProblemError:
+                assert region.is_empty(), seed
+                continue
+            climbers = 12 if seed % 2 else 200
+            best = field.best(rough, score, region, query["collision_free"], climbers, rng)
+            if answer.status == "infeasible":
+                assert best == -math.inf, seed
+                continue
+            (grasp,) = answer.grasps
+            pose = np.array([grasp.position]), np.array([grasp.quaternion_xyzw])
+            assert region.contains(*pose).all(), seed
+            assert field.near(*pose).all(), seed
+            assert not query["collision_free"] or not field.scene.collides(*pose, PG70).any(), seed
+            assert grasp.score == pytest.approx(float(score(*pose)[0]), rel=1e-3, abs=1e-6), seed
+            assert grasp.score >= share * best, (seed, grasp.score / best, query)
+
+
+def test_chances_and_means_against_exhaustive_search(
+    sqlite_url: str, sqlite_http: httpx.Client, put_box: Callable[..., Scene], post: Post
+) -> None:
+    compare_scores(sqlite_url, sqlite_http, put_box, post, 600, range(6), 0.99)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3_600)
+def test_chances_and_means_against_exhaustive_search_at_20_000_kernels(
+    sqlite_url: str, sqlite_http: httpx.Client, put_box: Callable[..., Scene], post: Post
+) -> None:
+    compare_scores(sqlite_url, sqlite_http, put_box, post, 20_000, range(100, 150), 0.999)
 
 
 @pytest.mark.long

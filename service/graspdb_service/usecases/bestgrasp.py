@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -121,18 +122,19 @@ def _question(ctx: Context, slug: str, request: GraspConstraints, built: Built) 
         admissible=None,
         ranking=Ranking(objective=request.objective, score="density, 1/(m^3 rad^3)"),
         score=None,
+        of_chances=of_chances,
         quick=None,
         threads=ctx.compute.threads,
     )
-    return ctx.compute.run(lambda: _with_score(question, of_chances, averaged))
+    return ctx.compute.run(lambda: _with_score(question, averaged))
 
 
-def _with_score(question: Question, of_chances: bool, averaged: str) -> Question:
+def _with_score(question: Question, averaged: str) -> Question:
     """A question with what ranks poses, and what refuses them."""
-    question = replace(question, admissible=searches.admissible_for(question, of_chances))
+    question = replace(question, admissible=searches.admissible_for(question))
     if question.request.objective == "robust":
         return _robust(question, averaged)
-    if of_chances:
+    if question.of_chances:
         model = question.model
         assert model is not None
         told = f"lower end of the success probability's {LEVEL:.0%} interval"
@@ -231,7 +233,7 @@ def _pivot(question: Question) -> tuple[tuple[float, float, float], str]:
     return (x, y, z), named
 
 
-def _chances(question: Question, model: SuccessModel, column: str) -> Score:
+def _chances(question: Question, model: SuccessModel, column: Literal["low", "probability"]) -> Score:
     """A column of the success probability as a score: 0 where the open gripper collides."""
     test, threads = question.test, question.threads
 
@@ -240,9 +242,13 @@ def _chances(question: Question, model: SuccessModel, column: str) -> Score:
         index = np.arange(len(positions))
         if test is not None:
             index = np.flatnonzero(test.free(positions, quaternions, threads=threads))
-        if len(index):
-            found = model.evaluate(positions[index], quaternions[index], level=LEVEL, threads=threads)
-            values[index] = getattr(found, column)
+        if not len(index):
+            return values
+        p, q = positions[index], quaternions[index]
+        if column == "low":
+            values[index] = model.lower_end(p, q, level=LEVEL, threads=threads)
+        else:
+            values[index] = model.probability(p, q, threads=threads)
         return values
 
     return score

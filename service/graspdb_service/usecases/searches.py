@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, Maximum, MixtureDensity, se3, search_scored
@@ -31,7 +30,7 @@ _CANDIDATES = 1_024
 #: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
 _NEAR = 2.0
 #: Grasps found by the quick score that are scored again, those that go on climbing, by so many steps.
-_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 4, 8, 6
+_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 6, 8, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +49,8 @@ class Question:
     ranking: Ranking
     score: Score | None
     """None: the density's own search."""
+    of_chances: bool
+    """Whether the score is of success probabilities."""
     quick: Score | None
     """Nearly the score, and much faster: what a search feels its way by."""
     threads: int
@@ -69,12 +70,12 @@ class Question:
         )
 
 
-def admissible_for(question: Question, of_chances: bool) -> Admissible | None:
+def admissible_for(question: Question) -> Admissible | None:
     """Every constraint that a region can't express, the cheap ones first; a score ``of_chances`` has one."""
     request, limits, test, threads = question.request, question.limits, question.test, question.threads
     checks: list[Callable[[Floats, Floats], Bools]] = []
-    if of_chances:
-        checks.append(near_successes(question.density, _NEAR, threads))
+    if question.of_chances:
+        checks.append(NearSuccesses(question.density))
     if limits.exclude is not None and len(limits.exclude[0]):
         checks.append(_away_from(limits.exclude, question.separation, bool(question.density.symmetric.all())))
     distance = request.pregrasp_distance_m or 0.0
@@ -102,31 +103,48 @@ def admissible_for(question: Question, of_chances: bool) -> Admissible | None:
     return admissible
 
 
+@dataclass(frozen=True, eq=False)
+class NearSuccesses:
+    """Whether some success is within so many standard deviations, position and rotation together."""
+
+    density: GraspDensity
+    reach: float = _NEAR
+
+    def __call__(self, positions: Floats, quaternions: Floats) -> Bools:
+        _, distance = self.density.nearest_each(positions, quaternions, within=self.reach)
+        return np.asarray(distance <= self.reach)
+
+    def pull(self, positions: Floats, quaternions: Floats) -> Poses:
+        """Poses a little farther from a success moved straight towards it as far as the reach."""
+        density, reach = self.density, self.reach * (1.0 - 1e-4)
+        rows, distance = density.nearest_each(positions, quaternions, within=1.5 * self.reach)
+        far = np.flatnonzero((distance > reach) & (rows >= 0))
+        p, q = positions.copy(), quaternions.copy()
+        if not len(far):
+            return p, q
+        rows = rows[far]
+        centre, to = density.positions[rows], density.quaternions_xyzw[rows]
+        # The end of the success's rotation, of its twin's and of both antipodes that is nearest.
+        twin = se3.jaw_twin(to)
+        own, other = (np.einsum("ij,ij->i", end, q[far]) for end in (to, twin))
+        turned = density.symmetric[rows] & (np.abs(other) > np.abs(own))
+        to = np.where(turned[:, None], twin, to) * np.sign(np.where(turned, other, own))[:, None]
+        kernel = density.kernel
+        share = np.ones(len(far))
+        for _ in range(3):
+            at = centre + share[:, None] * (positions[far] - centre)
+            mixed = se3.normalise(to + share[:, None] * (quaternions[far] - to))
+            squared = np.sum((at - centre) ** 2, axis=1) / kernel.sigma_position_m**2
+            squared += 2.0 * kernel.kappa * (1.0 - np.einsum("ij,ij->i", mixed, to))
+            share *= np.minimum(reach / np.sqrt(np.maximum(squared, 1e-12)), 1.0)
+        p[far] = centre + share[:, None] * (positions[far] - centre)
+        q[far] = se3.normalise(to + share[:, None] * (quaternions[far] - to))
+        return p, q
+
+
 def near_successes(density: GraspDensity, reach: float, threads: int) -> Callable[[Floats, Floats], Bools]:
-    """Whether some success is within so many standard deviations, position and rotation together.
-
-    A kernel's exponent ``|dp|^2 / (2 sigma^2) + kappa (1 - q . q')`` is half a squared distance of points
-    (p / sigma, sqrt(kappa) q), both signs of q being one rotation.
-    """
-    kernel = density.kernel
-    scale, turn = 1.0 / kernel.sigma_position_m, math.sqrt(kernel.kappa)
-    tree = cKDTree(np.hstack([density.positions * scale, density.quaternions_xyzw * turn]))
-    twins = bool(density.symmetric.any())
-
-    def near(positions: Floats, quaternions: Floats) -> Bools:
-        ends = [quaternions, -quaternions]
-        if twins:
-            twin = se3.jaw_twin(quaternions)
-            ends += [twin, -twin]
-        found = np.zeros(len(positions), dtype=np.bool_)
-        for q in ends:
-            left = np.flatnonzero(~found)
-            points = np.hstack([positions[left] * scale, q[left] * turn])
-            distance, _ = tree.query(points, distance_upper_bound=reach, workers=threads)
-            found[left] = np.isfinite(distance)
-        return found
-
-    return near
+    """Whether some success is within so many standard deviations, position and rotation together."""
+    return NearSuccesses(density, reach)
 
 
 def _away_from(
@@ -183,6 +201,7 @@ def found(question: Question) -> list[Maximum]:
         min_separation_m=separation_m,
         min_separation=separation,
         admissible=question.admissible,
+        pull=NearSuccesses(density).pull if question.of_chances else None,
         threads=question.threads,
     )
     return found if exact or not found else _polished(question, question.score, found)[: request.count]
