@@ -361,6 +361,45 @@ def test_planes_that_nearly_coincide_hold_no_climb_back(shell: Shell) -> None:
     assert math.exp(density.maximum(region)[0].log_density - best) >= 0.999
 
 
+def test_runners_up_are_found_however_far_apart_they_must_be() -> None:
+    """Hundreds of rows about one place outrank the single rows at four others."""
+    rng = np.random.default_rng(8)
+    lone = np.array([[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [-0.3, 0.0, 0.0], [0.0, -0.3, 0.0]])
+    p = np.concatenate([0.04 * rng.standard_normal((3_000, 3)), lone])
+    q = np.concatenate([se3.random_quaternions(3_000, rng), np.tile(se3.IDENTITY, (4, 1))])
+    density = GraspDensity.build(p, q, kernel=KERNEL)
+    found = density.maximum(count=5, min_separation_m=0.25, min_separation=math.pi)
+    assert len(found) == 5
+    places = np.array([grasp.position for grasp in found[1:]])
+    apart = np.linalg.norm(places[:, None] - lone[None], axis=2)
+    assert (apart.min(axis=0) < 0.01).all()
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.005, 1.0])
+def test_nearest_rows_are_those_of_all(shift: float, shell: Shell) -> None:
+    """Whether the rows lie in the cells around the pose or far from it; some with a twin, some without."""
+    rng = np.random.default_rng(9)
+    p, q = shell(2_000, rng)
+    symmetric = rng.random(2_000) < 0.5
+    density = GraspDensity.build(p, q, kernel=KERNEL, symmetric=symmetric)
+    for row in range(0, 2_000, 200):
+        at, to = p[row] + shift, se3.normalise(q[row] + 0.05)
+        cosine = np.abs(q @ to)
+        cosine = np.where(symmetric, np.maximum(cosine, np.abs(q @ se3.jaw_twin(to))), cosine)
+        squared = np.sum((p - at) ** 2, axis=1) / KERNEL.sigma_position_m**2
+        distance = np.sqrt(squared + 2.0 * KERNEL.kappa * (1.0 - cosine))
+        rows = density.nearest_rows(at, to, 5)
+        np.testing.assert_allclose(distance[rows], np.sort(distance)[:5], rtol=1e-3)
+        (nearest,), (apart,) = density.nearest_each(at[None], to[None], within=2.0)
+        if distance.min() < 2.0:
+            assert distance[nearest] == pytest.approx(distance.min(), rel=1e-3)
+            assert apart == pytest.approx(distance.min(), rel=1e-3, abs=1e-3)
+        else:
+            assert nearest == -1 or apart > 2.0
+    few = GraspDensity.build(p[:3], q[:3], kernel=KERNEL)
+    assert sorted(few.nearest_rows(p[0], q[0], 5)) == [0, 1, 2]
+
+
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_projection_onto_a_polyhedron_is_exact(seed: int) -> None:

@@ -56,6 +56,9 @@ def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> Non
     assert found[0].score > found[1].score
     estimate = model.evaluate(found[0].position[None], found[0].quaternion_xyzw[None])
     assert found[0].score == pytest.approx(estimate.low[0])
+    every = model.evaluate(p, q, level=0.8)
+    np.testing.assert_array_equal(model.lower_end(p, q, level=0.8), every.low)
+    np.testing.assert_array_equal(model.probability(p, q), every.probability)
 
 
 def test_refused_poses_are_never_returned(shell: Shell) -> None:
