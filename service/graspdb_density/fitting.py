@@ -40,8 +40,9 @@ __all__ = [
 
 #: Fewer successes or displacements than this shape no kernel.
 LEAST_SUCCESSES, LEAST_DISPLACEMENTS = 50, 200
-#: Numbers of components tried where none is asked for, until so many in a row have not raised the likelihood.
-_TRIED_COMPONENTS, _GIVEN_UP = (1, 2, 3, 4, 6, 8, 12, 16), 2
+#: Numbers of components tried where none is asked for, until two in a row have not raised the likelihood by
+#: so many nats: what queries cost grows with them.
+_TRIED_COMPONENTS, _GIVEN_UP, _WORTH = (1, 2, 3, 4, 6, 8, 12, 16), 2, 0.02
 _FACTORS = tuple(float(f) for f in np.geomspace(0.3, 1.7, 9))
 _ITERATIONS, _ENOUGH = 60, 1e-5
 _FITTED_MOST, _SCALED_MOST, _JUDGED_MOST = 8_000, 5_000, 600
@@ -340,17 +341,19 @@ def _shape(
     if held.all() or not held.any():
         return _fitted(x, w, tried[0], added, plain), {}
     likelihoods = {}
-    best, failed = tried[0], 0
+    best, highest, failed = tried[0], -math.inf, 0
     for count in tried:
         try:
             kernel = _fitted(x[~held], w[~held], count, added, plain)
         except ValueError:
-            # A component wider than one may be: more of them may not be.
+            # A component wider than one may be: those of more components may not be.
             continue
         likelihoods[count] = float(np.average(kernel.log_kernel(x[held]), weights=w[held]))
-        failed = 0 if likelihoods[count] > likelihoods.get(best, -math.inf) else failed + 1
-        best = count if not failed else best
-        if failed >= _GIVEN_UP and count != best:
+        if likelihoods[count] > highest + _WORTH:
+            best, highest, failed = count, likelihoods[count], 0
+        else:
+            failed += 1
+        if failed == _GIVEN_UP:
             break
     return _fitted(x, w, best, added, plain), likelihoods
 

@@ -361,7 +361,7 @@ def test_sampled_kernels_are_bounded_and_checked(
     assert refused(kind="sampled", components=[one] * 5_001)
     assert refused(kind="sampled", components=[one], alignment="object") == ["alignment"]
     assert refused(kind="sampled", object="thing", components="auto") == ["components"]
-    assert refused(object="thing", components=5) == ["components"]
+    assert refused(object="thing", components=17) == ["components"]
     assert refused(components=[one]) == ["components.0.covariance"]
     assert refused(components=[{"covariance": diagonal(*[0.01] * 3, *[0.1] * 3)}] * 33) == ["components"]
     assert refused(kind="sampled", components=[{"mean": [5.0, 0, 0, 0, 0, 0]}]) == ["components.0.mean"]

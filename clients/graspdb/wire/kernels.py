@@ -12,7 +12,7 @@ from graspdb.wire.base import Request, Response, Slug, Source
 Alignment = Literal["gripper", "object", "edge", "surface-pair"]
 """Axes that translations are measured along; rotations are always in the gripper's frame."""
 MAX_COMPONENTS = 32
-MAX_FITTED = 4
+MAX_FITTED = 16
 MAX_SAMPLED, SAMPLED = 5_000, 900
 """Most displacements of a sampled kernel, and how many are drawn by default (the paper's number)."""
 
