@@ -292,8 +292,8 @@ class Reports:
         Parameters
         ----------
         matching
-            With a stored kernel: how the isotropic one beside it is chosen, ``determinants`` or
-            ``likelihood``.
+            With a stored kernel: how the isotropic one beside it is chosen, by ``determinants``,
+            ``likelihood``, or ``success`` of draws simulated as checks.
 
         Raises
         ------

@@ -194,3 +194,37 @@ def test_calibration_judges_grasps_that_were_simulated_again(filled: httpx.Clien
     assert f"Simulated again, {won} of 200 given grasps succeed" in body["text"]
     png = http.get(PATH + "calibration", headers={"Accept": "image/png"})
     assert png.content.startswith(b"\x89PNG")
+
+
+def test_convergence_matched_by_the_success_of_simulated_draws(filled: httpx.Client) -> None:
+    http = filled
+    kernel = http.post("/kernels", json={"object": "thing"}).json()
+    path = PATH + f"convergence?kernel={kernel['id']}&matching=success"
+    refused = http.get(path)
+    assert refused.status_code == 409, refused.text
+    problem = refused.json()
+    assert problem["type"].endswith("checks-needed")
+    # The kernel itself, and isotropic ones at several widths.
+    assert len(problem["calls"]) == 6
+    for call in problem["calls"]:
+        made = http.request(call["method"], call["path"], json=call["body"])
+        assert made.status_code == 202, made.text
+    assert simulate(http) == 6 * 500
+    body = ok(http.get(path))
+    assert body["matching"] == "success"
+    own, matched = body["curves"]
+    assert own["kernel"]["id"] == kernel["id"]
+    drawn = ok(http.get(PATH + "bandwidth"))["draws"]
+    target = next(d["success"]["value"] for d in drawn if d["kernel"]["id"] == kernel["id"])
+    shares = {
+        d["kernel"]["sigma_position_m"]: d["success"]["value"] for d in drawn if d["kernel"]["id"] is None
+    }
+    widths = sorted(shares)
+    if body["matched"]:
+        # Between the widths whose draws succeed more and less often.
+        wide = next((w for w in widths if shares[w] < target), widths[-1])
+        assert widths[0] * 0.98 <= matched["kernel"]["sigma_position_m"] <= wide * 1.02
+    else:
+        assert any("matches by success" in warning for warning in body["warnings"])
+        ends = (widths[0], widths[-1])
+        assert min(abs(matched["kernel"]["sigma_position_m"] / end - 1.0) for end in ends) < 0.02

@@ -125,8 +125,10 @@ def test_convergence_beside_the_matched_isotropic_kernel(filled: httpx.Client) -
     # Both judged by the same held-out grasps: the shape of the vicinity predicts them better.
     assert own["points"][-1]["log_likelihood"] > matched["points"][-1]["log_likelihood"]
     assert body["ratio"]["low"] <= body["ratio"]["value"] <= body["ratio"]["high"]
-    told = problem(filled.get(REPORT + "convergence?kernel=anisotropic&matching=success"), 422)
-    assert "POST /objects/thing/sweeps" in told["errors"][0]["message"]
+    told = problem(filled.get(REPORT + "convergence?kernel=anisotropic&matching=success"), 409)
+    assert told["type"].endswith("checks-needed")
+    assert "POST /objects/thing/sweeps" in told["title"]
+    assert told["calls"][0]["body"]["sample"]["kernel"] == kernel["id"]
 
 
 def test_empirical_anisotropy_is_that_of_the_maths(

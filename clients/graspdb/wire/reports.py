@@ -86,8 +86,9 @@ class ConvergenceCurve(Response):
 class ConvergenceReport(Report):
     """Have we tried enough? N counts successes; twins by the jaw's symmetry are not counted.
 
-    With a stored kernel the second curve is the isotropic kernel matched to it, and ``ratio`` the grasps it
-    needs over those the isotropic one needs.
+    With a stored kernel the second curve is the isotropic kernel matched to it (by equal determinants, equal
+    likelihood of left-out grasps, or equal success of draws that were simulated as checks), and ``ratio`` the
+    grasps it needs over those the isotropic one needs.
     """
 
     report: Literal["convergence"] = "convergence"

@@ -14,6 +14,7 @@ from graspdb.wire.reports import (
     ConvergencePoint,
     ConvergenceReport,
     ReportRange,
+    SimulatedDraws,
 )
 from graspdb.wire.reports import Verdict as VerdictModel
 from graspdb_density import GraspDensity, IsotropicKernel
@@ -24,10 +25,10 @@ from graspdb_density.convergence import (
     needed_ratio,
     verdict,
 )
-from graspdb_density.matching import Match, match_determinants, match_likelihood
+from graspdb_density.matching import Match, match_determinants, match_likelihood, match_success, scaled
 from graspdb_density.rows import Kernel, KernelRows, Progress
 from graspdb_service.problems import conflict
-from graspdb_service.usecases import shapes
+from graspdb_service.usecases import checks, shapes
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.reportparts import (
     LEVEL,
@@ -40,6 +41,9 @@ from graspdb_service.usecases.reportparts import (
 Floats = NDArray[np.float64]
 
 SUBSETS, REPLICATES, POINTS = 5, 50, 20_000
+#: Widths whose draws are compared with a stored kernel's, as factors on those of equal determinants; how many
+#: of them it takes, and how nearly widths must be those factors.
+_SUCCESS_FACTORS, _LEAST_WIDTHS, _ALIKE = (0.4, 0.6, 0.8, 1.0, 1.25), 3, 0.02
 
 
 def convergence_report(
@@ -59,6 +63,8 @@ def convergence_report(
         raise conflict(
             "nothing-to-match", "matching compares an anisotropic kernel with an isotropic one: name kernel="
         )
+    # Missing checks are said before anything is computed.
+    match = _by_success(sources, built) if matching == "success" and built.shaped is not None else None
     share = 1.0 if built.shaped is None else 0.5
     kernel: Kernel = density.kernel if built.shaped is None else built.shaped.kernel
     frames = None
@@ -69,12 +75,20 @@ def convergence_report(
     curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
     extra: dict[str, Any] = {}
     if built.shaped is not None:
-        match = _matched(sources, density, kernel, frames, str(matching))
+        match = match or _matched(sources, density, kernel, frames, str(matching))
         base = _curve(sources, density, match.kernel, None, lambda done: progress(0.5 + 0.5 * done))
         curves.append(_curve_model("isotropic, matched", _isotropic_info(match), base))
         ratio = needed_ratio(curve, base, level=LEVEL)
         extra = {"matching": matching, "matched": match.reached, "ratio": interval(*ratio)}
     judged = curves[0].verdict
+    warnings = (
+        [] if judged.exponent > 0 else ["the curve does not rise: it is noise, or all grasps are alike"]
+    )
+    if match is not None and not match.reached:
+        warnings.append(
+            f"no width tried matches by {match.rule}: {match.achieved:.3g} comes nearest to"
+            f" {match.target:.3g}"
+        )
     return ConvergenceReport(
         **head(built),
         text=_convergence_text(curves[0], extra.get("ratio")),
@@ -83,9 +97,7 @@ def convergence_report(
         subsets=SUBSETS,
         replicates=REPLICATES,
         curves=curves,
-        warnings=[]
-        if judged.exponent > 0
-        else ["the curve does not rise: it is noise, or all grasps are alike"],
+        warnings=warnings,
         **extra,
     )
 
@@ -133,6 +145,52 @@ def _matched(
         return float(np.average(rows.log_density(p[held], q[held], threads=sources.threads), weights=w[held]))
 
     return match_likelihood(likelihood(kernel), match.kernel, likelihood)
+
+
+def _by_success(sources: Sources, built: Built) -> Match:
+    """The isotropic kernel whose simulated draws succeed as often as those of the stored one.
+
+    Raises
+    ------
+    ProblemError
+        409 ``checks-needed`` while draws of either have not been simulated, with the sweeps that do it.
+    """
+    assert built.shaped is not None
+    base = match_determinants(built.shaped.kernel).kernel
+    drawn = checks.draws(checks.read(sources.database, built))
+    target = next((item for item in drawn if item.kernel.id == built.kernel.id), None)
+    found: dict[float, SimulatedDraws] = {}
+    for item in drawn:
+        if item.kernel.id is None and (target is None or item.protocol == target.protocol):
+            factor = item.kernel.sigma_position_m / base.sigma_position_m
+            turn = math.radians(item.kernel.sigma_rotation_deg) / base.sigma_rotation
+            if abs(turn / factor - 1.0) < _ALIKE:
+                found[factor] = item
+    missing: list[IsotropicKernel | str] = []
+    if target is None:
+        assert built.kernel.id is not None
+        missing.append(built.kernel.id)
+    near = {f for f in _SUCCESS_FACTORS if any(abs(g / f - 1.0) < _ALIKE for g in found)}
+    missing += [scaled(base, f) for f in _SUCCESS_FACTORS if f not in near]
+    if target is None or len(found) < _LEAST_WIDTHS:
+        protocol = built.selected.protocol
+        calls = checks.calls(built, missing, protocol if protocol in ("wrench", "lift") else None)
+        raise conflict(
+            "checks-needed",
+            "Matching by success compares draws of this kernel and of isotropic ones at several widths, which"
+            " have not all been simulated: send each of `calls`"
+            f" (POST /objects/{built.object_row.slug}/sweeps), wait for a worker, and ask again; determinants"
+            " and likelihood need none",
+            calls=[call.model_dump(mode="json") for call in calls],
+        )
+    factors = sorted(found)
+    return match_success(
+        target.success.value or 0.0,
+        base,
+        [found[f].success.value or 0.0 for f in factors],
+        factors=factors,
+        draws=[found[f].draws for f in factors],
+    )
 
 
 def _isotropic_info(match: Match) -> KernelInfo:

@@ -22,7 +22,7 @@ from typing import Any
 from graspdb.wire import Selection
 from graspdb.wire.reports import ReportRun
 from graspdb_service import __version__
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.settings import Settings
 from graspdb_service.storage import checks, report_runs
 from graspdb_service.storage.database import Database
@@ -48,7 +48,7 @@ _KEPT_STATUSES = (404, 409, 413, 422)
 
 
 #: Reports that say what became of simulated checks.
-_OF_CHECKS = ("bandwidth", "calibration", "convergence")
+_OF_CHECKS = ("bandwidth", "calibration")
 
 
 class Cancelled(Exception):
@@ -93,19 +93,12 @@ class ReportRuns:
             404 and 409 as the selection; what the report itself was refused for; 429 where too many are
             under way.
         """
-        if options.get("matching") == "success":
-            raise invalid(
-                "matching",
-                "needs draws simulated at several widths, which are not compared yet: simulate them with"
-                f' POST /objects/{slug}/sweeps {{"sample": ..., "purpose": "check"}}; determinants and'
-                " likelihood need none",
-            )
         choice, _ = kernel_of(selection)
         row, selected = self._densities.current(slug, Filters.of(selection))
         if choice.stored is not None:
             choice = KernelChoice(stored=self._densities.stored(row, selected, choice.stored).id)
         given = {name: value for name, value in options.items() if value is not None}
-        if report in _OF_CHECKS:
+        if report in _OF_CHECKS or given.get("matching") == "success":
             # Checks change no revision: what of them there is belongs to the question.
             with self._database.read() as tx:
                 given["checks"] = checks.stamp(tx, row.id)
