@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
@@ -73,44 +73,36 @@ def outcomes_of(tx: Tx, job_id: str) -> bytes:
 
 @dataclass(frozen=True)
 class TriedGrid:
-    """How much of a collecting grid sweep is done.
+    """A collecting grid sweep that has stored something.
 
-    ``places`` of the plan were simulated; ``kept`` of their poses no other sweep had stored before. ``grid``
-    is the plan as :class:`graspdb.wire.GridPlan` has it.
+    ``kept`` counts the distinct poses it tried that no other sweep had stored before; ``grid`` is the plan as
+    :class:`graspdb.wire.GridPlan` has it.
     """
 
     sweep_id: str
     batch_id: int
     repeat_key: str
     grid: dict[str, Any]
-    places: int
     kept: int
 
 
 def tried_grids(tx: Tx, object_id: int, *, provenance_ids: Collection[int]) -> list[TriedGrid]:
-    """Grids of which at least a chunk is done, in the order the sweeps were made."""
+    """Grids of which something was tried, in the order the sweeps were made. Reads no job, however many."""
+    kept = batches.c.inserted + batches.c.packed
     query = (
-        select(
-            sweeps.c.id,
-            batches.c.id,
-            sweeps.c.snapshot,
-            func.sum(jobs.c.stop - jobs.c.start),
-            batches.c.inserted + batches.c.packed,
-        )
+        select(sweeps.c.id, batches.c.id, sweeps.c.snapshot, kept)
         # A sweep without its batch is one whose outcomes were deleted.
         .join(batches, batches.c.sweep_id == sweeps.c.id)
-        .join(jobs, jobs.c.sweep_id == sweeps.c.id)
         .where(
             sweeps.c.object_id == object_id,
             sweeps.c.purpose == "collect",
             sweeps.c.plan == "grid",
             sweeps.c.provenance_id.in_(sorted(provenance_ids)),
-            jobs.c.state == "done",
+            kept > 0,
         )
-        .group_by(sweeps.c.id, batches.c.id)
         .order_by(sweeps.c.id)
     )
     return [
-        TriedGrid(sweep, int(batch), snapshot["repeat_key"], snapshot["grid"], int(places), int(kept))
-        for sweep, batch, snapshot, places, kept in tx.execute(query)
+        TriedGrid(sweep, int(batch), snapshot["repeat_key"], snapshot["grid"], int(number))
+        for sweep, batch, snapshot, number in tx.execute(query)
     ]

@@ -105,9 +105,9 @@ def read(tx: Tx, object_id: int, selected: Selected) -> Exposure:
     for grid in grids:
         same = (grid.grid["region"] and str(grid.grid["region"]), _order(grid))
         lattices.setdefault(grid.repeat_key, {}).setdefault(same, []).append(grid)
-    shared = [
-        g.sweep_id for alike in lattices.values() for own in alike.values() if len(own) > 1 for g in own
-    ]
+    # A sweep alone on its lattice has tried what it stored; those that share one have repeated each other.
+    keys = [grid.repeat_key for grid in grids]
+    shared = [grid.sweep_id for grid in grids if keys.count(grid.repeat_key) > 1]
     ranges = sweeps.done_ranges(tx, shared) if shared else {}
     found = (_lattice(alike.values(), ranges) for alike in lattices.values())
     return Exposure(
@@ -131,8 +131,8 @@ def _lattice(
         plan = GridPlan.model_validate({**grids[0].grid, "max_poses": None})
         box = _box(plan)
         density, step = box.density, plan.position_step_m
-        places = grids[0].places
-        if len(grids) > 1:
+        places = grids[0].kept
+        if grids[0].sweep_id in ranges:
             # Plans of one order share places.
             places = _union([part for grid in grids for part in ranges[grid.sweep_id]])
         parts.append(_Plan(box.lower, box.upper, places / box.count))
