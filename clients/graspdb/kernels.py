@@ -19,10 +19,11 @@ class Kernels:
         self._transport = transport
 
     def fit(self, /, object: str, **options: Any) -> wire.StoredKernel:
-        """Fit a kernel on an object's successes.
+        """Fit a kernel on an object's successes, or with ``kind="probability"`` on all its attempts.
 
-        Options are those of :class:`graspdb.wire.KernelCreate`: ``gripper``, ``alignment``, ``components``
-        (how many Gaussians, or ``auto``), ``window``, ``component_widths``, ``protocol``, ``source``.
+        Options are those of :class:`graspdb.wire.KernelCreate`: ``kind``, ``gripper``, ``alignment``,
+        ``components`` (how many Gaussians, or ``auto``), ``window``, ``component_widths``, ``protocol``,
+        ``source``.
 
         Raises
         ------

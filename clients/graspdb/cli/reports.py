@@ -33,6 +33,7 @@ from graspdb.reports import (
     Summary,
 )
 from graspdb.wire import OUTCOMES
+from graspdb.wire.kernels import KernelProvenance
 from graspdb.wire.reports import REPORTS, ReportRange, ReportRun
 
 kernels = typer.Typer(help="Stored kernels.", no_args_is_help=True)
@@ -347,25 +348,47 @@ def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f}"
 
 
+def _fitted_on(source: KernelProvenance) -> dict[str, str]:
+    """What a kernel was fitted on, and how well it does on what it has not seen."""
+    if source.attempts is not None:
+        skill, isotropic = _number(source.brier_skill), _number(source.isotropic_brier_skill)
+        return {
+            "fitted on": f"{source.attempts:,} attempts",
+            "Brier skill": f"{skill} (isotropic {isotropic})",
+            "log loss": f"{_number(source.log_loss)} (isotropic {_number(source.isotropic_log_loss)})",
+        }
+    told = {"fitted on": f"{source.successes:,} successes, {source.displacements:,} displacements"}
+    if source.log_likelihood is not None:
+        told["held-out log density"] = (
+            f"{_number(source.log_likelihood)} (isotropic {_number(source.isotropic_log_likelihood)})"
+        )
+    return told
+
+
 @kernels.command("fit")
 def fit_kernel(
     context: typer.Context,
     id: ObjectId,
-    alignment: Annotated[str, typer.Option(help="gripper or object.")] = "gripper",
-    components: Annotated[str, typer.Option(help="1 to 4 Gaussians, or auto.")] = "1",
+    alignment: Annotated[
+        str, typer.Option(help="anisotropic: gripper, object, edge or surface-pair.")
+    ] = "gripper",
+    components: Annotated[
+        str | None, typer.Option(help="anisotropic: 1 to 16 Gaussians, or auto; sampled: displacements.")
+    ] = None,
+    kind: Annotated[str, typer.Option(help="anisotropic, sampled or probability.")] = "anisotropic",
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
 ) -> None:
-    """Fit an anisotropic kernel on an object's successes."""
+    """Fit a kernel on an object's successes, or widths that predict success on all its attempts."""
     state = state_of(context)
-    count: int | str = int(components) if components.isdigit() else components
-    given = {"gripper": gripper, "protocol": protocol, "source": source}
+    count = int(components) if components is not None and components.isdigit() else components
+    given = {"gripper": gripper, "protocol": protocol, "source": source, "components": count}
     with state.client() as db:
         made = db.kernels.fit(
             id,
+            kind=kind,
             alignment=alignment,
-            components=count,
             **{name: value for name, value in given.items() if value is not None},
         )
     if state.json:
@@ -376,9 +399,7 @@ def fit_kernel(
         {
             "id": made.id,
             "widths": _widths(made.widths_m, 1e3, "mm") + "; " + _widths(made.widths_deg, 1.0, "°"),
-            "fitted on": f"{source_of.successes:,} successes, {source_of.displacements:,} displacements",
-            "held-out log density": f"{_number(source_of.log_likelihood)}"
-            f" (isotropic {_number(source_of.isotropic_log_likelihood)})",
+            **_fitted_on(source_of),
         }
     )
 
