@@ -94,8 +94,10 @@ def _nearest_in_gripper(data, begin, n, px, py, pz, qx, qy, qz, qw, metres, twin
 
 
 @fast
-def _component(data, begin, n, xi, lower, log_weight):
-    """Sum over a block of weight times one component, and that sum weighted by the exponent."""
+def _component(data, begin, n, all_n, xi, lower, log_weight):
+    """Sum over the first ``n`` of a block of ``all_n`` of weight times one component, and that sum weighted
+    by the exponent.
+    """
     l00, l10, l11 = lower[0], lower[1], lower[2]
     l20, l21, l22 = lower[3], lower[4], lower[5]
     l30, l31, l32, l33 = lower[6], lower[7], lower[8], lower[9]
@@ -103,7 +105,8 @@ def _component(data, begin, n, xi, lower, log_weight):
     l50, l51, l52, l53, l54, l55 = lower[15], lower[16], lower[17], lower[18], lower[19], lower[20]
     b0, b1, b2, b3, b4, b5 = lower[21], lower[22], lower[23], lower[24], lower[25], lower[26]
     total, spread = _ZERO, _ZERO
-    for k in range(np.uint64(n)):
+    count, log_weight = np.int32(n), log_weight * c._LOG2E
+    for k in range(np.uint64(all_n)):
         x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
         z0 = l00 * x0 - b0
         z1 = l10 * x0 + l11 * x1 - b1
@@ -113,7 +116,8 @@ def _component(data, begin, n, xi, lower, log_weight):
         z5 = l50 * x0 + l51 * x1 + l52 * x2 + l53 * x3 + l54 * x4 + l55 * x5 - b5
         place = z0 * z0 + z1 * z1 + z2 * z2
         square = place + z3 * z3 + z4 * z4 + z5 * z5
-        value = data[7, np.uint64(begin) + k] * c._exp(log_weight - square)
+        value = data[7, np.uint64(begin) + k] * c._exp2(log_weight - square * c._LOG2E)
+        value = value if np.int32(k) < count else _ZERO
         total += value
         spread += value * place
     return total, spread
@@ -136,14 +140,18 @@ def mixture_sums_at(
             visited += end - begin
             while begin < end:
                 n = min(BLOCK, end - begin)
+                # Whole vectors, of which the end is thrown away: LLVM would take the rest one by one.
+                all_n = n + -n % c.LANES
+                if begin + all_n > data.shape[1]:
+                    all_n = n
                 if turning > 0.0:
-                    _nearest_in_gripper(data, begin, n, fx, fy, fz, q0, q1, q2, q3, F32(metres), twin, xi)
+                    _nearest_in_gripper(data, begin, all_n, fx, fy, fz, q0, q1, q2, q3, F32(metres), twin, xi)
                 else:
                     _nearest_displacements(
-                        data, frames, begin, n, fx, fy, fz, q0, q1, q2, q3, F32(metres), twin, xi
+                        data, frames, begin, all_n, fx, fy, fz, q0, q1, q2, q3, F32(metres), twin, xi
                     )
                 for j in range(lowers.shape[0]):
-                    part = _component(data, begin, n, xi, lowers[j], log_weights[j])
+                    part = _component(data, begin, n, all_n, xi, lowers[j], log_weights[j])
                     total += part[0]
                     spread += part[1]
                 begin += n
