@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.errors import GraspDBError, error_for
+from graspdb.sweeps import Sweep
 from graspdb.transport import Transport
 from graspdb.wire.reports import (
     REPORTS,
@@ -464,6 +465,24 @@ class Reports:
             "sigma_rotation_deg": sigma_rotation_deg,
         }
         return Sources(self._get("sources", SourcesReport, params, progress, timeout_s))
+
+    def simulate(self, calls: Iterable[CheckCall | Mapping[str, Any]]) -> list[Sweep]:
+        """Make the sweeps that a report names as missing: checks, which enter no density.
+
+        Parameters
+        ----------
+        calls
+            ``calls`` of a bandwidth report, or of the refusal of ``convergence(matching="success")``.
+        """
+        made = []
+        for item in calls:
+            call = CheckCall.model_validate(item)
+            expected = f"{self._path}/sweeps"
+            if (call.method, call.path) != ("POST", expected):
+                raise ValueError(f"{call.method} {call.path} makes no sweep of this object (POST {expected})")
+            answer = self._transport.json("POST", expected, body=call.body, idempotent=True)
+            made.append(Sweep(self._transport, wire.SweepInfo.model_validate(answer)))
+        return made
 
     def _get(
         self,

@@ -130,6 +130,10 @@ def test_widths_and_the_summary_of_all_objects(
     assert found.recommended[0] in {point.sigma_position_m for point in found.raw.grid}
     assert {call.path for call in found.calls} == {f"/objects/{thing.id}/sweeps"}
     drawn_on_the_page(found, "No draws were simulated yet")
+    with pytest.raises(Conflict, match="has no mesh"):
+        thing.reports.simulate(found.calls)
+    with pytest.raises(ValueError, match="makes no sweep of this object"):
+        thing.reports.simulate([{"method": "DELETE", "path": f"/objects/{thing.id}", "body": {}}])
     code, out, err = run("report", thing.id, "bandwidth")
     assert (code, "Recommended" in out, "Missing: POST" in err) == (0, True, True)
 
