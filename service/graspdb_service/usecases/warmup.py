@@ -47,4 +47,12 @@ def _exercise() -> None:
     density.log_density(positions, quaternions)
     density.log_density(positions[:3] + 1.0, quaternions[:3], cutoff=None)
     density.maximum(region, count=2, admissible=free)
-    density.global_maximum()
+    top = density.global_maximum()
+
+    def elsewhere(p: se3.Floats, q: se3.Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        return np.asarray(np.linalg.norm(p - top.position, axis=1) > 0.005)
+
+    density.maximum(admissible=elsewhere)
+    density.nearest_rows(positions[0], quaternions[0], 5)
+    density.nearest_each(positions[:5], quaternions[:5], within=2.0)
+    model.lower_end(positions[:5], quaternions[:5])
