@@ -304,7 +304,7 @@ def anisotropic(rng: np.random.Generator) -> None:
         six = AnisotropicKernel.diagonal([0.015] * 3 + [math.radians(15.0)] * 3)
         iso, full = GraspDensity.build(*rows, kernel=plain), MixtureDensity(*rows, kernel=six)
         one, other = interleaved(
-            ROUNDS,
+            3 * ROUNDS,
             lambda d=iso, q=poses: d.log_density(*q),
             lambda d=full, q=poses: d.log_density(*q),
         )
@@ -391,7 +391,7 @@ def draw(path: str, counts: list[int], curves: dict[str, list[float]]) -> None:
     """Time of a pose against the number of kernels, beside the peers."""
     import matplotlib.pyplot as plt
 
-    plt.rcParams["svg.hashsalt"] = "graspdb"
+    plt.rcParams.update({"svg.hashsalt": "graspdb", "svg.fonttype": "none"})
     figure, axes = plt.subplots(figsize=(6, 4))
     for (name, values), style, label in zip(
         curves.items(),
