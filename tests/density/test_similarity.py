@@ -131,3 +131,27 @@ def test_sampled_kernel_is_mirror_symmetric() -> None:
         kernel.log_density(*sm.mirrored_displacements(at_t, at_r)),
         atol=1e-3,
     )
+
+
+class Known:
+    """A density that draws one pose and can't tell itself at some."""
+
+    def __init__(self, values: list[float]) -> None:
+        self._values = values
+
+    def log_density(self, positions: object, quaternions_xyzw: object, *, threads: int = 1) -> np.ndarray:
+        count = len(np.asarray(positions))
+        return np.resize(np.array(self._values), count)
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+
+
+def test_where_a_density_is_beyond_telling_nothing_is_shared() -> None:
+    rng = np.random.default_rng(0)
+    alike = sm.bhattacharyya(Known([1.0]), Known([1.0]), rng, points=400)
+    assert alike.value == pytest.approx(1.0)
+    for nothing in (math.nan, -math.inf):
+        half = sm.bhattacharyya(Known([1.0]), Known([1.0, nothing]), rng, points=400)
+        assert half.value == pytest.approx(0.5)
+        assert math.isfinite(half.standard_error)
