@@ -18,6 +18,11 @@ from graspdb_geometry.meshes import Mesh, MeshError, Part
 
 #: Concavity that a part may keep, in CoACD's measure (the mesh's longest side is 2), from coarse to fine.
 THRESHOLDS = (0.05, 0.02, 0.01)
+#: How hard CoACD searches for its cuts at thresholds from here on: little, so that there are parts within
+#: minutes (half a minute of one core for a mug of 884 triangles or a teddy of 2,432). Below it takes its own
+#: defaults, several times as long.
+QUICK_FROM = 0.02
+_QUICK = {"mcts_iterations": 60, "mcts_max_depth": 2, "resolution": 1000}
 #: Parts are good enough when they are as near to the mesh as the larger of these.
 TARGET_M, TARGET_SHARE = 5e-4, 0.01
 #: Vertices of one part at most: the physics engine gets slow beyond, and nothing is gained.
@@ -77,6 +82,7 @@ def decompose(mesh: Mesh, threshold: float, *, max_parts: int, seed: int) -> Can
             threshold=threshold,
             seed=seed,
             max_ch_vertex=MAX_PART_VERTICES,
+            **(_QUICK if threshold >= QUICK_FROM else {}),
         )
     except RuntimeError as error:
         raise Undecomposable(f"CoACD fails: {error}") from None

@@ -21,6 +21,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from numba import njit
 
 from graspdb_simworker.bodies import MassProperties, Quaternion, Vector, multiply, rotate
 from graspdb_simworker.labels import GRAVITY_M_S2
@@ -94,6 +98,8 @@ def load(
 ) -> tuple[Vector, Vector]:
     """Force (newtons, at the centre of mass) and torque (newton metres) on a carried body.
 
+    Compiled: this is done at every step.
+
     Parameters
     ----------
     frame : Frame
@@ -103,19 +109,55 @@ def load(
     velocity, spin
         Relative to the jaw, in its axes.
     """
-    s, m = frame.spin, mass.mass_kg
-    euler, inward = _cross(frame.spin_rate, position), _cross(s, _cross(s, position))
+    found: tuple[Vector, Vector] = _load(
+        frame.push,
+        frame.spin,
+        frame.spin_rate,
+        mass.mass_kg,
+        mass.inertia,
+        position,
+        orientation,
+        velocity,
+        spin,
+    )
+    return found
+
+
+@lru_cache(maxsize=4)
+def frames(step_s: float) -> tuple[Frame, ...]:
+    """The jaw's motion in the middle of every step, from the first on."""
+    return tuple(frame_at((k + 0.5) * step_s) for k in range(math.ceil(DURATION_S / step_s)))
+
+
+@njit(cache=True)
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+_turned: Any = njit(rotate)
+
+
+@njit
+def _load(push, s, rate, m, inertia, position, orientation, velocity, spin):  # type: ignore[no-untyped-def]
+    euler, inward = _cross(rate, position), _cross(s, _cross(s, position))
     coriolis = _cross(s, velocity)
-    px, py, pz = (m * (frame.push[k] - euler[k] - inward[k] - 2.0 * coriolis[k]) for k in range(3))
+    force = (
+        m * (push[0] - euler[0] - inward[0] - 2.0 * coriolis[0]),
+        m * (push[1] - euler[1] - inward[1] - 2.0 * coriolis[1]),
+        m * (push[2] - euler[2] - inward[2] - 2.0 * coriolis[2]),
+    )
     back = (-orientation[0], -orientation[1], -orientation[2], orientation[3])
-    s, a, w = rotate(back, s), rotate(back, frame.spin_rate), rotate(back, spin)
-    inertia = mass.inertia
-    half = 0.5 * sum(inertia)
-    momentum = (inertia[0] * s[0], inertia[1] * s[1], inertia[2] * s[2])
-    gyro = _cross(s, momentum)
-    mixed = _cross(w, ((half - inertia[0]) * s[0], (half - inertia[1]) * s[1], (half - inertia[2]) * s[2]))
-    tx, ty, tz = (-inertia[k] * a[k] - gyro[k] + 2.0 * mixed[k] for k in range(3))
-    return (px, py, pz), rotate(orientation, (tx, ty, tz))
+    own, a, w = _turned(back, s), _turned(back, rate), _turned(back, spin)
+    ix, iy, iz = inertia
+    half = 0.5 * (ix + iy + iz)
+    gyro = _cross(own, (ix * own[0], iy * own[1], iz * own[2]))
+    mixed = _cross(w, ((half - ix) * own[0], (half - iy) * own[1], (half - iz) * own[2]))
+    torque = (
+        -ix * a[0] - gyro[0] + 2.0 * mixed[0],
+        -iy * a[1] - gyro[1] + 2.0 * mixed[1],
+        -iz * a[2] - gyro[2] + 2.0 * mixed[2],
+    )
+    return force, _turned(orientation, torque)
 
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
@@ -138,7 +180,3 @@ def _there_and_back(phase: float, period_s: float) -> tuple[float, float, float]
 
 def _scaled(v: Vector, factor: float) -> Vector:
     return (factor * v[0], factor * v[1], factor * v[2])
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

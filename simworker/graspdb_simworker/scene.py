@@ -37,7 +37,7 @@ from graspdb_simworker.bodies import (
     rotate,
 )
 from graspdb_simworker.bullet import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
-from graspdb_simworker.labels import rating
+from graspdb_simworker.labels import MOVED_M, TURNED_RAD, rating
 
 Fidelity = Literal["standard", "fine"]
 
@@ -60,6 +60,8 @@ finger to finger, and whether it stays depends on the time step more than on the
 docs/experiments.md."""
 SLACK_S = 1.0
 """A closing may last this much longer than the fingers need to meet at full speed."""
+LOST = 5.0
+"""A carried object this many times farther away than allowed is lost: no need to see where it ends."""
 _EMPTY_CHECK_STEPS = 10
 _GEAR_FORCES = 100.0
 """The coupling of the fingers may exert so many times the closing force: as good as rigid."""
@@ -75,9 +77,11 @@ class Stepping:
     solver_iterations: int
 
 
-_LIGHT = Stepping(1.0 / 240.0, 1.0 / 480.0, 1.0 / 480.0, 50)
-_HEAVY = Stepping(1.0 / 240.0, 1.0 / 240.0, 1.0 / 480.0, 80)
+_LIGHT = Stepping(1.0 / 240.0, 1.0 / 480.0, 1.0 / 240.0, 50)
+_HEAVY = Stepping(1.0 / 240.0, 1.0 / 240.0, 1.0 / 240.0, 80)
 """What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each."""
+_LIFTED = Stepping(1.0 / 240.0, 1.0 / 480.0, 1.0 / 240.0, 300)
+"""Whether it slips hangs on friction that is balanced between many contacts, which takes many iterations."""
 _FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 1.0 / 2000.0, 200)
 
 
@@ -85,7 +89,9 @@ def stepping_for(fidelity: Fidelity, mass_kg: float, *, lifts: bool = False) -> 
     """How finely to simulate an object of this mass."""
     if fidelity == "fine":
         return _FINE
-    return _HEAVY if mass_kg >= HEAVY_KG and not lifts else _LIGHT
+    if lifts:
+        return _LIFTED
+    return _HEAVY if mass_kg >= HEAVY_KG else _LIGHT
 
 
 class GraspWorld(BulletWorld):
@@ -190,7 +196,7 @@ class GraspWorld(BulletWorld):
 
         dt = stepping.approach_dt_s
         self._drive(dt)
-        touched = False
+        touched = by_faces = False
         elapsed = 0.0
         limit = 2.0 * start / gripper.max_speed_m_s + SLACK_S
         opening = 2.0 * start
@@ -229,6 +235,13 @@ class GraspWorld(BulletWorld):
                 mark_opening, mark_time = opening, elapsed
                 contacts.clear()
             elif elapsed - mark_time >= READING_AGES_S[len(contacts)] - 1e-9:
+                if self._lifts and not by_faces:
+                    # Stalled, so from now on by faces, which takes many times as long; and until it has
+                    # stalled on them as well.
+                    by_faces = True
+                    self._touch_by_faces(True)
+                    mark_opening, mark_time = opening, elapsed
+                    continue
                 contacts.append(self._contacts())
                 if (
                     self._lifts
@@ -302,10 +315,10 @@ class GraspWorld(BulletWorld):
         anchor = rotate((-x, -y, -z, w), (-where[0], -where[1], -where[2]))
         translation = rotation = 0.0
         held = True
-        for step in range(1, math.ceil(lifting.DURATION_S / (pace * dt)) + 1):
+        for step, frame in enumerate(lifting.frames(dt * pace), 1):
             velocity, spin = pybullet.getBaseVelocity(body, physicsClientId=client)
             force, torque = lifting.load(
-                lifting.frame_at((step - 0.5) * dt * pace),
+                frame,
                 self.mass,
                 where,
                 orientation,
@@ -319,7 +332,8 @@ class GraspWorld(BulletWorld):
                 body, -1, [scale * f for f in torque], pybullet.WORLD_FRAME, physicsClientId=client
             )
             pybullet.stepSimulation(physicsClientId=client)
-            self._film(dt)
+            if self._visible:
+                self._film(dt)
             where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
             if step % _EMPTY_CHECK_STEPS:
                 continue
@@ -331,6 +345,8 @@ class GraspWorld(BulletWorld):
             )
             if not self._between():
                 held = False
+                break
+            if max(translation / MOVED_M, rotation / TURNED_RAD) > LOST:
                 break
         held = held and {0, 1} <= set(self._contacts().fingers.tolist())
         return Carried(held, translation, rotation)
@@ -361,6 +377,7 @@ class GraspWorld(BulletWorld):
         client, jaw = self._client, self._jaw
         if self._lifts:
             self._couple(self._gear, 0.0)
+            self._touch_by_faces(False)
             self._damp(self._damping)
         pybullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY, physicsClientId=client)
         pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)

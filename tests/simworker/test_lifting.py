@@ -153,11 +153,13 @@ def test_what_is_too_slippery_is_dropped(payload_of: MakePayload) -> None:
 
 def test_a_heavier_bar_slips_where_a_lighter_one_stays(payload_of: MakePayload) -> None:
     """Two contacts of 40 N at friction 0.4 hold 3.3 kg at rest, and half of it at an acceleration of 1 g."""
-    outcomes = [
-        grasp(payload_of, bar(0.06), (0.0, 0.0, 0.0), protocol="lift", mass_kg=mass, friction=0.4).outcome
-        for mass in (0.4, 1.0, 4.0)
+    labels = [
+        grasp(payload_of, bar(0.06), (0.0, 0.0, 0.0), protocol="lift", mass_kg=mass, friction=0.4)
+        for mass in (0.4, 1.0, 1.5, 4.0)
     ]
-    assert outcomes == [Outcome.SUCCESS, Outcome.SUCCESS, Outcome.DROPPED]
+    assert [label.outcome for label in labels] == [Outcome.SUCCESS] * 3 + [Outcome.DROPPED]
+    # What holds does not creep: less than 0.2 mm and 0.3 degrees.
+    assert all(label.quality > 0.98 for label in labels[:3])
 
 
 def test_light_objects_meet_the_full_force_in_slow_motion(payload_of: MakePayload) -> None:
