@@ -22,11 +22,12 @@ from graspdb.client import Client, Grippers
 from graspdb.kernels import Kernels
 from graspdb.objects import GraspObject, Objects
 from graspdb.pages import PAGE, Item, Listing
-from graspdb.reports import Reports
+from graspdb.reports import AllReports, Reports
 from graspdb.sweeps import ProgressCallback, Sweep, Sweeps
 from graspdb.trials import Batches, TrialListing, Trials
 
 __all__ = [
+    "AsyncAllReports",
     "AsyncBatches",
     "AsyncClient",
     "AsyncGraspObject",
@@ -224,6 +225,17 @@ class AsyncReports(Mirror[Reports]):
     convergence = _awaited(Reports.convergence)
     anisotropy = _awaited(Reports.anisotropy)
     calibration = _awaited(Reports.calibration)
+    projection = _awaited(Reports.projection)
+    bandwidth = _awaited(Reports.bandwidth)
+    kernel_similarity = _awaited(Reports.kernel_similarity)
+    sources = _awaited(Reports.sources)
+    simulate = _mirrored(Reports.simulate, lambda sweeps: [AsyncSweep(sweep) for sweep in sweeps])
+
+
+class AsyncAllReports(Mirror[AllReports]):
+    """:class:`graspdb.reports.AllReports`."""
+
+    summary = _awaited(AllReports.summary)
 
 
 class AsyncGraspObject(Mirror[GraspObject]):
@@ -326,6 +338,7 @@ class AsyncClient(Mirror[Client]):
         self.grippers = AsyncGrippers(self.sync.grippers)
         self.kernels = AsyncKernels(self.sync.kernels)
         self.sweeps = AsyncSweeps(self.sync.sweeps)
+        self.reports = AsyncAllReports(self.sync.reports)
 
     @property
     def url(self) -> str:

@@ -17,7 +17,7 @@ from graspdb.client import Grippers
 from graspdb.kernels import Kernels
 from graspdb.objects import GraspObject, Objects
 from graspdb.pages import Listing
-from graspdb.reports import Reports
+from graspdb.reports import AllReports, Reports
 from graspdb.sweeps import Sweep, Sweeps
 from graspdb.trials import Batches, TrialListing, Trials
 
@@ -30,6 +30,7 @@ MIRRORS = {
     Listing: asynchronous.AsyncListing,
     Batches: asynchronous.AsyncBatches,
     Reports: asynchronous.AsyncReports,
+    AllReports: asynchronous.AsyncAllReports,
     Sweeps: asynchronous.AsyncSweeps,
     Sweep: asynchronous.AsyncSweep,
     Grippers: asynchronous.AsyncGrippers,
