@@ -39,7 +39,7 @@ def test_every_operation_names_its_problems_and_bodies(sqlite_http: httpx.Client
             assert set(problem) == {"application/problem+json"}, (method, path)
             assert operation["description"], (method, path)
     body = document["paths"]["/objects/{id}/trials"]["post"]["requestBody"]["content"]
-    assert set(body) == {"application/json", "application/x-ndjson"}
+    assert set(body) == {"application/json", "application/x-ndjson", "application/vnd.apache.arrow.stream"}
     mesh = document["paths"]["/objects/{id}/mesh"]["put"]["requestBody"]["content"]
     assert set(mesh) == {"model/stl", "model/obj", "model/ply", "model/gltf-binary"}
 
