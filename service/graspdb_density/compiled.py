@@ -466,7 +466,8 @@ def _sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):
         dz = np.float64(data[2, i]) - pz
         base = -kappa - (dx * dx + dy * dy + dz * dz) - top
         a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        # Without a twin b may be far above the top: e^(base + b) would be beyond float32, and 0 times it NaN.
+        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
         own = _exp(F32(base + a)) + _exp(F32(base - a))
         other = _exp(F32(base + b)) + _exp(F32(base - b))
         total += data[7, i] * (own + F32(twin) * other)

@@ -162,6 +162,21 @@ def test_a_row_without_symmetry_has_no_twin() -> None:
     )
 
 
+@pytest.mark.parametrize("degrees", [5.0, 10.0, 20.0, 45.0])
+@pytest.mark.parametrize("distance", [0.0, 0.1, 1.0])
+def test_rows_without_a_twin_are_told_from_far_away_and_half_a_turn(degrees: float, distance: float) -> None:
+    """What the twin would have is far above what there is: no overflow of it may get into the sum."""
+    kernel = IsotropicKernel(0.01, math.radians(degrees))
+    rng = np.random.default_rng(0)
+    p, q = 0.01 * rng.standard_normal((200, 3)), np.tile(se3.IDENTITY, (200, 1))
+    q = se3.multiply(q, se3.from_rotation_vector(0.1 * rng.standard_normal((200, 3))))
+    density = GraspDensity.build(p, q, kernel=kernel, symmetric=False)
+    poses = p[:40] + [distance, 0.0, 0.0], se3.jaw_twin(q[40:80])
+    expected = reference.log_density(kernel, p, q, *poses, symmetric=False)
+    for cutoff in (4.0, None):
+        np.testing.assert_allclose(density.log_density(*poses, cutoff=cutoff), expected, rtol=2e-6, atol=5e-3)
+
+
 @pytest.mark.parametrize("kernel", KERNELS[:3], ids=str)
 @pytest.mark.parametrize("flags", [True, False])
 def test_gradient_against_finite_differences(
