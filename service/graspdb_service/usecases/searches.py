@@ -30,7 +30,7 @@ _CANDIDATES = 1_024
 #: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
 _NEAR = 2.0
 #: Grasps found by the quick score that are scored again, those that go on climbing, by so many steps.
-_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 6, 8, 12
+_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 4, 16, 40
 
 
 @dataclass(frozen=True, eq=False)
