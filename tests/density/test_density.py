@@ -171,7 +171,7 @@ def test_rows_without_a_twin_are_told_from_far_away_and_half_a_turn(degrees: flo
     p, q = 0.01 * rng.standard_normal((200, 3)), np.tile(se3.IDENTITY, (200, 1))
     q = se3.multiply(q, se3.from_rotation_vector(0.1 * rng.standard_normal((200, 3))))
     density = GraspDensity.build(p, q, kernel=kernel, symmetric=False)
-    poses = p[:40] + [distance, 0.0, 0.0], se3.jaw_twin(q[40:80])
+    poses = p[:40] + np.array([distance, 0.0, 0.0]), se3.jaw_twin(q[40:80])
     expected = reference.log_density(kernel, p, q, *poses, symmetric=False)
     for cutoff in (4.0, None):
         np.testing.assert_allclose(density.log_density(*poses, cutoff=cutoff), expected, rtol=2e-6, atol=5e-3)
