@@ -21,7 +21,7 @@ from .rowloops import _angle_factor, mixture_log_sum
 __all__ = ["mixture_log_sums", "mixture_sums_at"]
 
 F32 = np.float32
-BLOCK = 256
+BLOCK = 512
 _ONE, _ZERO = F32(1.0), F32(0.0)
 
 
