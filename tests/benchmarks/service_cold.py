@@ -29,7 +29,7 @@ from graspdb_service.storage.trials import TrialColumns
 
 TRIALS, SUCCESSES = 3_500_000, 167_000
 BATCH = 250_000
-ROUNDS = 3
+ROUNDS = 5
 SLUG = "cold"
 
 

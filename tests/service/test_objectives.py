@@ -497,6 +497,7 @@ def test_chances_and_means_against_exhaustive_search_at_20_000_kernels(
 
 
 @pytest.mark.long
+@pytest.mark.timeout(3_600)
 def test_against_exhaustive_search_at_20_000_kernels(
     sqlite_url: str, sqlite_http: httpx.Client, put_box: Callable[..., Scene], post: Post
 ) -> None:
