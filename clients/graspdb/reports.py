@@ -328,7 +328,8 @@ class Reports:
         method
             ``empirical`` counts pairs of trials; ``density`` compares densities.
         alignment
-            Translations along the axes of the ``gripper`` or the ``object``'s principal ones.
+            Axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the nearest) or
+            ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
         """
         params = {
             "method": method,

@@ -57,7 +57,7 @@ def propose(ctx: Context, slug: str, request: ProposalsRequest) -> tuple[Draw, s
     if request.strategy == "edges":
         raise conflict(
             "edges-unknown",
-            "The edges of meshes are not measured yet: before anything is known, sweep a grid"
+            "Proposals do not start from edges yet: before anything is known, sweep a grid"
             " (POST /objects/{id}/sweeps); afterwards use strategy=density or uncertainty",
             strategies=sorted(CRITERIA),
         )
