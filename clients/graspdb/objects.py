@@ -304,7 +304,8 @@ class GraspObject:
             the objective needs it or there are at most 500,000 attempts.
         verify
             Have a worker simulate the grasps at the fine step before they are answered: ``grasp.simulated``
-            is what became of each, and those that held come first. The outcomes are stored as a check.
+            is what became of each, and those that held come first. The outcomes are stored as a check. With
+            the gripper and protocol of the trials, where they say; else ``pg70`` and ``wrench``.
         verify_timeout_s
             How long to wait for that.
 

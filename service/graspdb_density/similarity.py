@@ -128,8 +128,7 @@ def bhattacharyya(
         p[inside], q[inside], threads=threads
     )
     # 2 sqrt(d1 d2) / (d1 + d2) = 1 / cosh((log d1 - log d2) / 2), without overflow.
-    # Too far from one of them for its density to be told: the two share nothing there.
-    decay = np.exp(-0.5 * np.nan_to_num(np.abs(difference), nan=np.inf))
+    decay = np.exp(-0.5 * np.abs(difference))
     value[inside] = 2.0 * decay / (1.0 + decay * decay)
     shares = [float(inside[:half].mean()), float(inside[half:].mean())]
     scale = 1.0 / math.sqrt(shares[0] * shares[1])
