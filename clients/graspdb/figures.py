@@ -164,10 +164,16 @@ def _number(value: float | None) -> str:
 
 def _anisotropy(figure: Figure, report: AnisotropyReport) -> None:
     frame = "gripper" if report.alignment == "gripper" else f"{report.alignment}'s axes"
-    _title(figure, report, f"what a success tells about its vicinity ({report.method}, {frame})")
+    lines = _title(figure, report, f"what a success tells about its vicinity ({report.method}, {frame})")
+    # What the words take more than three lines for is added above the panels, which keep their size.
+    height = figure.get_figheight()
+    figure.set_figheight(height + 0.18 * max(0, lines - 3))
+    part = height / figure.get_figheight()
     # Placed by hand: a layout that measures every label takes seconds for as many axes.
     rows = [
-        figure.add_gridspec(1, columns, left=0.06, right=right, bottom=bottom, top=top, wspace=space)
+        figure.add_gridspec(
+            1, columns, left=0.06, right=right, bottom=part * bottom, top=part * top, wspace=space
+        )
         for columns, right, bottom, top, space in (
             (len(report.translations), 0.9, 0.69, 0.88, 0.12),
             (len(report.rotations), 0.9, 0.32, 0.63, 0.2),
@@ -192,7 +198,7 @@ def _anisotropy(figure: Figure, report: AnisotropyReport) -> None:
         axes.set_title(f"rotation about {first}, then {second}; n = {_total(histogram)}", fontsize=8)
         axes.set_xlabel(f"about {first} [deg]", fontsize=8)
         axes.set_ylabel(f"about {second} [deg]", fontsize=8)
-    bar = figure.colorbar(image, cax=figure.add_axes((0.93, 0.36, 0.015, 0.5)))
+    bar = figure.colorbar(image, cax=figure.add_axes((0.93, part * 0.36, 0.015, part * 0.5)))
     bar.set_label("share of displaced grasps that succeed (hatched: none tried)", fontsize=8)
     for i, item in enumerate(report.tolerances):
         _profile(figure.add_subplot(rows[2][0, i]), item, report.level, first=i == 0)

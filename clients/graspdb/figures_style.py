@@ -30,16 +30,18 @@ BLUE, ORANGE, GREEN, YELLOW, GREY = "#0072B2", "#D55E00", "#009E73", "#E69F00", 
 COLOURS = (BLUE, ORANGE, GREEN, YELLOW, "#CC79A7", "#56B4E9", GREY)
 
 
-def title(figure: Figure, report: Any, kind: str) -> None:
-    """The object, of which trials the report is, and its answer in words."""
+def title(figure: Figure, report: Any, kind: str) -> int:
+    """The object, of which trials the report is, and its answer in words; how many lines that takes."""
     of = ", ".join(x for x in (report.gripper, report.protocol, report.source) if x)
     first = f"{report.object}: {kind}" + (f" ({of})" if of else "") + f", revision {report.revision}"
-    heading(figure, first, report.text)
+    return heading(figure, first, report.text)
 
 
-def heading(figure: Figure, first: str, text: str) -> None:
-    """A title line and words below it, wrapped to the figure's width."""
-    figure.suptitle(f"{first}\n{_wrapped(text, round(11 * figure.get_figwidth()))}", fontsize=10)
+def heading(figure: Figure, first: str, text: str) -> int:
+    """A title line and words below it, wrapped to the figure's width; the number of lines."""
+    words = f"{first}\n{_wrapped(text, round(11 * figure.get_figwidth()))}"
+    figure.suptitle(words, fontsize=10)
+    return 1 + words.count("\n")
 
 
 def _wrapped(text: str, width: int) -> str:
