@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import HAAR_VOLUME
+from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage import attempts, sweeps, trials
 from graspdb_service.storage.attempts import PackedChunk
 from graspdb_service.storage.database import Database, Tx
@@ -36,6 +37,9 @@ class AllTrials:
     proposal : 1/(m^3 rad^3), NaN where not known
     keys : (rotation, position) or None
         Equal where two poses of the one grid share them; None unless all attempts are of one grid.
+    left_out : int
+        Attempts that collided and are not here, where fewer of them were asked for: those that are stand for
+        all, each as much as the other.
     """
 
     position: Floats
@@ -45,9 +49,15 @@ class AllTrials:
     symmetric: Bools
     proposal: Floats
     keys: tuple[Ints, Ints] | None
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(self.success)
+
+    @property
+    def attempts(self) -> int:
+        """All of them, those left out too."""
+        return len(self) + self.left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +97,20 @@ class _Part:
     index: Ints | None = None
 
 
-def read(database: Database, row: ObjectRow, selected: Selected) -> AllTrials:
-    """Every attempt of a selection, packed outcomes included, of sources that post failures, too."""
+def read(
+    database: Database, row: ObjectRow, selected: Selected, *, most_collided: int | None = None
+) -> AllTrials:
+    """Every attempt of a selection, packed outcomes included, of sources that post failures, too.
+
+    Parameters
+    ----------
+    most_collided
+        About so many of the attempts that collided, drawn at random; None: all. Nearly all poses of a large
+        grid collide, and arrays of them would fill the memory.
+    """
     with database.read() as tx:
         stored = fetch(tx, row.id, selected)
-    return joined(stored)
+    return joined(stored, most_collided=most_collided)
 
 
 def fetch(
@@ -130,57 +149,114 @@ def fetch(
     return Stored(rows, swept, selected, without)
 
 
-def joined(stored: Stored) -> AllTrials:
-    """Attempts in arrays, each pose of a grid once."""
-    rows, provenances = stored.rows, stored.selected.provenances
+def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
+    """Attempts in arrays, each pose of a grid once; ``most_collided`` as :func:`read` takes it."""
+    rows, provenances, swept = stored.rows, stored.selected.provenances, stored.swept
+    grids = {item.sweep.id: plans.grid_of(item.sweep) for item in swept if item.poses is None}
+    codes = [rows.outcome, *(np.frombuffer(item.chunk.outcomes, dtype=np.uint8) for item in swept)]
+    kept = [np.ones(len(rows.outcome), dtype=bool), *(~np.isin(c, stored.without) for c in codes[1:])]
+    indices: list[Ints | None] = [None]
+    for item in swept:
+        grid = grids.get(item.sweep.id)
+        indices.append(None if grid is None else grid.pose_indices(item.chunk.start, item.chunk.stop))
+    _drop_repeated(stored, indices, kept)
+    left_out = 0 if most_collided is None else _drop_collided(codes, kept, most_collided)
     flags = np.array([provenances[int(p)] for p in rows.provenance], dtype=bool)
-    parts = [_Part(rows.position, rows.quaternion_xyzw, rows.outcome, flags, rows.proposal_density)]
-    seen: dict[str, list[Ints]] = {}
-    for item in stored.swept:
-        parts.append(_chunk(item, provenances[item.sweep.provenance_id], stored.without, seen))
-    codes = np.concatenate([part.codes for part in parts])
+    first = kept[0]
+    parts = [
+        _Part(
+            rows.position[first],
+            rows.quaternion_xyzw[first],
+            rows.outcome[first],
+            flags[first],
+            rows.proposal_density[first],
+        )
+    ]
+    for item, code, keep, index in zip(swept, codes[1:], kept[1:], indices[1:], strict=True):
+        known = None if index is None else index[keep]
+        symmetric = provenances[item.sweep.provenance_id]
+        parts.append(_chunk(item, grids.get(item.sweep.id), symmetric, code, keep, known))
+    code = np.concatenate([part.codes for part in parts])
     return AllTrials(
         position=np.concatenate([part.position for part in parts]),
         quaternion=np.concatenate([part.quaternion for part in parts]),
-        success=codes == _SUCCESS,
-        collided=codes == COLLISION,
+        success=code == _SUCCESS,
+        collided=code == COLLISION,
         symmetric=np.concatenate([part.symmetric for part in parts]),
         proposal=np.concatenate([part.proposal for part in parts]),
-        keys=_keys(parts, stored.swept, seen),
+        keys=_keys(parts, stored, grids),
+        left_out=left_out,
     )
 
 
-def _chunk(item: Swept, symmetric: bool, without: Sequence[int], seen: dict[str, list[Ints]]) -> _Part:
-    sweep, chunk, poses = item.sweep, item.chunk, item.poses
-    codes = np.frombuffer(chunk.outcomes, dtype=np.uint8)
-    kept = ~np.isin(codes, without)
-    if poses is not None:
-        count = int(kept.sum())
-        return _Part(
-            poses.position[kept],
-            poses.quaternion_xyzw[kept],
-            codes[kept],
-            np.full(count, symmetric),
-            poses.proposal_density[kept],
+def _drop_repeated(stored: Stored, indices: list[Ints | None], kept: list[Bools]) -> None:
+    """Two sweeps of one grid share poses, which count once: the first one stored."""
+    together: dict[str, list[int]] = {}
+    sweeps_of: dict[str, set[str]] = {}
+    for place, item in enumerate(stored.swept, start=1):
+        if indices[place] is not None:
+            key = item.sweep.snapshot["repeat_key"]
+            together.setdefault(key, []).append(place)
+            sweeps_of.setdefault(key, set()).add(item.sweep.id)
+    for key, places in together.items():
+        # Chunks of one sweep share nothing.
+        if len(sweeps_of[key]) < 2:
+            continue
+        chosen = [np.flatnonzero(kept[place]) for place in places]
+        index = np.concatenate(
+            [
+                part[rows]
+                for place, rows in zip(places, chosen, strict=True)
+                if (part := indices[place]) is not None
+            ]
         )
-    grid = plans.grid_of(sweep)
-    index = grid.pose_indices(chunk.start, chunk.stop)
-    earlier = seen.setdefault(sweep.snapshot["repeat_key"], [])
-    # Two sweeps of one grid share poses, which count once.
-    for known in earlier:
-        kept &= ~np.isin(index, known)
-    index = index[kept]
-    earlier.append(index)
+        first = np.zeros(len(index), dtype=bool)
+        first[np.unique(index, return_index=True)[1]] = True
+        ends = np.cumsum([len(rows) for rows in chosen])[:-1]
+        for place, rows, new in zip(places, chosen, np.split(first, ends), strict=True):
+            kept[place][rows[~new]] = False
+
+
+def _drop_collided(codes: list[NDArray[np.uint8]], kept: list[Bools], most: int) -> int:
+    """Keep about ``most`` of what collided, drawn at random; the number of those left out."""
+    hits = [np.flatnonzero(keep & (code == COLLISION)) for code, keep in zip(codes, kept, strict=True)]
+    total = sum(map(len, hits))
+    if total <= most:
+        return 0
+    rng = np.random.default_rng(0)
+    left_out = 0
+    for keep, rows in zip(kept, hits, strict=True):
+        dropped = rows[rng.random(len(rows)) >= most / total]
+        keep[dropped] = False
+        left_out += len(dropped)
+    return left_out
+
+
+def _chunk(
+    item: Swept,
+    grid: PoseGrid | None,
+    symmetric: bool,
+    codes: NDArray[np.uint8],
+    kept: Bools,
+    index: Ints | None,
+) -> _Part:
+    count = int(kept.sum())
+    flags, poses = np.full(count, symmetric), item.poses
+    if poses is not None:
+        at, to, proposal = poses.position[kept], poses.quaternion_xyzw[kept], poses.proposal_density[kept]
+        return _Part(at, to, codes[kept], flags, proposal)
+    assert grid is not None
+    assert index is not None
     position, quaternion = grid.poses(index)
-    proposal = np.full(len(index), 1.0 / (HAAR_VOLUME * grid.volume_m3))
-    return _Part(position, quaternion, codes[kept], np.full(len(index), symmetric), proposal, index)
+    proposal = np.full(count, 1.0 / (HAAR_VOLUME * grid.volume_m3))
+    return _Part(position, quaternion, codes[kept], flags, proposal, index)
 
 
-def _keys(parts: list[_Part], swept: list[Swept], seen: dict[str, list[Ints]]) -> tuple[Ints, Ints] | None:
+def _keys(parts: list[_Part], stored: Stored, grids: dict[str, PoseGrid]) -> tuple[Ints, Ints] | None:
     of_grids = [part.index for part in parts if part.index is not None]
     elsewhere = sum(len(part.codes) for part in parts if part.index is None)
-    if len(seen) != 1 or elsewhere:
+    keys = {stored.repeat_keys[sweep] for sweep in grids}
+    if len(keys) != 1 or elsewhere:
         return None
-    grid = plans.grid_of(next(item.sweep for item in swept if item.sweep.plan == "grid"))
-    position, rotation = np.divmod(np.concatenate(of_grids), grid.rotation_count)
+    position, rotation = np.divmod(np.concatenate(of_grids), next(iter(grids.values())).rotation_count)
     return rotation, position

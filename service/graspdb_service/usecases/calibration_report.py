@@ -26,13 +26,12 @@ from graspdb_density.calibration import (
 from graspdb_density.predicting import ShapedSuccessModel
 from graspdb_density.rows import Progress
 from graspdb_service.problems import conflict
-from graspdb_service.usecases import checks
+from graspdb_service.usecases import alltrials, checks
 from graspdb_service.usecases.alltrials import AllTrials
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.reportparts import (
     LEVEL,
     Sources,
-    attempts_of,
     finite,
     head,
     interval,
@@ -45,6 +44,8 @@ Floats = NDArray[np.float64]
 
 #: Outcomes judged: of those that collided fewer, for nearly all are right.
 _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
+#: Of those that collided, about so many are read: enough to judge, and to tell where blocks lie.
+_KEPT_COLLIDED = 100_000
 LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
 #: Kernels end at this many standard deviations of position.
@@ -67,19 +68,21 @@ def _model(
 def calibration_report(
     sources: Sources, built: Built, options: dict[str, str], progress: Progress
 ) -> CalibrationReport:
-    everything = attempts_of(sources, built)
+    test = sources.scenes.test(built.object_row, built.selected)
+    # Where geometry tells them apart, those that collided are only judged, and few of them.
+    most = None if test is None else _KEPT_COLLIDED
+    everything = alltrials.read(sources.database, built.object_row, built.selected, most_collided=most)
     successes = int(everything.success.sum())
-    if len(everything) < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
+    if everything.attempts < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
         raise conflict(
             "too-few-trials",
             f"Calibration needs at least {LEAST_ATTEMPTS} attempts and {LEAST_SUCCESSES} successes in them,"
-            f" of sources that post failures, too; there are {len(everything)} and {successes}",
+            f" of sources that post failures, too; there are {everything.attempts} and {successes}",
         )
     need_failures(everything, "Calibration", LEAST_FAILURES)
     density = built.density
     assert density is not None
     kernel = density.kernel
-    test = sources.scenes.test(built.object_row, built.selected)
     edge = 3.0 * kernel.sigma_position_m
     blocks = said(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
     judged, weights = _judged(everything)
@@ -142,7 +145,7 @@ def calibration_report(
         text="",
         level=LEVEL,
         kernel=built.kernel,
-        attempts=len(everything),
+        attempts=everything.attempts,
         successes=successes,
         judged=len(judged),
         blocks=blocks.count,
@@ -219,13 +222,16 @@ def _judged(everything: AllTrials) -> tuple[NDArray[np.int64], Floats]:
     """Rows to judge and what each stands for: drawn at random from those that collided and from the rest."""
     rng = np.random.default_rng(0)
     rows, weights = [], []
-    for chosen, most in ((~everything.collided, _JUDGED_FREE), (everything.collided, _JUDGED_COLLIDED)):
+    for chosen, most, more in (
+        (~everything.collided, _JUDGED_FREE, 0),
+        (everything.collided, _JUDGED_COLLIDED, everything.left_out),
+    ):
         members = np.flatnonzero(chosen)
         if not members.size:
             continue
         drawn = members if members.size <= most else np.sort(rng.choice(members, size=most, replace=False))
         rows.append(drawn)
-        weights.append(np.full(drawn.size, members.size / drawn.size))
+        weights.append(np.full(drawn.size, (members.size + more) / drawn.size))
     return np.concatenate(rows), np.concatenate(weights)
 
 
