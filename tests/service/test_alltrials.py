@@ -32,8 +32,8 @@ def sweep_of(name: str, **options: Any) -> SweepRow:
         id=name, object_id=1, provenance_id=7, gripper="pg70", protocol="wrench", fidelity="standard",
         purpose="collect", plan="grid", request={},
         snapshot={"grid": plan.model_dump(), "repeat_key": "one grid"},
-        pose_count=poses, chunk_poses=100, chunks=1, cancelled=False, created_at=now, started_at=now, finished_at=now,
-        object="thing", batch_id=1, batch="b",
+        pose_count=poses, chunk_poses=100, chunks=1, cancelled=False, created_at=now, started_at=now,
+        finished_at=now, object="thing", batch_id=1, batch="b",
     )  # fmt: skip
 
 
