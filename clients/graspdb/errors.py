@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from graspdb.wire import FieldError, Problem
+from graspdb.wire.reports import CheckCall
 from graspdb.wire.sweeps import FailedChunk
 
 __all__ = [
     "AmbiguousSelection",
+    "ChecksNeeded",
     "Conflict",
     "Forbidden",
     "GraspDBError",
@@ -70,6 +72,19 @@ class AmbiguousSelection(Conflict):
     """409: several grippers or protocols have trials, and none was named."""
 
 
+class ChecksNeeded(Conflict):
+    """409: a report compares simulated draws that are not there yet; ``calls`` are the sweeps that make them.
+
+    ``mug.reports.simulate(error.calls)`` makes those sweeps.
+    """
+
+    @property
+    def calls(self) -> list[CheckCall]:
+        """The sweeps, of purpose ``check``."""
+        extra = {} if self.problem is None else self.problem.model_extra or {}
+        return [CheckCall.model_validate(call) for call in extra.get("calls", [])]
+
+
 class LeaseLost(Conflict):
     """409: the job's lease is another worker's now, or the job was cancelled."""
 
@@ -107,6 +122,7 @@ class SweepFailed(GraspDBError):
 
 _BY_TYPE: dict[str, type[GraspDBError]] = {
     "ambiguous-selection": AmbiguousSelection,
+    "checks-needed": ChecksNeeded,
     "lease-lost": LeaseLost,
 }
 _BY_STATUS: dict[int, type[GraspDBError]] = {
@@ -125,7 +141,8 @@ def error_for(problem: Problem) -> GraspDBError:
     lines += [f"  {item.field}: {item.message}" for item in problem.errors]
     if problem.request_id:
         lines.append(f"  (request {problem.request_id})")
-    kind = _BY_TYPE.get(problem.type.rsplit("/", 1)[-1]) or _BY_STATUS.get(problem.status)
+    name = problem.type.rsplit(":", 1)[-1].rsplit("/", 1)[-1]
+    kind = _BY_TYPE.get(name) or _BY_STATUS.get(problem.status)
     if kind is None:
         kind = ServiceError if problem.status >= 500 else InvalidInput
     return kind("\n".join(lines), problem=problem)

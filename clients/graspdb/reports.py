@@ -298,6 +298,8 @@ class Reports:
 
         Raises
         ------
+        ChecksNeeded
+            Where draws to match by have not been simulated; :meth:`simulate` its ``calls`` and ask again.
         Conflict
             For too few successes, saying how many are needed.
         """
@@ -473,7 +475,8 @@ class Reports:
         Parameters
         ----------
         calls
-            ``calls`` of a bandwidth report, or of the refusal of ``convergence(matching="success")``.
+            ``calls`` of a bandwidth report, or of :class:`graspdb.errors.ChecksNeeded`, with which
+            ``convergence(matching="success")`` is refused.
         """
         made = []
         for item in calls:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from graspdb import Client, cli
-from graspdb.errors import Conflict, NotFound
+from graspdb.errors import ChecksNeeded, Conflict, NotFound
 from graspdb.objects import GraspObject
 from graspdb.reports import Report
 
@@ -192,6 +192,13 @@ def test_kernels_are_fitted_and_used(db: Client, thing: GraspObject) -> None:
     used = thing.density(kernel="anisotropic").kernel
     assert (used.id, used.alignment) == (made.id, "gripper")
     assert thing.best_grasp(kernel=made.id).relative == pytest.approx(1, abs=0.02)
+    with pytest.raises(ChecksNeeded) as refused:
+        thing.reports.convergence(kernel=made.id, matching="success")
+    calls = refused.value.calls
+    assert made.id in [call.body["sample"]["kernel"] for call in calls]
+    assert {call.body["purpose"] for call in calls} == {"check"}
+    with pytest.raises(Conflict, match="has no mesh"):
+        thing.reports.simulate(calls)
     given = db.kernels.create([{"covariance": made.components[0].covariance}])
     assert given.provenance.origin == "given"
     for kernel in (made, given):
@@ -229,5 +236,11 @@ def test_on_the_command_line(run: Run, thing: GraspObject, tmp_path: Path) -> No
     assert run("likelihood", thing.id, "--pose=0,0,0,0,0,0,1", "--kernel", kernel)[0] == 0
     code, out, _ = run("report", thing.id, "convergence", "--kernel", kernel)
     assert (code, "times the grasps of the matched isotropic kernel" in out) == (0, True)
+    by_success = ("report", thing.id, "convergence", "--kernel", kernel, "--matching", "success")
+    code, _, err = run(*by_success)
+    assert (code, "have not all been simulated" in err) == (1, True)
+    # It makes the sweeps, which this object without a mesh refuses.
+    code, _, err = run(*by_success, "--simulate")
+    assert (code, "has no mesh" in err) == (1, True)
     assert run("kernels", "delete", kernel)[0] == 0
     assert kernel not in run("kernels", "list")[1]

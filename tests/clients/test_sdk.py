@@ -12,7 +12,15 @@ import pytest
 import trimesh
 
 from graspdb import Client, Infeasible, wire
-from graspdb.errors import Conflict, InvalidInput, NotFound, Unreachable
+from graspdb.errors import (
+    AmbiguousSelection,
+    Conflict,
+    InvalidInput,
+    LeaseLost,
+    NotFound,
+    Unreachable,
+    error_for,
+)
 from graspdb.objects import GraspObject
 from graspdb.poses import as_poses, matrices
 
@@ -409,3 +417,13 @@ def test_everything_shows_itself_in_words(db: Client, grasped: GraspObject) -> N
     assert "density" in best[0]._repr_html_()
     assert "300 trials" in repr(grasped.trials.list().arrays())
     assert db.url in repr(db)
+
+
+def test_errors_have_the_class_that_their_problem_names(db: Client) -> None:
+    thing = db.objects.create("two-grippers")
+    for gripper in ("pg70", "panda"):
+        thing.trials.add([0, 0, 0, 0, 0, 0, 1], True, gripper=gripper)
+    with pytest.raises(AmbiguousSelection, match="panda"):
+        thing.density()
+    problem = wire.Problem(type="urn:graspdb:problem:lease-lost", title="Another's", status=409)
+    assert isinstance(error_for(problem), LeaseLost)

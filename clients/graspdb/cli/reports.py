@@ -24,11 +24,13 @@ from graspdb.cli.common import (
     show_table,
     state_of,
 )
+from graspdb.errors import ChecksNeeded
 from graspdb.reports import (
     Bandwidth,
     Calibration,
     Convergence,
     KernelSimilarity,
+    Reports,
     Sources,
     Summary,
 )
@@ -118,6 +120,9 @@ def report(
     component_rotation_deg: Annotated[
         float | None, typer.Option("--component-rotation-deg", help="kernel-similarity: width of a sample.")
     ] = None,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Have a worker simulate the draws that the report lacks.")
+    ] = False,
     gripper: Gripper = None,
     protocol: Protocol = None,
     source: Source = None,
@@ -149,7 +154,7 @@ def report(
         with state.client() as db:
             found = db.reports.summary()
     else:
-        found = _computed(state, id, name, given)
+        found = _computed(state, id, name, given, simulate)
     if figure is not None:
         found.save(figure)
     if state.json:
@@ -162,12 +167,29 @@ def report(
         ERRORS.print(f"Figure: {figure}")
 
 
-def _computed(state: State, id: str, name: str, options: dict[str, Any]) -> Any:
-    """The report, with a bar while the service computes it."""
+def _computed(state: State, id: str, name: str, options: dict[str, Any], simulate: bool) -> Any:
+    """The report, with a bar while the service computes it, and before that while it is simulated."""
+    with state.client() as db:
+        reports = db.objects.get(id).reports
+        try:
+            found = _asked(reports, id, name, options)
+            calls = getattr(found.raw, "calls", [])
+        except ChecksNeeded as error:
+            if not simulate:
+                raise
+            calls = error.calls
+        if not simulate or not calls:
+            return found
+        for sweep in reports.simulate(calls):
+            sweep.wait(progress=not state.json)
+        return _asked(reports, id, name, options)
+
+
+def _asked(reports: Reports, id: str, name: str, options: dict[str, Any]) -> Any:
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
     )
-    with state.client() as db, bar:
+    with bar:
         task: Any = None
 
         def show(run: ReportRun) -> None:
@@ -175,8 +197,7 @@ def _computed(state: State, id: str, name: str, options: dict[str, Any]) -> Any:
             task = bar.add_task(f"{name} of {id}", total=1.0) if task is None else task
             bar.update(task, completed=run.progress)
 
-        ask = getattr(db.objects.get(id).reports, name.replace("-", "_"))
-        return ask(**options, progress=show)
+        return getattr(reports, name.replace("-", "_"))(**options, progress=show)
 
 
 def _show(found: Any) -> None:

@@ -223,7 +223,12 @@ class FieldError(Response):
 
 
 class Problem(Response):
-    """An RFC 9457 problem: ``type`` is stable, ``title`` says what to do, ``errors`` name the fields."""
+    """An RFC 9457 problem: ``type`` is stable, ``title`` says what to do, ``errors`` name the fields.
+
+    What else a type of problem has (``calls``, ``kernels``) is in ``model_extra``.
+    """
+
+    model_config = ConfigDict(extra="allow")
 
     type: str
     title: str
