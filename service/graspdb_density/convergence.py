@@ -3,7 +3,7 @@
 ``s = mean over b of BC(m, d_b)``: the Bhattacharyya coefficient between the density m of all grasps and the
 density d_b of a bootstrap replicate; 1 means that the replicates agree with it entirely. Equation 9 of
 Bodenhagen, Detry, Piater and Krueger takes the mean density of the replicates; the density of all grasps is
-what that mean tends to. Estimated with points drawn from m: ``BC_b = E_m sqrt(d_b / m)``.
+what that mean tends to. Estimated with points drawn from m: ``BC_b = E_m sqrt(d_b / m)`` (`coefficients`).
 
 s measures variance, not truth: a wider kernel raises it while the likelihood of held-out grasps falls. So
 every point of a curve carries both. N counts successes; a grasp and its twin under the jaw's turn are one.
@@ -12,14 +12,12 @@ every point of a curve carries both. N counts successes; a grasp and its twin un
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from . import se3
-from .rows import Kernel, KernelRows, Progress
+from .rows import KernelRows, Progress
 from .se3 import Floats
 
 __all__ = [
@@ -31,7 +29,7 @@ __all__ = [
     "Similarity",
     "Verdict",
     "bootstrap_similarity",
-    "convergence_curve",
+    "coefficients",
     "curve_sizes",
     "grasps_needed",
     "needed_ratio",
@@ -42,10 +40,8 @@ __all__ = [
 TARGET = 0.95
 #: Smallest subset of a curve and the fewest sizes that make one.
 LEAST_SUBSET, LEAST_SIZES = 25, 4
-#: Fewest grasps for a curve: sizes are halved from the whole down.
+#: Fewest grasps for a curve: sizes are doubled up to half the whole.
 LEAST_GRASPS = LEAST_SUBSET * 2 ** (LEAST_SIZES - 1)
-#: Grasps held out for the likelihood: this share of all, but no more than.
-_HELD_OUT_SHARE, _HELD_OUT_MOST = 0.1, 2_000
 #: Resamples behind intervals.
 _RESAMPLES = 400
 #: Extrapolations beyond this many times the present number say nothing.
@@ -184,18 +180,46 @@ def bootstrap_similarity(
         again = rows.weights * counts
         weightings[b] = again * (rows.size / again.sum())
     sums = rows.sums(p, q, weightings.T, threads=threads, progress=progress)
-    whole = sums[:, 0]
+    values = coefficients(sums[:, 0], sums[:, 1:], np.ones(replicates))
+    return Similarity(float(values.mean()), float(values.std(ddof=1)), values)
+
+
+def coefficients(
+    whole: NDArray[np.floating], replicates: NDArray[np.floating], totals: NDArray[np.floating]
+) -> Floats:
+    """BC of every replicate with the whole, (B,), at most 1, from kernel sums at points drawn from the whole.
+
+    The mean of ``sqrt(r)`` with ``r = d_b / m``. Since r has the mean 1 whatever the replicate,
+    ``(r - 1) / 2`` is taken off it: to first order what the choice of the points adds, which is more than the
+    deviation between replicates where there are few points.
+
+    Parameters
+    ----------
+    whole : (M,)
+        Sums under the weights of all grasps.
+    replicates : (M, B)
+        Sums under each replicate's weights.
+    totals : (B,)
+        The sum of each replicate's weights over that of all grasps.
+
+    Raises
+    ------
+    ValueError
+        Where no point is within reach of any grasp.
+    """
     # A point all of whose kernels fell below the threshold says nothing.
     seen = whole > 0.0
     if not seen.any():
         raise ValueError("no drawn pose is within reach of any grasp")
-    ratio = sums[seen, 1:] / whole[seen, None]
-    values = np.sqrt(ratio, out=ratio).mean(axis=0, dtype=np.float64)
-    return Similarity(float(values.mean()), float(values.std(ddof=1)), values)
+    ratio = replicates[seen] / whole[seen, None]
+    ratio /= totals.astype(ratio.dtype)
+    excess = 0.5 * (ratio.mean(axis=0, dtype=np.float64) - 1.0)
+    mean = np.sqrt(ratio, out=ratio).mean(axis=0, dtype=np.float64)
+    return np.asarray(mean - excess, dtype=np.float64)
 
 
 def curve_sizes(count: int) -> list[int]:
-    """Numbers of grasps of a curve: the whole, halved down to about `LEAST_SUBSET`, rising.
+    """Numbers of grasps of a curve: 25, 50, 100, ... below the whole, at most half of it, and the whole.
 
     Raises
     ------
@@ -207,126 +231,10 @@ def curve_sizes(count: int) -> list[int]:
             f"a convergence curve needs at least {LEAST_GRASPS} successful grasps (a grasp and its twin "
             f"under the jaw's turn are one); there are {count}, so {LEAST_GRASPS - count} more are needed"
         )
-    sizes = [count]
-    while sizes[-1] // 2 >= LEAST_SUBSET:
-        sizes.append(sizes[-1] // 2)
-    return sizes[::-1]
-
-
-def convergence_curve(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
-    kernel: Kernel,
-    *,
-    weights: ArrayLike | None = None,
-    symmetric: ArrayLike | bool = True,
-    frames: ArrayLike | None = None,
-    held_out: tuple[ArrayLike, ArrayLike] | None = None,
-    sizes: Sequence[int] | None = None,
-    subsets: int = 5,
-    replicates: int = 50,
-    points: int = 20_000,
-    seed: int = 0,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> ConvergenceCurve:
-    """s and the held-out likelihood against the number of grasps (figures 6 and 14).
-
-    Parameters
-    ----------
-    positions, quaternions_xyzw : (N, 3) metres, (N, 4)
-        Successful grasps, one row a physical grasp.
-    kernel, weights, symmetric, frames
-        As `KernelRows` takes them.
-    held_out : poses or None
-        Grasps to judge the likelihood on. None: a tenth of the rows (2,000 at most), the same for every point
-        and kernel of a seed; they take part in s and are left out of the density whose likelihood is taken.
-        They count with their weights, given ones equally.
-    sizes : rising numbers of grasps, at least 4, or None for `curve_sizes`
-    subsets : int
-        Subsets drawn without replacement at each size, at least 5. At the whole number they are the same
-        grasps with other draws.
-    points : int
-        Draws from the density at each size, over its subsets together.
-
-    Raises
-    ------
-    ValueError
-        Where there are too few grasps (saying how many are needed) or an argument is out of range.
-    """
-    p, q = se3.as_poses(positions, quaternions_xyzw)
-    count = len(p)
-    wanted = curve_sizes(count)
-    if sizes is not None:
-        wanted = [int(n) for n in sizes]
-        if len(wanted) < LEAST_SIZES or wanted != sorted(set(wanted)):
-            raise ValueError(f"a curve needs at least {LEAST_SIZES} different sizes, rising")
-        if wanted[0] < LEAST_SUBSET or wanted[-1] > count:
-            raise ValueError(f"sizes of a curve lie between {LEAST_SUBSET} and the {count} grasps there are")
-    if subsets < 5:
-        raise ValueError("a point of a curve is the mean over at least 5 subsets")
-    # Children of one seed: the split and the subsets do not depend on how many numbers a kernel's draws take.
-    split, *children = np.random.default_rng(seed).spawn(1 + len(wanted) * subsets)
-    everything = KernelRows(p, q, kernel, weights=weights, symmetric=symmetric, frames=frames)
-    judged = np.zeros(count, dtype=bool)
-    if held_out is None:
-        share = min(_HELD_OUT_MOST, max(1, round(_HELD_OUT_SHARE * count)))
-        judged[split.permutation(count)[:share]] = True
-        test = p[judged], q[judged]
-        shares = everything.weights[judged]
-    else:
-        test = se3.as_poses(*held_out)
-        if not len(test[0]):
-            raise ValueError("the held-out grasps must not be empty")
-        shares = np.ones(len(test[0]))
-    work = sum(wanted) * subsets
-    finished = 0
-    result = []
-    for index, n in enumerate(wanted):
-        values: list[Floats] = []
-        likelihoods: list[Floats] = []
-        for turn in range(subsets):
-            picker, draws = children[index * subsets + turn].spawn(2)
-            chosen = np.arange(count) if n == count else np.sort(picker.permutation(count)[:n])
-            subset = everything if n == count else everything.subset(chosen)
-            values.append(
-                bootstrap_similarity(
-                    subset,
-                    draws,
-                    replicates=replicates,
-                    points=max(2, points // subsets),
-                    threads=threads,
-                    progress=_part(progress, finished / work, 0.9 * n / work),
-                ).replicates
-            )
-            # All subsets of the whole are the same grasps, so their likelihood is too.
-            if n < count or not likelihoods:
-                training = chosen[~judged[chosen]]
-                likelihoods.append(everything.subset(training).log_density(*test, threads=threads))
-            finished += n
-            if progress is not None:
-                progress(finished / work)
-        result.append(_curve_point(n, np.array(values), np.mean(likelihoods, axis=0), shares))
-    return ConvergenceCurve(tuple(result), len(test[0]))
-
-
-def _part(progress: Progress | None, begin: float, share: float) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda done: progress(begin + share * done)
-
-
-def _curve_point(grasps: int, values: Floats, log_density: Floats, shares: Floats) -> CurvePoint:
-    share = shares / shares.sum()
-    mean = float(share @ log_density)
-    return CurvePoint(
-        grasps=grasps,
-        similarity=float(values.mean()),
-        deviation=float(np.sqrt(values.var(axis=1, ddof=1).mean())),
-        replicates=values,
-        log_likelihood=mean,
-        log_likelihood_error=float(np.linalg.norm(share * (log_density - mean))),
-    )
+    sizes = [LEAST_SUBSET]
+    while sizes[-1] * 4 <= count:
+        sizes.append(sizes[-1] * 2)
+    return [*sizes, count]
 
 
 # -- how many more

@@ -28,14 +28,22 @@ from .kernels import IsotropicKernel
 from .se3 import Floats
 from .threads import for_blocks
 
-__all__ = ["CUTOFF", "Kernel", "KernelRows", "MixtureKernel", "Progress", "rotation_normaliser"]
+__all__ = [
+    "CUTOFF",
+    "TRUSTED_SUM",
+    "Kernel",
+    "KernelRows",
+    "MixtureKernel",
+    "Progress",
+    "rotation_normaliser",
+]
 
 #: Kernels further than this many standard deviations of position are dropped.
 CUTOFF = 5.0
 #: Kernel values not above this share of the largest are dropped.
 LEAST = 1e-6
 #: Mixture sums below this many smallest weights are taken again without a cut-off.
-_TRUSTED_SUM = 1e-2
+TRUSTED_SUM = 1e-2
 _POSE_BLOCK = 512
 #: Wider than this, a row's farther twin and its antipodes add more than 1e-4 of a kernel.
 _WIDE_ROTATION = math.radians(20.0)
@@ -296,17 +304,35 @@ class KernelRows:
         raw = (self.weights / self.weights.mean()).astype(np.float32)[:, None]
         sums = self.sums(p, q, raw, least=0.0, threads=threads)[:, 0].astype(np.float64)
         # Where little is left, what lies beyond the cut-off may count as much: those poses are taken again.
-        near = sums > _TRUSTED_SUM * float(raw.min())
+        near = sums > TRUSTED_SUM * float(raw.min())
         out = np.empty(len(p))
-        out[near] = np.log(sums[near]) - math.log(self.size)
+        out[near] = np.log(sums[near]) - math.log(self.size) + self.log_unit
         if not near.all():
-            log_rows = np.log(self.weights * np.where(self.symmetric, 0.5, 1.0))
-            frames = np.ascontiguousarray(self.frames.reshape(-1, 9))
-            for j in np.flatnonzero(~near):
-                out[j] = rowloops.mixture_log_sum(
-                    self.positions, self.quaternions_xyzw, frames, self.symmetric, self._own_frames, log_rows,
-                    self._lowers, self._log_weights, self._wraps, p[j], q[j],
-                )  # fmt: skip
+            out[~near] = self.exact_log_density(p[~near], q[~near], threads=threads)
+        return out
+
+    def exact_log_density(
+        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
+    ) -> Floats:
+        """As `log_density`, over all rows at every pose: for the few that are far from all of them."""
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        if isinstance(self.kernel, IsotropicKernel):
+            density = GraspDensity.build(
+                self.positions,
+                self.quaternions_xyzw,
+                kernel=self.kernel,
+                weights=self.weights,
+                symmetric=self.symmetric,
+            )
+            return density.log_density(p, q, cutoff=None, threads=threads)
+        log_rows = np.log(self.weights * np.where(self.symmetric, 0.5, 1.0))
+        frames = np.ascontiguousarray(self.frames.reshape(-1, 9))
+        out = np.empty(len(p))
+        for j in range(len(p)):
+            out[j] = rowloops.mixture_log_sum(
+                self.positions, self.quaternions_xyzw, frames, self.symmetric, self._own_frames, log_rows,
+                self._lowers, self._log_weights, self._wraps, p[j], q[j],
+            )  # fmt: skip
         return out + self.log_unit
 
     # -- sampling
@@ -327,21 +353,31 @@ class KernelRows:
         edges = np.cumsum(self.weights)
         steps = (np.arange(count) + rng.random()) / max(count, 1)
         row = np.minimum(np.searchsorted(edges, steps * edges[-1], side="right"), self.size - 1)
-        turned = self.symmetric[row] & (rng.random(count) < 0.5)
+        turned = rng.random(count) < 0.5
+        return self.displaced(row, turned, *self.displacements(count, rng))
+
+    def displacements(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Draw displacements from the kernel: translations (count, 3) in metres along a row's axes, and
+        turns (count, 4).
+        """
+        if isinstance(self.kernel, IsotropicKernel):
+            return self.kernel.sample_displacements(count, rng)
+        vectors = self._draw_vectors(count, rng)
+        return vectors[:, :3], se3.from_rotation_vector(vectors[:, 3:])
+
+    def displaced(
+        self, row: NDArray[np.intp], turned: NDArray[np.bool_], moves: Floats, turns: Floats
+    ) -> tuple[Floats, Floats]:
+        """Poses (n, 3), (n, 4) at displacements from rows (n,), or from their twins where they are ``turned``
+        and have one.
+        """
+        turned = turned & self.symmetric[row]
         centre = self.quaternions_xyzw[row]
         centre = np.where(turned[:, None], se3.jaw_twin(centre), centre)
-        if isinstance(self.kernel, IsotropicKernel):
-            moves, turns = self.kernel.sample_displacements(count, rng)
-        else:
-            vectors = self._draw_vectors(count, rng)
-            turns = se3.from_rotation_vector(vectors[:, 3:])
-            moves = np.einsum("nij,nj->ni", self.frames[row], vectors[:, :3])
-            if self._own_frames:
-                # The twin's own x and y axes point the other way.
-                turned_moves = np.einsum(
-                    "nij,nj->ni", self.frames[row], vectors[:, :3] * np.array([-1.0, -1.0, 1.0])
-                )
-                moves = np.where(turned[:, None], turned_moves, moves)
+        if not isinstance(self.kernel, IsotropicKernel):
+            # The twin's own x and y axes point the other way.
+            flip = np.where((turned & self._own_frames)[:, None], np.array([-1.0, -1.0, 1.0]), 1.0)
+            moves = np.einsum("nij,nj->ni", self.frames[row], moves * flip)
         return self.positions[row] + moves, se3.multiply(centre, turns)
 
     def _draw_vectors(self, count: int, rng: np.random.Generator) -> Floats:

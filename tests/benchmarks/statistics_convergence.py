@@ -20,7 +20,8 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.convergence import bootstrap_similarity, convergence_curve
+from graspdb_density.convergence import bootstrap_similarity
+from graspdb_density.growing import convergence_curve
 from graspdb_density.rows import LEAST, KernelRows
 from graspdb_density.threads import processors
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, choose_widths, se3
 from graspdb_density.anisotropy import empirical
 from graspdb_density.calibration import area_under_curve, assign_blocks, calibrate
-from graspdb_density.convergence import convergence_curve, verdict
+from graspdb_density.convergence import verdict
+from graspdb_density.growing import convergence_curve
 from graspdb_service.storage import objects, report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import Question

@@ -88,7 +88,8 @@ class ConvergenceReport(Report):
 
     With a stored kernel the second curve is the isotropic kernel matched to it (by equal determinants, equal
     likelihood of left-out grasps, or equal success of draws that were simulated as checks), and ``ratio`` the
-    grasps it needs over those the isotropic one needs.
+    grasps it needs over those the isotropic one needs. ``method`` says how the numbers were made: which
+    bootstrap, which subsets, and what stays while trials are added.
     """
 
     report: Literal["convergence"] = "convergence"
@@ -96,6 +97,7 @@ class ConvergenceReport(Report):
     held_out: int
     subsets: int
     replicates: int
+    method: str = ""
     curves: list[ConvergenceCurve]
     matching: Matching | None = None
     matched: bool | None = None

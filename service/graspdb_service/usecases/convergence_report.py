@@ -18,13 +18,8 @@ from graspdb.wire.reports import (
 )
 from graspdb.wire.reports import Verdict as VerdictModel
 from graspdb_density import GraspDensity, IsotropicKernel
-from graspdb_density.convergence import (
-    ConvergenceCurve,
-    convergence_curve,
-    curve_sizes,
-    needed_ratio,
-    verdict,
-)
+from graspdb_density.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
+from graspdb_density.growing import GrowingCurve
 from graspdb_density.matching import Match, match_determinants, match_likelihood, match_success, scaled
 from graspdb_density.rows import Kernel, KernelRows, Progress
 from graspdb_service.problems import conflict
@@ -39,6 +34,16 @@ from graspdb_service.usecases.reportparts import (
 )
 
 Floats = NDArray[np.float64]
+
+_METHOD = (
+    "eq 9: mean Bhattacharyya coefficient between the density of all grasps and bootstrap replicates of it,"
+    " at poses drawn from the density. All grasps: Poisson bootstrap (a replicate counts a grasp k times, k"
+    " of mean 1 and fixed by the grasp's place in commit order, renormalises, and is taken for one of as many"
+    " draws as there are grasps), so that new grasps add to what was summed. Fewer grasps: subsets drawn"
+    " without replacement from the first {prefix:,} in commit order, resampled with replacement. These"
+    " subsets, the held-out grasps and the poses drawn from the first {prefix:,} are chosen anew when the"
+    " number of grasps doubles"
+)
 
 SUBSETS, REPLICATES, POINTS = 5, 50, 20_000
 #: Widths whose draws are compared with a stored kernel's, as factors on those of equal determinants; how many
@@ -71,12 +76,15 @@ def convergence_report(
     if built.shaped is not None and built.kernel.alignment is not None:
         axes = shapes.axes(built.kernel.alignment, built.object_row, built.selected, sources.scenes.features)
         frames = shapes.axes_at(axes, density.positions, density.quaternions_xyzw)
-    curve = _curve(sources, density, kernel, frames, lambda done: progress(share * done))
+    grown = _curve(sources, built, None, kernel, frames, lambda done: progress(share * done))
+    curve = grown.curve
     curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
     extra: dict[str, Any] = {}
     if built.shaped is not None:
-        match = match or _matched(sources, density, kernel, frames, str(matching))
-        base = _curve(sources, density, match.kernel, None, lambda done: progress(0.5 + 0.5 * done))
+        match = match or _matched(sources, density, grown, kernel, frames, str(matching))
+        base = _curve(
+            sources, built, match, match.kernel, None, lambda done: progress(0.5 + 0.5 * done)
+        ).curve
         curves.append(_curve_model("isotropic, matched", _isotropic_info(match), base))
         ratio = needed_ratio(curve, base, level=LEVEL)
         extra = {"matching": matching, "matched": match.reached, "ratio": interval(*ratio)}
@@ -96,6 +104,7 @@ def convergence_report(
         held_out=curve.held_out,
         subsets=SUBSETS,
         replicates=REPLICATES,
+        method=_METHOD.format(prefix=grown.prefix),
         curves=curves,
         warnings=warnings,
         **extra,
@@ -103,14 +112,24 @@ def convergence_report(
 
 
 def _curve(
-    sources: Sources, density: GraspDensity, kernel: Kernel, frames: Floats | None, progress: Progress
-) -> ConvergenceCurve:
-    return said(
-        lambda: convergence_curve(
+    sources: Sources,
+    built: Built,
+    matched: Match | None,
+    kernel: Kernel,
+    frames: Floats | None,
+    progress: Progress,
+) -> GrowingCurve:
+    """The curve under a kernel: what was kept of it, and the trials that came since."""
+    density = built.density
+    assert density is not None
+
+    def grow(before: GrowingCurve | None, progress: Progress) -> GrowingCurve:
+        return GrowingCurve.grown(
+            before,
             density.positions,
             density.quaternions_xyzw,
             kernel,
-            weights=density.weights,
+            weights=density.raw_weights,
             symmetric=density.symmetric,
             frames=frames,
             subsets=SUBSETS,
@@ -119,20 +138,24 @@ def _curve(
             threads=sources.threads,
             progress=progress,
         )
-    )
+
+    return said(lambda: sources.curves.grown(built, matched, grow, progress))
 
 
 def _matched(
-    sources: Sources, density: GraspDensity, kernel: Kernel, frames: Floats | None, rule: str
+    sources: Sources,
+    density: GraspDensity,
+    grown: GrowingCurve,
+    kernel: Kernel,
+    frames: Floats | None,
+    rule: str,
 ) -> Match:
+    """By equal determinants, or by the likelihood of the first grasps, so that it stays while they do."""
     match = match_determinants(kernel)
     if rule == "determinants":
         return match
-    order = np.random.default_rng(0).permutation(density.size)
-    held, train = (
-        order[: max(1, min(2_000, density.size // 10))],
-        order[max(1, min(2_000, density.size // 10)) :],
-    )
+    order = np.random.default_rng(0).permutation(grown.prefix)
+    held, train = np.split(order, [max(1, min(2_000, grown.prefix // 10))])
     p, q, w = density.positions, density.quaternions_xyzw, density.weights
     if frames is not None and frames.ndim == 3:
         frames = frames[train]
@@ -144,7 +167,9 @@ def _matched(
         )  # fmt: skip
         return float(np.average(rows.log_density(p[held], q[held], threads=sources.threads), weights=w[held]))
 
-    return match_likelihood(likelihood(kernel), match.kernel, likelihood)
+    return sources.curves.match(
+        grown, rule, lambda: match_likelihood(likelihood(kernel), match.kernel, likelihood)
+    )
 
 
 def _by_success(sources: Sources, built: Built) -> Match:

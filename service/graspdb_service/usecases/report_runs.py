@@ -28,6 +28,7 @@ from graspdb_service.storage import checks, report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import Question, RunRow
 from graspdb_service.usecases import reports
+from graspdb_service.usecases.curves import KeptCurves
 from graspdb_service.usecases.densities import Densities, KernelChoice, kernel_of
 from graspdb_service.usecases.reportparts import Sources
 from graspdb_service.usecases.reports import Asked
@@ -43,6 +44,8 @@ _MAX_WAITING = 8
 _LEASE_S = 30.0
 _TICK_S = 2.0
 _POLL_S = 0.1
+#: Kept convergence curves may take this part of what densities may.
+_CURVES_SHARE = 4
 #: What the request is to blame for, and would be again: kept as the run's answer.
 _KEPT_STATUSES = (404, 409, 413, 422)
 
@@ -71,7 +74,8 @@ class ReportRuns:
         self._database = database
         self._densities = densities
         self._wait_s = settings.report_wait_s
-        self._sources = Sources(database, densities, scenes, settings.threads)
+        curves = KeptCurves(settings.max_density_cache_bytes // _CURVES_SHARE)
+        self._sources = Sources(database, densities, scenes, settings.threads, curves)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspdb-report")
         self._waiting = threading.BoundedSemaphore(_MAX_WAITING)
         self._held: dict[str, _Held] = {}

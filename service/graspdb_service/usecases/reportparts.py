@@ -14,6 +14,7 @@ from graspdb_service.problems import conflict
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases import alltrials
 from graspdb_service.usecases.alltrials import AllTrials
+from graspdb_service.usecases.curves import KeptCurves
 from graspdb_service.usecases.densities import Built, Densities
 from graspdb_service.usecases.scenes import Scenes
 
@@ -31,6 +32,7 @@ class Sources:
     densities: Densities
     scenes: Scenes
     threads: int
+    curves: KeptCurves
 
 
 def said(call: Callable[[], T]) -> T:
