@@ -101,6 +101,11 @@ class MassProperties:
         """Points (N, 3) of the object frame in the principal frame."""
         return np.asarray((points - np.array(self.centre)) @ self._axes, dtype=np.float64)
 
+    def radius_of(self, parts: Sequence[Part]) -> float:
+        """Farthest that any vertex is from the centre of mass, metres."""
+        centre = np.array(self.centre)
+        return max(float(np.linalg.norm(vertices - centre, axis=1).max()) for vertices, _ in parts)
+
 
 def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
     """Mass properties of a union of convex parts; where parts overlap, their common volume counts once
@@ -261,6 +266,8 @@ class Closing:
         The object's pose in the tool frame.
     steps : int
         Simulation steps spent.
+    ratings : tuple of float
+        Weights held at the same instants, over the object's, where they were rated.
     carried : Carried, optional
         How the object came through lift and shake, where that was asked for and the jaw had stalled.
     """
@@ -272,4 +279,5 @@ class Closing:
     position: Vector
     quaternion_xyzw: Quaternion
     steps: int
+    ratings: tuple[float, ...] = ()
     carried: Carried | None = None

@@ -37,7 +37,7 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 class BulletWorld:
-    """A jaw at the origin, its tool frame the world's; an object; and a ghost between the open fingers.
+    """A jaw at the origin, its tool frame the world's, and an object.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class BulletWorld:
             else:
                 self._jaw = self._build_gripper()
                 self._object = self._build_object(parts, self.mass)
-            self._column = self._build_column()
+            self._column, self._column_at = self._build_column()
             self._gear = self._build_gear() if by_faces else -1
             self._finish_bodies(math.sqrt(friction))
             if by_faces:
@@ -201,21 +201,12 @@ class BulletWorld:
             )
         return int(jaw), int(body)
 
-    def _build_column(self) -> int:
-        """A ghost as large as the space between the open fingers: it collides with nothing and answers
-        one question."""
+    def _build_column(self) -> tuple[int, Vector]:
+        """The space between the open fingers: a shape without a body, which would cost time at every step,
+        and its centre."""
         half = self.gripper.finger_half_extents
         shape = self._box((half[0], 0.5 * self.gripper.max_opening_m, half[2]))
-        body = int(
-            pybullet.createMultiBody(
-                baseMass=0.0,
-                baseCollisionShapeIndex=shape,
-                basePosition=(0.0, 0.0, self.gripper.tip_offset_m - half[2]),
-                physicsClientId=self._client,
-            )
-        )
-        pybullet.setCollisionFilterGroupMask(body, -1, 0, 0, physicsClientId=self._client)
-        return body
+        return shape, (0.0, 0.0, self.gripper.tip_offset_m - half[2])
 
     def _build_gear(self) -> int:
         """What couples the fingers while they carry: both joints move alike. Idle until then."""
@@ -281,6 +272,21 @@ class BulletWorld:
             self._object, -1, linearDamping=rate, angularDamping=rate, physicsClientId=self._client
         )
 
+    def _depth_between(self) -> float:
+        """How deep the object is in the space between the open fingers, metres; negative outside.
+
+        The deepest part counts: moved by less than its depth, it is still there.
+        """
+        points = pybullet.getClosestPoints(
+            bodyA=self._object,
+            bodyB=-1,
+            distance=0.0,
+            collisionShapeB=self._column,
+            collisionShapePositionB=self._column_at,
+            physicsClientId=self._client,
+        )
+        return max((-float(point[8]) for point in points), default=-math.inf)
+
     def frictions(self) -> list[float]:
         """Coefficients between the object and palm, first and second finger, as Bullet multiplies them."""
         roots = [
@@ -291,9 +297,6 @@ class BulletWorld:
 
     def _render(self) -> NDArray[np.uint8]:
         width, height = 640, 480
-        # The ghost column would be drawn: out of sight meanwhile.
-        column = pybullet.getBasePositionAndOrientation(self._column, physicsClientId=self._client)
-        pybullet.resetBasePositionAndOrientation(self._column, PARKED, IDENTITY, physicsClientId=self._client)
         lens = pybullet.computeProjectionMatrixFOV(fov=32.0, aspect=width / height, nearVal=0.02, farVal=4.0)
         views = []
         # Along the fingers' width, and obliquely from the tips; the approach points down.
@@ -310,5 +313,4 @@ class BulletWorld:
                 physicsClientId=self._client,
             )
             views.append(np.asarray(pixels, dtype=np.uint8).reshape(height, width, 4)[:, :, :3])
-        pybullet.resetBasePositionAndOrientation(self._column, *column, physicsClientId=self._client)
         return np.concatenate(views, axis=1)

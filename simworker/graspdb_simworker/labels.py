@@ -359,7 +359,10 @@ def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float
         return SIMULATION_ERROR
     if closing.carried is not None:
         return _carried_label(closing.carried, width)
-    quality = statistics.median(rating(now, gripper, mass_kg, friction) for now in closing.contacts[-RATED:])
+    ratings = closing.ratings[-RATED:] or [
+        rating(now, gripper, mass_kg, friction) for now in closing.contacts[-RATED:]
+    ]
+    quality = statistics.median(ratings)
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
 
 

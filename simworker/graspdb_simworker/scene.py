@@ -63,6 +63,9 @@ SLACK_S = 1.0
 LOST = 5.0
 """A carried object this many times farther away than allowed is lost: no need to see where it ends."""
 _EMPTY_CHECK_STEPS = 10
+_SURELY_BETWEEN = 0.8
+"""An object that no point of which moved by this share of its depth between the fingers is still there."""
+_ANY_LINK = -2
 _GEAR_FORCES = 100.0
 """The coupling of the fingers may exert so many times the closing force: as good as rigid."""
 
@@ -146,6 +149,9 @@ class GraspWorld(BulletWorld):
         """The last closing from two sides, each (480, 1280, 3), drawn by pybullet's CPU renderer; the end
         is last. Empty unless the world is visible."""
         self._to_body = self.mass.inverse_rotation()
+        self._radius = self.mass.radius_of(parts)
+        # Where the object was when it was last looked for between the fingers, and how deep.
+        self._seen: tuple[Vector, Quaternion, float] | None = None
         try:
             self._damp(self._damping)
             self._park()
@@ -188,14 +194,14 @@ class GraspWorld(BulletWorld):
         client, jaw, body = self._client, self._jaw, self._object
         gripper, stepping = self.gripper, self.stepping
         where, orientation = self._body_pose(position, quaternion_xyzw)
+        # Parking left the object at rest and the motors driven at the steps of the approach.
         pybullet.resetBasePositionAndOrientation(body, where, orientation, physicsClientId=client)
-        pybullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
+        self._seen = None
         start = gripper.max_opening_m * 0.5 - max(0.0, travel_m - APPROACH_GAP_M)
         for joint in (0, 1):
             pybullet.resetJointState(jaw, joint, start, -gripper.max_speed_m_s, physicsClientId=client)
 
         dt = stepping.approach_dt_s
-        self._drive(dt)
         touched = by_faces = False
         elapsed = 0.0
         limit = 2.0 * start / gripper.max_speed_m_s + SLACK_S
@@ -203,25 +209,27 @@ class GraspWorld(BulletWorld):
         # The opening at the beginning of the running stall window.
         mark_opening, mark_time = opening, 0.0
         contacts: list[Contacts] = []
+        ratings: list[float] = []
         steps = 0
         end = End.TIMEOUT
+        # What is done at every step costs as much as the physics of a light one: names looked up once, and
+        # arguments without their names.
+        step, states, touching = pybullet.stepSimulation, pybullet.getJointStates, pybullet.getContactPoints
+        visible, joints = self._visible, (0, 1)
         while elapsed < limit:
-            pybullet.stepSimulation(physicsClientId=client)
+            step(client)
             steps += 1
             elapsed += dt
-            if self._visible:
+            if visible:
                 self._film(dt)
-            first, second = pybullet.getJointStates(jaw, (0, 1), physicsClientId=client)
+            first, second = states(jaw, joints, client)
             opening = first[0] + second[0]
-            if not math.isfinite(opening):
-                end = End.UNSTABLE
-                break
-            if opening <= 0.0:
-                end = End.EMPTY
+            if not 0.0 < opening < math.inf:
+                end = End.EMPTY if math.isfinite(opening) else End.UNSTABLE
                 break
             if not touched:
                 pressing = 0
-                for contact in pybullet.getContactPoints(jaw, body, physicsClientId=client):
+                for contact in touching(jaw, body, _ANY_LINK, _ANY_LINK, client):
                     if contact[9] > 0.0:
                         pressing |= 1 << (contact[3] + 1)
                 if pressing & 0b110 == 0b110:
@@ -231,9 +239,11 @@ class GraspWorld(BulletWorld):
                         self._drive(dt)
                     mark_opening, mark_time = opening, elapsed
                     contacts.clear()
+                    ratings.clear()
             if mark_opening - opening > STALL_PROGRESS_M:
                 mark_opening, mark_time = opening, elapsed
                 contacts.clear()
+                ratings.clear()
             elif elapsed - mark_time >= READING_AGES_S[len(contacts)] - 1e-9:
                 if self._lifts and not by_faces:
                     # Stalled, so from now on by faces, which takes many times as long; and until it has
@@ -243,18 +253,19 @@ class GraspWorld(BulletWorld):
                     mark_opening, mark_time = opening, elapsed
                     continue
                 contacts.append(self._contacts())
+                if not self._lifts:
+                    ratings.append(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction))
                 if (
                     self._lifts
                     or len(contacts) == len(READING_AGES_S)
-                    or rating(contacts[-1], gripper, self.mass.mass_kg, self.friction)
-                    >= NO_DOUBT[len(contacts) - 1]
+                    or ratings[-1] >= NO_DOUBT[len(contacts) - 1]
                 ):
                     end = End.STALLED
                     break
             if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
                 end = End.EMPTY
                 break
-        closing = self._closing(end, touched, opening, contacts, steps)
+        closing = self._closing(end, touched, opening, contacts, ratings, steps)
         if self._lifts and closing.end is End.STALLED:
             return replace(closing, carried=self._carry())
         return closing
@@ -275,15 +286,14 @@ class GraspWorld(BulletWorld):
         # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
         pybullet.setPhysicsEngineParameter(fixedTimeStep=dt, physicsClientId=self._client)
         speed, force = -self.gripper.max_speed_m_s, self.gripper.closing_force_n
-        for joint in (0, 1):
-            pybullet.setJointMotorControl2(
-                self._jaw,
-                joint,
-                pybullet.VELOCITY_CONTROL,
-                targetVelocity=speed,
-                force=force,
-                physicsClientId=self._client,
-            )
+        pybullet.setJointMotorControlArray(
+            self._jaw,
+            (0, 1),
+            pybullet.VELOCITY_CONTROL,
+            targetVelocities=(speed, speed),
+            forces=(force, force),
+            physicsClientId=self._client,
+        )
 
     def _contacts(self) -> Contacts:
         contacts = [
@@ -352,10 +362,30 @@ class GraspWorld(BulletWorld):
         return Carried(held, translation, rotation)
 
     def _between(self) -> bool:
-        return bool(pybullet.getClosestPoints(self._object, self._column, 0.0, physicsClientId=self._client))
+        """Whether any of the object is in the space between the open fingers.
+
+        A convex part that is in it by a depth d, the least translation that would part the two, can't be out
+        of it before one of its points has moved by d: so the collision test, which takes as long as a step,
+        is not made again until then.
+        """
+        where, orientation = pybullet.getBasePositionAndOrientation(self._object, self._client)
+        if self._seen is not None:
+            then, turned, depth = self._seen
+            moved = math.dist(where, then) + self._radius * lifting.angle_between(turned, orientation)
+            if moved < _SURELY_BETWEEN * depth:
+                return True
+        depth = self._depth_between()
+        self._seen = (where, orientation, depth)
+        return depth > -math.inf
 
     def _closing(
-        self, end: End, touched: bool, opening: float, contacts: Sequence[Contacts], steps: int
+        self,
+        end: End,
+        touched: bool,
+        opening: float,
+        contacts: Sequence[Contacts],
+        ratings: Sequence[float],
+        steps: int,
     ) -> Closing:
         where, orientation = pybullet.getBasePositionAndOrientation(
             self._object, physicsClientId=self._client
@@ -369,8 +399,8 @@ class GraspWorld(BulletWorld):
         quaternion = multiply(orientation, self._to_body)
         shift = rotate(quaternion, self.mass.centre)
         position = (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2])
-        held = tuple(contacts) if end is End.STALLED else ()
-        return Closing(end, touched, opening, held, position, quaternion, steps)
+        held, rated = (tuple(contacts), tuple(ratings)) if end is End.STALLED else ((), ())
+        return Closing(end, touched, opening, held, position, quaternion, steps, ratings=rated)
 
     def _park(self) -> None:
         """Empty Bullet's caches: the object far away, one step without any contact."""
