@@ -26,7 +26,7 @@ from .threads import for_blocks
 if TYPE_CHECKING:
     from .density import GraspDensity
 
-__all__ = ["Admissible", "Maximum", "Pool", "Search", "nearest", "search"]
+__all__ = ["Admissible", "Maximum", "Pool", "Search", "distinct_from", "nearest", "search"]
 
 #: Whether poses (K, 3), (K, 4) are free of what a region can't express, collisions for one: (K,) bool.
 Admissible = Callable[[Floats, Floats], NDArray[np.bool_]]
@@ -186,12 +186,16 @@ class Search:
         if not len(found):
             return []
         logs = self.density.log_density(found.positions, found.quaternions)
-        scores = self.values(found, logs)
-        maxima = [
-            Maximum(p, se3.canonical(q), float(log), self.region.active(p, q), float(score))
-            for p, q, log, score in zip(found.positions, found.quaternions, logs, scores, strict=True)
+        return self.maxima(found, logs, logs)
+
+    def maxima(self, found: Pool, logs: Floats, scores: Floats) -> list[Maximum]:
+        """What is answered, best first."""
+        order = np.argsort(-scores, kind="stable")
+        p, q = found.positions[order], se3.canonical(found.quaternions[order])
+        return [
+            Maximum(p[i], q[i], float(logs[row]), self.region.active(p[i], q[i]), float(scores[row]))
+            for i, row in enumerate(order)
         ]
-        return sorted(maxima, key=lambda m: -m.score)
 
     @property
     def rough(self) -> int:
@@ -202,10 +206,6 @@ class Search:
         """So many kernel widths, in metres and radians."""
         kernel = self.density.kernel
         return count * kernel.sigma_position_m, count * kernel.sigma_rotation
-
-    def values(self, found: Pool, logs: Floats) -> Floats:
-        """The scores to report of poses with these log densities."""
-        return logs
 
     def starts(self, wanted: int, separation_m: float, separation: float) -> Pool:
         """Distinct feasible poses to climb from, admissible ones only, the most promising first."""
@@ -465,6 +465,26 @@ class Search:
             np.where(moved, scores[each, winner], ends.sums),
         )
         return there, np.where(moved, np.minimum(step, 1.0), 0.6 * step)
+
+
+def distinct_from(
+    positions: Floats, quaternions: Floats, *, separation_m: float, separation: float, twins: bool
+) -> Admissible:
+    """Whether a pose is distinct from all given ones (N, 3), (N, 4): farther apart or turned by more.
+
+    With ``twins`` a pose and the one turned half around the jaw's approach are the same.
+    """
+
+    def distinct(p: Floats, q: Floats) -> NDArray[np.bool_]:
+        near = np.zeros(len(p), dtype=np.bool_)
+        for at, to in zip(positions, quaternions, strict=True):
+            angle = se3.angle_between(q, to)
+            if twins:
+                angle = np.minimum(angle, se3.angle_between(q, se3.jaw_twin(to)))
+            near |= (np.linalg.norm(p - at, axis=1) <= separation_m) & (angle <= separation)
+        return ~near
+
+    return distinct
 
 
 def best_of(pool: Pool, share: float, most: int) -> Pool:

@@ -2,7 +2,7 @@
 
 A density has its own climb (`maximum`). A success probability's lower end, an expectation under noise or a
 mixture kernel's density have none; here they are searched by values alone, from where an isotropic density is
-high.
+high: first by random steps, then by evolution strategies that learn how the score falls off.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from cmaes import CMA
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from . import se3
-from .maximum import Admissible, Maximum, Pool, Search
+from .maximum import Admissible, Maximum, Pool, Search, distinct_from
 from .region import Region
 from .se3 import Floats
 
@@ -36,13 +37,18 @@ _CANDIDATES = 192
 #: Centres whose score is asked for before any is climbed from: a density tells little of where another score
 #: is high.
 _ASKED = 4096
-#: Climbs, random steps a climb tries at a time, and how often: many for a little, the best of them further.
-_PHASES = ((64, 8, 12), (12, 12, 24), (3, 24, 20))
+#: First climbs, by random steps: how many, steps one tries at a time, how often.
+_FIRST, _TRIES, _ROUNDS = 64, 8, 12
+#: Of what they passed, so many are valued by the score itself. From the best the last climbs start: so many
+#: for so many generations, then the best of them, each of so many poses a generation.
+_FINALISTS, _LAST, _POPULATION = 32, ((12, 12), (6, 12), (3, 24)), 14
+#: Generations of a runner-up's climb, which stays away from the other answers, and how many climb.
+_RUNNER_UP, _RUNNERS_UP = 20, 8
 #: Draws around centres in reach, and how many of them may join the starts: where the nearest poses of centres
 #: are refused, others may not be.
 _DRAWN, _JOINING = 2048, 64
 #: Steps in kernel widths.
-_FIRST_STEP, _LAST_STEP = 0.6, 5e-3
+_FIRST_STEP, _LAST_STEP = 0.6, 0.4
 
 
 def search_scored(
@@ -55,16 +61,20 @@ def search_scored(
     min_separation: float = math.radians(20.0),
     admissible: Admissible | None = None,
     pull: Pull | None = None,
+    rough: Score | None = None,
     threads: int = 1,
 ) -> list[Maximum]:
     """The ``count`` best distinct grasps by ``score``, best first; arguments as in `maximum.search`.
 
     Candidates are well separated centres of the density, projected into the region, those of the highest
     score among at most 4,096 centres: half of them where the density is highest, half drawn at random. The
-    best climb by random steps, drawn from a fixed seed, that shrink as they fail. ``Maximum.score`` is the
-    score. ``pull`` brings poses nearer to where they are admissible; random steps end where it puts them.
+    best climb by random steps that shrink as they fail. Of where these led, the best climb on by CMA-ES
+    (Hansen and Ostermeier, 2001), which learns along which directions a score falls off slowly. All is drawn
+    from fixed seeds. ``Maximum.score`` is the score. ``pull`` brings poses nearer to where they are
+    admissible; random steps end where it puts them. ``rough``, nearly the score but faster, ranks candidates
+    and leads the first climbs.
     """
-    found = _ScoredSearch(density, region or Region(), admissible, threads, score, pull)
+    found = _ScoredSearch(density, region or Region(), admissible, threads, score, pull, rough or score)
     return found.run(count, min_separation_m, min_separation)
 
 
@@ -79,23 +89,51 @@ class _ScoredSearch(Search):
         threads: int,
         score: Score,
         pull: Pull | None,
+        rough: Score,
     ) -> None:
         super().__init__(density, region, admissible, threads)
         self.score = score
         self.pull = pull
+        self.felt = rough
 
-    @property
-    def rough(self) -> int:
-        return 1
+    def run(self, count: int, separation_m: float, separation: float) -> list[Maximum]:
+        apart = separation_m, separation
+        starts = self.starts(max(self.starts_wanted, 3 * count), *self.widths(1.0))
+        if count > 1 and len(starts):
+            # Runners-up may have to be farther apart than the best starts are.
+            starts = starts.joined(self.starts(2 * count, *apart))
+        if not len(starts):
+            return []
+        pool = self.first_climbs(starts)
+        best = self.scored(pool.take(self.choose(pool, max(count, _FINALISTS), *apart))).sort()
+        best = best.joined(self.last_climbs(best, _LAST)).sort()
+        best = best.take(self.choose(best, count, *apart))
+        for place in range(1, min(len(best), _RUNNERS_UP)):
+            rest = best.take(np.arange(len(best)) != place)
+            away = distinct_from(
+                rest.positions,
+                rest.quaternions,
+                separation_m=separation_m,
+                separation=separation,
+                twins=self.twins,
+            )
+            on = self.last_climbs(best.take(np.array([place])), ((1, _RUNNER_UP),), away)
+            best.positions[place], best.quaternions[place], best.sums[place] = (
+                on.positions[0],
+                on.quaternions[0],
+                on.sums[0],
+            )
+        logs = self.density.log_density(best.positions, best.quaternions)
+        return self.maxima(best, logs, best.sums)
 
     def sums(self, positions: Floats, quaternions: Floats) -> Floats:
-        values = np.asarray(self.score(positions, quaternions), dtype=np.float64)
+        return self.asked(self.score, positions, quaternions)
+
+    def asked(self, score: Score, positions: Floats, quaternions: Floats) -> Floats:
+        values = np.asarray(score(positions, quaternions), dtype=np.float64)
         if values.shape != (len(positions),):
             raise ValueError(f"the score answered shape {values.shape} for {len(positions)} poses")
         return values
-
-    def values(self, found: Pool, logs: Floats) -> Floats:
-        return self.sums(found.positions, found.quaternions)
 
     def candidates(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.bool_]]]:
         promise, turned = self.scores(0, self.density.size)
@@ -131,31 +169,70 @@ class _ScoredSearch(Search):
         p, q, inside = self.region.project(positions, quaternions)
         if self.pull is not None:
             p, q = self.pull(p, q)
-            inside &= self.region.contains(p, q)
-        return p, q, inside
+        return p, q, inside & self.region.contains(p, q)
 
     def valued(self, positions: Floats, quaternions: Floats) -> Pool:
-        return self.scored(Pool(positions, quaternions, np.zeros(len(positions)))).sort()
+        return Pool(positions, quaternions, self.asked(self.felt, positions, quaternions)).sort()
 
-    def climbed(self, starts: Pool, finalists: int) -> tuple[Pool, Pool]:
+    def first_climbs(self, starts: Pool) -> Pool:
+        """The starts and what random steps from the best of them passed, by the rough score, best first."""
         rng = np.random.default_rng(0)
-        ends, step, passed = starts, np.full(len(starts), _FIRST_STEP), starts.take(np.arange(0))
-        for climbers, tries, rounds in _PHASES:
-            order = np.argsort(-ends.sums, kind="stable")[: max(climbers, finalists)]
-            ends, step = ends.take(order), step[order]
-            for _ in range(rounds):
-                ends, step, moved = self.tried(ends, step, tries, rng)
-                passed = passed.joined(ends.take(moved))
-                if step.max() < _LAST_STEP:
-                    break
-        return passed, ends
+        ends, pool = starts.take(np.argsort(-starts.sums, kind="stable")[:_FIRST]), starts
+        step = np.full(len(ends), _FIRST_STEP)
+        for _ in range(_ROUNDS):
+            ends, step, moved = self.tried(ends, step, _TRIES, rng)
+            pool = pool.joined(ends.take(moved))
+        return pool.sort()
 
-    def pool(self, starts: Pool, passed: Pool, ends: Pool, most: int) -> Pool:
-        return starts.joined(passed).joined(ends).sort()
+    def last_climbs(
+        self, starts: Pool, plan: tuple[tuple[int, int], ...], kept: Admissible | None = None
+    ) -> Pool:
+        """The best admissible pose that evolution from each start found, of the best starts.
 
-    def explore(self, pool: Pool) -> Pool:
-        """Nothing: the climbs were of admissible steps."""
-        return pool.take(np.arange(0))
+        Parameters
+        ----------
+        starts
+            With their scores.
+        plan
+            How many climb, for how many generations, how many of them go on, and so forth.
+        kept
+            Refuses poses besides ``admissible``.
+        """
+        found = Pool(starts.positions.copy(), starts.quaternions.copy(), starts.sums.copy())
+        climbs = [CMA(np.zeros(6), _LAST_STEP, seed=0, population_size=_POPULATION) for _ in found.sums]
+        on = begun = np.argsort(-found.sums, kind="stable")[: plan[0][0]]
+        for climbers, generations in plan:
+            on = on[np.argsort(-found.sums[on], kind="stable")[:climbers]]
+            for _ in range(generations):
+                steps = np.array([[climbs[i].ask() for _ in range(_POPULATION)] for i in on])
+                poses = self.stepped_to(starts.take(np.repeat(on, _POPULATION)), steps.reshape(-1, 6), kept)
+                for i, moves, part in zip(on, steps, np.split(np.arange(len(poses)), len(on)), strict=True):
+                    # What is refused ranks last, the farther the later.
+                    ranked = np.lexsort((np.sum(moves**2, axis=1), -poses.sums[part]))
+                    places = np.argsort(ranked).astype(np.float64)
+                    climbs[i].tell(list(zip(moves, places.tolist(), strict=True)))
+                    top = part[ranked[0]]
+                    if poses.sums[top] > found.sums[i]:
+                        found.positions[i], found.quaternions[i] = (
+                            poses.positions[top],
+                            poses.quaternions[top],
+                        )
+                        found.sums[i] = poses.sums[top]
+        return found.take(begun)
+
+    def stepped_to(self, at: Pool, steps: Floats, kept: Admissible | None) -> Pool:
+        """Poses ``steps`` (K, 6) kernel widths away, with scores: -inf where they are refused."""
+        kernel = self.density.kernel
+        away = steps * np.repeat([kernel.sigma_position_m, kernel.sigma_rotation], 3)
+        turned = se3.multiply(at.quaternions, se3.from_rotation_vector(away[:, 3:]))
+        p, q, allowed = self.landed(at.positions + away[:, :3], turned)
+        for refuses in (kept, self.admissible and self.check):
+            if refuses is not None and allowed.any():
+                allowed[allowed] = refuses(p[allowed], q[allowed])
+        values = np.full(len(p), -np.inf)
+        if allowed.any():
+            values[allowed] = self.sums(p[allowed], q[allowed])
+        return Pool(p, q, values)
 
     def tried(
         self, ends: Pool, step: Floats, tries: int, rng: np.random.Generator
@@ -176,7 +253,7 @@ class _ScoredSearch(Search):
         turns = se3.from_rotation_vector(rng.standard_normal(at.shape) * scale * kernel.sigma_rotation)
         p, q, inside = self.landed(away, se3.multiply(to, turns))
         scores = np.full(len(p), -np.inf)
-        scores[inside] = self.sums(p[inside], q[inside])
+        scores[inside] = self.asked(self.felt, p[inside], q[inside])
         better = scores > np.repeat(ends.sums, tries)
         if self.admissible is not None and better.any():
             better[better] = self.check(p[better], q[better])

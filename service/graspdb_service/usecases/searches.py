@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, Maximum, MixtureDensity, se3, search_scored
-from graspdb_density.maximum import Admissible
+from graspdb_density.maximum import Admissible, distinct_from
 from graspdb_density.scored import Score
 from graspdb_geometry.grippers import GripperShape
 from graspdb_service.usecases.constraints import Constraints, Poses
@@ -29,8 +29,8 @@ _CANDIDATES = 1_024
 #: A chance is told within so many standard deviations of a success, position and rotation together. Farther
 #: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
 _NEAR = 2.0
-#: Grasps found by the quick score that are scored again, those that go on climbing, by so many steps.
-_FINALISTS, _POLISHED, _TRIES, _ROUNDS = 32, 4, 16, 40
+#: Candidates that the quick score ranks first are scored by the score itself, at least so many.
+_FEW = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +150,7 @@ def near_successes(density: GraspDensity, reach: float, threads: int) -> Callabl
 def _away_from(
     poses: Poses, separation: tuple[float, float], twins: bool
 ) -> Callable[[Floats, Floats], Bools]:
-    def away(positions: Floats, quaternions: Floats) -> Bools:
-        near = np.zeros(len(positions), dtype=np.bool_)
-        for p, q in zip(*poses, strict=True):
-            angle = se3.angle_between(quaternions, q)
-            if twins:
-                angle = np.minimum(angle, se3.angle_between(quaternions, se3.jaw_twin(q)))
-            near |= (np.linalg.norm(positions - p, axis=1) <= separation[0]) & (angle <= separation[1])
-        return ~near
-
-    return away
+    return distinct_from(*poses, separation_m=separation[0], separation=separation[1], twins=twins)
 
 
 def _clear_of(
@@ -191,55 +182,18 @@ def found(question: Question) -> list[Maximum]:
             admissible=question.admissible,
             threads=question.threads,
         )
-    assert question.quick is not None
-    exact = question.quick is question.score
-    found = search_scored(
+    return search_scored(
         density,
-        question.quick,
+        question.score,
         question.limits.region,
-        count=request.count if exact else max(request.count, _FINALISTS),
+        count=request.count,
         min_separation_m=separation_m,
         min_separation=separation,
         admissible=question.admissible,
         pull=NearSuccesses(density).pull if question.of_chances else None,
+        rough=question.quick,
         threads=question.threads,
     )
-    return found if exact or not found else _polished(question, question.score, found)[: request.count]
-
-
-def _polished(question: Question, score: Score, found: list[Maximum]) -> list[Maximum]:
-    """Grasps by their own score, best first, the best of them after some more random steps uphill."""
-    kernel, region = question.density.kernel, question.limits.region
-    twins = bool(question.density.symmetric.all())
-    p, q = np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
-    values = score(p, q)
-    rng = np.random.default_rng(0)
-    for top in np.argsort(-values, kind="stable")[
-        : max(_POLISHED, min(question.request.count, 2 * _POLISHED))
-    ]:
-        others = np.arange(len(found)) != top
-        away = _away_from((p[others], q[others]), question.separation, twins)
-        step = 0.4
-        for _ in range(_ROUNDS):
-            turns = se3.from_rotation_vector(rng.standard_normal((_TRIES, 3)) * step * kernel.sigma_rotation)
-            moved = p[top] + rng.standard_normal((_TRIES, 3)) * step * kernel.sigma_position_m
-            at, to, inside = region.project(moved, se3.multiply(q[top], turns))
-            at, to = at[inside], to[inside]
-            there = score(at, to) if len(at) else np.empty(0)
-            better = np.flatnonzero(there > values[top])
-            better = better[away(at[better], to[better])] if len(better) else better
-            if len(better) and question.admissible is not None:
-                better = better[question.admissible(at[better], to[better])]
-            if len(better):
-                best = better[np.argmax(there[better])]
-                p[top], q[top], values[top] = at[best], to[best], there[best]
-            else:
-                step *= 0.6
-    logs = question.asked.log_density(p, q, threads=question.threads)
-    return [
-        Maximum(p[i], se3.canonical(q[i]), float(logs[i]), region.active(p[i], q[i]), float(values[i]))
-        for i in np.argsort(-values, kind="stable")
-    ]
 
 
 def _ranked(question: Question, poses: Poses) -> list[Maximum]:
@@ -251,7 +205,7 @@ def _ranked(question: Question, poses: Poses) -> list[Maximum]:
     if not len(index):
         return []
     p, q = poses[0][index], poses[1][index]
-    few = max(request.count, _FINALISTS)
+    few = max(request.count, _FEW)
     if question.quick is not question.score and question.quick is not None and len(p) > few:
         # Only those that may be among the best are worth the score itself.
         best = np.argsort(-question.quick(p, q), kind="stable")[:few]
