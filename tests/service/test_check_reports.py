@@ -14,9 +14,12 @@ import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sqlalchemy import select
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import se3
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.tables import report_runs
 
 Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
 Post = Callable[..., dict[str, Any]]
@@ -228,3 +231,40 @@ def test_convergence_matched_by_the_success_of_simulated_draws(filled: httpx.Cli
         assert any("matches by success" in warning for warning in body["warnings"])
         ends = (widths[0], widths[-1])
         assert min(abs(matched["kernel"]["sigma_position_m"] / end - 1.0) for end in ends) < 0.02
+
+
+def test_answers_about_past_checks_are_not_kept(filled: httpx.Client, database_url: str) -> None:
+    """Reports that say what became of checks: one answer a question, however often checks finish."""
+    http = filled
+    database = Database(database_url)
+
+    def kept() -> list[tuple[str, int, str]]:
+        with database.read() as tx:
+            rows = tx.execute(select(report_runs.c.report, report_runs.c.revision, report_runs.c.parameters))
+            return sorted((r.report, r.revision, str(r.parameters["filters"]["protocol"])) for r in rows)
+
+    for path in ("bandwidth", "calibration", "anisotropy"):
+        ok(http.get(PATH + path))
+    before = kept()
+    assert [report for report, _, _ in before] == ["anisotropy", "bandwidth", "calibration"]
+    for seed in range(2):
+        sample = {"count": 30, "seed": seed}
+        made = http.post("/objects/thing/sweeps", json={"sample": sample, "gripper": "pg70",
+                         "protocol": "wrench", "purpose": "check"})  # fmt: skip
+        assert made.status_code == 202, made.text
+        simulate(http)
+        for path in ("bandwidth", "calibration", "anisotropy"):
+            ok(http.get(PATH + path))
+        assert kept() == before
+    # Another revision's answers go with the checks', those of other questions stay.
+    ok(http.get(PATH + "bandwidth?gripper=pg70"))
+    assert kept() == before
+    http.post("/objects/thing/trials", json={"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1],
+              "outcome": True, "gripper": "pg70", "protocol": "wrench"}).raise_for_status()  # fmt: skip
+    ok(http.get(PATH + "bandwidth"))
+    assert [(report, revision > before[0][1]) for report, revision, _ in kept()] == [
+        ("anisotropy", False),
+        ("bandwidth", True),
+        ("calibration", False),
+    ]
+    database.dispose()

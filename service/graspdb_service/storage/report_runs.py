@@ -13,6 +13,9 @@ from graspdb_service.storage.database import Tx, unix_now
 from graspdb_service.storage.tables import objects, report_runs
 from graspdb_service.storage.upsert import insert
 
+#: The option that stands for the checks there are: another one whenever they change.
+CHECKS = "checks"
+
 
 @dataclass(frozen=True)
 class RunRow:
@@ -83,16 +86,33 @@ def ask(tx: Tx, question: Question, *, id: str, lease_id: str, lease_s: float) -
     ).first()
     if made is None:
         return _take(tx, _same(question), lease)
-    # Answers to the same question about a past state of the object are asked for no more.
-    tx.execute(
-        delete(report_runs).where(
-            report_runs.c.object_id == question.object_id,
-            report_runs.c.parameters_key == question.parameters_key,
-            report_runs.c.revision < question.revision,
-            or_(report_runs.c.state != "running", report_runs.c.lease_expires_at < unix_now()),
-        )
-    )
+    _delete_superseded(tx, question)
     return True
+
+
+def _delete_superseded(tx: Tx, question: Question) -> None:
+    """Delete answers to the same question about a past state of the object or of its checks: they are asked
+    for no more. Who computes one goes on.
+    """
+    runs = select(report_runs.c.id, report_runs.c.revision, report_runs.c.parameters).where(
+        report_runs.c.object_id == question.object_id,
+        report_runs.c.report == question.report,
+        report_runs.c.revision <= question.revision,
+        or_(report_runs.c.state != "running", report_runs.c.lease_expires_at < unix_now()),
+    )
+    wanted = _without_checks(question.parameters)
+    superseded = [
+        run.id
+        for run in tx.execute(runs)
+        if _without_checks(run.parameters) == wanted
+        and (run.revision < question.revision or run.parameters != question.parameters)
+    ]
+    tx.execute(delete(report_runs).where(report_runs.c.id.in_(superseded)))
+
+
+def _without_checks(parameters: dict[str, Any]) -> dict[str, Any]:
+    options = parameters.get("options", {})
+    return {**parameters, "options": {k: v for k, v in options.items() if k != CHECKS}}
 
 
 def take_over(tx: Tx, id: str, *, lease_id: str, lease_s: float) -> bool:

@@ -105,7 +105,7 @@ class ReportRuns:
         if report in _OF_CHECKS or given.get("matching") == "success":
             # Checks change no revision: what of them there is belongs to the question.
             with self._database.read() as tx:
-                given["checks"] = checks.stamp(tx, row.id)
+                given[report_runs.CHECKS] = checks.stamp(tx, row.id)
         asked = Asked(report, selected.filters, choice, given)
         document = asked.document()
         digest = hashlib.sha256(json.dumps([document, __version__], sort_keys=True).encode()).hexdigest()
