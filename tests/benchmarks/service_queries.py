@@ -6,7 +6,8 @@ along the normal within 20 mm; approach the inward normal plus noise, roll unifo
 searches have to look for the edge of the free space.
 
 Best grasps are timed over HTTP and in process, by the clock and by the processor's time; in process also
-under wider kernels, most of which reach each other, without a collision test.
+under wider kernels, most of which reach each other, without a collision test. All kinds of request take
+turns, some of each in every round, so that what else the machine does meets them alike.
 """
 
 from __future__ import annotations
@@ -36,10 +37,13 @@ from graspdb_density import se3
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases import bestgrasp
+from graspdb_service.usecases.context import Context
 
 Floats = NDArray[np.float64]
 AXES = np.array([0.06, 0.03, 0.03])
 KERNELS = (20_000, 160_000)
+ROUNDS = 5
+DENSE = {"sigma_position_m": 0.015, "sigma_rotation_deg": 15.0, "collision_free": False}
 
 
 def shell(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -133,7 +137,7 @@ def timed(call: Callable[[], httpx.Response]) -> float:
 
 def told(name: str, times: list[float], note: str = "") -> None:
     p50, p99 = np.percentile(times, [50, 99])
-    print(f"{name:46s} p50 {p50:9.1f} ms   p99 {p99:9.1f} ms   n {len(times):4d}   {note}", flush=True)
+    print(f"{name:58s} p50 {p50:9.1f} ms   p99 {p99:9.1f} ms   n {len(times):4d}   {note}", flush=True)
 
 
 def workspace(rng: np.random.Generator) -> dict[str, Any]:
@@ -149,31 +153,90 @@ def workspace(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def in_process(database: str, slug: str, rng: np.random.Generator) -> None:
-    """The same question to the use case, in this process over the same database; then with wide kernels."""
-    context = create_app(Settings(database_url=database)).state.context
+class Asked:
+    """The same questions over HTTP, by several clients, and to the use case in this process."""
+
+    def __init__(self, url: str, context: Context, slug: str, rng: np.random.Generator) -> None:
+        self.context, self.slug, self.rng = context, slug, rng
+        self.clients = [httpx.Client(base_url=url, timeout=300) for _ in range(4)]
+        self.http = self.clients[0]
+        self.times: dict[str, list[float]] = {}
+        self.notes: dict[str, str] = {}
+
+    def close(self) -> None:
+        for client in self.clients:
+            client.close()
+
+    def took(self, name: str, times: list[float]) -> None:
+        self.times.setdefault(name, []).extend(times)
+
+    def best(self, client: httpx.Client) -> httpx.Response:
+        return client.get(f"/objects/{self.slug}/best-grasp", params=workspace(self.rng))
+
+    def in_process(self, more: dict[str, Any]) -> tuple[float, float]:
+        """Milliseconds by the clock and of the processor."""
+        asked = {
+            key: [float(x) for x in value.split(",")] if isinstance(value, str) else value
+            for key, value in workspace(self.rng).items()
+        }
+        request = BestGraspRequest(**(asked | more))
+        started, busy = time.perf_counter(), time.process_time()
+        bestgrasp.best_grasps(self.context, self.slug, request)
+        return (time.perf_counter() - started) * 1000, (time.process_time() - busy) * 1000
+
+    def likelihoods(self, name: str, body: bytes, times: int) -> None:
+        """Posts a body of poses, and asks whether the service is alive meanwhile."""
+        headers = {"Content-Type": "application/json"}
+        alive: list[float] = []
+        done = threading.Event()
+
+        def watch() -> None:
+            while not done.is_set():
+                alive.append(timed(lambda: self.clients[1].get("/livez")))
+                time.sleep(0.01)
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        path = f"/objects/{self.slug}/likelihood"
+        try:
+            self.took(
+                name,
+                [timed(lambda: self.http.post(path, content=body, headers=headers)) for _ in range(times)],
+            )
+        finally:
+            done.set()
+            watcher.join()
+        self.took(f"  /livez meanwhile ({name})", alive)
+
+    def round(self, bodies: dict[str, bytes]) -> None:
+        """Some of every kind of request; the first after more trials is not counted."""
+        self.best(self.http).raise_for_status()
+        self.took(
+            "best grasp: box, cone, collision test", [timed(lambda: self.best(self.http)) for _ in range(15)]
+        )
+        for name, more in (("  in process", {}), ("  in process, 15 mm and 15 degrees: dense", DENSE)):
+            self.in_process(more)
+            pairs = [self.in_process(more) for _ in range(10)]
+            self.took(name, [clock for clock, _ in pairs])
+            self.took(f"{name}, processor's time", [busy for _, busy in pairs])
+        with concurrent.futures.ThreadPoolExecutor(4) as pool:
+            each = pool.map(lambda c: [timed(lambda: self.best(c)) for _ in range(15)], self.clients)
+            self.took("  4 clients", [t for times in each for t in times])
+        for name, body in bodies.items():
+            self.likelihoods(name, body, 15 if len(body) < 1_000 else 1)
+        path = f"/objects/{self.slug}/samples"
+        self.took("samples, 10,000", [timed(lambda: self.http.post(path, json={"count": 10_000}))])
+        post(self.http, self.slug, shell(1000, self.rng))
+        self.took(
+            "density after 1,000 more trials (extends)",
+            [timed(lambda: self.http.get(f"/objects/{self.slug}/density"))],
+        )
+
+
+def run(url: str, context: Context, slug: str, count: int, rng: np.random.Generator) -> None:
+    asked = Asked(url, context, slug, rng)
+    http = asked.http
     try:
-        wide = {"sigma_position_m": 0.015, "sigma_rotation_deg": 15.0, "collision_free": False}
-        for name, more in (("  in process", {}), ("  in process, 15 mm and 15 degrees: dense", wide)):
-            clock, processor = [], []
-            for _ in range(43):
-                asked = {
-                    key: [float(x) for x in value.split(",")] if isinstance(value, str) else value
-                    for key, value in workspace(rng).items()
-                }
-                request = BestGraspRequest(**(asked | more))
-                started, busy = time.perf_counter(), time.process_time()
-                bestgrasp.best_grasps(context, slug, request)
-                clock.append((time.perf_counter() - started) * 1000)
-                processor.append((time.process_time() - busy) * 1000)
-            # The first ones read, build and load compiled code.
-            told(name, clock[3:], f"processor's time p50 {np.median(processor[3:]):.1f} ms")
-    finally:
-        context.close()
-
-
-def run(url: str, database: str, slug: str, count: int, rng: np.random.Generator) -> None:
-    with httpx.Client(base_url=url, timeout=300) as http:
         http.post("/objects", json={"id": slug}).raise_for_status()
         http.put(
             f"/objects/{slug}/mesh?unit=m", content=sphere_stl(), headers={"Content-Type": "model/stl"}
@@ -182,74 +245,37 @@ def run(url: str, database: str, slug: str, count: int, rng: np.random.Generator
         started = time.perf_counter()
         post(http, slug, poses)
         print(f"\n{count} successes posted in {time.perf_counter() - started:.1f} s")
-        path = f"/objects/{slug}/best-grasp"
-
-        def best(client: httpx.Client = http) -> httpx.Response:
-            return client.get(path, params=workspace(rng))
-
-        told("first best grasp (reads, builds)", [timed(best)])
-        told("best grasp: box, cone, collision test", [timed(best) for _ in range(60)])
-        in_process(database, slug, rng)
-        clients = [httpx.Client(base_url=url, timeout=300) for _ in range(4)]
-        with concurrent.futures.ThreadPoolExecutor(4) as pool:
-            each = pool.map(lambda c: [timed(lambda: best(c)) for _ in range(40)], clients)
-            told("  4 clients", [t for times in each for t in times])
-        body = json.dumps(
-            {"poses": {"position": poses[0][:1].tolist(), "quaternion_xyzw": poses[1][:1].tolist()}}
-        )
-        headers = {"Content-Type": "application/json"}
-        told(
-            "likelihood, 1 pose",
-            [
-                timed(lambda: http.post(f"/objects/{slug}/likelihood", content=body, headers=headers))
-                for _ in range(60)
-            ],
-        )
-        for many in (10_000, 200_000):
+        asked.took("first best grasp (reads, builds)", [timed(lambda: asked.best(http))])
+        # Here too the first ones read, build and load compiled code.
+        for more in ({}, DENSE):
+            for _ in range(2):
+                asked.in_process(more)
+        bodies = {}
+        for many in (1, 10_000, 200_000):
             rows = rng.integers(0, count, many)
             moved = poses[0][rows] + 0.01 * rng.normal(size=(many, 3))
-            big = json.dumps(
-                {"poses": {"position": moved.tolist(), "quaternion_xyzw": poses[1][rows].tolist()}}
-            ).encode()
-            alive: list[float] = []
-            done = threading.Event()
-
-            def watch(alive: list[float] = alive, done: threading.Event = done) -> None:
-                with httpx.Client(base_url=url, timeout=60) as other:
-                    while not done.is_set():
-                        alive.append(timed(lambda: other.get("/livez")))
-                        time.sleep(0.01)
-
-            watcher = threading.Thread(target=watch)
-            watcher.start()
-
-            def ask(big: bytes = big) -> httpx.Response:
-                return http.post(f"/objects/{slug}/likelihood", content=big, headers=headers)
-
-            times = [timed(ask) for _ in range(3)]
-            done.set()
-            watcher.join()
-            told(f"likelihood, {many} poses, all columns", times, f"{len(big) / 2**20:.0f} MiB of JSON")
-            told("  /livez meanwhile", alive, f"max {max(alive):.0f} ms")
-        told(
-            "samples, 10,000",
-            [timed(lambda: http.post(f"/objects/{slug}/samples", json={"count": 10_000})) for _ in range(5)],
-        )
-        after = []
-        for _ in range(5):
-            post(http, slug, shell(1000, rng))
-            after.append(timed(lambda: http.get(f"/objects/{slug}/density")))
-        told("density after 1,000 more trials (extends)", after)
+            columns = {"position": moved.tolist(), "quaternion_xyzw": poses[1][rows].tolist()}
+            bodies[f"likelihood, {many} poses, all columns"] = json.dumps({"poses": columns}).encode()
+        for _ in range(ROUNDS):
+            asked.round(bodies)
+        for name, times in asked.times.items():
+            told(name, times, f"max {max(times):.0f} ms" if "livez" in name else "")
         info = http.get(f"/objects/{slug}/density").json()
-        print(f"{'density in memory':46s} {info['bytes'] / 2**20:.0f} MiB")
+        print(f"{'density in memory':58s} {info['bytes'] / 2**20:.0f} MiB")
+    finally:
+        asked.close()
 
 
 def main(kernels: tuple[int, ...] = KERNELS) -> None:
     """Print the table."""
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder, server(Path(folder)) as url:
-        for count in kernels:
-            run(url, database_in(Path(folder)), f"shell-{count}", count, rng)
+        context = create_app(Settings(database_url=database_in(Path(folder)))).state.context
+        try:
+            for count in kernels:
+                run(url, context, f"shell-{count}", count, rng)
+        finally:
+            context.close()
 
 
 if __name__ == "__main__":
