@@ -51,6 +51,8 @@ _LEAST_GAP_M, _LEAST_AREA_M2, _LEAST_LENGTH_M = 5e-4, 1e-5, 3e-3
 _MOST_FACES, _MOST_EDGES, _MOST_PAIRS = 600, 1_200, 2_000
 _SAMPLES, _LEAST_OVERLAP, _MOST_BORDERS = 160, 6, 16
 _OUTSIDE_M = 1e-4
+#: Steps of an additive sequence that fills four dimensions evenly: powers of 1 / g, where g^5 = g + 1.
+_STEPS = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,37 @@ class JawPairs:
                 self.half + np.array([MARGIN_M, 0.0, MARGIN_M]), which, cosine,
             )  # fmt: skip
         return which, np.arccos(np.clip(cosine, 0.0, 1.0))
+
+    def grasps(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """About ``count`` grasps spread over the regions, at least one a pair; always the same.
+
+        The tool's origin lies in the middle of the gap, anywhere along e and f; y is c or its opposite, and
+        the turn about it any.
+
+        Returns
+        -------
+        positions : (n, 3) metres
+        quaternions_xyzw : (n, 4)
+        weights : (n,)
+            Sum to 1; a pair's are in proportion to its region, widened by `MARGIN_M` along e and f: so edges,
+            which have no width, count too.
+        """
+        if not len(self):
+            return np.empty((0, 3)), np.empty((0, 4)), np.empty(0)
+        share = (self.half[:, 0] + MARGIN_M) * (self.half[:, 2] + MARGIN_M)
+        share = share / share.sum()
+        number = np.maximum(np.rint(share * count), 1.0).astype(np.int64)
+        pair = np.repeat(np.arange(len(self)), number)
+        spread = (np.arange(1, len(pair) + 1)[:, None] * _STEPS) % 1.0
+        axes, half = self.axes[pair], self.half[pair]
+        e, c, f = axes[:, :, 0], axes[:, :, 1], axes[:, :, 2]
+        along = (2.0 * spread[:, :2] - 1.0) * half[:, [0, 2]]
+        positions = self.centres[pair] + along[:, :1] * e + along[:, 1:] * f
+        turn = 2.0 * math.pi * spread[:, 2:3]
+        z = np.sin(turn) * e + np.cos(turn) * f
+        y = np.where(spread[:, 3:] < 0.5, c, -c)
+        rotations = Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=-1))
+        return positions, np.asarray(rotations.as_quat()), share[pair] / number[pair]
 
     def frames(self, positions: npt.ArrayLike, quaternions_xyzw: npt.ArrayLike) -> FloatArray:
         """Frames (n, 3, 3) of the pairs that grasps are at, their axes named as the gripper's.

@@ -155,3 +155,26 @@ def test_nothing_to_close_on() -> None:
     assert ball.frames(np.empty((0, 3)), np.empty((0, 4))).shape == (0, 3, 3)
     with pytest.raises(ValueError, match="opening"):
         of(trimesh.creation.box(), opening=0.0)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_grasps_on_pairs_are_at_their_pairs(name: str) -> None:
+    parts = example(name).parts
+    found = pairs_of_parts(parts, ridges_of_parts(parts), opening_m=0.07)
+    positions, quaternions, weights = found.grasps(4_000)
+    assert len(positions) == pytest.approx(4_000, rel=0.1)
+    assert weights.sum() == pytest.approx(1.0)
+    which, angle = found.at(positions, quaternions)
+    assert (which >= 0).all()
+    np.testing.assert_allclose(angle, 0.0, atol=1e-6)
+    # Every pair has its share, and every turn about its axis.
+    share = (found.half[:, 0] + MARGIN_M) * (found.half[:, 2] + MARGIN_M)
+    number = np.maximum(np.rint(share / share.sum() * 4_000), 1).astype(int)
+    own = np.repeat(np.arange(len(found)), number)
+    np.testing.assert_allclose(np.bincount(own, weights=weights), share / share.sum(), atol=1e-9)
+    largest = own == np.argmax(share)
+    approach = Rotation.from_quat(quaternions[largest]).as_matrix()[:, :, 2]
+    assert np.linalg.norm(approach.mean(axis=0)) < 0.2
+    again = found.grasps(4_000)
+    assert all(np.array_equal(a, b) for a, b in zip(again, (positions, quaternions, weights), strict=True))
+    assert len(found.of().grasps(10)[0]) == 0

@@ -175,7 +175,6 @@ def test_what_can_not_be_proposed_says_why(
 
     for strategy in ("density", "uncertainty"):
         assert refused(strategy=strategy) == (409, "no-successes")
-    assert refused(strategy="edges") == (409, "edges-unknown")
     post(http, "thing", two_clusters)
     assert refused(strategy="uncertainty") == (409, "no-attempts")
     assert refused(strategy="luck")[0] == 422

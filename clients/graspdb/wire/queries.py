@@ -211,6 +211,11 @@ class GraspConstraints(Selection):
 
     ``include`` limits which scores of a grasp are computed. Without it the success probability comes along
     where the objective needs it or the selection has few enough attempts to give it at once.
+
+    ``prior``: whether an object with geometry and no success yet may answer from its edges, by the density
+    that proposals of strategy ``edges`` are drawn from; each such grasp is marked ``prior``. By default it
+    does where a gripper is known; true says what is missing where it can't, false leaves it at
+    ``no_successes``.
     """
 
     count: Annotated[int, Field(ge=1, le=1_000)] = 1
@@ -221,6 +226,7 @@ class GraspConstraints(Selection):
     tool_noise_m: NoiseM | None = None
     tool_noise_deg: NoiseDeg | None = None
     include: list[LikelihoodColumn] | None = None
+    prior: bool | None = None
     box_min: Position | None = None
     box_max: Position | None = None
     sphere: Vector4 | None = None
@@ -263,7 +269,8 @@ class Grasp(Response):
     """A grasp in the object frame, and in the world's where the object's pose was given.
 
     ``score`` is what it was ranked by. ``width_m`` is the jaw's opening once both fingers touch the object,
-    null where geometry or gripper is unknown or nothing is between the fingers.
+    null where geometry or gripper is unknown or nothing is between the fingers. ``prior``: chosen by the
+    object's edges before any success; its density is that of the edges.
     """
 
     position: Triple
@@ -277,6 +284,7 @@ class Grasp(Response):
     interval: Interval | None = None
     effective_trials: float | None = None
     collision_free: bool | None = None
+    prior: bool = False
     candidate: int | None = None
     width_m: float | None = None
     nearest_trials: list[int] = Field(default_factory=list)
@@ -326,7 +334,7 @@ Strategy = Literal["density", "uncertainty", "edges"]
 
 class ProposalsRequest(SamplesRequest):
     """Grasps to try next. ``density``: where successes lie. ``uncertainty``: where one more trial teaches
-    most. ``edges``: along the object's edges, before anything is known."""
+    most. ``edges``: where the jaw can close on two opposed surfaces or edges, before anything is known."""
 
     strategy: Strategy = "density"
 

@@ -175,7 +175,14 @@ def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
 
 @router.post("/objects/{id}/proposals", response_model=Proposals, **scope("read"))
 def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
-    """Grasps to try next; sent back with the trial, ``proposal_density`` weights it."""
+    """Grasps to try next; sent back with the trial, ``proposal_density`` weights it.
+
+    ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges`` needs
+    no trial, but a mesh and a gripper: it draws about grasps that close on two opposed surfaces or edges no
+    farther apart than the jaw opens, at any angle about the closing axis, by default with 10 mm and 15
+    degrees. Grasps at which the open gripper collides are left out before; what is drawn about the others is
+    not tested, for then the density would not be the one it was drawn with.
+    """
     drawn, criterion = proposals.propose(ctx, id, query)
     return _drawn(drawn, {"strategy": query.strategy, "criterion": criterion})
 

@@ -1,4 +1,7 @@
-"""The best grasps under constraints: by density, by success probability, or by a mean under noise."""
+"""The best grasps under constraints: by density, by success probability, or by a mean under noise.
+
+Before any success they are chosen by the prior of the object's edges, where geometry and gripper are known.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from graspdb.wire import BestGrasps, Grasp, GraspConstraints, Interval, Ranking, WorldPose
+from graspdb.wire import BestGrasps, Grasp, GraspConstraints, Interval, KernelInfo, Ranking, WorldPose
 from graspdb_density import (
     GraspDensity,
     Maximum,
@@ -23,7 +26,8 @@ from graspdb_service.problems import conflict
 from graspdb_service.usecases import searches
 from graspdb_service.usecases.constraints import Constraints, constraints
 from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.densities import Built, kernel_of
+from graspdb_service.usecases.densities import Built, KernelChoice, kernel_of
+from graspdb_service.usecases.priors import Prior
 from graspdb_service.usecases.scenes import CollisionTest
 from graspdb_service.usecases.searches import Bools, Floats, Question
 from graspdb_service.usecases.selection import Filters
@@ -50,21 +54,33 @@ def best_grasps(ctx: Context, slug: str, request: GraspConstraints) -> tuple[Bes
     constraints(request)
     with ctx.compute.admitted():
         built = ctx.densities.get(slug, Filters.of(request), choice)
-        question = _question(ctx, slug, request, built)
+        prior = None if built.density is not None else _prior(ctx, request, built, choice)
+        kernel = built.kernel if prior is None else prior.kernel
+        question = _question(ctx, slug, request, built, built.density if prior is None else prior.density)
         if question is None:
-            return _answer(built, "no_successes", []), built.object_row.id
+            return _answer(built, built.kernel, "no_successes", []), built.object_row.id
+        ranking = question.ranking
         found = ctx.compute.run(lambda: searches.found(question))
         if found:
             grasps = _described(ctx, question, found)
             status = "ok" if len(grasps) >= request.count else "fewer"
-            return _answer(built, status, grasps, ranking=question.ranking), built.object_row.id
+            return _answer(built, kernel, status, grasps, ranking=ranking), built.object_row.id
         closest = ctx.compute.run(lambda: searches.closest(question))
         nearest = _described(ctx, question, closest)
-        return _answer(built, "infeasible", [], *nearest, ranking=question.ranking), built.object_row.id
+        return _answer(built, kernel, "infeasible", [], *nearest, ranking=ranking), built.object_row.id
+
+
+def _prior(ctx: Context, request: GraspConstraints, built: Built, choice: KernelChoice) -> Prior | None:
+    """What to choose from before any success, where it may be and can be known."""
+    if request.prior is False or choice.stored is not None:
+        return None
+    get = ctx.priors.get if request.prior else ctx.priors.known
+    return get(built.object_row, built.selected, choice)
 
 
 def _answer(
     built: Built,
+    kernel: KernelInfo,
     status: str,
     grasps: list[Grasp],
     nearest: Grasp | None = None,
@@ -78,7 +94,7 @@ def _answer(
             "nearest": nearest,
             "ranking": ranking,
             "revision": built.revision,
-            "kernel": built.kernel,
+            "kernel": kernel,
         }
     )
 
@@ -86,8 +102,13 @@ def _answer(
 # -- what is asked -----------------------------------------------------------------------------------------
 
 
-def _question(ctx: Context, slug: str, request: GraspConstraints, built: Built) -> Question | None:
-    """None where there is no success to choose from."""
+def _question(
+    ctx: Context, slug: str, request: GraspConstraints, built: Built, density: GraspDensity | None
+) -> Question | None:
+    """A question about a density; None where there is nothing to choose from.
+
+    Before any success the density is the prior's, and ``built`` has none.
+    """
     limits = constraints(request, jaw_symmetric=built.selected.jaw_symmetric)
     needed = request.collision_free or request.pregrasp_distance_m is not None or request.max_width_m
     if needed:
@@ -96,7 +117,6 @@ def _question(ctx: Context, slug: str, request: GraspConstraints, built: Built) 
         test = ctx.scenes.test(built.object_row, built.selected)
     if limits.obstacles and built.selected.profile is None:
         raise conflict("gripper-unknown", "Obstacles need the gripper's shape: name one (gripper=)")
-    density = built.density
     if density is None:
         return None
     model, chances = None, _wants_chances(request, built)
@@ -106,6 +126,9 @@ def _question(ctx: Context, slug: str, request: GraspConstraints, built: Built) 
     of_chances = request.objective == "success_probability" or (
         request.objective == "robust" and averaged == "success_probability"
     )
+    if of_chances and model is None and built.density is None:
+        # Nothing was tried: no chance ranks what no trial tells of.
+        return None
     if of_chances and model is None:
         raise conflict(
             "no-attempts",
@@ -132,6 +155,8 @@ def _question(ctx: Context, slug: str, request: GraspConstraints, built: Built) 
 def _with_score(question: Question, averaged: str) -> Question:
     """A question with what ranks poses, and what refuses them."""
     question = replace(question, admissible=searches.admissible_for(question))
+    if question.built.density is None:
+        question = _holding(question)
     if question.request.objective == "robust":
         return _robust(question, averaged)
     if question.of_chances:
@@ -143,6 +168,20 @@ def _with_score(question: Question, averaged: str) -> Question:
         quick = score if model.quick is model.whole else _chances(question, model.quick, "low")
         return replace(question, ranking=ranking, score=score, quick=quick)
     return question
+
+
+def _holding(question: Question) -> Question:
+    """A question about a prior: between the grasps on its pairs lie others that hold nothing."""
+    admissible, test, threads = question.admissible, question.test, question.threads
+    assert test is not None
+
+    def holds(positions: Floats, quaternions: Floats) -> Bools:
+        allowed = np.isfinite(test.widths(positions, quaternions, threads))
+        if admissible is not None and allowed.any():
+            allowed[allowed] = admissible(positions[allowed], quaternions[allowed])
+        return np.asarray(allowed)
+
+    return replace(question, admissible=holds)
 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:
@@ -262,7 +301,7 @@ def _described(ctx: Context, question: Question, found: list[Maximum]) -> list[G
     if not found:
         return []
     density, limits, test = question.density, question.limits, question.test
-    asked = question.asked
+    asked, prior = question.asked, question.built.density is None
     positions = np.array([item.position for item in found])
     quaternions = np.array([item.quaternion_xyzw for item in found])
 
@@ -270,7 +309,7 @@ def _described(ctx: Context, question: Question, found: list[Maximum]) -> list[G
         free = None if test is None else test.free(positions, quaternions, threads=question.threads)
         widths = None if test is None else test.widths(positions, quaternions, threads=question.threads)
         nearest = [
-            _nearest_trials(question.built, density, p, q)
+            [] if prior else _nearest_trials(question.built, density, p, q)
             for p, q in zip(positions, quaternions, strict=True)
         ]
         if asked is not density:
@@ -312,6 +351,7 @@ def _described(ctx: Context, question: Question, found: list[Maximum]) -> list[G
                     "relative": min(math.exp(item.log_density - top), 1.0),
                     **chances,
                     "collision_free": None if free is None else bool(free[i]),
+                    "prior": prior,
                     "candidate": _place(limits, item),
                     "width_m": measured,
                     "nearest_trials": nearest[i],

@@ -10,6 +10,7 @@ from graspdb_service.storage.database import Database
 from graspdb_service.usecases.compute import Compute
 from graspdb_service.usecases.densities import Densities
 from graspdb_service.usecases.features import Features
+from graspdb_service.usecases.priors import Priors
 from graspdb_service.usecases.report_runs import ReportRuns
 from graspdb_service.usecases.scenes import Scenes
 from graspdb_service.usecases.success import Successes
@@ -24,6 +25,7 @@ class Context:
     compute: Compute
     densities: Densities
     scenes: Scenes
+    priors: Priors
     successes: Successes
     reports: ReportRuns
     mesh_children: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
@@ -40,6 +42,7 @@ class Context:
             compute=compute,
             densities=densities,
             scenes=scenes,
+            priors=Priors(compute, scenes),
             successes=Successes(database, compute, settings.max_density_cache_bytes),
             reports=ReportRuns(settings, database, densities, scenes),
         )

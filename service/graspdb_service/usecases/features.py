@@ -79,7 +79,7 @@ class Features:
         if selected.profile is None:
             raise conflict(
                 "gripper-unknown",
-                "How wide the jaw opens is not known, for no trial names its gripper: name one (gripper=)",
+                "How wide the jaw opens is not known, for no trial names its gripper: name one (gripper)",
             )
         opening = selected.profile.max_opening_m
         found = self._prepared(row, opening).pairs
@@ -87,7 +87,7 @@ class Features:
             raise conflict(
                 "no-surface-pairs",
                 f"Object {row.slug!r} has no two opposed surfaces or edges within {1e3 * opening:.0f} mm, as"
-                " far as the jaw opens: use alignment=gripper or edge",
+                " far as the jaw opens: name a wider gripper, or go without (alignment=gripper or edge)",
             )
         return found
 
@@ -134,7 +134,7 @@ class Features:
             raise conflict(
                 "mesh-missing",
                 f"Object {row.slug!r} has no mesh, so its edges and surfaces are not known:"
-                f" PUT /objects/{row.slug}/mesh, or use alignment=gripper",
+                f" PUT /objects/{row.slug}/mesh, or go without them (alignment=gripper)",
             )
 
         def read_parts(content: bytes, _: str) -> _Prepared:

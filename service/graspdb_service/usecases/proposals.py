@@ -16,12 +16,14 @@ from graspdb.wire import ProposalsRequest
 from graspdb.wire.queries import Strategy
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_density.success import PRIOR_TRIALS
-from graspdb_service.problems import conflict
+from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases import queries
 from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.densities import kernel_of
 from graspdb_service.usecases.queries import Draw
 from graspdb_service.usecases.scenes import CollisionTest
 from graspdb_service.usecases.searches import near_successes
+from graspdb_service.usecases.selection import Filters
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +43,11 @@ CRITERIA: dict[Strategy, str] = {
         " P (1 - P) / (n + 2)^2 for n effective trials, times the density of successes under a kernel twice"
         " as wide; poses that collide are left out"
     ),
+    "edges": (
+        "about grasps that close on two opposed surfaces or edges, at any angle about the closing axis,"
+        " without those at which the open gripper collides; the draws themselves are not tested, and some"
+        " collide"
+    ),
 }
 
 
@@ -55,12 +62,7 @@ def propose(ctx: Context, slug: str, request: ProposalsRequest) -> tuple[Draw, s
     if request.strategy == "density":
         return queries.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]
     if request.strategy == "edges":
-        raise conflict(
-            "edges-unknown",
-            "Proposals do not start from edges yet: before anything is known, sweep a grid"
-            " (POST /objects/{id}/sweeps); afterwards use strategy=density or uncertainty",
-            strategies=sorted(CRITERIA),
-        )
+        return _from_edges(ctx, slug, request), CRITERIA["edges"]
     queries.check_count(ctx, request.count)
     seed = secrets.randbits(63) if request.seed is None else request.seed
     with ctx.compute.admitted():
@@ -98,6 +100,31 @@ def propose(ctx: Context, slug: str, request: ProposalsRequest) -> tuple[Draw, s
         proposal_density=densities,
     )
     return draw, CRITERIA["uncertainty"]
+
+
+def _from_edges(ctx: Context, slug: str, request: ProposalsRequest) -> Draw:
+    """Draws from the prior: no trial is needed, nor does any change it."""
+    queries.check_count(ctx, request.count)
+    choice, _ = kernel_of(request)
+    if choice.stored is not None:
+        raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
+    seed = secrets.randbits(63) if request.seed is None else request.seed
+    with ctx.compute.admitted():
+        row, selected = ctx.densities.current(slug, Filters.of(request))
+        prior = ctx.priors.get(row, selected, choice)
+        position, quaternion = ctx.compute.run(
+            lambda: prior.density.sample(request.count, np.random.default_rng(seed))
+        )
+        densities = queries.density_at(ctx, prior.density, position, quaternion)
+    return Draw(
+        object_id=row.id,
+        revision=row.revision,
+        kernel=prior.kernel,
+        seed=seed,
+        position=position,
+        quaternion_xyzw=se3.canonical(quaternion),
+        proposal_density=densities,
+    )
 
 
 def uncertain(
