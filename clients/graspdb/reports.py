@@ -6,13 +6,14 @@ import html
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.errors import GraspDBError, error_for
+from graspdb.selection import Selection, TrialSelection, query, taken
 from graspdb.sweeps import Sweep
 from graspdb.transport import Transport
 from graspdb.wire.reports import (
@@ -265,7 +266,8 @@ def _column(values: Any) -> Floats:
 
 
 class Reports:
-    """``mug.reports``. All of them take the selection of trials and the kernel, as queries do.
+    """``mug.reports``. They take the selection of trials, most of them the kernel, too: see
+    :class:`graspdb.selection.Selection`.
 
     They wait until the report is computed; ``progress`` is called with its run meanwhile, and ``timeout_s``
     ends the wait, not the computation: asking again goes on waiting.
@@ -279,14 +281,9 @@ class Reports:
         self,
         *,
         matching: str | None = None,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        source: str | None = None,
-        kernel: str | None = None,
-        sigma_position_m: float | None = None,
-        sigma_rotation_deg: float | None = None,
         progress: Progress | None = None,
         timeout_s: float | None = None,
+        **selection: Unpack[Selection],
     ) -> Convergence:
         """Whether there are enough successful grasps, and how many more it takes.
 
@@ -305,7 +302,7 @@ class Reports:
         """
         params = {
             "matching": matching,
-            **_selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg),
+            **_asked(selection, "convergence"),
         }
         return Convergence(self._get("convergence", ConvergenceReport, params, progress, timeout_s))
 
@@ -314,14 +311,9 @@ class Reports:
         *,
         method: str | None = None,
         alignment: str | None = None,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        source: str | None = None,
-        kernel: str | None = None,
-        sigma_position_m: float | None = None,
-        sigma_rotation_deg: float | None = None,
         progress: Progress | None = None,
         timeout_s: float | None = None,
+        **selection: Unpack[Selection],
     ) -> Anisotropy:
         """How far a good grasp may be displaced along and about every axis.
 
@@ -336,24 +328,19 @@ class Reports:
         params = {
             "method": method,
             "alignment": alignment,
-            **_selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg),
+            **_asked(selection, "anisotropy"),
         }
         return Anisotropy(self._get("anisotropy", AnisotropyReport, params, progress, timeout_s))
 
     def calibration(
         self,
         *,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        source: str | None = None,
-        kernel: str | None = None,
-        sigma_position_m: float | None = None,
-        sigma_rotation_deg: float | None = None,
         progress: Progress | None = None,
         timeout_s: float | None = None,
+        **selection: Unpack[Selection],
     ) -> Calibration:
         """How often grasps hold that are predicted to, judged on trials the prediction has not seen."""
-        params = _selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg)
+        params = _asked(selection, "calibration")
         return Calibration(self._get("calibration", CalibrationReport, params, progress, timeout_s))
 
     def projection(
@@ -364,14 +351,9 @@ class Reports:
         approach_cone_deg: float | None = None,
         direction: str | ArrayLike | None = None,
         direction_cone_deg: float | None = None,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        source: str | None = None,
-        kernel: str | None = None,
-        sigma_position_m: float | None = None,
-        sigma_rotation_deg: float | None = None,
         progress: Progress | None = None,
         timeout_s: float | None = None,
+        **selection: Unpack[Selection],
     ) -> Projection:
         """The density on a plane: where grasps succeed.
 
@@ -389,24 +371,22 @@ class Reports:
             "approach_cone_deg": approach_cone_deg,
             "direction": _axis(direction),
             "direction_cone_deg": direction_cone_deg,
-            **_selection(gripper, protocol, source, kernel, sigma_position_m, sigma_rotation_deg),
+            **_asked(selection, "projection"),
         }
         return Projection(self._get("projection", ProjectionReport, params, progress, timeout_s))
 
     def bandwidth(
         self,
         *,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        source: str | None = None,
         progress: Progress | None = None,
         timeout_s: float | None = None,
+        **selection: Unpack[TrialSelection],
     ) -> Bandwidth:
         """Which widths the kernel should have, and how often draws at several widths succeed.
 
         Those are simulated by sweeps of purpose ``check``; ``calls`` says which are missing.
         """
-        params = {"gripper": gripper, "protocol": protocol, "source": source}
+        params = taken(TrialSelection, selection, "bandwidth")
         return Bandwidth(self._get("bandwidth", BandwidthReport, params, progress, timeout_s))
 
     def kernel_similarity(
@@ -416,11 +396,9 @@ class Reports:
         window_rotation_deg: float | None = None,
         component_position_m: float | None = None,
         component_rotation_deg: float | None = None,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        source: str | None = None,
         progress: Progress | None = None,
         timeout_s: float | None = None,
+        **selection: Unpack[TrialSelection],
     ) -> KernelSimilarity:
         """How many samples, or Gaussians, a kernel needs (figure 13).
 
@@ -436,9 +414,7 @@ class Reports:
             "window_rotation_deg": window_rotation_deg,
             "component_position_m": component_position_m,
             "component_rotation_deg": component_rotation_deg,
-            "gripper": gripper,
-            "protocol": protocol,
-            "source": source,
+            **taken(TrialSelection, selection, "kernel_similarity"),
         }
         return KernelSimilarity(
             self._get("kernel-similarity", KernelSimilarityReport, params, progress, timeout_s)
@@ -548,19 +524,5 @@ def _axis(value: str | ArrayLike | None) -> str | None:
     return ",".join(repr(float(x)) for x in numbers)
 
 
-def _selection(
-    gripper: str | None,
-    protocol: str | None,
-    source: str | None,
-    kernel: str | None,
-    sigma_position_m: float | None,
-    sigma_rotation_deg: float | None,
-) -> dict[str, Any]:
-    return {
-        "gripper": gripper,
-        "protocol": protocol,
-        "source": source,
-        "kernel": kernel,
-        "sigma_position_m": sigma_position_m,
-        "sigma_rotation_deg": sigma_rotation_deg,
-    }
+def _asked(selection: Mapping[str, Any], method: str) -> dict[str, Any]:
+    return query(taken(Selection, selection, method))

@@ -85,6 +85,8 @@ class Grasp:
         Estimate, its interval and the trials it rests on; None where the service gives none.
     collision_free
         None until mesh and gripper are known.
+    prior
+        Chosen by the object's edges before any success; its density is that of the edges.
     candidate
         Its place among the candidates that were given.
     simulated
@@ -113,6 +115,7 @@ class Grasp:
     score: float | None = None
     candidate: int | None = None
     simulated: str | None = None
+    prior: bool = False
     raw: wire.Grasp | None = field(default=None)
 
     @classmethod
@@ -135,6 +138,7 @@ class Grasp:
             active_constraints=tuple(grasp.active_constraints),
             score=grasp.score,
             candidate=grasp.candidate,
+            prior=grasp.prior,
             raw=grasp,
         )
 
@@ -162,6 +166,8 @@ class Grasp:
             "density [1/(m³ rad³)]": f"{self.density:.4g}",
             "relative": f"{self.relative:.3f}",
         }
+        if self.prior:
+            rows["chosen by"] = "the object's edges: nothing has succeeded yet"
         if self.world is not None:
             rows["position in the world [m]"] = _vector(self.world[:3, 3])
         if self.success_probability is not None:
@@ -181,7 +187,7 @@ class Grasp:
     def __repr__(self) -> str:
         return (
             f"Grasp(position={_vector(self.position)}, quaternion_xyzw={_vector(self.quaternion_xyzw)}, "
-            f"density={self.density:.4g}, relative={self.relative:.3f})"
+            f"density={self.density:.4g}, relative={self.relative:.3f}{', prior=True' if self.prior else ''})"
         )
 
     def _repr_html_(self) -> str:

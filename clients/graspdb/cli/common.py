@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import json
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from rich.table import Table
 
 from graspdb.client import Client
 
-__all__ = ["State", "out", "show_rows", "show_table", "state_of", "vector"]
+__all__ = ["State", "out", "selecting", "show_rows", "show_table", "state_of", "vector"]
 
 ERRORS = Console(stderr=True)
 
@@ -83,6 +85,38 @@ SigmaPosition = Annotated[
 SigmaRotation = Annotated[
     float | None, typer.Option("--sigma-rotation-deg", help="Kernel width in rotation, degrees.")
 ]
+
+
+def selecting(command: Callable[..., None]) -> Callable[..., None]:
+    """A command with the options of a selection; it gets them as ``selection``, if it has that parameter."""
+    signature = inspect.signature(command, eval_str=True)
+    own = [parameter for parameter in signature.parameters.values() if parameter.name != "selection"]
+    options = {
+        "gripper": Gripper,
+        "protocol": Protocol,
+        "source": Source,
+        "kernel": Kernel,
+        "sigma_position_m": SigmaPosition,
+        "sigma_rotation_deg": SigmaRotation,
+    }
+    more = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+        for name, annotation in options.items()
+    ]
+
+    @functools.wraps(command)
+    def call(**given: Any) -> None:
+        chosen = {name: given.pop(name) for name in options}
+        if "selection" in signature.parameters:
+            given["selection"] = chosen
+        command(**given)
+
+    parameters = [*own, *more]
+    vars(call)["__signature__"] = signature.replace(parameters=parameters)
+    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return call
+
+
 ObjectId = Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.", show_default=False)]
 
 

@@ -9,16 +9,11 @@ import typer
 
 from graspdb.cli.common import (
     ERRORS,
-    Gripper,
-    Kernel,
     ObjectId,
-    Protocol,
-    SigmaPosition,
-    SigmaRotation,
-    Source,
     Vector,
     numbers,
     out,
+    selecting,
     show_rows,
     show_table,
     state_of,
@@ -27,28 +22,20 @@ from graspdb.cli.common import (
 from graspdb.errors import Infeasible
 from graspdb.files import read_poses
 from graspdb.results import SampledPoses
+from graspdb.selection import Selection
 
 
+@selecting
 def density(
     context: typer.Context,
     id: ObjectId,
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-    kernel: Kernel = None,
-    sigma_position_m: SigmaPosition = None,
-    sigma_rotation_deg: SigmaRotation = None,
+    selection: Selection,
 ) -> None:
     """Show an object's grasp density: kernel, widths, counts, effective sample size."""
     state = state_of(context)
     with state.client() as db:
         found = db.objects.get(id).density(
-            gripper=gripper,
-            protocol=protocol,
-            source=source,
-            kernel=kernel,
-            sigma_position_m=sigma_position_m,
-            sigma_rotation_deg=sigma_rotation_deg,
+            **selection,
         )
     if state.json:
         out(found)
@@ -69,9 +56,11 @@ def density(
     show_rows(rows)
 
 
+@selecting
 def best_grasp(
     context: typer.Context,
     id: ObjectId,
+    selection: Selection,
     count: Annotated[int, typer.Option(min=1, max=1_000, help="So many distinct grasps.")] = 1,
     objective: Annotated[
         str | None, typer.Option(help="density, success_probability (its interval's lower end) or robust.")
@@ -114,12 +103,10 @@ def best_grasp(
     frame: Annotated[str | None, typer.Option(help="Frame of the constraints: world or object.")] = None,
     min_separation_m: Annotated[float | None, typer.Option(help="Distinct from this distance on.")] = None,
     min_separation_deg: Annotated[float | None, typer.Option(help="Distinct from this angle on.")] = None,
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-    kernel: Kernel = None,
-    sigma_position_m: SigmaPosition = None,
-    sigma_rotation_deg: SigmaRotation = None,
+    prior: Annotated[
+        bool | None,
+        typer.Option("--prior/--no-prior", help="Before any success: whether to choose by the edges."),
+    ] = None,
     verify: Annotated[
         bool, typer.Option("--verify", help="Simulate the grasps at the fine step first (needs a worker).")
     ] = False,
@@ -157,12 +144,8 @@ def best_grasp(
                 frame=frame,
                 min_separation_m=min_separation_m,
                 min_separation_deg=min_separation_deg,
-                gripper=gripper,
-                protocol=protocol,
-                source=source,
-                kernel=kernel,
-                sigma_position_m=sigma_position_m,
-                sigma_rotation_deg=sigma_rotation_deg,
+                prior=prior,
+                **selection,
                 verify=verify,
             )
         except Infeasible as error:
@@ -210,25 +193,23 @@ def best_grasp(
         ],
         empty="No grasp.",
     )
+    if found[0].prior:
+        ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
         ERRORS.print(f"Only {len(found)} distinct grasps exist.")
 
 
+@selecting
 def likelihood(
     context: typer.Context,
     id: ObjectId,
+    selection: Selection,
     file: Annotated[
         str | None, typer.Argument(help="Poses: .csv (x,y,z,qx,qy,qz,qw), .npy, .json, NDJSON.")
     ] = None,
     pose: Annotated[
         Vector | None, vector_option("One pose instead.", "--pose", count=7, metavar="x,y,z,qx,qy,qz,qw")
     ] = None,
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-    kernel: Kernel = None,
-    sigma_position_m: SigmaPosition = None,
-    sigma_rotation_deg: SigmaRotation = None,
     limit: Annotated[int, typer.Option(min=1, help="Rows of the table; --json gives all.")] = 20,
 ) -> None:
     """Say how likely grasps are."""
@@ -239,12 +220,7 @@ def likelihood(
     with state.client() as db:
         found = db.objects.get(id).likelihood(
             poses,
-            gripper=gripper,
-            protocol=protocol,
-            source=source,
-            kernel=kernel,
-            sigma_position_m=sigma_position_m,
-            sigma_rotation_deg=sigma_rotation_deg,
+            **selection,
         )
     if state.json:
         out(found)
@@ -272,17 +248,13 @@ def _cell(value: Any) -> str:
     return f"{value:.5g}"
 
 
+@selecting
 def samples(
     context: typer.Context,
     id: ObjectId,
+    selection: Selection,
     count: Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")] = 10,
     seed: Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")] = None,
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-    kernel: Kernel = None,
-    sigma_position_m: SigmaPosition = None,
-    sigma_rotation_deg: SigmaRotation = None,
     csv: Annotated[
         bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")
     ] = False,
@@ -293,30 +265,25 @@ def samples(
         found = db.objects.get(id).samples(
             count,
             seed=seed,
-            gripper=gripper,
-            protocol=protocol,
-            source=source,
-            kernel=kernel,
-            sigma_position_m=sigma_position_m,
-            sigma_rotation_deg=sigma_rotation_deg,
+            **selection,
         )
     _show_poses(found, csv=csv, json=state.json)
 
 
+@selecting
 def proposals(
     context: typer.Context,
     id: ObjectId,
+    selection: Selection,
     count: Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")] = 10,
     strategy: Annotated[
-        str, typer.Option(help="density: where successes lie; uncertainty: where a trial teaches most.")
+        str,
+        typer.Option(
+            help="density: where successes lie; uncertainty: where a trial teaches most;"
+            " edges: where the jaw can close, before any trial (needs a mesh and --gripper)."
+        ),
     ] = "density",
     seed: Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")] = None,
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-    kernel: Kernel = None,
-    sigma_position_m: SigmaPosition = None,
-    sigma_rotation_deg: SigmaRotation = None,
     csv: Annotated[
         bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")
     ] = False,
@@ -328,12 +295,7 @@ def proposals(
             count,
             strategy=strategy,
             seed=seed,
-            gripper=gripper,
-            protocol=protocol,
-            source=source,
-            kernel=kernel,
-            sigma_position_m=sigma_position_m,
-            sigma_rotation_deg=sigma_rotation_deg,
+            **selection,
         )
     _show_poses(found, csv=csv, json=state.json)
 

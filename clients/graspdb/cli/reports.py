@@ -12,14 +12,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from graspdb.cli.common import (
     ERRORS,
     Gripper,
-    Kernel,
     ObjectId,
     Protocol,
-    SigmaPosition,
-    SigmaRotation,
     Source,
     State,
     out,
+    selecting,
     show_rows,
     show_table,
     state_of,
@@ -70,6 +68,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
+@selecting
 def report(
     context: typer.Context,
     id: ObjectId,
@@ -84,7 +83,6 @@ def report(
     figure: Annotated[
         Path | None, typer.Option(help="Write the figure to this .png or .svg file.", dir_okay=False)
     ] = None,
-    kernel: Kernel = None,
     matching: Annotated[
         str | None,
         typer.Option(help="convergence: determinants, likelihood or success, beside a stored kernel."),
@@ -123,11 +121,6 @@ def report(
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Have a worker simulate the draws that the report lacks.")
     ] = False,
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-    sigma_position_m: SigmaPosition = None,
-    sigma_rotation_deg: SigmaRotation = None,
 ) -> None:
     """Report on an object's trials: where grasps succeed, tolerances, enough of them, calibration, sources.
 

@@ -1,0 +1,237 @@
+"""What can be asked about grasping an object: its density, how likely grasps are, which is best, draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Unpack, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from graspdb import wire
+from graspdb.errors import Infeasible
+from graspdb.pages import checked, segment
+from graspdb.poses import as_poses
+from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
+from graspdb.selection import (
+    Constraints,
+    Selection,
+    TrialSelection,
+    best_grasp_request,
+    named,
+    query,
+    taken,
+)
+from graspdb.sweeps import create_sweep
+from graspdb.transport import Transport
+
+__all__ = ["Questions"]
+
+QUERY_POSES = 100_000
+"""Poses a likelihood request: some 15 MB of JSON, well under the service's default body limit."""
+
+
+class Questions:
+    """The questions about one object.
+
+    They take the selection of trials that a density is built from, and the kernel: see
+    :class:`graspdb.selection.Selection`. All poses are of the tool frame in the object frame, in metres,
+    quaternions xyzw.
+    """
+
+    def __init__(self, transport: Transport, object_id: str) -> None:
+        self._transport = transport
+        self._object = object_id
+        self._path = f"/objects/{segment(object_id)}"
+
+    def density(self, **selection: Unpack[Selection]) -> wire.DensityInfo:
+        """The grasp density: kernel, widths and how they were chosen, counts, effective sample size.
+
+        Takes the :class:`~graspdb.selection.Selection`.
+        """
+        params = query(taken(Selection, selection, "density"))
+        return wire.DensityInfo.model_validate(
+            self._transport.json("GET", f"{self._path}/density", params=params)
+        )
+
+    def likelihood(
+        self,
+        poses: ArrayLike | Any,
+        *,
+        include: Sequence[str] | None = None,
+        chunk: int = QUERY_POSES,
+        **selection: Unpack[Selection],
+    ) -> LikelihoodArrays:
+        """How likely these grasps are, as NumPy arrays in the poses' order.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples.
+        include
+            Columns to compute: ``density``, ``log_density``, ``relative``, ``success_probability``,
+            ``interval``, ``effective_trials``, ``collision_free``; by default all.
+        chunk
+            Poses a request.
+        **selection
+            :class:`~graspdb.selection.Selection`.
+        """
+        options = taken(Selection, selection, "likelihood")
+        position, quaternion = as_poses(poses)
+        options["include"] = None if include is None else named(include)
+        # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
+        probe = {"position": position[:1].tolist(), "quaternion_xyzw": quaternion[:1].tolist()}
+        request = checked(wire.LikelihoodRequest, {**options, "poses": probe}).model_dump(
+            mode="json", exclude_unset=True
+        )
+        answers: list[wire.Likelihoods] = []
+        for attempt in range(3):
+            answers = []
+            for start in range(0, len(position), chunk):
+                part = slice(start, start + chunk)
+                columns = {"position": position[part].tolist(), "quaternion_xyzw": quaternion[part].tolist()}
+                answer = self._transport.json(
+                    "POST", f"{self._path}/likelihood", body={**request, "poses": columns}
+                )
+                answers.append(wire.Likelihoods.model_validate(answer))
+                if answers[-1].revision != answers[0].revision and attempt < 2:
+                    break  # new trials came in between: one answer must rest on one revision
+            else:
+                break
+        return LikelihoodArrays.from_wire(answers)
+
+    def best_grasp(
+        self,
+        *,
+        verify: bool = False,
+        verify_timeout_s: float = 300.0,
+        **constraints: Unpack[Constraints],
+    ) -> Grasp:
+        """The best grasp within constraints; takes what :meth:`best_grasps` does, without ``count``.
+
+        Raises
+        ------
+        Infeasible
+            If no admissible grasp lies within reach of what was tried, or nothing has succeeded yet.
+        """
+        if "count" in constraints:
+            raise TypeError("best_grasp() gives one grasp; use best_grasps(count=...)")
+        given = taken(Constraints, constraints, "best_grasp")
+        return self._best_grasps(1, given, verify, verify_timeout_s)[0]
+
+    def best_grasps(
+        self,
+        *,
+        count: int = 5,
+        verify: bool = False,
+        verify_timeout_s: float = 300.0,
+        **constraints: Unpack[Constraints],
+    ) -> Grasps:
+        """At most ``count`` distinct grasps, best first.
+
+        Parameters
+        ----------
+        verify
+            Have a worker simulate the grasps at the fine step before they are answered: ``grasp.simulated``
+            is what became of each, and those that held come first. The outcomes are stored as a check. With
+            the gripper and protocol of the trials, where they say; else ``pg70`` and ``wrench``.
+        verify_timeout_s
+            How long to wait for that.
+        **constraints
+            :class:`~graspdb.selection.Constraints`: workspace, directions, collisions, objective; and the
+            :class:`~graspdb.selection.Selection` of trials.
+
+        Raises
+        ------
+        Infeasible
+            If there is none; ``nearest`` is the closest grasp outside the constraints, where there is one.
+        TimeoutError
+            If the simulation has not finished in time; it says so where no worker has come.
+        """
+        given = taken(Constraints, constraints, "best_grasps")
+        return self._best_grasps(count, given, verify, verify_timeout_s)
+
+    def _best_grasps(self, count: int, given: dict[str, Any], verify: bool, timeout_s: float) -> Grasps:
+        request = best_grasp_request(count, given)
+        answer = self._transport.json("POST", f"{self._path}/best-grasp", body=request)
+        grasps = Grasps(wire.BestGrasps.model_validate(answer))
+        if len(grasps):
+            return self._simulated(grasps, given, timeout_s) if verify else grasps
+        if grasps.status == "no_successes":
+            way_out = (
+                "" if given.get("prior") is False else "; with a mesh, name a gripper to choose by its edges"
+            )
+            raise Infeasible(
+                f"{self._object} has no successful trial yet, so there is no grasp to choose from{way_out}"
+            )
+        where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
+        raise Infeasible(
+            f"no grasp of {self._object} fulfils the constraints within reach of what was tried{where}",
+            nearest=grasps.nearest,
+        )
+
+    def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:
+        """The grasps with their outcomes in simulation, by the gripper and protocol of their trials."""
+        trials: TrialSelection = {
+            "gripper": given.get("gripper"),
+            "protocol": given.get("protocol"),
+            "source": given.get("source"),
+        }
+        chosen = self.density(**trials)
+        sweep = create_sweep(
+            self._transport,
+            self._object,
+            poses=grasps.matrices,
+            gripper=chosen.gripper,
+            protocol=chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None,
+            fidelity="fine",
+            purpose="check",
+        )
+        try:
+            sweep.wait(timeout=timeout_s)
+        except TimeoutError as error:
+            hint = sweep.hint()
+            raise TimeoutError(f"{error}{'' if hint is None else f': {hint}'}") from None
+        outcomes = sweep.outcomes()
+        return grasps.simulated(outcomes.outcome[np.argsort(outcomes.pose_index)].tolist())
+
+    def samples(
+        self, count: int = 100, *, seed: int | None = None, **selection: Unpack[Selection]
+    ) -> SampledPoses:
+        """Poses drawn from the density; the same seed and revision give the same poses.
+
+        Takes the :class:`~graspdb.selection.Selection`.
+        """
+        fields = {**taken(Selection, selection, "samples"), "count": count, "seed": seed}
+        request = checked(wire.SamplesRequest, fields)
+        answer = self._transport.json("POST", f"{self._path}/samples", body=request)
+        return SampledPoses.from_wire(wire.Samples.model_validate(answer))
+
+    def proposals(
+        self,
+        count: int = 100,
+        *,
+        strategy: str = "density",
+        seed: int | None = None,
+        **selection: Unpack[Selection],
+    ) -> SampledPoses:
+        """Grasps to try next; send ``proposal_density`` back with their trials.
+
+        Parameters
+        ----------
+        strategy
+            ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most.
+            ``edges`` needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on two
+            opposed surfaces or edges. Some of what it draws collides.
+        **selection
+            :class:`~graspdb.selection.Selection`.
+        """
+        fields = {
+            **taken(Selection, selection, "proposals"),
+            "count": count,
+            "seed": seed,
+            "strategy": strategy,
+        }
+        request = checked(wire.ProposalsRequest, fields)
+        answer = self._transport.json("POST", f"{self._path}/proposals", body=request)
+        return SampledPoses.from_wire(wire.Proposals.model_validate(answer))
