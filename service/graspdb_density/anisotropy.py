@@ -7,9 +7,10 @@ about the gripper's axes; in planes of two they are compositions ``R_a(alpha) R_
 ``R_x(180) R_y(180)`` is the jaw's mirror, not components of a rotation vector.
 
 `empirical` counts pairs of trials: translations between trials at the same rotation, rotations between trials
-at the same position. A displacement that leads to a pose nobody tried is unknown, not a failure. `smoothed`
-is the paper's method: the density of successes in the place of a trial. Intervals come from resampling the
-grasps A: each takes part in many pairs, which are not independent.
+at the same position. A displacement that leads to a pose nobody tried is unknown, not a failure. Profiles
+along one axis of trials on a grid, whose pairs lie at a lattice's places, are told as `profiles` says.
+`smoothed` is the paper's method: the density of successes in the place of a trial. Intervals come from
+resampling the grasps A: each takes part in many pairs, which are not independent.
 
 Reference: Bodenhagen, Detry, Piater and Krueger, sections II-A and III-A, figures 8 to 12.
 """
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import pairloops, pairs, se3
+from .profiles import Profiles
 from .rows import Progress
 from .se3 import Floats
 from .smoothed import attempt_density, smoothed
@@ -103,7 +105,8 @@ def empirical(
     weights : (N,) or None
         Importance of each success as an A (eq 1), where trials were not spread evenly.
     tolerance_m, tolerance
-        How far the coordinates that a histogram or profile does not show may be off, metres and radians.
+        How far the coordinates that a histogram or profile does not show may be off, metres and radians. On a
+        grid: half its steps.
     max_grasps, max_candidates : int
         Limits on the successes A, drawn at random, and on the pairs looked at.
 
@@ -149,6 +152,13 @@ def empirical(
     )
     quaternions = se3.from_matrix(axes) if rotate_in_frame else q[grasps]
     used = [0, 0]
+    # Of trials on a grid profiles are told from each grasp's own pairs, which are at a lattice's places.
+    along_lines = Profiles(
+        0 if rotation_keys is None else len(grasps), layout.line("position"), layout.profile_m, tolerance_m
+    )
+    about_lines = Profiles(
+        0 if position_keys is None else len(grasps), layout.line("rotation"), layout.profile, tolerance
+    )
     near_p, near_q, near_won, near_order, near_grasps = _streamed(p, q, won, shifted.order, grasps)
     for begin in range(0, len(grasps), _STEP):
         part = slice(begin, begin + _STEP)
@@ -158,14 +168,14 @@ def empirical(
             math.cos(0.5 * tolerance) if rotation_keys is None else -1.0,
             layout.extent_m, layout.slices, layout.slice_m, layout.across, layout.profile_m,
             layout.line("position"), tolerance_m, along.planes.tried, along.planes.won, along.planes.pairs,
-            along.lines.tried, along.lines.won, along.lines.pairs, along.lines.moved,
+            along.lines.tried, along.lines.won, along.lines.pairs, along.lines.moved, along_lines.found[part],
         )  # fmt: skip
         used[1] += pairloops.rotation_pairs(
             p, q, won, turned.order, grasps[part], quaternions[part], share[part],
             turned.first[begin : begin + _STEP + 1], turned.runs, symmetric, rotate_in_frame,
             tolerance_m if position_keys is None else -1.0, layout.angles, layout.line("rotation"),
             layout.profile, tolerance, about.planes.tried, about.planes.won, about.planes.pairs,
-            about.lines.tried, about.lines.won, about.lines.pairs, about.lines.moved,
+            about.lines.tried, about.lines.won, about.lines.pairs, about.lines.moved, about_lines.found[part],
         )  # fmt: skip
         if progress is not None:
             progress(min(1.0, (begin + _STEP) / len(grasps)))
@@ -174,9 +184,14 @@ def empirical(
             "no trial lies within reach of a success at the same rotation or the same position: trials on a "
             "grid, or many more, are needed"
         )
-    if (symmetric and alignment in ("gripper", "surface-pair")) or alignment == "edge":
-        # The twin of A sees every translation mirrored; an edge's tangent has no sign either.
+    # The twin of A sees every translation mirrored; an edge's tangent has no sign either.
+    mirrored = (symmetric and alignment in ("gripper", "surface-pair")) or alignment == "edge"
+    if mirrored:
         _mirror(along, layout)
+    if rotation_keys is not None:
+        _take(along_lines, along.lines, share, mirrored)
+    if position_keys is not None:
+        _take(about_lines, about.lines, share, symmetric and not rotate_in_frame)
     return report(
         "empirical", alignment, layout, along, about, len(grasps), (used[0], used[1]), level, aligned
     )
@@ -197,6 +212,16 @@ def _keys(keys: ArrayLike, count: int) -> NDArray[np.int64]:
     if k.shape != (count,) or not np.issubdtype(k.dtype, np.integer):
         raise ValueError(f"keys are integers of shape ({count},)")
     return k.astype(np.int64)
+
+
+def _take(profiles: Profiles, lines: Counts, weights: NDArray[np.float32], mirrored: bool) -> None:
+    """Profiles of a grid into the tallies they are reported from."""
+    share, weight = profiles.shares(weights, mirrored=mirrored)
+    lines.tried = weight.astype(np.float32)
+    lines.won = (np.nan_to_num(share) * weight).astype(np.float32)
+    middle = profiles.bins // 2
+    at: Floats = (np.arange(profiles.bins, dtype=np.float64) - middle) * profiles.step
+    lines.moved = np.tile(at, 3) * lines.pairs
 
 
 def _mirror(along: Tallies, layout: Bins) -> None:

@@ -6,6 +6,9 @@ others with its weight in every bootstrap resample of the grasps A. ``pairs`` (b
 
 Candidates B of the A at ``a`` are the rows ``order[run[0]:run[1]]`` of ``runs[first[a]:first[a + 1]]``.
 Only A's own row is left out: another trial of the same pose tells how repeatable success is.
+
+``nearby`` (A, 3, bins, 5) takes the pairs of profiles one grasp A at a time, see `profiles`, in the place of
+``line_tried`` and ``line_won``; with no grasps those are filled.
 """
 
 from __future__ import annotations
@@ -31,6 +34,17 @@ def _add(tried, won, pairs, bin_, success, weights):  # type: ignore[no-untyped-
             won[bin_, r] += weights[r]
 
 
+@inlined
+def _note(nearby, bin_, success, at, off_u, off_v):  # type: ignore[no-untyped-def]
+    """A pair of one grasp in the profile of an axis (bins, 5)."""
+    if 0 <= bin_ < nearby.shape[0]:
+        nearby[bin_, 0] += 1.0
+        nearby[bin_, 1] += 1.0 if success else 0.0
+        nearby[bin_, 2] += at
+        nearby[bin_, 3] += abs(off_u)
+        nearby[bin_, 4] += abs(off_v)
+
+
 @exact
 def _own_and_twin(qa, qb):  # type: ignore[no-untyped-def]
     """Cosines of half the angles from a to b and to b's twin under the jaw's turn."""
@@ -43,7 +57,7 @@ def _own_and_twin(qa, qb):  # type: ignore[no-untyped-def]
 def translation_pairs(  # type: ignore[no-untyped-def]
     positions, quaternions, success, order, grasps, frames, weights, first, runs, symmetric, least_cosine,
     extent, slices, slice_m, across, profile_m, profile_bins, tolerance_m,
-    tried, won, pairs, line_tried, line_won, line_pairs, line_moved,
+    tried, won, pairs, line_tried, line_won, line_pairs, line_moved, nearby,
 ):  # fmt: skip
     """Pairs of the same rotation into the histograms (slice, x, y) and the profiles (axis, bin); how many.
 
@@ -55,6 +69,8 @@ def translation_pairs(  # type: ignore[no-untyped-def]
     used = 0
     half_depth = 0.5 * slices * slice_m
     middle = profile_bins // 2
+    apart = nearby.shape[0] > 0
+    margin = (nearby.shape[2] - profile_bins) // 2
     t = np.empty(3)
     for a in range(grasps.shape[0]):
         i = grasps[a]
@@ -85,9 +101,14 @@ def translation_pairs(  # type: ignore[no-untyped-def]
                     u, v = abs(t[(axis + 1) % 3]), abs(t[(axis + 2) % 3])
                     if u <= tolerance_m + _EDGE_M and v <= tolerance_m + _EDGE_M:
                         b = middle + math.floor(t[axis] / profile_m + 0.5)
+                        if apart:
+                            _note(nearby[a, axis], b + margin, success[j], t[axis], u, v)
                         if 0 <= b < profile_bins:
                             b += axis * profile_bins
-                            _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
+                            if apart:
+                                line_pairs[b] += 1
+                            else:
+                                _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
                             line_moved[b] += t[axis]
                             hit = True
                 used += hit
@@ -139,7 +160,7 @@ def composition_angles(q, plane):  # type: ignore[no-untyped-def]
 def rotation_pairs(  # type: ignore[no-untyped-def]
     positions, quaternions, success, order, grasps, frames, weights, first, runs, symmetric, framed,
     reach_m, bins, profile_bins, profile_step, tolerance,
-    tried, won, pairs, line_tried, line_won, line_pairs, line_moved,
+    tried, won, pairs, line_tried, line_won, line_pairs, line_moved, nearby,
 ):  # fmt: skip
     """Pairs at the same position into the histograms (plane, alpha, beta) and the profiles (axis, bin); how
     many.
@@ -153,6 +174,8 @@ def rotation_pairs(  # type: ignore[no-untyped-def]
     sine = math.sin(tolerance)
     least = math.cos(0.5 * tolerance) ** 2
     middle = profile_bins // 2
+    apart = nearby.shape[0] > 0
+    margin = (nearby.shape[2] - profile_bins) // 2
     step = 2.0 * math.pi / bins
     turn = np.array([0.0, 0.0, 1.0, 0.0])
     back = np.array([0.0, 0.0, -1.0, 0.0])
@@ -214,9 +237,19 @@ def rotation_pairs(  # type: ignore[no-untyped-def]
                         if w * w + v * v >= least:
                             angle = _wrapped(2.0 * math.atan2(v, w))
                             b = middle + math.floor(angle / profile_step + 0.5)
+                            if apart and variant < 2:
+                                # What turns the rest of the way, in A's axes.
+                                n = math.sqrt(w * w + v * v)
+                                e, g = relative[(axis + 1) % 3] / n, relative[(axis + 2) % 3] / n
+                                off_u = 2.0 * math.asin(min(1.0, abs(e * w - g * v)))
+                                off_v = 2.0 * math.asin(min(1.0, abs(g * w + e * v)))
+                                _note(nearby[a, axis], b + margin, success[j], angle, off_u, off_v)
                             if 0 <= b < profile_bins:
                                 b += axis * profile_bins
-                                _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
+                                if apart:
+                                    line_pairs[b] += 1
+                                else:
+                                    _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
                                 line_moved[b] += angle
                                 hit = True
                 used += hit

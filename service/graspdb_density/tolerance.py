@@ -31,7 +31,8 @@ class Tolerance:
         P does not fall to one half within what was looked at on at least one side: the numbers are lower
         bounds.
     displacement : (n,)
-        Mean displacement of the pairs in each bin of the profile, rising; bins without pairs are left out.
+        Mean displacement of the pairs in each bin of the profile (on a grid the bin's middle), rising; bins
+        without pairs are left out.
     probability, profile_low, profile_high : (n,)
     count : (n,) int64
     resampled : (R,)
