@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from . import compiled, projection
+from . import compiled, exponential, projection
 from .compiler import exact, fast
 
 F32 = np.float32
@@ -147,7 +147,7 @@ def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
     count = 0
     for s in range(table.shape[0]):
         twin = F32(table[s, compiled.TWIN])
-        for r in range(compiled._runs(start, table, s, px, py, pz, math.sqrt(cut), runs)):
+        for r in range(compiled.runs_within(start, table, s, px, py, pz, math.sqrt(cut), runs)):
             begin = runs[r, 0]
             while begin < runs[r, 1]:
                 stop = min(begin + _GATHERED, runs[r, 1])
@@ -191,7 +191,7 @@ def _moments(near, begin, end, px, py, pz, qx, qy, qz, qw, kappa, sums):
         dz = near[2, i] - pz
         u0, u1, u2, u3 = near[3, i], near[4, i], near[5, i], near[6, i]
         a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
-        k = near[7, i] * compiled._exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+        k = near[7, i] * exponential.exp(a - kappa - (dx * dx + dy * dy + dz * dz))
         s += k
         sx += k * dx
         sy += k * dy
@@ -221,7 +221,7 @@ def _sum(near, count, px, py, pz, qx, qy, qz, qw, kappa):
             dy = near[1, i] - py
             dz = near[2, i] - pz
             a = near[3, i] * qx + near[4, i] * qy + near[5, i] * qz + near[6, i] * qw
-            s += near[7, i] * compiled._exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+            s += near[7, i] * exponential.exp(a - kappa - (dx * dx + dy * dy + dz * dz))
         total += s
     return total
 
@@ -442,7 +442,7 @@ def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, 
     last = best.shape[0] - 1
     for s in range(table.shape[0]):
         twin = F32(table[s, compiled.TWIN])
-        for r in range(compiled._runs(start, table, s, px, py, pz, radius, runs)):
+        for r in range(compiled.runs_within(start, table, s, px, py, pz, radius, runs)):
             begin = runs[r, 0]
             while begin < runs[r, 1]:
                 stop = min(begin + _GATHERED, runs[r, 1])

@@ -15,8 +15,10 @@ import math
 import numpy as np
 
 from . import compiled as c
+from . import exponential
 from .compiler import fast
 from .rowloops import _angle_factor, mixture_log_sum
+from .runloops import LANES
 
 __all__ = ["mixture_log_sums", "mixture_sums_at"]
 
@@ -105,7 +107,7 @@ def _component(data, begin, n, all_n, xi, lower, log_weight):
     l50, l51, l52, l53, l54, l55 = lower[15], lower[16], lower[17], lower[18], lower[19], lower[20]
     b0, b1, b2, b3, b4, b5 = lower[21], lower[22], lower[23], lower[24], lower[25], lower[26]
     total, spread = _ZERO, _ZERO
-    count, log_weight = np.int32(n), log_weight * c._LOG2E
+    count, log_weight = np.int32(n), log_weight * exponential.LOG2E
     for k in range(np.uint64(all_n)):
         x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
         z0 = l00 * x0 - b0
@@ -116,7 +118,7 @@ def _component(data, begin, n, all_n, xi, lower, log_weight):
         z5 = l50 * x0 + l51 * x1 + l52 * x2 + l53 * x3 + l54 * x4 + l55 * x5 - b5
         place = z0 * z0 + z1 * z1 + z2 * z2
         square = place + z3 * z3 + z4 * z4 + z5 * z5
-        value = data[7, np.uint64(begin) + k] * c._exp2(log_weight - square * c._LOG2E)
+        value = data[7, np.uint64(begin) + k] * exponential.exp2(log_weight - square * exponential.LOG2E)
         value = value if np.int32(k) < count else _ZERO
         total += value
         spread += value * place
@@ -135,13 +137,13 @@ def mixture_sums_at(
     total, spread, visited = 0.0, 0.0, 0
     for s in range(table.shape[0]):
         twin = F32(table[s, c.TWIN])
-        for r in range(c._runs(start, table, s, px, py, pz, radius, runs)):
+        for r in range(c.runs_within(start, table, s, px, py, pz, radius, runs)):
             begin, end = runs[r, 0], runs[r, 1]
             visited += end - begin
             while begin < end:
                 n = min(BLOCK, end - begin)
                 # Whole vectors, of which the end is thrown away: LLVM would take the rest one by one.
-                all_n = n + -n % c.LANES
+                all_n = n + -n % LANES
                 if begin + all_n > data.shape[1]:
                     all_n = n
                 if turning > 0.0:

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from . import compiled as c
+from . import exponential
 from .compiler import exact, fast, inlined
 
 F32 = np.float32
@@ -69,7 +70,7 @@ def _isotropic_values(data, begin, n, px, py, pz, qx, qy, qz, qw, kappa, twin, w
         dz = data[2, i] - pz
         a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
         b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        out[k] = c._exp(max(a, b) - kappa - (dx * dx + dy * dy + dz * dz))
+        out[k] = exponential.exp(max(a, b) - kappa - (dx * dx + dy * dy + dz * dz))
     if wide:
         for k in range(np.uint64(n)):
             i = np.uint64(begin) + k
@@ -81,7 +82,9 @@ def _isotropic_values(data, begin, n, px, py, pz, qx, qy, qz, qw, kappa, twin, w
             b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz)
             low = min(a, b)
             # The nearest of the four is there already; the others are both antipodes and the farther twin.
-            out[k] += c._exp(base - a) + twin * (c._exp(base + low) + c._exp(base - b))
+            out[k] += exponential.exp(base - a) + twin * (
+                exponential.exp(base + low) + exponential.exp(base - b)
+            )
 
 
 @fast
@@ -144,7 +147,7 @@ def _add_component(xi, n, lower, log_weight, far, out):  # type: ignore[no-untyp
         z4 = l40 * x0 + l41 * x1 + l42 * x2 + l43 * x3 + l44 * x4 - b4
         z5 = l50 * x0 + l51 * x1 + l52 * x2 + l53 * x3 + l54 * x4 + l55 * x5 - b5
         square = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3 + z4 * z4 + z5 * z5
-        out[k] += c._exp(log_weight - square)
+        out[k] += exponential.exp(log_weight - square)
 
 
 @fast
@@ -220,7 +223,7 @@ def isotropic_sums(  # type: ignore[no-untyped-def]
         out[j, :] = _ZERO
         for s in range(table.shape[0]):
             twin = F32(table[s, c.TWIN])
-            for r in range(c._runs(start, table, s, px, py, pz, radius, runs)):
+            for r in range(c.runs_within(start, table, s, px, py, pz, radius, runs)):
                 begin, end = runs[r, 0], runs[r, 1]
                 while begin < end:
                     n = min(BLOCK, end - begin)
@@ -253,7 +256,7 @@ def mixture_sums(  # type: ignore[no-untyped-def]
         out[j, :] = _ZERO
         for s in range(table.shape[0]):
             twin = table[s, c.TWIN] > 0.5
-            for r in range(c._runs(start, table, s, p[0], p[1], p[2], radius, runs)):
+            for r in range(c.runs_within(start, table, s, p[0], p[1], p[2], radius, runs)):
                 begin, end = runs[r, 0], runs[r, 1]
                 while begin < end:
                     n = min(BLOCK, end - begin)

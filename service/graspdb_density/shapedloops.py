@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .compiled import MAX_RUNS, TWIN, _runs
+from .compiled import MAX_RUNS, TWIN, runs_within
 from .compiler import exact, inlined
 
 __all__ = ["held_out_sums", "near_pairs", "shaped_sums"]
@@ -59,7 +59,7 @@ def shaped_sums(data, start, table, centre, scale, positions, quaternions, half,
         total, squares = 0.0, 0.0
         for s in range(table.shape[0]):
             twin = table[s, TWIN] > 0.0
-            for r in range(_runs(start, table, s, px, py, pz, radius, runs)):
+            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
                 for i in range(runs[r, 0], runs[r, 1]):
                     dx, dy, dz = px - data[0, i], py - data[1, i], pz - data[2, i]
                     ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]

@@ -38,6 +38,7 @@ from graspdb_density import (
     Region,
     SampledKernel,
     compiled,
+    exponential,
     fitting,
     reference,
     se3,
@@ -220,7 +221,7 @@ def _bare_kernels(data, poses, kappa, out):
             dy = data[1, i] - py
             dz = data[2, i] - pz
             a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-            total += compiled._exp(abs(a) - kappa - (dx * dx + dy * dy + dz * dz))
+            total += exponential.exp(abs(a) - kappa - (dx * dx + dy * dy + dz * dz))
         out[j] = total
 
 
