@@ -22,7 +22,7 @@ from graspdb.wire import GridPlan, GripperProfile, ResultRows, SimulatePayload, 
 from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import GripperShape
-from graspdb_simworker.bodies import Gripper, Part, closing_force
+from graspdb_simworker.bodies import MIN_FINGER_SHARE, Gripper, Part, closing_force
 from graspdb_simworker.labels import Label, Outcome, compile_force_test, label_of
 from graspdb_simworker.scene import GraspWorld
 
@@ -127,7 +127,7 @@ def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:
         finger_length_m=profile.finger.length_m,
         tip_offset_m=profile.tip_offset_m,
         palm_size_m=profile.palm_size_m,
-        finger_mass_kg=profile.finger_mass_kg,
+        finger_mass_kg=max(profile.finger_mass_kg, MIN_FINGER_SHARE * mass_kg),
         max_speed_m_s=profile.max_speed_m_s,
         force_n=profile.force_n,
         closing_force_n=closing_force(profile.force_n, mass_kg),

@@ -34,6 +34,12 @@ from graspdb_simworker.verification import Stored
 
 Protocol = Literal["wrench", "lift"]
 
+_DRIVES: dict[str, dict[str, float]] = {
+    "pg70": {"finger_mass_kg": 0.1, "max_speed_m_s": 0.06, "force_n": 40.0, "friction": 0.4},
+    "panda": {"finger_mass_kg": 0.015, "max_speed_m_s": 0.05, "force_n": 70.0, "friction": 0.4},
+}
+"""What closes the grippers that can be had without a service: as every service has them built in."""
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -80,6 +86,7 @@ def load(
             ),
             tip_offset_m=shape.tip_offset_m,
             palm_size_m=shape.palm_size_m,
+            **_DRIVES[gripper],
         )
         parts, mass, friction = thing.parts, thing.mass_kg, thing.friction
     else:

@@ -211,7 +211,10 @@ def test_a_mesh_in_the_wrong_unit_is_noticed(sqlite_http: httpx.Client) -> None:
         ({"tip_offset_m": 0.2}, "gripper"),
         ({"max_opening_m": 5e-4}, "gripper"),
         ({"max_speed_m_s": 1e-6}, "gripper"),
+        ({"max_speed_m_s": 5}, "gripper"),
+        ({"max_acceleration_m_s2": 1e-9}, "gripper"),
         ({"force_n": 1e-6}, "gripper"),
+        ({"finger_mass_kg": 1e-9}, "gripper"),
         ({"finger": {"width_m": 2e-5, "thickness_m": 0.01, "length_m": 0.05}}, "gripper"),
     ],
 )
@@ -230,6 +233,28 @@ def test_a_degenerate_gripper_is_refused(
     answer = sqlite_http.post("/objects/box/sweeps", json={"grid": GRID, "gripper": "odd"})
     assert problem(answer)[0] == 422
     assert problem(answer)[2] == [field]
+    if made.status_code == 201:
+        # It names what is wrong, and the bound.
+        (changed,) = change
+        assert changed in answer.text
+        assert "below" in answer.text or "above" in answer.text or changed == "tip_offset_m"
+
+
+@pytest.mark.parametrize("given", ["mass_kg", "density_kg_m3"])
+def test_an_object_lighter_than_a_gram_is_refused(sqlite_http: httpx.Client, given: str) -> None:
+    http = sqlite_http
+    add_box(http)
+    other = "density_kg_m3" if given == "mass_kg" else "mass_kg"
+    for bad in (0, -1, "NaN", "Infinity"):
+        body = f'{{"{given}": {bad}}}'
+        answer = http.patch("/objects/box", content=body, headers={"Content-Type": "application/json"})
+        assert answer.status_code == 422, bad
+    assert http.patch("/objects/box", json={given: 1e-9, other: None}).status_code == 200
+    answer = http.post("/objects/box/sweeps", json={"grid": GRID})
+    assert problem(answer)[::2] == (422, [given])
+    assert "below 0.001 kg" in answer.text
+    http.patch("/objects/box", json={given: 0.5 if given == "mass_kg" else 1_000})
+    start(http, "box", grid=GRID)
 
 
 BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [

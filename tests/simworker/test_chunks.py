@@ -110,3 +110,13 @@ def test_a_payload_that_contradicts_itself_is_refused(
     payload = payload_of("cone", poses=[pose, pose]).model_copy(update=change)
     with pytest.raises(ValueError, match="poses"):
         chunks.poses_of(payload)
+
+
+@pytest.mark.parametrize(("finger_kg", "object_kg", "simulated"), [(0.1, 1.6, 0.1), (0.015, 1.6, 0.1)])
+def test_fingers_are_not_simulated_far_lighter_than_the_object(
+    payload_of: MakePayload, finger_kg: float, object_kg: float, simulated: float
+) -> None:
+    pg70 = payload_of("mug", start=0, stop=1).gripper
+    light = pg70.model_copy(update={"finger_mass_kg": finger_kg})
+    assert chunks.gripper_of(light, object_kg).finger_mass_kg == pytest.approx(simulated)
+    assert chunks.gripper_of(light, 0.05).finger_mass_kg == finger_kg

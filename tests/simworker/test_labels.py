@@ -174,6 +174,8 @@ def test_every_end_has_its_outcome(end: End, touched: bool, outcome: Outcome) ->
 
 def test_light_objects_are_closed_on_gently_and_rated_at_full_force() -> None:
     assert (closing_force(40.0, 0.29), closing_force(40.0, 0.3), closing_force(5.0, 0.1)) == (10.0, 40.0, 5.0)
+    # What is lighter still, or held by an enormous force, is not thrown about either.
+    assert (closing_force(40.0, 0.002), closing_force(10_000.0, 0.5)) == (2.0, 500.0)
     hold = 2.0 * 0.4 * 40.0 * math.cos(math.atan(0.4))
     for mass, measured in ((0.1, 10.0), (0.5, 40.0)):
         label = label_of(closing(End.STALLED, measured), jaw(mass), mass, 0.4)

@@ -14,7 +14,8 @@ import pytest
 
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload
-from graspdb_simworker import png, verification
+from graspdb_service.usecases.grippers import BUILTIN
+from graspdb_simworker import png, sources, verification
 from graspdb_simworker.labels import Outcome
 
 
@@ -100,6 +101,14 @@ def test_show_draws_the_grasp_it_simulates(tmp_path: Path) -> None:
     collision = run("show", "mug", "--position", "0,0,0.02", folder=tmp_path)
     assert collision.returncode == 0
     assert collision.stdout.splitlines()[-1].startswith("collision")
+
+
+@pytest.mark.parametrize("gripper", ["pg70", "panda"])
+def test_a_gripper_without_a_service_is_the_one_that_services_have(gripper: str) -> None:
+    payload, _ = sources.load("cone", gripper)
+    _, profile = BUILTIN[gripper]
+    not_simulated = {"base_to_tool", "max_acceleration_m_s2"}
+    assert payload.gripper.model_dump(exclude=not_simulated) == profile.model_dump(exclude=not_simulated)
 
 
 def test_show_names_what_is_wrong(tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 
 from graspdb.wire import GridPlan, GripperProfile
 from graspdb_geometry.meshes import UNITS
@@ -16,9 +17,14 @@ MAX_SIZE_IN_OPENINGS, MIN_SIZE_IN_OPENINGS = 40.0, 0.01
 #: Between these an object looks made for the gripper.
 _USUAL_SIZE_IN_OPENINGS = (0.2, 12.0)
 MIN_OPENING_M = 1e-3
-#: A gripper slower than this would still be closing when the simulation gives up.
-MAX_CLOSING_S = 60.0
-MIN_FORCE_N = 1e-2
+#: A gripper that takes longer to close, at full speed or from rest, would still close when the simulation
+#: gives up.
+MAX_CLOSING_S = 20.0
+#: A finger faster than this would jump by 2 mm at a step of the simulation.
+MAX_SPEED_M_S = 0.5
+MIN_FORCE_N, MIN_FINGER_KG = 1e-2, 1e-3
+#: What weighs less than a gram between fingers that press with newtons is thrown about by rounding.
+MIN_MASS_KG = 1e-3
 
 
 def check_gripper(profile: GripperProfile) -> None:
@@ -29,23 +35,75 @@ def check_gripper(profile: GripperProfile) -> None:
     ProblemError
         422 naming what is wrong.
     """
-    closing_s = 0.5 * profile.max_opening_m / profile.max_speed_m_s
     reason = None
     try:
         shape_of(profile)
     except ValueError as error:
         reason = str(error)
-    if reason is None and profile.max_opening_m < MIN_OPENING_M:
-        reason = f"max_opening_m is {profile.max_opening_m:g}, below {MIN_OPENING_M:g}: metres are meant"
-    if reason is None and closing_s > MAX_CLOSING_S:
-        reason = (
-            f"max_speed_m_s is {profile.max_speed_m_s:g}, so that closing takes {closing_s:.0f} s, more than"
-            f" {MAX_CLOSING_S:.0f}: metres per second are meant"
-        )
-    if reason is None and profile.force_n < MIN_FORCE_N:
-        reason = f"force_n is {profile.force_n:g}, below {MIN_FORCE_N:g}: newtons are meant"
+    if reason is None:
+        reason = next(_troubles(profile), None)
     if reason is not None:
         raise invalid("gripper", reason, "This gripper can't be simulated")
+
+
+def _troubles(profile: GripperProfile) -> Iterator[str]:
+    opening, speed = profile.max_opening_m, profile.max_speed_m_s
+    if opening < MIN_OPENING_M:
+        yield f"max_opening_m is {opening:g}, below {MIN_OPENING_M:g}: metres are meant"
+    if speed > MAX_SPEED_M_S:
+        yield (
+            f"max_speed_m_s is {speed:g}, above {MAX_SPEED_M_S:g}, at which a finger jumps in the simulation:"
+            " give the speed with which it closes on an object, in metres per second"
+        )
+    least = 0.5 * opening / MAX_CLOSING_S
+    if speed < least:
+        yield (
+            f"max_speed_m_s is {speed:g}, below {least:.2g}, so that closing takes more than"
+            f" {MAX_CLOSING_S:.0f} s: metres per second are meant"
+        )
+    least = opening / MAX_CLOSING_S**2
+    if profile.max_acceleration_m_s2 is not None and profile.max_acceleration_m_s2 < least:
+        yield (
+            f"max_acceleration_m_s2 is {profile.max_acceleration_m_s2:g}, below {least:.2g}, so that closing"
+            f" from rest takes more than {MAX_CLOSING_S:.0f} s: metres per second squared are meant; leave it"
+            " out if it is not known"
+        )
+    if profile.force_n < MIN_FORCE_N:
+        yield f"force_n is {profile.force_n:g}, below {MIN_FORCE_N:g}: newtons are meant"
+    if profile.finger_mass_kg < MIN_FINGER_KG:
+        yield f"finger_mass_kg is {profile.finger_mass_kg:g}, below {MIN_FINGER_KG:g}: kilograms are meant"
+
+
+def check_mass(row: ObjectRow, mass_kg: float | None, sides_m: Sequence[float]) -> None:
+    """Refuse an object too light to be simulated.
+
+    Parameters
+    ----------
+    row
+    mass_kg
+        None where it follows from the density once the volume is known; the box bounds that volume.
+    sides_m
+        Of the mesh's bounding box.
+
+    Raises
+    ------
+    ProblemError
+        422 naming the mass, or the density that it comes from.
+    """
+    by_density = row.mass_kg is None and row.density_kg_m3 is not None
+    most = mass_kg
+    if most is None:
+        most = (row.density_kg_m3 or 0.0) * math.prod(sides_m)
+    if most >= MIN_MASS_KG:
+        return
+    field = "density_kg_m3" if by_density else "mass_kg"
+    of = f"{row.density_kg_m3:g}, which makes its mass {most:.3g} kg" if by_density else f"{most:g}"
+    unit = "kilograms per cubic metre" if by_density else "kilograms"
+    raise invalid(
+        field,
+        f"is {of}, below {MIN_MASS_KG:g} kg: {unit} are meant; PATCH /objects/{row.slug}",
+        f"Object {row.slug!r} is too light to be simulated",
+    )
 
 
 def check_size(row: ObjectRow, longest_m: float, profile: GripperProfile) -> None:

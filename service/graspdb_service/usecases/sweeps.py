@@ -171,10 +171,12 @@ def _world(row: ObjectRow, profile: GripperProfile) -> _World:
     box = row.mesh_info["bounding_box"]
     lower, upper = np.array(box["lower"]), np.array(box["upper"])
     simulability.check_size(row, float(np.max(upper - lower)), profile)
+    mass_kg = _mass(row)
+    simulability.check_mass(row, mass_kg, (upper - lower).tolist())
     snapshot = {
         "mesh_sha256": row.mesh_sha256,
         "parts_sha256": row.parts_sha256,
-        "mass_kg": _mass(row),
+        "mass_kg": mass_kg,
         "friction": row.friction if row.friction is not None else profile.friction,
         "gripper": profile.model_dump(mode="json"),
         "lower": lower.tolist(),
