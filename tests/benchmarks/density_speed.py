@@ -44,30 +44,11 @@ from graspdb_density import (
     se3,
 )
 from graspdb_density.density import CUTOFF, scaled_radius
+from graspdb_density.shell import SEMI_AXES_M, shell
 from graspdb_density.similarity import bhattacharyya, sampled_kernel_rows
 
 Poses = tuple[se3.Floats, se3.Floats]
 ROUNDS = 5
-
-
-def shell(count: int, rng: np.random.Generator, scale: float = 1.0) -> Poses:
-    """Grasps on an ellipsoid of semi-axes 0.2, 0.1, 0.1 m (times ``scale``), moved along its normal within
-    20 mm, any roll."""
-    axes = scale * np.array([0.2, 0.1, 0.1])
-    unit = rng.standard_normal((count, 3))
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    normal = unit / axes
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    positions = unit * axes + normal * rng.uniform(-0.01, 0.01, (count, 1))
-    z = -normal + 0.4 * rng.standard_normal((count, 3))
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    frames = se3.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
-    roll = np.zeros((count, 3))
-    roll[:, 2] = rng.uniform(-np.pi, np.pi, count)
-    return positions, se3.multiply(frames, se3.from_rotation_vector(roll))
 
 
 def queries(rows: Poses, count: int, kernel: IsotropicKernel, rng: np.random.Generator) -> Poses:
@@ -355,7 +336,8 @@ def growth(rng: np.random.Generator, plot: str | None) -> None:
         print("" if scaled else "   scikit-learn   SciPy+NumPy")
         reaches, spent = [], []
         for count in counts:
-            rows = shell(count, rng, math.sqrt(count / 20_000) if scaled else 1.0)
+            scale = math.sqrt(count / 20_000) if scaled else 1.0
+            rows = shell(count, rng, semi_axes_m=scale * np.array(SEMI_AXES_M))
             density = GraspDensity.build(*rows, kernel=kernel)
             cells = density.cells
             poses = queries(rows, 10_000, kernel, rng)

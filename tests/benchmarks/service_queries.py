@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import BestGraspRequest
-from graspdb_density import se3
+from graspdb_density import shell as shells
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases import bestgrasp
@@ -48,17 +48,7 @@ DENSE = {"sigma_position_m": 0.015, "sigma_rotation_deg": 15.0, "collision_free"
 
 def shell(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Grasps on the shell of a graspable ellipsoid (60 x 30 x 30 mm semi-axes), tool z inwards."""
-    u = rng.normal(size=(count, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    normal = u / AXES
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    position = u * AXES + normal * rng.uniform(-0.02, 0.02, (count, 1))
-    z = -normal + 0.4 * rng.normal(size=(count, 3))
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    helper = rng.normal(size=(count, 3))
-    y = np.cross(z, helper)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    return position, se3.from_matrix(np.stack([np.cross(y, z), y, z], axis=-1))
+    return shells.shell(count, rng, semi_axes_m=AXES, depth_m=0.02)
 
 
 def sphere_stl(subdivisions: int = 3) -> bytes:

@@ -21,8 +21,9 @@ from scipy.spatial import cKDTree
 
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.convergence import bootstrap_similarity
-from graspdb_density.growing import convergence_curve
-from graspdb_density.rows import LEAST, KernelRows
+from graspdb_density.growing import GrowingCurve, convergence_curve
+from graspdb_density.rows import LEAST, Kernel, KernelRows
+from graspdb_density.shell import shell
 from graspdb_density.threads import processors
 
 Poses = tuple[se3.Floats, se3.Floats]
@@ -36,25 +37,6 @@ class Gaussian:
     weights = np.ones(1)
     means = np.zeros((1, 6))
     covariances = np.diag(np.square([0.02, 0.008, 0.02, 0.2, 0.4, 0.2]))[None]
-
-
-def shell(count: int, rng: np.random.Generator) -> Poses:
-    """Grasps on an ellipsoid of semi-axes 0.2, 0.1, 0.1 m, moved along its normal within 20 mm, any roll."""
-    axes = np.array([0.2, 0.1, 0.1])
-    unit = rng.standard_normal((count, 3))
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    normal = unit / axes
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    positions = unit * axes + normal * rng.uniform(-0.01, 0.01, (count, 1))
-    z = -normal + 0.4 * rng.standard_normal((count, 3))
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    frames = se3.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
-    roll = np.zeros((count, 3))
-    roll[:, 2] = rng.uniform(-np.pi, np.pi, count)
-    return positions, se3.multiply(frames, se3.from_rotation_vector(roll))
 
 
 def peer_similarity(rows: KernelRows, points: int, rng: np.random.Generator) -> float:
@@ -103,6 +85,31 @@ def peak(count: int, points: int) -> float:
         return pool.apply(_peak, (count, points))
 
 
+def growth(count: int, added: int, rng: np.random.Generator) -> None:
+    """Print what a report costs that has a curve of ``count`` grasps and gets ``added`` more."""
+    p, q = shell(count + added, rng)
+    for name, kernel in (("isotropic", KERNEL), ("anisotropic", Gaussian())):
+        kept = GrowingCurve.grown(None, p[:count], q[:count], kernel)
+
+        def grown(known: GrowingCurve | None, kernel: Kernel = kernel) -> tuple[GrowingCurve, float]:
+            began = time.process_time()
+            return GrowingCurve.grown(known, p, q, kernel), time.process_time() - began
+
+        whole, at_once = grown(None)
+        more, extended = grown(kept)
+        _, unchanged = grown(more)
+        assert (whole.kept, more.kept) == (0, count)
+        apart = max(
+            float(np.abs(one.replicates - other.replicates).max())
+            for one, other in zip(whole.curve.points, more.curve.points, strict=True)
+        )
+        print(
+            f"{count} grasps and {added} more, {name}: {extended:.2f} CPU s, at once {at_once:.2f},"
+            f" nothing new {unchanged:.2f}; s differs by {apart:.0e} at most; {more.nbytes / 1e6:.0f} MB kept",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Print the table."""
     rng = np.random.default_rng(0)
@@ -139,6 +146,7 @@ def main() -> None:
         f"20,000 grasps, 2,000 points: {ours:.2f} CPU s; SciPy and NumPy {peer:.2f}, "
         f"{peer / ours:.0f} times as long"
     )
+    growth(20_000, 500, rng)
     for count in (20_000, 160_000):
         poses = shell(count, rng)
         wall, cpu = timed(lambda poses=poses: convergence_curve(*poses, KERNEL), 1)  # type: ignore[misc]
