@@ -8,22 +8,17 @@ and hatched, never a colour.
 from __future__ import annotations
 
 import io
-import math
 import threading
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graspdb import figures_projection, figures_sources, figures_widths
+from graspdb import figures_anisotropy, figures_projection, figures_sources, figures_widths
 from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, bars, told
 from graspdb.figures_style import plain as _plain
 from graspdb.figures_style import title as _title
 from graspdb.wire.reports import (
-    AnisotropyHistogram,
     AnisotropyReport,
-    AnisotropyTolerance,
     AnyReport,
     BandwidthReport,
     CalibrationReport,
@@ -35,12 +30,9 @@ from graspdb.wire.reports import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["draw", "rendered"]
-
-Floats = NDArray[np.float64]
 
 _COLOURS = (BLUE, ORANGE, GREEN)
 _DPI = 120
@@ -75,8 +67,8 @@ def draw(report: AnyReport | SummaryReport) -> Figure:
         figure = NewFigure(figsize=(8.0, 6.4), layout="constrained")
         _convergence(figure, report)
     elif isinstance(report, AnisotropyReport):
-        figure = NewFigure(figsize=(14.0, 11.5))
-        _anisotropy(figure, report)
+        figure = NewFigure()
+        figures_anisotropy.anisotropy(figure, report)
     elif isinstance(report, ProjectionReport):
         figure = NewFigure()
         figures_projection.projection(figure, report)
@@ -157,108 +149,6 @@ def _convergence(figure: Figure, report: ConvergenceReport) -> None:
 
 def _number(value: float | None) -> str:
     return "can't be told" if value is None else f"{value:,.0f}"
-
-
-# -- anisotropy
-
-
-def _anisotropy(figure: Figure, report: AnisotropyReport) -> None:
-    frame = "gripper" if report.alignment == "gripper" else f"{report.alignment}'s axes"
-    lines = _title(figure, report, f"what a success tells about its vicinity ({report.method}, {frame})")
-    # What the words take more than three lines for is added above the panels, which keep their size.
-    height = figure.get_figheight()
-    figure.set_figheight(height + 0.18 * max(0, lines - 3))
-    part = height / figure.get_figheight()
-    # Placed by hand: a layout that measures every label takes seconds for as many axes.
-    rows = [
-        figure.add_gridspec(
-            1, columns, left=0.06, right=right, bottom=part * bottom, top=part * top, wspace=space
-        )
-        for columns, right, bottom, top, space in (
-            (len(report.translations), 0.9, 0.69, 0.88, 0.12),
-            (len(report.rotations), 0.9, 0.32, 0.63, 0.2),
-            (len(report.tolerances), 0.98, 0.05, 0.22, 0.08),
-        )
-    ]
-    image: Any = None
-    for i, histogram in enumerate(report.translations):
-        axes = figure.add_subplot(rows[0][0, i])
-        image = _heat(axes, histogram, 1e3)
-        low, high = histogram.slice_m or (0.0, 0.0)
-        axes.set_title(f"z {1e3 * low:.0f} to {1e3 * high:.0f} mm, n = {_total(histogram)}", fontsize=8)
-        axes.set_xlabel("x [mm]", fontsize=8)
-        if i == 0:
-            axes.set_ylabel("y [mm]", fontsize=8)
-        else:
-            axes.set_yticklabels([])
-    for i, histogram in enumerate(report.rotations):
-        axes = figure.add_subplot(rows[1][0, i])
-        image = _heat(axes, histogram, 180.0 / math.pi)
-        first, second = (name[1:] for name in histogram.axes)
-        axes.set_title(f"rotation about {first}, then {second}; n = {_total(histogram)}", fontsize=8)
-        axes.set_xlabel(f"about {first} [deg]", fontsize=8)
-        axes.set_ylabel(f"about {second} [deg]", fontsize=8)
-    bar = figure.colorbar(image, cax=figure.add_axes((0.93, part * 0.36, 0.015, part * 0.5)))
-    bar.set_label("share of displaced grasps that succeed (hatched: none tried)", fontsize=8)
-    for i, item in enumerate(report.tolerances):
-        _profile(figure.add_subplot(rows[2][0, i]), item, report.level, first=i == 0)
-
-
-def _total(histogram: AnisotropyHistogram) -> str:
-    return f"{sum(map(sum, histogram.count)):,}"
-
-
-def _heat(axes: Axes, histogram: AnisotropyHistogram, factor: float) -> Any:
-    value = _array(histogram.probability)
-    axes.set_facecolor("white")
-    x, y = (factor * np.asarray(edge) for edge in histogram.edges)
-    axes.fill_between(
-        [x[0], x[-1]], y[0], y[-1], facecolor="white", edgecolor="0.8", hatch="////", linewidth=0
-    )
-    image = axes.pcolormesh(
-        x, y, np.ma.masked_invalid(value.T), cmap="viridis", vmin=0.0, vmax=1.0, linewidth=0, rasterized=True
-    )
-    axes.plot(0.0, 0.0, marker="+", color="white", markersize=7, markeredgewidth=1.6)
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=7)
-    return image
-
-
-def _array(values: Sequence[Sequence[float | None]]) -> Floats:
-    return np.array([[math.nan if v is None else v for v in row] for row in values], dtype=np.float64)
-
-
-def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool) -> None:
-    turn = item.unit == "rad"
-    factor, unit = (180.0 / math.pi, "deg") if turn else (1e3, "mm")
-    name = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
-    at = factor * np.asarray(item.displacement)
-    if len(at):
-        axes.fill_between(
-            at, item.profile_low, item.profile_high, color=BLUE, alpha=0.2, linewidth=0,
-            label=f"{level:.0%} interval",
-        )  # fmt: skip
-        axes.plot(at, item.probability, color=BLUE, marker=".", markersize=4, linewidth=1.2)
-    axes.axhline(0.5, color=GREY, linestyle="--", linewidth=0.8)
-    if item.half_width is None:
-        told = "hidden by the kernel" if item.within else "nothing tried"
-    else:
-        more = "> " if item.beyond else "< " if item.within else ""
-        told = f"{more}{factor * item.half_width:.0f} {unit}"
-        if item.low is not None and item.high is not None and not more:
-            told += f" ({factor * item.low:.0f} to {factor * item.high:.0f})"
-        for end, sign in ((item.minus, -1.0), (item.plus, 1.0)):
-            if end is not None:
-                axes.axvline(sign * factor * end, color=ORANGE, linestyle=":", linewidth=1.2)
-    axes.set_title(f"{name}: {told}\nn = {sum(item.count):,}", fontsize=8)
-    axes.set_ylim(0.0, 1.02)
-    axes.set_xlabel(f"[{unit}]", fontsize=8)
-    axes.tick_params(labelsize=7)
-    if first:
-        axes.set_ylabel("share that succeeds\n(others unchanged)", fontsize=8)
-    else:
-        axes.set_yticklabels([])
-    _plain(axes)
 
 
 # -- calibration
