@@ -153,18 +153,18 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
     name = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
     at = factor * np.asarray(item.displacement)
     if len(at):
-        axes.fill_between(
-            at, item.profile_low, item.profile_high, color=BLUE, alpha=0.2, linewidth=0,
-            label=f"{level:.0%} interval",
-        )  # fmt: skip
-        told = np.asarray(item.probability, dtype=np.float64)
+        told, low, high = (
+            np.asarray(values, dtype=np.float64)
+            for values in (item.probability, item.profile_low, item.profile_high)
+        )
         if not (np.abs(at) < 0.02 * np.abs(at).max()).any():
-            # No trial is where the success itself is: the line would hide it.
+            # No trial is where the success itself is: a line across would hide it.
             place = int(np.searchsorted(at, 0.0))
             axes.plot([0.0], [1.0], color=BLUE, marker="o", markerfacecolor="white", markersize=4, zorder=3)
             ends = np.insert(at, place, 0.0), np.insert(told, place, 1.0)
             axes.plot(*ends, color=BLUE, linewidth=0.8, linestyle="--")
-            at, told = np.insert(at, place, np.nan), np.insert(told, place, np.nan)
+            at, told, low, high = (np.insert(values, place, np.nan) for values in (at, told, low, high))
+        axes.fill_between(at, low, high, color=BLUE, alpha=0.2, linewidth=0, label=f"{level:.0%} interval")
         axes.plot(at, told, color=BLUE, marker=".", markersize=4, linewidth=1.2)
         if item.axis == "x":
             axes.legend(fontsize=7, loc="lower center", framealpha=0.9)
