@@ -11,7 +11,8 @@ import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -262,12 +263,11 @@ def _read_tuples(tx: Tx, columns: Sequence[str], where: str) -> Columns:
     cursor = tx.connection.cursor()
     try:
         cursor.execute(f"SELECT {names} FROM trials WHERE {where} ORDER BY seq")
-        blocks = []
-        while rows := cursor.fetchmany(100_000):
-            blocks.append(np.array(rows, dtype=np.float64))
+        # Straight into an array: lists of rows would take longer, and much more memory.
+        rows = cast("Iterable[Sequence[float]]", cursor)
+        table = np.fromiter(chain.from_iterable(rows), dtype=np.float64).reshape(-1, len(columns))
     finally:
         cursor.close()
-    table = np.concatenate(blocks) if blocks else np.empty((0, len(columns)))
     proposal = np.where(table[:, 8] < 0, np.nan, table[:, 8])
     return Columns(
         seq=table[:, 0].astype(np.int64),
