@@ -7,6 +7,7 @@ from typing import Any
 
 from graspdb import wire
 from graspdb.pages import Listing, checked, segment
+from graspdb.runs import RunProgress, finished
 from graspdb.transport import Transport
 
 __all__ = ["Kernels"]
@@ -18,8 +19,19 @@ class Kernels:
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
 
-    def fit(self, /, object: str, **options: Any) -> wire.StoredKernel:
+    def fit(
+        self,
+        /,
+        object: str,
+        *,
+        progress: RunProgress | None = None,
+        timeout_s: float | None = None,
+        **options: Any,
+    ) -> wire.StoredKernel:
         """Fit a kernel on an object's successes, or with ``kind="probability"`` on all its attempts.
+
+        Waits until it is fitted. ``components="auto"`` may take a while: ``progress`` is called with its run
+        meanwhile, and ``timeout_s`` ends the wait, not the fit: the kernel is in the list once it is done.
 
         Options are those of :class:`graspdb.wire.KernelCreate`: ``kind``, ``gripper``, ``alignment``,
         ``components`` (how many Gaussians, or ``auto``), ``window``, ``component_widths``, ``protocol``,
@@ -30,7 +42,7 @@ class Kernels:
         Conflict
             For too few trials, saying how many are needed.
         """
-        return self._create({"object": object, **options})
+        return self._create({"object": object, **options}, progress, timeout_s)
 
     def create(self, /, components: list[Any], **options: Any) -> wire.StoredKernel:
         """Store a kernel given by its components: ``weight``, ``mean`` (6), ``covariance`` (6, 6)."""
@@ -51,7 +63,13 @@ class Kernels:
         """Delete a kernel."""
         self._transport.request("DELETE", f"/kernels/{segment(id)}")
 
-    def _create(self, fields: dict[str, Any]) -> wire.StoredKernel:
+    def _create(
+        self, fields: dict[str, Any], progress: RunProgress | None = None, timeout_s: float | None = None
+    ) -> wire.StoredKernel:
         request = checked(wire.KernelCreate, fields)
-        answer = self._transport.json("POST", "/kernels", body=request, idempotent=True)
-        return wire.StoredKernel.model_validate(answer)
+        answer = self._transport.request("POST", "/kernels", body=request, idempotent=True)
+        made = answer.json()
+        if answer.status_code == 202:
+            where = answer.headers["Location"]
+            made = finished(self._transport, where, "the kernel", progress, timeout_s)
+        return wire.StoredKernel.model_validate(made)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import html
-import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
-from graspdb.errors import GraspDBError, error_for
+from graspdb.runs import RunProgress, finished
 from graspdb.selection import Selection, TrialSelection, query, taken
 from graspdb.sweeps import Sweep
 from graspdb.transport import Transport
@@ -26,7 +25,6 @@ from graspdb.wire.reports import (
     ConvergenceReport,
     KernelSimilarityReport,
     ProjectionReport,
-    ReportRun,
     SourceComparison,
     SourcesReport,
     SummaryReport,
@@ -54,9 +52,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 R = TypeVar("R", bound=ReportModel | SummaryReport)
 M = TypeVar("M", bound=ReportModel)
-Progress = Callable[[ReportRun], None]
-
-_POLL_S = 0.5
+Progress = RunProgress
 
 
 class Report(Generic[R]):
@@ -472,28 +468,14 @@ class Reports:
         progress: Progress | None,
         timeout_s: float | None,
     ) -> M:
-        began = time.monotonic()
         answer = self._transport.request(
             "GET", f"{self._path}/reports/{name}", params=params, headers={"Accept": "application/json"}
         )
-        if answer.status_code != 202:
-            return model.model_validate(answer.json())
-        location = answer.headers["Location"]
-        while True:
-            run = ReportRun.model_validate(self._transport.json("GET", location))
-            if progress is not None:
-                progress(run)
-            if run.result is not None:
-                return model.model_validate(run.result)
-            if run.problem is not None:
-                raise error_for(wire.Problem.model_validate(run.problem))
-            if run.state != "running":
-                raise GraspDBError(f"the report was {run.state}: ask again to compute it anew")
-            if timeout_s is not None and time.monotonic() - began > timeout_s:
-                raise TimeoutError(
-                    f"the {name} report is {run.progress:.0%} done after {timeout_s:g} s; it goes on"
-                )
-            time.sleep(_POLL_S)
+        found = answer.json()
+        if answer.status_code == 202:
+            where = answer.headers["Location"]
+            found = finished(self._transport, where, f"the {name} report", progress, timeout_s)
+        return model.model_validate(found)
 
     def __repr__(self) -> str:
         return f"<reports: {', '.join(REPORTS)}>"

@@ -24,7 +24,7 @@ from .calibration import assign_blocks
 from .density import GraspDensity
 from .kernels import HAAR_VOLUME, IsotropicKernel
 from .mixture import MixtureDensity
-from .rows import KernelRows
+from .rows import KernelRows, Progress
 from .se3 import Floats
 from .similarity import Coefficient, DisplacementWindow, bhattacharyya, sampled_kernel_rows
 
@@ -49,6 +49,8 @@ _FITTED_MOST, _SCALED_MOST, _JUDGED_MOST = 8_000, 5_000, 600
 #: Share of a uniform density mixed in, so that a grasp without neighbours counts as an outlier and no more.
 _UNIFORM_SHARE = 1e-3
 _SAMPLES = 900
+#: What the shape takes of the time where numbers of components are tried.
+_SHAPE_SHARE = 0.8
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -169,6 +171,7 @@ def fit_kernel(
     frame: ArrayLike | None = None,
     seed: int = 0,
     threads: int = 1,
+    progress: Progress | None = None,
 ) -> FittedKernel:
     """Learn a kernel from successful grasps.
 
@@ -218,7 +221,10 @@ def fit_kernel(
         )
     added = np.diag([widths.sigma_position_m**2] * 3 + [widths.sigma_rotation**2] * 3)
     tried = (1,) if frame is not None else _TRIED_COMPONENTS if components is None else (components,)
-    shape, likelihoods = _shape(found, tried, added, frame is not None, rng)
+    told = progress or (lambda _: None)
+    shape, likelihoods = _shape(
+        found, tried, added, frame is not None, rng, lambda done: told(_SHAPE_SHARE * done)
+    )
     turns = se3.from_rotation_vector(found.vectors[:, 3:])
     chosen = rng.choice(len(turns), size=min(_SAMPLES, len(turns)), p=found.weights / found.weights.sum())
     sampled = sampled_kernel_rows(found.vectors[chosen, :3], turns[chosen], widths)
@@ -233,7 +239,10 @@ def fit_kernel(
         raise ValueError(
             "the displacements spread over more than a kernel may be wide: ask for a smaller window"
         )
-    values = [judge.anisotropic(kernel) for _, kernel in candidates]
+    values = []
+    for _, candidate in candidates:
+        values.append(judge.anisotropic(candidate))
+        told(_SHAPE_SHARE + (1.0 - _SHAPE_SHARE) * len(values) / len(candidates))
     known = [i for i, value in enumerate(values) if math.isfinite(value)]
     best = max(known, key=lambda i: values[i]) if known else len(candidates) - 1
     return FittedKernel(
@@ -329,7 +338,12 @@ def _scaled(kernel: AnisotropicKernel, factor: float) -> AnisotropicKernel | Non
 
 
 def _shape(
-    found: Displacements, tried: Sequence[int], added: Floats, plain: bool, rng: np.random.Generator
+    found: Displacements,
+    tried: Sequence[int],
+    added: Floats,
+    plain: bool,
+    rng: np.random.Generator,
+    told: Progress,
 ) -> tuple[AnisotropicKernel, dict[int, float]]:
     """The mixture with the best held-out likelihood, fitted again on all, and those likelihoods."""
     keep = np.sort(rng.permutation(len(found.vectors))[:_FITTED_MOST])
@@ -342,7 +356,9 @@ def _shape(
         return _fitted(x, w, tried[0], added, plain), {}
     likelihoods = {}
     best, highest, failed = tried[0], -math.inf, 0
-    for count in tried:
+    for at, count in enumerate(tried):
+        # A fit takes as long as it has components; the last one is repeated on all displacements.
+        told(sum(tried[:at]) / (sum(tried) + tried[-1]))
         try:
             kernel = _fitted(x[~held], w[~held], count, added, plain)
         except ValueError:

@@ -105,7 +105,7 @@ def growth(count: int, added: int, rng: np.random.Generator) -> None:
         )
         print(
             f"{count} grasps and {added} more, {name}: {extended:.2f} CPU s, at once {at_once:.2f},"
-            f" nothing new {unchanged:.2f}; s differs by {apart:.0e} at most; {more.nbytes / 1e6:.0f} MB kept",
+            f" nothing new {unchanged:.2f}; s differs by {apart:.0e}; {more.nbytes / 1e6:.0f} MB kept",
             flush=True,
         )
 

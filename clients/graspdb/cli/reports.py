@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -179,6 +181,13 @@ def _computed(state: State, id: str, name: str, options: dict[str, Any], simulat
 
 
 def _asked(reports: Reports, id: str, name: str, options: dict[str, Any]) -> Any:
+    with _bar(f"{name} of {id}") as show:
+        return getattr(reports, name.replace("-", "_"))(**options, progress=show)
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Callable[[ReportRun], None]]:
+    """How far a run is, for a person to see, once it is told."""
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
     )
@@ -187,10 +196,10 @@ def _asked(reports: Reports, id: str, name: str, options: dict[str, Any]) -> Any
 
         def show(run: ReportRun) -> None:
             nonlocal task
-            task = bar.add_task(f"{name} of {id}", total=1.0) if task is None else task
+            task = bar.add_task(title, total=1.0) if task is None else task
             bar.update(task, completed=run.progress)
 
-        return getattr(reports, name.replace("-", "_"))(**options, progress=show)
+        yield show
 
 
 def _show(found: Any) -> None:
@@ -397,12 +406,18 @@ def fit_kernel(
     """Fit a kernel on an object's successes, or widths that predict success on all its attempts."""
     state = state_of(context)
     count = int(components) if components is not None and components.isdigit() else components
-    given = {"gripper": gripper, "protocol": protocol, "source": source, "components": count}
-    with state.client() as db:
+    given: dict[str, Any] = {
+        "gripper": gripper,
+        "protocol": protocol,
+        "source": source,
+        "components": count,
+    }
+    with state.client() as db, _bar(f"kernel of {id}") as show:
         made = db.kernels.fit(
             id,
             kind=kind,
             alignment=alignment,
+            progress=show,
             **{name: value for name, value in given.items() if value is not None},
         )
     if state.json:

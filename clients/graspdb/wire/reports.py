@@ -500,11 +500,14 @@ REPORTS: dict[str, type[AnyReport]] = {
 
 
 class ReportRun(Response):
-    """A report's computation; ``result`` once it is done, ``problem`` where it failed."""
+    """A report's computation; ``result`` once it is done, ``problem`` where it failed.
+
+    ``kernel`` instead of a report's name: a kernel that is being fitted (:class:`StoredKernel` once it is).
+    """
 
     id: str
     object: str
-    report: ReportName
+    report: ReportName | Literal["kernel"]
     revision: int
     parameters: dict[str, Any]
     state: RunState

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import JSONResponse
 
 from graspdb.wire import Page, Slug
 from graspdb.wire.kernels import KernelCreate, StoredKernel
+from graspdb.wire.reports import ReportRun
 from graspdb_service.api.routing import (
     Ctx,
     Cursor,
@@ -24,12 +26,24 @@ from graspdb_service.usecases import kernels
 router = APIRouter(tags=["kernels"])
 
 
-@router.post("/kernels", status_code=201, response_model=StoredKernel, **scope("admin"))
+@router.post(
+    "/kernels",
+    status_code=201,
+    response_model=StoredKernel,
+    responses={202: {"model": ReportRun, "description": "Being fitted: Location says where it will be"}},
+    **scope("admin"),
+)
 def create_kernel(
     ctx: Ctx, request: KernelCreate, response: Response, body: RawBody, key: IdempotencyKey
 ) -> object:
-    """Fit a kernel on an object's successes, or store one given by its components."""
+    """Fit a kernel on an object's successes, or store one given by its components.
+
+    With ``components: "auto"`` this may take longer than a request should: then the answer is 202 with the
+    run that fits it, whose ``result`` is the kernel.
+    """
     made = kernels.create(ctx, request, key=key, body=body)
+    if made.status == 202:
+        return JSONResponse(made.body, 202, headers={"Location": made.location, "Retry-After": "2"})
     response.headers["Location"] = made.location
     return made.body
 

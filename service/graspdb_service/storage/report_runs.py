@@ -171,6 +171,11 @@ def cancel(tx: Tx, id: str) -> bool:
     return bool(tx.execute(statement).rowcount)
 
 
+def remove(tx: Tx, id: str) -> None:
+    """Delete a run, where there is one."""
+    tx.execute(delete(report_runs).where(report_runs.c.id == id))
+
+
 def _take(tx: Tx, which: ColumnElement[bool], lease: dict[str, Any]) -> bool:
     free = or_(
         report_runs.c.state == "cancelled",

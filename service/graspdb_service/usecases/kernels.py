@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import uuid
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,43 +13,34 @@ from numpy.typing import NDArray
 
 from graspdb.wire.kernels import (
     MAX_COMPONENTS,
-    MAX_FITTED,
     MAX_SAMPLED,
-    SAMPLED,
-    KernelComponent,
     KernelCreate,
     KernelProvenance,
     KernelWidths,
-    KernelWindow,
     StoredKernel,
 )
-from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
-from graspdb_density.fitting import LEAST_DISPLACEMENTS, displacements, fit_kernel
-from graspdb_density.similarity import DisplacementWindow, bhattacharyya, sampled_kernel_rows
-from graspdb_service.problems import conflict, invalid, not_found
+from graspdb_density import AnisotropicKernel
+from graspdb_service.problems import invalid, not_found
 from graspdb_service.storage import grippers, kernels
+from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.kernels import KernelRow
-from graspdb_service.usecases import predictors, shapes
+from graspdb_service.usecases import kernel_fits, predictors, report_runs
 from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.densities import Built, KernelChoice, require_object
-from graspdb_service.usecases.features import Axes
+from graspdb_service.usecases.densities import require_object
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.idempotency import Created, replay_or, replayed
-from graspdb_service.usecases.selection import Filters
 
 Floats = NDArray[np.float64]
 
 #: Farther along an axis no displacement between grasps of one object reaches.
 _MOST_SHIFT_M = 1.0
-#: Displacements that stand for all of them where a sample is compared with them.
-_WHOLE = 20_000
 #: Shares of a covariance's scale, and metres, below which an entry is none.
 _SAME = 1e-9
 
 
 def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
-    """Store a kernel.
+    """Store a kernel, or with ``components=auto`` start the run that fits it (status 202) unless it is done
+    at once.
 
     Raises
     ------
@@ -63,13 +56,17 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
     scope = "POST /kernels"
     # A fit takes a while, and the trials may have gone since.
     earlier = replayed(ctx, scope=scope, key=key, request=body)
-    if earlier is not None:
+    if earlier is not None and earlier.status == 201:
         return earlier
+    if not isinstance(request.components, list) and request.kind != "probability":
+        kernel_fits.check(request)
+        if request.components == "auto":
+            return _started(ctx, request, scope=scope, key=key, body=body)
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
         row = kernels.create(tx, str(uuid.uuid4()), **made)
-        return Created(info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
+        return Created(kernel_fits.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
     return replay_or(ctx, scope=scope, key=key, request=body, create=make)
 
@@ -80,7 +77,7 @@ def get(ctx: Context, id: str) -> StoredKernel:
         row = kernels.find(tx, id)
     if row is None:
         raise not_found("kernel", id[:80], "GET /kernels lists those there are")
-    return info(row)
+    return kernel_fits.info(row)
 
 
 def page(
@@ -90,7 +87,7 @@ def page(
     with ctx.database.read() as tx:
         object_id = None if object is None else require_object(tx, object).id
         rows = kernels.page(tx, after=after, limit=limit + 1, object_id=object_id, gripper=gripper)
-    items = [info(row) for row in rows[:limit]]
+    items = [kernel_fits.info(row) for row in rows[:limit]]
     return items, rows[limit - 1].number if len(rows) > limit else None
 
 
@@ -99,6 +96,8 @@ def remove(ctx: Context, id: str) -> None:
     with ctx.database.write() as tx:
         if not kernels.remove(tx, id):
             raise not_found("kernel", id[:80], "GET /kernels lists those there are")
+        # The run that fitted it has its id, and answers with it.
+        report_run_rows.remove(tx, id)
 
 
 def _given(ctx: Context, request: KernelCreate) -> dict[str, Any]:
@@ -148,7 +147,7 @@ def _checked_gaussians(request: KernelCreate) -> list[dict[str, Any]]:
             _check_signs(kernel)
     except ValueError as error:
         raise invalid("components", str(error), "These components make no kernel") from None
-    return _components(kernel)
+    return kernel_fits.components_of(kernel)
 
 
 def _check_signs(kernel: AnisotropicKernel) -> None:
@@ -201,171 +200,34 @@ def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
 
 
 def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
-    assert request.object is not None
     if request.kind == "probability":
         return predictors.fitted(ctx, request)
-    sampled, count = request.kind == "sampled", request.components
-    assert not isinstance(count, list)
-    if sampled and count == "auto":
-        raise invalid(
-            "components", f"how many displacements to draw: 1 to {MAX_SAMPLED}, {SAMPLED} by default"
-        )
-    if not sampled and isinstance(count, int) and count > MAX_FITTED:
-        raise invalid(
-            "components", f"at most {MAX_FITTED} Gaussians, or auto; kind sampled takes {MAX_SAMPLED}"
-        )
-    if request.alignment != "gripper" and count not in (None, 1, "auto"):
-        raise invalid(
-            "components",
-            "axes that do not turn with the jaw have no sign: a kernel aligned with them has 1",
-        )
-    window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
-    filters = Filters(request.gripper, request.protocol, request.source)
     with ctx.compute.admitted():
-        built = ctx.densities.get(request.object, filters, KernelChoice())
-        # Said first: without axes no number of trials helps.
-        axes = shapes.axes(request.alignment, built.object_row, built.selected, ctx.scenes.features)
-        if built.density is None:
-            raise conflict(
-                "too-few-trials",
-                "No trial of this selection succeeded, so there is nothing to fit a kernel on:"
-                f" post trials (POST /objects/{request.object}/trials) or sweep a grid first",
-            )
-        threads = ctx.compute.threads
-        try:
-            components, told = ctx.compute.run(
-                lambda: (
-                    _sample(request, built, window, widths, threads)
-                    if sampled
-                    else _fit(request, built, axes, window, widths, threads)
-                )
-            )
-        except ValueError as error:
-            raise conflict("too-few-trials", f"No kernel can be fitted: {error}") from None
-    provenance = KernelProvenance(
-        origin="fitted",
-        object=built.object_row.slug,
-        revision=built.revision,
-        protocol=built.selected.protocol,
-        source=built.selected.source,
-        window=window,
-        component_widths=widths,
-        **told,
-    )
-    return {
-        "kind": request.kind,
-        "alignment": request.alignment,
-        "gripper": built.selected.gripper,
-        "object_id": built.object_row.id,
-        "components": components,
-        "provenance": provenance.model_dump(mode="json", exclude_none=True),
-    }
-
-
-def _fit(
-    request: KernelCreate,
-    built: Built,
-    axes: Axes,
-    window: KernelWindow,
-    widths: KernelWidths,
-    threads: int,
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """A Gaussian, or a mixture of a few: its components and what is told of the fit."""
-    density, count = built.density, request.components
-    assert density is not None
-    assert not isinstance(count, list)
-    fit = fit_kernel(
-        density.positions,
-        density.quaternions_xyzw,
-        window=_window(window),
-        widths=_isotropic(widths),
-        compared=density.kernel,
-        components=None if count == "auto" else count or 1,
-        weights=density.weights,
-        symmetric=density.symmetric,
-        frame=shapes.axes_at(axes, density.positions, density.quaternions_xyzw),
-        threads=threads,
-    )
-    return _components(fit.kernel), {
-        "successes": fit.successes,
-        "displacements": fit.displacements,
-        "scale": fit.scale,
-        "log_likelihood": _finite(fit.log_likelihood),
-        "isotropic_log_likelihood": _finite(fit.isotropic_log_likelihood),
-        "similarity": fit.similarity.value,
-        "likelihood_by_components": {str(k): v for k, v in fit.likelihoods.items()} or None,
-    }
-
-
-def _sample(
-    request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths, threads: int
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Displacements drawn from those between successes (eq 5), and their likeness to all of them."""
-    density, rng = built.density, np.random.default_rng(0)
-    assert density is not None
-    count = request.components if isinstance(request.components, int) else SAMPLED
-    found = displacements(
-        density.positions,
-        density.quaternions_xyzw,
-        window=_window(window),
-        rng=rng,
-        weights=density.weights,
-        symmetric=density.symmetric,
-    )
-    if len(found.vectors) < LEAST_DISPLACEMENTS:
-        raise ValueError(
-            f"the window holds {len(found.vectors)} displacements between successes, and a kernel is sampled"
-            f" from at least {LEAST_DISPLACEMENTS}: widen the window or add trials"
+        return kernel_fits.fitted(
+            ctx.densities,
+            ctx.scenes.features,
+            request,
+            threads=ctx.compute.threads,
+            computed=ctx.compute.run,
+            progress=lambda _: None,
         )
-    share = found.weights / found.weights.sum()
-    chosen = found.vectors[rng.choice(len(share), size=count, p=share)]
-    whole = found.vectors[rng.choice(len(share), size=min(_WHOLE, len(share)), p=share)]
-    one, every = (
-        sampled_kernel_rows(part[:, :3], se3.from_rotation_vector(part[:, 3:]), _isotropic(widths))
-        for part in (chosen, whole)
-    )
-    similarity = bhattacharyya(one, every, rng, points=4_000, window=_window(window), threads=threads)
-    return [{"weight": 1.0, "mean": vector.tolist()} for vector in chosen], {
-        "successes": density.size,
-        "displacements": len(found.vectors),
-        "similarity": similarity.value,
-    }
 
 
-def _window(window: KernelWindow) -> DisplacementWindow:
-    return DisplacementWindow(window.position_m, math.radians(window.rotation_deg))
+def _started(ctx: Context, request: KernelCreate, *, scope: str, key: str | None, body: bytes) -> Created:
+    """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
+    assert request.object is not None
+    row, _ = ctx.densities.current(request.object, kernel_fits.filters_of(request))
+    lease = ctx.reports.place()
+    id = str(uuid.uuid4())
 
+    def make(tx: Tx) -> Created:
+        ctx.reports.enter_fit(tx, id, lease, row, request)
+        return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
-def _isotropic(widths: KernelWidths) -> IsotropicKernel:
-    return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _components(kernel: AnisotropicKernel) -> list[dict[str, Any]]:
-    return [
-        {"weight": float(w), "mean": m.tolist(), "covariance": s.tolist()}
-        for w, m, s in zip(kernel.weights, kernel.means, kernel.covariances, strict=True)
-    ]
-
-
-def info(row: KernelRow) -> StoredKernel:
-    """As the wire has it."""
-    used = shapes.info_of(row)
-    assert used.widths_m is not None
-    assert used.widths_deg is not None
-    return StoredKernel(
-        id=row.id,
-        kind=row.kind,
-        alignment=row.alignment,
-        gripper=row.gripper,
-        sigma_position_m=used.sigma_position_m,
-        sigma_rotation_deg=used.sigma_rotation_deg,
-        widths_m=used.widths_m,
-        widths_deg=used.widths_deg,
-        components=[KernelComponent.model_validate(item) for item in row.components],
-        provenance=KernelProvenance.model_validate(row.provenance),
-        created_at=row.created_at,
-    )
+    made = replay_or(ctx, scope=scope, key=key, request=body, create=make)
+    # The same request may have come before, even while this one did.
+    run = ctx.reports.follow(made.body["id"], lease if made.body["id"] == id else None)
+    if run.state == "running":
+        return replace(made, body=report_runs.model(run).model_dump(mode="json"))
+    assert run.result is not None
+    return Created(json.loads(run.result), location=f"/kernels/{run.id}")

@@ -1,5 +1,7 @@
 """Report runs: computed once for a revision and its parameters, whoever asks and of whichever replica.
 
+Fits of kernels that take long are runs, too: each makes the kernel of its own id.
+
 A run is a row with a lease. Who asks first takes it and computes; others, of other processes too, wait for
 the row or are told where it will be. A holder that dies stops renewing, and the next who asks takes over.
 Reports are computed one at a time on a thread of their own beside the compute pool: a minute's work must not
@@ -14,20 +16,23 @@ import logging
 import threading
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
 from graspdb.wire import Selection
+from graspdb.wire.kernels import KernelCreate
 from graspdb.wire.reports import ReportRun
+from graspdb_density.rows import Progress
 from graspdb_service import __version__
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.settings import Settings
-from graspdb_service.storage import checks, report_runs
-from graspdb_service.storage.database import Database
+from graspdb_service.storage import checks, kernels, report_runs
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.report_runs import Question, RunRow
-from graspdb_service.usecases import reports
+from graspdb_service.usecases import kernel_fits, reports
 from graspdb_service.usecases.curves import KeptCurves
 from graspdb_service.usecases.densities import Densities, KernelChoice, kernel_of
 from graspdb_service.usecases.reportparts import Sources
@@ -50,6 +55,8 @@ _CURVES_SHARE = 4
 _KEPT_STATUSES = (404, 409, 413, 422)
 
 
+#: What runs that fit a kernel are called where others have their report's name.
+FIT = "kernel"
 #: Reports that say what became of simulated checks.
 _OF_CHECKS = ("bandwidth", "calibration")
 
@@ -114,15 +121,41 @@ class ReportRuns:
             run = report_runs.find(tx, question)
         if run is None or not _settled(run):
             run = self._joined(question)
+        return self._answered(run)
+
+    def enter_fit(self, tx: Tx, id: str, lease_id: str, row: ObjectRow, request: KernelCreate) -> None:
+        """Enter the run that fits a kernel, of the same id; `follow` it once the transaction is through."""
+        # Every request makes a kernel of its own: its run is nobody else's.
+        document = {"report": FIT, "run": id, "request": request.model_dump(mode="json", exclude_unset=True)}
+        digest = hashlib.sha256(id.encode()).hexdigest()
+        question = Question(row.id, row.revision, FIT, digest, document)
+        report_runs.ask(tx, question, id=id, lease_id=lease_id, lease_s=_LEASE_S)
+
+    def follow(self, id: str, lease_id: str | None) -> RunRow:
+        """A run done, or under way after the wait; computed here where this process holds its lease.
+
+        Raises
+        ------
+        ProblemError
+            As :meth:`report`.
+        """
+        run = self._row(id)
+        if lease_id is not None:
+            self._start(run, lease_id)
+        return self._answered(run)
+
+    def _answered(self, run: RunRow) -> RunRow:
+        """The run once it has ended well, or as it is when the wait is over."""
         if run.state == "running":
             run = self._waited(run)
+        what = "fit" if run.report == FIT else "report"
         if run.state == "cancelled":
-            raise conflict("report-cancelled", "The report was cancelled: ask again to compute it anew")
+            raise conflict("report-cancelled", f"The {what} was cancelled: ask again to compute it anew")
         if run.problem is not None:
             raise _problem(run.problem)
         if run.state == "failed":
             raise ProblemError(
-                500, "internal-error", "The report failed; the service's log says more: ask again to retry"
+                500, "internal-error", f"The {what} failed; the service's log says more: ask again to retry"
             )
         return run
 
@@ -173,8 +206,14 @@ class ReportRuns:
             raise not_found("report run", id[:80], "runs of a past revision are deleted: ask for the report")
         return run
 
-    def _joined(self, question: Question) -> RunRow:
-        """The question's run, taken by this process where nobody has it."""
+    def place(self) -> str:
+        """A lease for a run that this process is to compute.
+
+        Raises
+        ------
+        ProblemError
+            429 where it has too many.
+        """
         with self._lock:
             if len(self._held) >= MAX_HELD:
                 raise ProblemError(
@@ -183,7 +222,11 @@ class ReportRuns:
                     f"{MAX_HELD} reports are under way already: try again when some are done",
                     headers={"Retry-After": "5"},
                 )
-        lease = str(uuid.uuid4())
+        return str(uuid.uuid4())
+
+    def _joined(self, question: Question) -> RunRow:
+        """The question's run, taken by this process where nobody has it."""
+        lease = self.place()
         with self._database.write() as tx:
             mine = report_runs.ask(tx, question, id=str(uuid.uuid4()), lease_id=lease, lease_s=_LEASE_S)
             run = report_runs.find(tx, question)
@@ -233,12 +276,11 @@ class ReportRuns:
             if held.stop.is_set():
                 raise Cancelled
 
-        result: str | None = None
+        made: Callable[[Tx], str] | None = None
         problem: dict[str, Any] | None = None
         try:
             progress(0.0)
-            answer = reports.compute(self._sources, run.object, Asked.of(run.parameters), progress)
-            result = answer.model_dump_json()
+            made = self._computed(run, progress)
         except Cancelled:
             self._drop(run.id)
             return
@@ -257,12 +299,34 @@ class ReportRuns:
             log.exception("report run %s failed", run.id)
         try:
             with self._database.write() as tx:
-                report_runs.finish(tx, run.id, held.lease_id, result=result, problem=problem)
+                result = None if made is None else made(tx)
+                if not report_runs.finish(tx, run.id, held.lease_id, result=result, problem=problem):
+                    # Cancelled, or somebody else's by now: nothing of it is stored.
+                    raise Cancelled
+        except Cancelled:
+            log.info("report run %s ended before it was done", run.id)
         except Exception:
             # Its lease runs out, and the next who asks computes it again.
             log.exception("report run %s could not be stored", run.id)
         finally:
             self._drop(run.id)
+
+    def _computed(self, run: RunRow, progress: Progress) -> Callable[[Tx], str]:
+        """What a run asks for, computed; in the transaction that ends the run, its result."""
+        if run.report != FIT:
+            asked = Asked.of(run.parameters)
+            result = reports.compute(self._sources, run.object, asked, progress).model_dump_json()
+            return lambda tx: result
+        sources = self._sources
+        fields = kernel_fits.fitted(
+            sources.densities,
+            sources.scenes.features,
+            KernelCreate.model_validate(run.parameters["request"]),
+            threads=sources.threads,
+            computed=lambda work: work(),
+            progress=progress,
+        )
+        return lambda tx: kernel_fits.info(kernels.create(tx, run.id, **fields)).model_dump_json()
 
     def _drop(self, id: str) -> None:
         with self._changed:

@@ -1,0 +1,47 @@
+"""Waiting for what the service computes after its answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from graspdb import wire
+from graspdb.errors import GraspDBError, error_for
+from graspdb.transport import Transport
+from graspdb.wire.reports import ReportRun
+
+__all__ = ["RunProgress", "finished"]
+
+RunProgress = Callable[[ReportRun], None]
+"""Called with a run while it is waited for."""
+
+_POLL_S = 0.5
+
+
+def finished(
+    transport: Transport, location: str, what: str, progress: RunProgress | None, timeout_s: float | None
+) -> dict[str, Any]:
+    """The result of the run at ``location``; ``what`` it is, for whoever reads an error.
+
+    Raises
+    ------
+    GraspDBError
+        The typed error of the problem it ended with, or that it was cancelled.
+    TimeoutError
+        After ``timeout_s``, which does not end the run.
+    """
+    began = time.monotonic()
+    while True:
+        run = ReportRun.model_validate(transport.json("GET", location))
+        if progress is not None:
+            progress(run)
+        if run.result is not None:
+            return run.result
+        if run.problem is not None:
+            raise error_for(wire.Problem.model_validate(run.problem))
+        if run.state != "running":
+            raise GraspDBError(f"{what} was {run.state}: ask again to compute it anew")
+        if timeout_s is not None and time.monotonic() - began > timeout_s:
+            raise TimeoutError(f"{what} is {run.progress:.0%} done after {timeout_s:g} s; it goes on")
+        time.sleep(_POLL_S)
