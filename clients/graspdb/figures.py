@@ -96,9 +96,11 @@ def draw(report: AnyReport | SummaryReport) -> Figure:
 
 
 def _convergence(figure: Figure, report: ConvergenceReport) -> None:
+    from matplotlib.ticker import FuncFormatter
+
     _title(figure, report, "are there enough grasps?")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    for curve, colour in zip(report.curves, _COLOURS, strict=False):
+    for curve, colour, marker in zip(report.curves, _COLOURS, "osD", strict=False):
         grasps = [point.grasps for point in curve.points]
         kernel = curve.kernel
         widths = f"{1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°"
@@ -107,7 +109,7 @@ def _convergence(figure: Figure, report: ConvergenceReport) -> None:
             [point.similarity for point in curve.points],
             yerr=[point.deviation for point in curve.points],
             color=colour,
-            marker="o",
+            marker=marker,
             markersize=4,
             capsize=3,
             linewidth=1.5,
@@ -118,7 +120,7 @@ def _convergence(figure: Figure, report: ConvergenceReport) -> None:
             [point.log_likelihood for point in curve.points],
             yerr=[point.log_likelihood_error for point in curve.points],
             color=colour,
-            marker="s",
+            marker=marker,
             markersize=4,
             capsize=3,
             linewidth=1.5,
@@ -136,6 +138,7 @@ def _convergence(figure: Figure, report: ConvergenceReport) -> None:
     target = report.curves[0].verdict.target
     top.axhline(target, color=GREY, linestyle="--", linewidth=1, label=f"target {target:g}")
     top.set_xscale("log")
+    bottom.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     top.set_ylabel(f"similarity s (eq 9)\nbars: deviation of {report.replicates} replicates")
     top.set_ylim(top=1.0)
     top.legend(fontsize=8, loc="lower right", framealpha=0.9)
@@ -213,10 +216,10 @@ def _calibration(figure: Figure, report: CalibrationReport) -> None:
         if item.count:
             bottom.annotate(
                 f"{item.count:,}", (0.5 * (item.lower + item.upper), item.count), ha="center", va="bottom",
-                fontsize=7,
+                fontsize=8,
             )  # fmt: skip
     bottom.set_yscale("log")
-    bottom.set_ylim(top=10 * max(counts, default=1))
+    bottom.set_ylim(0.7, 10 * max(counts, default=1))
     bottom.set_ylabel("attempts judged")
     bottom.set_xlabel("predicted success probability")
     for axes in (top, bottom):

@@ -66,16 +66,17 @@ def projection(figure: Figure, report: ProjectionReport) -> None:
         image, cax=placed(_LEFT + size[0] + _GAP + beside_inches + 0.25, _BELOW, 0.16, size[1])
     )
     bar.set_label(
-        f"density on the plane; 1 is {report.peak_per_m2:,.3g} of all grasps per m\u00b2", fontsize=8
+        f"density on the plane; 1 is {1e-4 * report.peak_per_m2:.3g} % of all grasps per mm\u00b2", fontsize=8
     )
-    _profile(above, first, report.level, upright=False)
-    _profile(beside, second, report.level, upright=True)
+    for each in (axes, bar.ax):
+        each.tick_params(labelsize=8)
+    _profile(above, first, upright=False)
+    _profile(beside, second, upright=True)
     above.tick_params(labelbottom=False)
     beside.tick_params(labelleft=False)
-    above.legend(fontsize=7, loc="upper right", framealpha=0.9)
     corner = placed(_LEFT + size[0] + _GAP, _BELOW + size[1] + _GAP, beside_inches, _ABOVE)
     corner.axis("off")
-    corner.text(0.0, 1.0, _key(report), transform=corner.transAxes, va="top", fontsize=7.5)
+    corner.text(0.0, 1.0, _key(report), transform=corner.transAxes, va="top", fontsize=8)
 
 
 def _reach(report: ProjectionReport, across: Any, upward: Any) -> tuple[float, float, float, float]:
@@ -87,18 +88,17 @@ def _reach(report: ProjectionReport, across: Any, upward: Any) -> tuple[float, f
     return float(min(x)), float(max(x)), float(min(y)), float(max(y))
 
 
-def _profile(axes: Axes, item: ProjectionProfile, level: float, *, upright: bool) -> None:
+def _profile(axes: Axes, item: ProjectionProfile, *, upright: bool) -> None:
     from matplotlib.ticker import MaxNLocator
 
     at = 1e3 * np.asarray(item.at_m)
     value, low, high = (0.1 * np.asarray(x) for x in (item.density_per_m, item.low, item.high))
     fill: Any = axes.fill_betweenx if upright else axes.fill_between
-    fill(at, low, high, color=BLUE, alpha=0.25, linewidth=0, label=f"{level:.0%} interval")
-    axes.plot(*((value, at) if upright else (at, value)), color=BLUE, linewidth=1.3, label="all depths")
+    fill(at, low, high, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(*((value, at) if upright else (at, value)), color=BLUE, linewidth=1.3)
     (axes.set_xlim if upright else axes.set_ylim)(0.0, None)
     (axes.set_xlabel if upright else axes.set_ylabel)("% of all\ngrasps per mm", fontsize=8)
     (axes.xaxis if upright else axes.yaxis).set_major_locator(MaxNLocator(3, prune="lower"))
-    axes.tick_params(labelsize=7)
     plain(axes)
 
 
@@ -113,4 +113,5 @@ def _key(report: ProjectionReport) -> str:
     kernel = report.kernel
     lines.append(f"kernel {1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}\u00b0")
     lines.append("grey: the object" if report.outline else "no mesh: no silhouette")
+    lines.append(f"band: {report.level:.0%} interval, all depths")
     return "\n".join(lines)

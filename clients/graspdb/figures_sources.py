@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["sources", "summary"]
 
-#: Okabe and Ito's, success the darkest, and hatches beside them for print.
+#: Okabe and Ito's, success the darkest.
 _OUTCOME_COLOURS = dict(
     zip(
         OUTCOMES,
@@ -25,6 +25,8 @@ _OUTCOME_COLOURS = dict(
     )
 )
 _MARKERS = "osD^v"
+#: On which white is read best, and the share of trials from which it is written down.
+_DARK, _LEAST_TOLD = ("failure", "success", "collision", "dropped"), 0.06
 
 
 def summary(figure: Figure, report: SummaryReport) -> None:
@@ -41,7 +43,11 @@ def summary(figure: Figure, report: SummaryReport) -> None:
             continue
         share = width / total
         left.barh(at, share, left=start, color=_OUTCOME_COLOURS[name], edgecolor="white", linewidth=0.5,
-                  height=0.7, label=name)  # fmt: skip
+                  height=0.7, label=name.replace("_", " "))  # fmt: skip
+        for y, part, begin in zip(at, share, start, strict=True):
+            if part >= _LEAST_TOLD:
+                left.text(begin + 0.5 * part, y, f"{100 * part:.0f} %", fontsize=8, ha="center", va="center",
+                          color="white" if name in _DARK else "0.1")  # fmt: skip
         start += share
     left.set_yticks(at)
     left.set_yticklabels([_name(row) for row in rows], fontsize=8)
@@ -49,7 +55,7 @@ def summary(figure: Figure, report: SummaryReport) -> None:
     left.set_xlim(0.0, 1.0)
     left.set_xlabel("share of the trials, by outcome")
     if rows:
-        left.legend(fontsize=7, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+        left.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     for number, (rule, colour, marker) in enumerate(zip(report.rules, COLOURS, _MARKERS, strict=False)):
         rates = [next(item for item in row.rates if item.rule == rule) for row in rows]
         known = [i for i, item in enumerate(rates) if item.rate.value is not None]
@@ -71,15 +77,15 @@ def summary(figure: Figure, report: SummaryReport) -> None:
                 (item.high or 0.0, at[i] + 0.2 * (1 - number)),
                 xytext=(6, 0),
                 textcoords="offset points",
-                fontsize=6.5,
+                fontsize=8,
                 va="center",
             )
     # Room for the numbers beside the markers.
-    right.set_xlim(0.0, 1.12)
+    right.set_xlim(0.0, 1.2)
     right.set_xticks(np.linspace(0.0, 1.0, 6))
     right.set_xlabel(f"share that succeeded, {report.level:.0%} intervals")
     if rows:
-        right.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+        right.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     for axes in (left, right):
         plain(axes)
 
@@ -126,13 +132,15 @@ def _calibrated(axes: Axes, item: SourceComparison, level: float) -> None:
             axes.annotate(
                 f"{b.count:,}",
                 (b.predicted or 0.0, y),
-                xytext=(5, -9),
+                xytext=(6, 4),
                 textcoords="offset points",
-                fontsize=7,
+                fontsize=8,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
             )
     else:
         axes.text(0.5, 0.5, "only successes, or too few trials", transform=axes.transAxes, ha="center",
-                  va="center", fontsize=8, color=GREY)  # fmt: skip
+                  va="center", fontsize=8, color=GREY,
+                  bbox={"facecolor": "white", "edgecolor": "none"})  # fmt: skip
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("predicted from simulation", fontsize=8)
@@ -157,11 +165,11 @@ def _shares(axes: Axes, item: SourceComparison, report: SourcesReport) -> None:
         axes.plot([0], [item.predicted], color=ORANGE, marker="D", markersize=6, linestyle="none",
                   label="simulation's mean prediction")  # fmt: skip
     axes.set_xticks(range(len(names)))
-    axes.set_xticklabels(names, fontsize=7)
+    axes.set_xticklabels(names)
     axes.set_xlim(-0.6, len(names) - 0.4)
     axes.set_ylim(0.0, 1.02)
     axes.set_ylabel("share of trials", fontsize=8)
-    axes.legend(fontsize=7, loc="lower right", framealpha=0.9)
+    axes.legend(fontsize=8, loc="lower right", framealpha=0.9)
     axes.set_title(f"simulation: {report.successes:,} of {report.attempts:,} succeeded", fontsize=8)
 
 
@@ -183,7 +191,7 @@ def _similar(axes: Axes, item: SourceComparison) -> None:
         markersize=6, capsize=4, linestyle="none",
     )  # fmt: skip
     axes.set_xticks([0, 1])
-    axes.set_xticklabels([f"{item.source}\nto simulation", "as many grasps\nof simulation"], fontsize=7)
+    axes.set_xticklabels([f"{item.source}\nto simulation", "as many grasps\nof simulation"])
     axes.set_xlim(-0.6, 1.6)
     kernel = found.kernel
     axes.set_title(

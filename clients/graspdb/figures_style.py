@@ -54,9 +54,10 @@ def _wrapped(text: str, width: int) -> str:
 
 
 def plain(axes: Axes) -> None:
-    """A grid behind, and no frame above and to the right."""
+    """A grid behind, ticks that can be read, and no frame above and to the right."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="0.9", linewidth=0.6)
+    axes.tick_params(labelsize=8)
     axes.set_axisbelow(True)
 
 

@@ -21,7 +21,7 @@ _MARKERS = "osD^v"
 def bandwidth(figure: Figure, report: BandwidthReport) -> None:
     """Draw the likelihood of left-out grasps by width, and what became of simulated draws."""
     title(figure, report, "how wide should the kernel be?")
-    left, right = figure.subplots(1, 2)
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1) if report.draws else (3, 1))
     turns = sorted({point.sigma_rotation_deg for point in report.grid})
     for turn, colour, marker in zip(turns, COLOURS, _MARKERS, strict=False):
         points = [p for p in report.grid if p.sigma_rotation_deg == turn and p.log_likelihood is not None]
@@ -43,8 +43,8 @@ def bandwidth(figure: Figure, report: BandwidthReport) -> None:
     left.set_xlabel(f"position width [mm] ({report.rows:,} grasps, {report.held_out:,} left out)")
     left.set_ylabel("log density of left-out grasps\n[nats of 1/(m³ rad³)]")
     left.set_title("bars: error of the difference to the best;\nband: not told from the best", fontsize=8)
-    left.legend(title="rotation width", fontsize=7, title_fontsize=7, loc="lower left", framealpha=0.9)
-    _ticks(left, sorted({1e3 * p.sigma_position_m for p in report.grid}))
+    left.legend(title="rotation width", fontsize=8, title_fontsize=8, loc="lower left", framealpha=0.9)
+    _ticks(left, sorted({1e3 * p.sigma_position_m for p in report.grid if p.log_likelihood is not None}))
     _draws(right, report.draws, report.level)
     for axes in (left, right):
         plain(axes)
@@ -56,8 +56,7 @@ def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
             0.5, 0.5, "No draws were simulated yet:\nthe report's `calls` are\nthe sweeps that do it",
             transform=axes.transAxes, ha="center", va="center", fontsize=9, color=GREY,
         )  # fmt: skip
-        axes.set_xticks([])
-        axes.set_yticks([])
+        axes.set_axis_off()
         return
     at = np.arange(len(draws))
     for ranges, colour, marker, label, shift in (
@@ -85,14 +84,13 @@ def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
             + ("" if d.kernel.id is None else f"\n{d.kernel.kind}")
             + f"\n{d.protocol}\nn = {d.draws:,}"
             for d in draws
-        ],
-        fontsize=7,
+        ]
     )
     axes.set_xlim(-0.5, len(draws) - 0.5)
     axes.set_ylim(0.0, 1.02)
     axes.set_ylabel("share of simulated draws")
     axes.set_title(f"draws simulated as checks, {level:.0%} intervals", fontsize=8)
-    axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+    axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
 
 
 def kernel_similarity(figure: Figure, report: KernelSimilarityReport) -> None:
@@ -119,9 +117,11 @@ def kernel_similarity(figure: Figure, report: KernelSimilarityReport) -> None:
     _ticks(left, [float(point.count) for point in report.samples])
     right.set_xticks([point.count for point in report.mixtures if point.count % 2 == 0 or point.count == 1])
     left.axvline(900, color=GREY, linestyle=":", linewidth=1.2)
-    left.annotate("900: the paper", (900, 0.03), fontsize=7, color=GREY, ha="right", rotation=90)
+    left.annotate("900: the paper", (900, 0.03), xytext=(-3, 0), textcoords="offset points",
+                  fontsize=8, color=GREY, ha="right", rotation=90)  # fmt: skip
     left.set_xlabel(f"samples, of {report.reference:,} displacements")
     right.set_xlabel("Gaussians of a mixture")
+    right.set_title("mixtures in the place of samples", fontsize=8)
     left.set_ylabel(f"similarity to the full statistics\n(Bhattacharyya; {report.level:.0%} intervals)")
     window = f"{1e3 * report.window_position_m:.0f} mm, {report.window_rotation_deg:.0f}°"
     widths = f"{1e3 * report.component_position_m:.0f} mm, {report.component_rotation_deg:.0f}°"
@@ -130,5 +130,5 @@ def kernel_similarity(figure: Figure, report: KernelSimilarityReport) -> None:
 
 def _ticks(axes: Axes, values: list[float]) -> None:
     axes.set_xticks(values)
-    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values], fontsize=7)
+    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values])
     axes.minorticks_off()
