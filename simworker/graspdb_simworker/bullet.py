@@ -15,7 +15,7 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from graspdb_simworker import urdf
+from graspdb_simworker import camera, urdf
 from graspdb_simworker.bodies import (
     Gripper,
     MassProperties,
@@ -67,6 +67,7 @@ class BulletWorld:
         self.friction = friction
         self.mass = mass_properties(parts, mass_kg)
         self._visible = visible
+        self._views: list[camera.View] = []
         self._client = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise RuntimeError("pybullet could not open a DIRECT world")
@@ -295,22 +296,58 @@ class BulletWorld:
         ]
         return [roots[0] * root for root in roots[1:]]
 
+    def _aim(self) -> None:
+        """Choose from where the grasp that begins is looked at."""
+        low, high = np.array(pybullet.getAABB(self._object, -1, physicsClientId=self._client))
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+        finger, palm = (
+            np.array(e) for e in (self.gripper.finger_half_extents, self.gripper.palm_half_extents)
+        )
+        tip = self.gripper.tip_offset_m
+        reach = np.array([finger[0], 0.5 * self.gripper.max_opening_m, finger[2]])
+        fingers = (2 * corners - 1) * reach + np.array([0.0, 0.0, tip - finger[2]])
+        behind = (2 * corners - 1) * palm + np.array([0.0, 0.0, self.gripper.palm_centre_z])
+        whole = np.concatenate([low + corners * (high - low), fingers, behind])
+        self._views = []
+        for points in (whole, 1.2 * (fingers - [0, 0, tip]) + [0, 0, tip]):
+            views = [v for v in camera.around(points) if all(v.aside(other) for other in self._views)]
+            drawn = [self._draw(view, 96, 72)[1] for view in views]
+            one, two, thing = (np.array([(d == kind).sum() for d in drawn]) for kind in self._kinds())
+            self._views.append(camera.best(views, one, two, thing))
+
+    def _kinds(self) -> tuple[int, int, int]:
+        """What pixels of the first finger, the second and the object are marked with."""
+        return (self._jaw + (1 << 24), self._jaw + (2 << 24), self._object)
+
+    def _draw(
+        self, view: camera.View, width: int, height: int
+    ) -> tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.float64]]:
+        """Pixels (height, width, 3), what each shows, and how far it is in metres."""
+        near, far = 0.2 * view.distance_m, 4.0 * view.distance_m
+        towards = np.subtract(view.eye, view.target) / view.distance_m
+        _, _, pixels, depth, bodies = pybullet.getCameraImage(
+            width,
+            height,
+            pybullet.computeViewMatrix(view.eye, view.target, camera.UP),
+            pybullet.computeProjectionMatrixFOV(camera.FIELD_OF_VIEW_DEG, camera.ASPECT, near, far),
+            # From above the beholder's shoulder, that no side is dark that is looked at.
+            lightDirection=np.add(towards, (0.3, -0.2, -0.7)).tolist(),
+            lightAmbientCoeff=0.55,
+            lightDiffuseCoeff=0.50,
+            lightSpecularCoeff=0.02,
+            shadow=0,
+            flags=pybullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=self._client,
+        )
+        shape = (height, width)
+        buffer = np.asarray(depth, dtype=np.float64).reshape(shape)
+        return (
+            np.asarray(pixels, dtype=np.uint8).reshape(*shape, 4)[:, :, :3],
+            np.asarray(bodies, dtype=np.int64).reshape(shape),
+            far * near / (far - (far - near) * buffer),
+        )
+
     def _render(self) -> NDArray[np.uint8]:
-        width, height = 640, 480
-        lens = pybullet.computeProjectionMatrixFOV(fov=32.0, aspect=width / height, nearVal=0.02, farVal=4.0)
-        views = []
-        # Along the fingers' width, and obliquely from the tips; the approach points down.
-        for eye in ((0.45, 0.0, 0.05), (0.28, -0.30, 0.25)):
-            view = pybullet.computeViewMatrix(eye, (0.0, 0.0, -0.02), (0.0, 0.0, -1.0))
-            _, _, pixels, _, _ = pybullet.getCameraImage(
-                width,
-                height,
-                view,
-                lens,
-                lightDirection=(0.6, -0.4, -0.8),
-                shadow=0,
-                renderer=pybullet.ER_TINY_RENDERER,
-                physicsClientId=self._client,
-            )
-            views.append(np.asarray(pixels, dtype=np.uint8).reshape(height, width, 4)[:, :, :3])
+        views = [camera.finished(*self._draw(view, 1280, 960)) for view in self._views]
         return np.concatenate(views, axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import logging
 import math
@@ -11,9 +12,10 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -22,6 +24,9 @@ from rich.progress import Progress
 from graspdb.errors import GraspDBError
 from graspdb.transport import Transport
 from graspdb.wire import Pose
+
+if TYPE_CHECKING:
+    from graspdb_simworker.supervisor import Child
 
 app = typer.Typer(
     add_completion=False,
@@ -66,7 +71,18 @@ def run(
         str | None,
         typer.Option(envvar="GRASPDB_URL", help="The service's address."),
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, max=256, help="Simulating processes, one a core.")] = 1,
+    processes: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1024,
+            help="Chunks simulated at once, one a core: 1 here, with --dask one a thread of the cluster.",
+        ),
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Simulate on the Dask cluster of this scheduler, not here."),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="As the service lists this worker.")] = None,
     exit_when_idle: Annotated[
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
@@ -114,15 +130,19 @@ def run(
         else:
             log.warning("coacd is missing: meshes that are not convex are left to other workers")
 
-    with Transport(
-        url, api_key=api_key, user_agent="graspdb-simworker", retries=0, timeout_s=30.0
-    ) as transport:
+    with (
+        _cluster(dask) as cluster,
+        Transport(
+            url, api_key=api_key, user_agent="graspdb-simworker", retries=0, timeout_s=30.0
+        ) as transport,
+    ):
         worker = Worker(
             transport,
             name=name or f"{socket.gethostname()}-{os.getpid()}",
-            processes=processes,
+            processes=processes or cluster.threads,
             exit_when_idle=exit_when_idle,
             once=once,
+            make_child=cluster.make_child,
             report=report,
             decompositions=limits,
         )
@@ -138,6 +158,42 @@ def run(
         f" {tally.failures} failed, {tally.lost} not wanted any more",
         err=True,
     )
+
+
+@dataclass(frozen=True)
+class _Cluster:
+    """Where chunks are simulated: ``make_child`` for each of ``threads`` at once."""
+
+    threads: int
+    make_child: Callable[[], Child]
+
+
+@contextmanager
+def _cluster(address: str | None) -> Iterator[_Cluster]:
+    """This machine, or the Dask cluster of a scheduler."""
+    from graspdb_simworker.supervisor import Child
+
+    if address is None:
+        yield _Cluster(1, Child)
+        return
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError:
+        typer.echo(
+            "graspdb-simworker: --dask needs the extra, `pip install 'graspdb[sim,dask]'`, here and on the"
+            " cluster",
+            err=True,
+        )
+        raise typer.Exit(2) from None
+    from graspdb_simworker.dispatch import Dispatched
+
+    try:
+        client = distributed.Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        typer.echo(f"graspdb-simworker: no Dask scheduler at {address}: {error}", err=True)
+        raise typer.Exit(1) from None
+    with client, client.get_executor() as executor:
+        yield _Cluster(max(1, sum(client.nthreads().values())), lambda: Dispatched(executor))
 
 
 ObjectName = Annotated[
@@ -238,7 +294,9 @@ def show(
             "fine" if fine else "standard",
             film_every_s=pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf,
         )
-        written = pictures.write(out, shown.pictures)
+        # The outcome's name and the object's: what a picture is worth that went astray.
+        outcome = shown.label.outcome.name.lower().replace("_", " ")
+        written = pictures.write(out, shown.pictures, f"{object_name}, {gripper}, {protocol}: {outcome}")
     width, quality = (f"{v:.4g}" if v == v else "unknown" for v in (shown.label.width_m, shown.label.quality))
     meaning = (
         "(1: did not move in the jaw, below 0: too far)" if protocol == "lift" else "times the weight held"

@@ -146,8 +146,8 @@ class GraspWorld(BulletWorld):
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
         self.pictures: list[NDArray[np.uint8]] = []
-        """The last closing from two sides, each (480, 1280, 3), drawn by pybullet's CPU renderer; the end
-        is last. Empty unless the world is visible."""
+        """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
+        the end is last. Empty unless the world is visible."""
         self._to_body = self.mass.inverse_rotation()
         self._radius = self.mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
@@ -197,6 +197,8 @@ class GraspWorld(BulletWorld):
         # Parking left the object at rest and the motors driven at the steps of the approach.
         pybullet.resetBasePositionAndOrientation(body, where, orientation, physicsClientId=client)
         self._seen = None
+        if self._visible:
+            self._aim()
         start = gripper.max_opening_m * 0.5 - max(0.0, travel_m - APPROACH_GAP_M)
         for joint in (0, 1):
             pybullet.resetJointState(jaw, joint, start, -gripper.max_speed_m_s, physicsClientId=client)

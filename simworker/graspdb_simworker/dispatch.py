@@ -1,0 +1,102 @@
+"""Chunks simulated elsewhere: by any :class:`concurrent.futures.Executor`, such as a Dask cluster's.
+
+What is sent is a function, a chunk's payload and the object's parts; what comes back is its result. Where it
+runs, the function supervises a pybullet child of its own, as the worker does at home: a member of a pool can
+neither be killed when a pose hangs, nor, if it is a daemon, start a process by ``multiprocessing``.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable
+from concurrent import futures
+from types import TracebackType
+
+from graspdb.wire import SimulatePayload, SimulateResult
+from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
+
+POLL_S = 0.2
+
+_local = threading.local()
+
+
+def simulate(payload_json: str, parts_glb: bytes) -> str:
+    """Simulate a chunk in this thread's child; runs in a member of the pool.
+
+    The child stays for the next chunk and ends with the thread; should the process be killed, its child
+    notices.
+
+    Parameters
+    ----------
+    payload_json : str
+        A :class:`~graspdb.wire.SimulatePayload`.
+    parts_glb : bytes
+
+    Returns
+    -------
+    str
+        A :class:`~graspdb.wire.SimulateResult` as JSON.
+
+    Raises
+    ------
+    ChunkFailed, PybulletMissing
+    """
+    child: Child | None = getattr(_local, "child", None)
+    if child is None:
+        child = _local.child = Child()
+        weakref.finalize(threading.current_thread(), child.kill)
+    return child.run(SimulatePayload.model_validate_json(payload_json), parts_glb).model_dump_json()
+
+
+class Dispatched(Child):
+    """A child that is somewhere else: hands every chunk to an executor and waits for its result.
+
+    Parameters
+    ----------
+    executor : concurrent.futures.Executor
+        Shared by all; shut down by its owner.
+    """
+
+    def __init__(self, executor: futures.Executor) -> None:
+        super().__init__()
+        self._executor = executor
+
+    def run(
+        self,
+        payload: SimulatePayload,
+        parts_glb: bytes,
+        *,
+        wanted: Callable[[], bool] = lambda: True,
+        progress: Callable[[int], None] = lambda simulated: None,
+    ) -> SimulateResult:
+        """Have a chunk simulated. One that is no longer wanted is taken from the queue; if it runs already
+        it runs to its end, and nobody asks for its result.
+
+        Raises
+        ------
+        Cancelled
+            If it was not wanted any more.
+        ChunkFailed
+            With the reason, also if the executor lost it.
+        PybulletMissing
+        """
+        try:
+            future = self._executor.submit(simulate, payload.model_dump_json(), parts_glb)
+        except RuntimeError as error:
+            raise ChunkFailed(f"the executor takes no chunks: {error}") from error
+        while not futures.wait([future], POLL_S).done:
+            if not wanted():
+                future.cancel()
+                raise Cancelled
+        try:
+            return SimulateResult.model_validate_json(future.result())
+        except (ChunkFailed, PybulletMissing):
+            raise
+        except Exception as error:
+            raise ChunkFailed(f"the executor lost the chunk: {type(error).__name__}: {error}") from error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to end: the children belong to the executor's members."""

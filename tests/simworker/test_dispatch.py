@@ -1,0 +1,75 @@
+"""Chunks handed to an executor: a real pool of processes, each with its pybullet child."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from typing import Any
+
+import pytest
+from distributed import Client, LocalCluster
+
+from graspdb.examples import example
+from graspdb.wire import SimulatePayload
+from graspdb_simworker.dispatch import Dispatched
+from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed
+
+MakePayload = Callable[..., SimulatePayload]
+
+
+@pytest.fixture
+def pool() -> Iterator[ProcessPoolExecutor]:
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
+def test_a_pool_of_processes_gives_the_same_bytes_and_outlives_a_bad_chunk(
+    pool: ProcessPoolExecutor, payload_of: MakePayload
+) -> None:
+    parts = example("mug").parts_glb()
+    payload = payload_of("mug", start=0, stop=300)
+    with Dispatched(pool) as child:
+        first = child.run(payload, parts)
+        with pytest.raises(ChunkFailed, match="GLB"):
+            child.run(payload.model_copy(update={"parts_sha256": "other"}), b"no parts")
+        again = child.run(payload, parts)
+    with Child() as here:
+        assert first == again == here.run(payload, parts)
+    assert first.rows.pose_index
+
+
+def test_a_dask_cluster_is_an_executor_like_any_other(payload_of: MakePayload) -> None:
+    parts = example("mug").parts_glb()
+    payload = payload_of("mug", start=0, stop=300)
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+        client.get_executor() as executor,
+        Dispatched(executor) as child,
+        Child() as here,
+    ):
+        assert child.run(payload, parts) == here.run(payload, parts)
+
+
+def test_a_pool_whose_processes_die_fails_the_chunk_and_not_the_worker(payload_of: MakePayload) -> None:
+    with ProcessPoolExecutor(1) as pool, Dispatched(pool) as child:
+        pool.submit(os._exit, 3)
+        with pytest.raises(ChunkFailed, match=r"BrokenProcessPool|takes no chunks"):
+            child.run(payload_of("mug", start=0, stop=10), b"")
+
+
+def test_what_is_not_wanted_any_more_leaves_the_queue(payload_of: MakePayload) -> None:
+    taken: list[Future[Any]] = []
+
+    class Busy(ThreadPoolExecutor):
+        def submit(self, *call: Any, **options: Any) -> Future[Any]:
+            taken.append(Future())  # queued behind others
+            return taken[-1]
+
+    with Busy() as busy, Dispatched(busy) as child:
+        asked = iter((True, True, False))
+        with pytest.raises(Cancelled):
+            child.run(payload_of("mug", start=0, stop=10), b"", wanted=lambda: next(asked))
+    assert taken[0].cancelled()
