@@ -105,7 +105,8 @@ class _ScoredSearch(Search):
         if not len(starts):
             return []
         pool = self.first_climbs(starts)
-        best = self.scored(pool.take(self.choose(pool, max(count, _FINALISTS), *apart))).sort()
+        # More than are wanted: those that climb drive out others on their way.
+        best = self.scored(pool.take(self.choose(pool, max(2 * count, _FINALISTS), *apart))).sort()
         best = best.joined(self.last_climbs(best, _LAST)).sort()
         best = best.take(self.choose(best, count, *apart))
         for place in range(1, min(len(best), _RUNNERS_UP)):

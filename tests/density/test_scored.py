@@ -40,6 +40,20 @@ def test_the_density_itself_as_a_score_gives_its_maximum(seed: int, shell: Shell
     assert scored.score == pytest.approx(scored.log_density)
 
 
+def test_as_many_distinct_grasps_as_there_are(shell: Shell) -> None:
+    density = GraspDensity.build(*shell(1_500, np.random.default_rng(0)), kernel=KERNEL)
+    found = search_scored(density, density.log_density, count=100)
+    assert len(found) == 100
+    scores = [item.score for item in found]
+    assert scores == sorted(scores, reverse=True)
+    p = np.array([item.position for item in found])
+    q = np.array([item.quaternion_xyzw for item in found])
+    apart = np.linalg.norm(p[:, None] - p, axis=-1) > 0.01
+    twin = se3.angle_between(q[:, None], se3.jaw_twin(q))
+    apart |= np.minimum(se3.angle_between(q[:, None], q), twin) > math.radians(20.0)
+    assert (apart | np.eye(100, dtype=bool)).all()
+
+
 def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> None:
     """Many successes on one side, one lucky success on the other."""
     rng = np.random.default_rng(3)
