@@ -149,15 +149,21 @@ def test_new_trials_are_added_to_what_was_summed(
     asked(here, 0)
 
 
-@pytest.mark.parametrize("matching", ["determinants", "likelihood"])
+@pytest.mark.parametrize(
+    ("matching", "alignment"), [("determinants", "edge"), ("likelihood", "gripper"), ("likelihood", "object")]
+)
 def test_a_stored_kernels_curve_and_its_match_grow(
-    sqlite_url: str, serve: Serve, make_object: Make, post: Post, kept: list[int], matching: str
-) -> None:
+    sqlite_url: str, serve: Serve, make_object: Make, put_box: Callable[..., Any], post: Post,
+    kept: list[int], matching: str, alignment: str,
+) -> None:  # fmt: skip
     with httpx.Client(base_url=serve(sqlite_url, report_wait_s=60), timeout=90) as http:
         make_object(http)
+        put_box(http, "thing", (0.06, 0.01, 0.03))
         p, q = _grasps(330)
         post(http, "thing", (p[:300], q[:300]))
-        kernel = http.post("/kernels", json={"object": "thing"}).json()["id"]
+        made = http.post("/kernels", json={"object": "thing", "alignment": alignment})
+        assert made.status_code == 201, made.text
+        kernel = made.json()["id"]
         for begin, end, extended in ((300, 300, [0, 0]), (300, 320, [300, 300]), (320, 330, [320, 320])):
             if end > begin:
                 post(http, "thing", (p[begin:end], q[begin:end]))

@@ -23,7 +23,7 @@ from graspdb_density.growing import GrowingCurve
 from graspdb_density.matching import Match, match_determinants, match_likelihood, match_success, scaled
 from graspdb_density.rows import Kernel, KernelRows, Progress
 from graspdb_service.problems import conflict
-from graspdb_service.usecases import checks, shapes
+from graspdb_service.usecases import checks
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.reportparts import (
     LEVEL,
@@ -73,9 +73,9 @@ def convergence_report(
     share = 1.0 if built.shaped is None else 0.5
     kernel: Kernel = density.kernel if built.shaped is None else built.shaped.kernel
     frames = None
-    if built.shaped is not None and built.kernel.alignment is not None:
-        axes = shapes.axes(built.kernel.alignment, built.object_row, built.selected, sources.scenes.features)
-        frames = shapes.axes_at(axes, density.positions, density.quaternions_xyzw)
+    if built.shaped is not None and built.kernel.alignment not in (None, "gripper"):
+        # As the density has them: those of new trials only were looked for.
+        frames = built.shaped.frames
     grown = _curve(sources, built, None, kernel, frames, lambda done: progress(share * done))
     curve = grown.curve
     curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
