@@ -221,8 +221,8 @@ class Questions:
         ----------
         strategy
             ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most.
-            ``edges`` needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on two
-            opposed surfaces or edges. Some of what it draws collides.
+            ``edges`` needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on
+            opposed surfaces, edges or points. Some of what it draws collides.
         **selection
             :class:`~graspdb.selection.Selection`.
         """

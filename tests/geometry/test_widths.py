@@ -21,6 +21,7 @@ def test_a_box_by_hand() -> None:
     expected = [0.04, 0.04, 0.02, np.nan, np.nan]  # beside it: as wide; beyond: nothing; into it: collides
     for solid in (Scene([BOX]), Surface(*BOX, watertight=True)):
         np.testing.assert_allclose(solid.widths(poses, quaternions, PG70), expected, atol=2e-7)
+        np.testing.assert_array_equal(solid.holds(poses, quaternions, PG70), np.isfinite(expected))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -38,3 +39,5 @@ def test_parts_and_surface_agree(seed: int, random_hull: Any, random_poses: Any)
     np.testing.assert_allclose(a[both], b[both], atol=1e-6)
     # Poses that differ only touch: a corner within the tolerance.
     assert (np.isnan(a) != np.isnan(b)).sum() <= 3
+    for solid, widths in ((scene, a), (surface, b)):
+        assert (solid.holds(positions, quaternions, PG70) != np.isfinite(widths)).sum() <= 3

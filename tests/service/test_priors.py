@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, IsotropicKernel, se3
@@ -135,6 +136,30 @@ def test_what_edges_need_is_said(
     # It fits between the fingers by less than any collision test of the open jaw allows.
     put_box(http, "tight", (PG70.max_opening_m, 0.3, 0.3))
     assert refused("tight", gripper="pg70")[1] in ("edges-unreachable", "no-surface-pairs")
+
+
+def test_a_smooth_object_has_opposed_points(sqlite_http: httpx.Client, make_object: Make) -> None:
+    """No facet of it is large enough to be a face, and it has no edge."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.025)
+    ball.vertices *= [1.0, 1.0, 2.0]
+    make_object(sqlite_http)
+    put = sqlite_http.put(
+        "/objects/thing/mesh?unit=m",
+        content=ball.export(file_type="stl"),
+        headers={"Content-Type": "model/stl"},
+    )
+    assert put.status_code in (200, 201), put.text
+    p, q, _ = arrays(propose(sqlite_http, count=3_000, seed=1, sigma_position_m=0.005))
+    # Across the long axis, which does not fit, and not along it; all around it.
+    closing = se3.to_matrix(q)[:, :, 1]
+    assert np.median(np.abs(closing[:, 2])) < 0.35
+    turn = np.arctan2(closing[:, 1], closing[:, 0]) % np.pi
+    assert np.histogram(turn, bins=6, range=(0, np.pi))[0].min() > 0.1 * len(turn)
+    held = Scene([(np.asarray(ball.vertices), np.asarray(ball.faces))]).holds(p, q, PG70)
+    assert held.mean() > 0.5
+    (grasp,) = best(sqlite_http)["grasps"]
+    assert grasp["prior"] is True
+    assert grasp["width_m"] == pytest.approx(0.05, rel=0.1)
 
 
 # -- best grasps

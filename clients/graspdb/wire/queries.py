@@ -334,7 +334,7 @@ Strategy = Literal["density", "uncertainty", "edges"]
 
 class ProposalsRequest(SamplesRequest):
     """Grasps to try next. ``density``: where successes lie. ``uncertainty``: where one more trial teaches
-    most. ``edges``: where the jaw can close on two opposed surfaces or edges, before anything is known."""
+    most. ``edges``: where the jaw can close on opposed surfaces or edges, before anything is known."""
 
     strategy: Strategy = "density"
 

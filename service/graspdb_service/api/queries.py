@@ -178,8 +178,8 @@ def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
     """Grasps to try next; sent back with the trial, ``proposal_density`` weights it.
 
     ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges`` needs
-    no trial, but a mesh and a gripper: it draws about grasps that close on two opposed surfaces or edges no
-    farther apart than the jaw opens, at any angle about the closing axis, by default with 10 mm and 15
+    no trial, but a mesh and a gripper: it draws about grasps that close on opposed surfaces, edges or points
+    no farther apart than the jaw opens, at any angle about the closing axis, by default with 10 mm and 15
     degrees. Grasps at which the open gripper collides are left out before; what is drawn about the others is
     not tested, for then the density would not be the one it was drawn with.
     """

@@ -176,10 +176,10 @@ def _holding(question: Question) -> Question:
     assert test is not None
 
     def holds(positions: Floats, quaternions: Floats) -> Bools:
-        allowed = np.isfinite(test.widths(positions, quaternions, threads))
+        allowed = test.holds(positions, quaternions, threads)
         if admissible is not None and allowed.any():
             allowed[allowed] = admissible(positions[allowed], quaternions[allowed])
-        return np.asarray(allowed)
+        return allowed
 
     return replace(question, admissible=holds)
 

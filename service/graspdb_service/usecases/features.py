@@ -1,4 +1,4 @@
-"""What an object's geometry offers a gripper: ridges, and pairs of surfaces and edges; prepared once."""
+"""What an object's geometry offers a gripper: ridges, pairs of surfaces and edges, and opposed points."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_geometry import meshes
+from graspdb_geometry.antipodal import opposed_points
+from graspdb_geometry.collision import Surface
 from graspdb_geometry.jawpairs import JawPairs, pairs_of_mesh, pairs_of_parts
-from graspdb_geometry.ridges import Ridges, ridges_of_mesh, ridges_of_parts
+from graspdb_geometry.ridges import Ridges, parts_solid, ridges_of_mesh, ridges_of_parts
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
@@ -26,16 +28,19 @@ FramesOf = Callable[[Floats, Floats], Floats]
 Axes = Floats | FramesOf | None
 
 _MAX_BYTES = 32 * 2**20
+#: Hash of the geometry, how it is read, the jaw's opening (0: ridges only), whether with opposed points.
+_Key = tuple[str, str, float, bool]
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
     ridges: Ridges
     pairs: JawPairs | None = None
+    points: JawPairs | None = None
 
     @property
     def nbytes(self) -> int:
-        return 4_096 + self.ridges.nbytes + (0 if self.pairs is None else self.pairs.nbytes)
+        return 4_096 + sum(p.nbytes for p in (self.ridges, self.pairs, self.points) if p is not None)
 
 
 class Features:
@@ -46,9 +51,7 @@ class Features:
     def __init__(self, database: Database, compute: Compute) -> None:
         self._database = database
         self._compute = compute
-        self._cache: SingleFlightCache[tuple[str, str, float], _Prepared] = SingleFlightCache(
-            _MAX_BYTES, lambda p: p.nbytes
-        )
+        self._cache: SingleFlightCache[_Key, _Prepared] = SingleFlightCache(_MAX_BYTES, lambda p: p.nbytes)
 
     def ridges(self, row: ObjectRow) -> Ridges:
         """An object's ridges.
@@ -76,12 +79,7 @@ class Features:
             409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no opening is known,
             ``no-surface-pairs`` where there are none.
         """
-        if selected.profile is None:
-            raise conflict(
-                "gripper-unknown",
-                "How wide the jaw opens is not known, for no trial names its gripper: name one (gripper)",
-            )
-        opening = selected.profile.max_opening_m
+        opening = _opening(selected)
         found = self._prepared(row, opening).pairs
         if found is None or not len(found):
             raise conflict(
@@ -90,6 +88,18 @@ class Features:
                 " far as the jaw opens: name a wider gripper, or go without (alignment=gripper or edge)",
             )
         return found
+
+    def opposed(self, row: ObjectRow, selected: Selected) -> list[JawPairs]:
+        """What the selection's gripper can close on: pairs of surfaces and edges, and opposed points of the
+        surface, which tell of curved objects, too; none that is empty.
+
+        Raises
+        ------
+        ProblemError
+            409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no opening is known.
+        """
+        found = self._prepared(row, _opening(selected), points=True)
+        return [pairs for pairs in (found.pairs, found.points) if pairs is not None and len(pairs)]
 
     def known_pairs(self, row: ObjectRow, selected: Selected) -> JawPairs | None:
         """As :meth:`pairs`, None where there are none or they can't be known."""
@@ -112,8 +122,8 @@ class Features:
         pairs = self.pairs(row, selected)
         return pairs.frames
 
-    def _prepared(self, row: ObjectRow, opening_m: float) -> _Prepared:
-        """Ridges, and for an opening the pairs."""
+    def _prepared(self, row: ObjectRow, opening_m: float, *, points: bool = False) -> _Prepared:
+        """Ridges, for an opening the pairs, and, if asked for, opposed points."""
         info = row.mesh_info
         closed = info is not None and bool(info["watertight"])
         if info is not None and row.mesh_sha256 is not None and (closed or row.parts_sha256 is None):
@@ -124,12 +134,16 @@ class Features:
                 ridges = ridges_of_mesh(mesh.vertices, mesh.faces)
                 if not opening_m:
                     return _Prepared(ridges)
-                return _Prepared(
-                    ridges,
-                    pairs_of_mesh(mesh.vertices, mesh.faces, ridges, watertight=closed, opening_m=opening_m),
+                pairs = pairs_of_mesh(
+                    mesh.vertices, mesh.faces, ridges, watertight=closed, opening_m=opening_m
                 )
+                if not points:
+                    return _Prepared(ridges, pairs)
+                solid = Surface(mesh.vertices, mesh.faces, watertight=True).contains if closed else None
+                corners = mesh.vertices[mesh.faces]
+                return _Prepared(ridges, pairs, opposed_points(corners, solid, opening_m=opening_m))
 
-            return self._read((sha256, unit, opening_m), read)
+            return self._read((sha256, unit, opening_m, points), read)
         if row.parts_sha256 is None:
             raise conflict(
                 "mesh-missing",
@@ -142,11 +156,16 @@ class Features:
             ridges = ridges_of_parts(parts)
             if not opening_m:
                 return _Prepared(ridges)
-            return _Prepared(ridges, pairs_of_parts(parts, ridges, opening_m=opening_m))
+            pairs = pairs_of_parts(parts, ridges, opening_m=opening_m)
+            if not points:
+                return _Prepared(ridges, pairs)
+            corners = np.concatenate([v[f] for v, f in parts])
+            solid = parts_solid([v for v, _ in parts])
+            return _Prepared(ridges, pairs, opposed_points(corners, solid, opening_m=opening_m))
 
-        return self._read((row.parts_sha256, "parts", opening_m), read_parts)
+        return self._read((row.parts_sha256, "parts", opening_m, points), read_parts)
 
-    def _read(self, key: tuple[str, str, float], read: Callable[[bytes, str], _Prepared]) -> _Prepared:
+    def _read(self, key: _Key, read: Callable[[bytes, str], _Prepared]) -> _Prepared:
         def make(_: _Prepared | None) -> _Prepared:
             with self._database.read() as tx:
                 found = assets.get(tx, key[0])
@@ -155,3 +174,19 @@ class Features:
             return self._compute.run(lambda: read(*found))
 
         return self._cache.get(key, lambda _: True, make)
+
+
+def _opening(selected: Selected) -> float:
+    """How wide the jaw opens, metres.
+
+    Raises
+    ------
+    ProblemError
+        409 ``gripper-unknown``.
+    """
+    if selected.profile is None:
+        raise conflict(
+            "gripper-unknown",
+            "How wide the jaw opens is not known, for no trial names its gripper: name one (gripper)",
+        )
+    return selected.profile.max_opening_m

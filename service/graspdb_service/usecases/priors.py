@@ -1,14 +1,16 @@
 """Where an object can be grasped as far as its shape tells: a density before any success.
 
-Its rows are grasps that close on pairs of surfaces and edges (:mod:`graspdb_geometry.jawpairs`), at every
-angle about the closing axis; those at which the open gripper collides, or closes on nothing, are left out. A
-kernel about every row makes it a density over R^3 x SO(3) like any other: it integrates to 1, both twins of
-a symmetric jaw, and what is drawn from it may be weighted by it.
+Its rows are grasps that close on pairs of surfaces and edges (:mod:`graspdb_geometry.jawpairs`) and on
+opposed points of the surface (:mod:`graspdb_geometry.antipodal`), half of either, at every angle about the
+closing axis; those at which the open gripper collides, or closes on nothing, are left out. A kernel about
+every row makes it a density over R^3 x SO(3) like any other: it integrates to 1, both twins of a symmetric
+jaw, and what is drawn from it may be weighted by it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,9 +89,16 @@ class Priors:
         metres = _POSITION_M if choice.sigma_position_m is None else choice.sigma_position_m
         degrees = _ROTATION_DEG if choice.sigma_rotation_deg is None else choice.sigma_rotation_deg
         kernel = IsotropicKernel(metres, math.radians(degrees))
-        pairs = self._scenes.features.pairs(row, selected)
+        opposed = self._scenes.features.opposed(row, selected)
         test = self._scenes.require(row, selected)
         assert selected.profile is not None
+        if not opposed:
+            raise conflict(
+                "no-surface-pairs",
+                f"No two surfaces of object {row.slug!r} are opposed within"
+                f" {1e3 * selected.profile.max_opening_m:.0f} mm, as far as the jaw opens: name a wider"
+                " gripper",
+            )
         key = _Key(
             row.mesh_sha256,
             "" if row.mesh_info is None else str(row.mesh_info["unit"]),
@@ -101,8 +110,8 @@ class Priors:
 
         def make(_: _Made | None) -> _Made:
             threads = self._compute.threads
-            density = self._compute.run(lambda: density_on(pairs, test, kernel, symmetric, threads=threads))
-            return _Made(density, len(pairs))
+            density = self._compute.run(lambda: density_on(opposed, test, kernel, symmetric, threads=threads))
+            return _Made(density, sum(len(pairs) for pairs in opposed))
 
         made = self._cache.get(key, lambda _: True, make)
         if made.density is None:
@@ -111,7 +120,7 @@ class Priors:
                 f"The open gripper collides wherever it could close on two surfaces or edges of {row.slug!r}:"
                 " name another gripper, or sweep a grid",
             )
-        rule = f"about {made.density.size:,} grasps on {made.pairs:,} pairs of surfaces and edges"
+        rule = f"about {made.density.size:,} grasps on {made.pairs:,} pairs of surfaces, edges and points"
         info = KernelInfo(
             kind="isotropic", sigma_position_m=metres, sigma_rotation_deg=degrees, rule=f"edges: {rule}"
         )
@@ -128,14 +137,21 @@ class Priors:
 
 
 def density_on(
-    pairs: JawPairs, test: CollisionTest, kernel: IsotropicKernel, symmetric: bool, *, threads: int = 1
+    opposed: Sequence[JawPairs],
+    test: CollisionTest,
+    kernel: IsotropicKernel,
+    symmetric: bool,
+    *,
+    threads: int = 1,
 ) -> GraspDensity | None:
-    """The density of grasps on pairs that the open gripper can take and hold something at; None without."""
+    """The density of grasps on pairs that the open gripper can take and hold something at, each kind of pairs
+    alike; None without any.
+    """
     count = _LOOKED_AT
     while True:
-        p, q, weights = pairs.grasps(count)
-        # A width is known where the gripper is free and both fingers come to touch.
-        held = np.isfinite(test.widths(p, q, threads=threads))
+        found = [pairs.grasps(count // len(opposed)) for pairs in opposed]
+        p, q, weights = (np.concatenate(column) for column in zip(*found, strict=True))
+        held = test.holds(p, q, threads=threads)
         if held.sum() >= _ENOUGH or count >= _MOST:
             break
         count = _MOST

@@ -44,7 +44,7 @@ CRITERIA: dict[Strategy, str] = {
         " as wide; poses that collide are left out"
     ),
     "edges": (
-        "about grasps that close on two opposed surfaces or edges, at any angle about the closing axis,"
+        "about grasps that close on opposed surfaces, edges or points, at any angle about the closing axis,"
         " without those at which the open gripper collides; the draws themselves are not tested, and some"
         " collide"
     ),

@@ -54,6 +54,10 @@ class CollisionTest:
         """As :meth:`free`, all along the straight approach that starts this far back."""
         return ~self.solid.collides(positions, quaternions, self.shape, threads=threads, retreat_m=distance_m)
 
+    def holds(self, positions: Floats, quaternions: Floats, threads: int = 1) -> NDArray[np.bool_]:
+        """Which poses the open gripper can take with something between its fingers."""
+        return self.solid.holds(positions, quaternions, self.shape, threads=threads)
+
     def widths(self, positions: Floats, quaternions: Floats, threads: int = 1) -> Floats:
         """The jaw's opening (n,) once both fingers touch the object; NaN where it collides or misses."""
         return self.solid.widths(positions, quaternions, self.shape, threads=threads)
