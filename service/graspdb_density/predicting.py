@@ -1,7 +1,9 @@
-"""Success probabilities under widths for every axis of the gripper, and widths chosen to predict success.
+"""Success probabilities under widths for every axis, and widths chosen to predict success.
 
 What predicts success is not what shapes the density: closing fingers centre a free object, so attempts apart
-along the closing axis fare alike, while a few millimetres along the approach decide. Widths are chosen by the
+along the closing axis fare alike, while a few millimetres along the approach decide; along the axis of a
+round body attempts fare alike however the gripper is turned. So translations are along the gripper's axes, or
+along fixed ones of the object. Widths are chosen by the
 log loss of attempts whose block of space is left out; one half of them chooses, the other judges. Blocks are
 small: large ones would hide from the choice whatever changes within them, and blur. They hold what was tried
 at one position, so that repeated grasps and a grid's rotations do not predict themselves.
@@ -20,11 +22,11 @@ from .calibration import assign_blocks
 from .cells import Cells
 from .density import scaled_radius
 from .kernels import IsotropicKernel
-from .se3 import Floats
+from .se3 import UNIT_TOLERANCE, Floats
 from .success import PRIOR_TRIALS, SuccessModel, _attempts
 from .threads import for_blocks
 
-__all__ = ["LEAST_OF_EACH", "FittedWidths", "ShapedSuccessModel", "fit_widths"]
+__all__ = ["LEAST_OF_EACH", "FittedWidths", "ShapedSuccessModel", "Widths", "fit_widths"]
 
 #: Fewer successes, or failures, than this choose no widths.
 LEAST_OF_EACH = 50
@@ -42,21 +44,44 @@ _QUERY_BLOCK = 128
 _SORTED_FROM = 256
 
 
+@dataclass(frozen=True, slots=True)
+class Widths:
+    """A kernel that predicts success, to be compared with others.
+
+    Attributes
+    ----------
+    sigmas : (6,)
+        Standard deviations along (metres) and about (radians) x, y, z.
+    axes : (9,) or None
+        Of translations, object frame: a matrix row by row whose columns they are; None: the gripper's.
+    """
+
+    sigmas: tuple[float, ...]
+    axes: tuple[float, ...] | None = None
+
+
 class ShapedSuccessModel(SuccessModel):
-    """Attempts under a Gaussian over displacements in the gripper's frame, one width an axis; immutable.
+    """Attempts under a Gaussian over displacements, one width an axis; immutable.
 
     As `SuccessModel`, but for its kernel: ``k = exp(-sum xi^2 / (2 sigma^2))`` with xi the translation along
-    the gripper's axes and the rotation vector. Use `shaped` and `extend`.
+    the gripper's axes, or fixed ones, and the rotation vector in the gripper's frame. Use `shaped` and
+    `extend`.
     """
 
     def __init__(
-        self, widths: Floats, succeeded: Cells | None, failed: Cells | None, counts: tuple[int, int]
+        self,
+        widths: Floats,
+        axes: Floats | None,
+        succeeded: Cells | None,
+        failed: Cells | None,
+        counts: tuple[int, int],
     ) -> None:
         alike = IsotropicKernel(
             float(np.prod(widths[:3]) ** (1.0 / 3.0)), float(np.prod(widths[3:]) ** (1.0 / 3.0))
         )
         super().__init__(alike, succeeded, failed, counts)
         self._widths = widths
+        self._axes = axes
 
     @classmethod
     def shaped(
@@ -66,20 +91,39 @@ class ShapedSuccessModel(SuccessModel):
         success: ArrayLike,
         *,
         widths: ArrayLike,
+        axes: ArrayLike | None = None,
         symmetric: ArrayLike | bool = True,
     ) -> ShapedSuccessModel:
         """Sort attempts; ``widths`` (6,) are standard deviations along (metres) and about (radians) x, y, z.
 
+        The columns of ``axes`` (3, 3), object frame, are those of translations; None: each gripper's.
+
         Raises
         ------
         ValueError
-            As `SuccessModel.build`, and for widths that are not positive and finite.
+            As `SuccessModel.build`, and for widths that are not positive and finite, or axes that are none.
         """
         w = np.array(widths, dtype=np.float64)
         if w.shape != (6,) or not np.isfinite(w).all() or (w <= 0.0).any():
             raise ValueError("widths have shape (6,), are positive and finite")
-        empty = cls(w, None, None, (0, 0))
+        empty = cls(w, _axes(axes), None, None, (0, 0))
         return empty.extend(positions, quaternions_xyzw, success, symmetric)
+
+    @classmethod
+    def under(
+        cls,
+        widths: Widths,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        success: ArrayLike,
+        *,
+        symmetric: ArrayLike | bool = True,
+    ) -> ShapedSuccessModel:
+        """As `shaped`, with widths and axes as one."""
+        axes = None if widths.axes is None else np.reshape(widths.axes, (3, 3))
+        return cls.shaped(
+            positions, quaternions_xyzw, success, widths=widths.sigmas, axes=axes, symmetric=symmetric
+        )
 
     def extend(
         self,
@@ -90,6 +134,7 @@ class ShapedSuccessModel(SuccessModel):
     ) -> ShapedSuccessModel:
         """A model with further attempts; what is present is not sorted again."""
         p, q, won, flags = _attempts(positions, quaternions_xyzw, success, symmetric)
+        p = self._along(p)
         parts: list[Cells | None] = []
         for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
             columns = p[chosen], q[chosen], np.ones(int(chosen.sum())), flags[chosen]
@@ -100,7 +145,7 @@ class ShapedSuccessModel(SuccessModel):
             else:
                 parts.append(present.extend(*columns))
         counts = (self._counts[0] + int(won.sum()), self._counts[1] + int((~won).sum()))
-        return ShapedSuccessModel(self._widths, parts[0], parts[1], counts)
+        return ShapedSuccessModel(self._widths, self._axes, parts[0], parts[1], counts)
 
     @property
     def widths(self) -> Floats:
@@ -111,11 +156,17 @@ class ShapedSuccessModel(SuccessModel):
         self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
     ) -> Floats:
         """Probability here less that under widths half as large, (M,)."""
-        narrow = ShapedSuccessModel(0.5 * self._widths, self._succeeded, self._failed, self._counts)
+        narrow = ShapedSuccessModel(
+            0.5 * self._widths, self._axes, self._succeeded, self._failed, self._counts
+        )
         own = self.evaluate(positions, quaternions_xyzw, threads=threads).probability
         return np.asarray(
             own - narrow.evaluate(positions, quaternions_xyzw, threads=threads).probability, dtype=np.float64
         )
+
+    def _along(self, p: Floats) -> Floats:
+        """Positions along the fixed axes, where there are such: rows are sorted, and compared, in these."""
+        return p if self._axes is None else np.ascontiguousarray(p @ self._axes)
 
     def _sums(self, cells: Cells | None, p: Floats, q: Floats, cutoff: float, threads: int) -> Floats:
         """Sums of k and k^2 (M, 2)."""
@@ -123,6 +174,7 @@ class ShapedSuccessModel(SuccessModel):
         radius = scaled_radius(cutoff)
         if cells is None or not len(p):
             return out
+        p = self._along(p)
         half = 0.5 / self._widths**2
         half[:3] /= cells.scale**2
         # No width is larger than the one the cells were made for, so their runs reach far enough.
@@ -132,13 +184,22 @@ class ShapedSuccessModel(SuccessModel):
         def work(begin: int, end: int) -> None:
             shapedloops.shaped_sums(
                 cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                p[begin:end], q[begin:end], half, radius, out[begin:end],
+                p[begin:end], q[begin:end], half, self._axes is None, radius, out[begin:end],
             )  # fmt: skip
 
         for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
         result = np.empty_like(out)
         result[order] = out
         return result
+
+
+def _axes(axes: ArrayLike | None) -> Floats | None:
+    if axes is None:
+        return None
+    f = np.array(axes, dtype=np.float64)
+    if f.shape != (3, 3) or not np.all(np.abs(f.T @ f - np.eye(3)) < UNIT_TOLERANCE):
+        raise ValueError("the columns of axes (3, 3) must be orthonormal")
+    return f
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -173,6 +234,7 @@ def fit_widths(
     quaternions_xyzw: ArrayLike,
     success: ArrayLike,
     *,
+    axes: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
     seed: int = 0,
 ) -> FittedWidths:
@@ -183,6 +245,8 @@ def fit_widths(
     positions, quaternions_xyzw : (N, 3) metres, (N, 4)
         Attempts; where collisions are tested, those that did not collide.
     success : (N,) bool
+    axes : (3, 3) or None
+        Columns are the axes of translations, object frame; None: each gripper's.
 
     Raises
     ------
@@ -200,7 +264,9 @@ def fit_widths(
     kept = np.sort(rng.permutation(len(p))[:_TRAINED_MOST])
     p, q, won, flags = p[kept], q[kept], won[kept], np.ascontiguousarray(flags[kept])
     blocks = assign_blocks(p, edge_m=_BLOCK_M)
-    held = _HeldOut(p, q, won, flags, blocks.fold, blocks.block, rng)
+    fixed = _axes(axes)
+    along = p if fixed is None else np.ascontiguousarray(p @ fixed)
+    held = _HeldOut(along, q, won, flags, blocks.fold, blocks.block, fixed is None, rng)
     alike = _searched(held, np.array([0.015] * 3 + [math.radians(15.0)] * 3), ((0, 1, 2), (3, 4, 5)))
     widths = _searched(held, alike, tuple((axis,) for axis in range(6)))
     (loss, skill), (alike_loss, alike_skill) = held.judged(widths), held.judged(alike)
@@ -227,6 +293,7 @@ class _HeldOut:
         symmetric: NDArray[np.bool_],
         fold: NDArray[np.int64],
         block: NDArray[np.int64],
+        turning: bool,
         rng: np.random.Generator,
     ) -> None:
         # Successes are few: half of what is judged, each class weighted by what it stands for.
@@ -237,12 +304,13 @@ class _HeldOut:
         few = judged[: max(1, len(judged) // 20)]
         nothing = np.empty(0, dtype=np.int32), np.empty((0, 6), dtype=np.float32)
         first = np.empty(len(few) + 1, dtype=np.int64)
-        each = shapedloops.near_pairs(p, q, symmetric, fold, few, widest, _CUT, first, *nothing) / len(few)
+        every = p, q, symmetric, fold
+        each = shapedloops.near_pairs(*every, few, turning, widest, _CUT, first, *nothing) / len(few)
         judged = judged[: max(50, int(_PAIRS_MOST / max(1.2 * each, 1.0)))]
         room = min(_PAIRS_MOST, int(1.5 * each * len(judged)) + 10_000)
         self.first = np.empty(len(judged) + 1, dtype=np.int64)
         row, squared = np.empty(room, dtype=np.int32), np.empty((room, 6), dtype=np.float32)
-        count = shapedloops.near_pairs(p, q, symmetric, fold, judged, widest, _CUT, self.first, row, squared)
+        count = shapedloops.near_pairs(*every, judged, turning, widest, _CUT, self.first, row, squared)
         count = min(int(count), room)
         self.squared, self.won = squared[:count], won[row[:count]]
         self.outcome = won[judged]

@@ -1,4 +1,4 @@
-"""Compiled loops over attempts under a Gaussian with a width for every axis of the gripper."""
+"""Compiled loops over attempts under a Gaussian with a width for every axis, the gripper's or fixed ones."""
 
 from __future__ import annotations
 
@@ -43,10 +43,11 @@ def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped
 
 
 @exact
-def shaped_sums(data, start, table, centre, scale, positions, quaternions, half, radius, out):  # type: ignore[no-untyped-def]
+def shaped_sums(data, start, table, centre, scale, positions, quaternions, half, turning, radius, out):  # type: ignore[no-untyped-def]
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over rows with an exponent of at most radius^2.
 
-    ``half`` (6,): 1 / (2 sigma^2), translations in units of the cells' scale. A row's twin counts beside it.
+    ``half`` (6,): 1 / (2 sigma^2), translations in units of the cells' scale, along each row's gripper's axes
+    where ``turning`` and else along those positions are given in. A row's twin counts beside it.
     Of a row's jaw and its turn the translation's x and y differ in sign only, which widths do not see.
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
@@ -63,7 +64,9 @@ def shaped_sums(data, start, table, centre, scale, positions, quaternions, half,
                 for i in range(runs[r, 0], runs[r, 1]):
                     dx, dy, dz = px - data[0, i], py - data[1, i], pz - data[2, i]
                     ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
-                    x, y, z = _turned_back(ax, ay, az, aw, dx, dy, dz)
+                    x, y, z = dx, dy, dz
+                    if turning:
+                        x, y, z = _turned_back(ax, ay, az, aw, dx, dy, dz)
                     base = half[0] * x * x + half[1] * y * y + half[2] * z * z
                     if base > cut:
                         continue
@@ -85,8 +88,9 @@ def shaped_sums(data, start, table, centre, scale, positions, quaternions, half,
 
 
 @exact
-def near_pairs(positions, quaternions, symmetric, fold, judged, widest, cut, first, row, squared):  # type: ignore[no-untyped-def]
-    """Pairs of a judged attempt and one of another fold, the nearer twin, by squared displacements; how many.
+def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest, cut, first, row, squared):  # type: ignore[no-untyped-def]
+    """Pairs of a judged attempt and one of another fold, the nearer twin, by squared displacements (along the
+    gripper's axes where ``turning``); how many.
 
     ``widest`` (2,): the largest widths that will be asked for, m and rad; pairs whose exponent is larger than
     ``cut`` under even those are left out. Fills ``first`` (J + 1,), ``row`` (K,) and ``squared`` (K, 6) as
@@ -118,7 +122,9 @@ def near_pairs(positions, quaternions, symmetric, fold, judged, widest, cut, fir
             if e + b * (u * u + v * v + t * t) > cut:
                 continue
             if count < room:
-                x, y, z = _turned_back(ax, ay, az, aw, dx, dy, dz)
+                x, y, z = dx, dy, dz
+                if turning:
+                    x, y, z = _turned_back(ax, ay, az, aw, dx, dy, dz)
                 row[count] = i
                 squared[count, 0], squared[count, 1], squared[count, 2] = x * x, y * y, z * z
                 squared[count, 3], squared[count, 4], squared[count, 5] = u * u, v * v, t * t

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspdb_density import IsotropicKernel, SuccessModel, se3
-from graspdb_density.predicting import FittedWidths, ShapedSuccessModel, fit_widths
+from graspdb_density.predicting import FittedWidths, ShapedSuccessModel, Widths, fit_widths
 from graspdb_density.se3 import Floats
 from graspdb_density.success import PRIOR_TRIALS, SUCCESS_CUTOFF
 
@@ -71,6 +71,39 @@ def test_the_model_is_the_sum_over_attempts(seed: int) -> None:
     )
 
 
+def test_fixed_axes_are_those_of_the_sum() -> None:
+    rng = np.random.default_rng(5)
+    p, q, won = scattered(300, 5)
+    axes = se3.to_matrix(se3.random_quaternions(1, rng))[0]
+    model = ShapedSuccessModel.shaped(p[:200], q[:200], won[:200], widths=WIDTHS, axes=axes)
+    model = model.extend(p[200:], q[200:], won[200:])
+    at = rng.integers(300, size=20)
+    x = p[at] + rng.normal(size=(20, 3)) * 0.008
+    r = se3.multiply(q[at], se3.from_rotation_vector(rng.normal(size=(20, 3)) * 0.2))
+    found = model.evaluate(x, r)
+    half = model.smoothing_bias(x, r)
+    for j in range(20):
+        k = np.zeros((2, 300))
+        for turned in (q, se3.jaw_twin(q)):
+            shift = (x[j] - p) @ axes
+            turn = se3.to_rotation_vector(se3.canonical(se3.multiply(se3.conjugate(turned), r[j])))
+            for row, widths in enumerate((WIDTHS, 0.5 * WIDTHS)):
+                e = 0.5 * np.sum((np.concatenate([shift, turn], axis=1) / widths) ** 2, axis=1)
+                k[row] += np.where(e <= 0.5 * SUCCESS_CUTOFF**2, np.exp(-e), 0.0)
+        told = []
+        for weight in k:
+            trials = weight.sum() ** 2 / max((weight**2).sum(), 1e-300)
+            share = (weight * won).sum() / max(weight.sum(), 1e-300)
+            told.append((PRIOR_TRIALS * won.mean() + trials * share) / (PRIOR_TRIALS + trials))
+        assert found.probability[j] == pytest.approx(told[0], abs=2e-4)
+        assert half[j] == pytest.approx(told[0] - told[1], abs=4e-4)
+    one = Widths(tuple(WIDTHS.tolist()), tuple(axes.ravel().tolist()))
+    again = ShapedSuccessModel.under(one, p, q, won).evaluate(x, r)
+    np.testing.assert_allclose(again.probability, found.probability, atol=1e-5)
+    with pytest.raises(ValueError, match="orthonormal"):
+        ShapedSuccessModel.shaped(p, q, won, widths=WIDTHS, axes=2.0 * axes)
+
+
 def test_equal_widths_agree_with_the_isotropic_model() -> None:
     p, q, won = scattered(4_000, 3)
     kernel = IsotropicKernel(0.008, math.radians(9.0))
@@ -123,6 +156,22 @@ def test_the_gain_holds_for_attempts_never_seen(fitted: FittedWidths) -> None:
     plain = SuccessModel.build(p, q, won, kernel=fitted.isotropic, symmetric=False)
     errors = [np.mean((model.evaluate(x, r).probability - truth) ** 2) for model in (shaped, plain)]
     assert errors[0] < 0.8 * errors[1]
+
+
+def test_along_a_body_s_axis_widths_are_wide_however_grippers_are_turned() -> None:
+    """Success changes across a line in the object and not along it; grippers point every way."""
+    rng = np.random.default_rng(2)
+    p = rng.uniform(-0.04, 0.04, (12_000, 3))
+    q = se3.from_rotation_vector(rng.normal(size=(len(p), 3)) * 0.6)
+    line = se3.to_matrix(se3.random_quaternions(1, rng))[0]
+    chance = 0.5 + 0.45 * np.sin(2.0 * math.pi * (p @ line[:, 1]) / 0.04)
+    won = rng.random(len(p)) < chance
+    along, gripper = fit_widths(p, q, won, axes=line), fit_widths(p, q, won)
+    assert along.widths[0] > 1.8 * along.widths[1]
+    assert along.log_loss < gripper.log_loss - 0.02
+    assert along.skill > gripper.skill + 0.02
+    # The best isotropic kernel knows of no axes.
+    assert along.isotropic_log_loss == pytest.approx(gripper.isotropic_log_loss)
 
 
 def test_too_little_is_said_with_numbers() -> None:

@@ -147,7 +147,7 @@ def test_what_the_geometry_does_not_have_is_said(
     told = ["success"] * 30 + ["missed"] * 30
     post(http, "thing", (p, q), told)
     assert "PUT /objects/thing/mesh" in refused("edge", "mesh-missing")
-    assert "gripper=" in refused("surface-pair", "gripper-unknown")
+    assert "name one (gripper)" in refused("surface-pair", "gripper-unknown")
     body = http.get(REPORT, params={"alignment": "surface-pair", "gripper": "pg70"})
     assert body.json()["type"].endswith("mesh-missing")
     assert http.get(REPORT, params={"alignment": "corner"}).status_code == 422

@@ -224,6 +224,42 @@ def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     assert problem(http.get("/objects/thing/density?kernel=anisotropic"), 409)
 
 
+def test_success_predicted_along_the_object_s_own_axes(
+    http: httpx.Client, make_object: Make, post: Post, put_box: PutBox
+) -> None:
+    make_object(http)
+    make_object(http, "bare")
+    put_box(http, "thing", (0.02, 0.04, 0.16))
+    rng = np.random.default_rng(4)
+    # Beside the object, where nothing collides; grippers point every way.
+    p = rng.uniform([0.46, -0.04, -0.04], [0.54, 0.04, 0.04], (5_000, 3))
+    q = se3.from_rotation_vector(rng.normal(size=(len(p), 3)) * 0.6)
+    won = rng.random(len(p)) < 0.5 + 0.45 * np.sin(2 * math.pi * p[:, 1] / 0.04)
+    for slug in ("thing", "bare"):
+        post(http, slug, (p, q), ["success" if w else "missed" for w in won], gripper="pg70")
+    request = {"object": "thing", "kind": "probability"}
+    along = made(http.post("/kernels", json={**request, "alignment": "object"}))
+    gripper = made(http.post("/kernels", json=request))
+    assert (along["alignment"], gripper["alignment"]) == ("object", "gripper")
+    assert along["provenance"]["log_loss"] < gripper["provenance"]["log_loss"] - 0.01
+    # The longest way first: z, y, x.
+    assert along["widths_m"][1] < 0.6 * min(along["widths_m"][0], along["widths_m"][2])
+    at = {"position": p[:50].tolist(), "quaternion_xyzw": q[50:100].tolist()}
+    asked = {"poses": at, "kernel": along["id"]}
+    found = ok(http.post("/objects/thing/likelihood", json=asked))
+    assert found["kernel"]["alignment"] == "object"
+    widths = [*along["widths_m"], *np.radians(along["widths_deg"])]
+    model = ShapedSuccessModel.shaped(p, q, won, widths=widths, axes=np.eye(3)[::-1])
+    expected = model.evaluate(p[:50], q[50:100]).probability
+    np.testing.assert_allclose(found["success_probability"], expected, atol=1e-4)
+    judged = ok(http.get(f"/objects/thing/reports/calibration?kernel={along['id']}"))
+    assert judged["kernel"]["id"] == along["id"]
+    # Another object needs a shape to have such axes.
+    told = problem(http.post("/objects/bare/likelihood", json=asked), 409)
+    assert "PUT /objects/bare/mesh" in told["title"]
+    problem(http.post("/kernels", json={**request, "object": "bare", "alignment": "object"}), 409)
+
+
 def test_predictors_that_are_none(http: httpx.Client, make_object: Make, post: Post) -> None:
     make_object(http)
     (p, q), won = field(300, 1)
@@ -242,6 +278,6 @@ def test_predictors_that_are_none(http: httpx.Client, make_object: Make, post: P
     assert "no mean" in refused(components=[{**one, "mean": [0.01, 0, 0, 0, 0, 0]}])
     spread[1, 2] = spread[2, 1] = 1e-5
     assert "diagonal" in refused(components=[{"covariance": spread.tolist()}])
-    assert "gripper's axes" in refused(object="thing", alignment="edge")
+    assert "alignment=gripper or alignment=object" in refused(object="thing", alignment="edge")
     assert "no window" in refused(object="thing", window={"position_m": 0.03})
     assert "one component" in refused(object="thing", components=3)

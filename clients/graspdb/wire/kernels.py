@@ -59,7 +59,8 @@ class KernelCreate(Request):
 
     ``probability``: a width for every axis of the gripper, chosen by the log loss of attempts in blocks of
     space left out. A query with it estimates ``success_probability`` by these widths; its density is the
-    default one. Given: one component, centred, without correlations.
+    default one. Its axes are the gripper's or the ``object``'s. Given: one component, centred, without
+    correlations.
     """
 
     object: Slug | None = None

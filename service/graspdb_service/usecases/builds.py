@@ -26,6 +26,7 @@ from graspdb_density import (
     importance_weights,
     widths_prefix,
 )
+from graspdb_density.predicting import Widths
 from graspdb_density.sampled import MOST_COMPONENTS
 from graspdb_density.widths import FIRST_CHOICE
 from graspdb_service.problems import ProblemError
@@ -103,7 +104,7 @@ class Built:
     chosen_from: int = 0
     shaped: MixtureDensity | None = None
     sampled: GraspDensity | None = None
-    predicting: tuple[float, ...] | None = None
+    predicting: Widths | None = None
 
     @property
     def asked(self) -> GraspDensity | MixtureDensity | None:
@@ -191,7 +192,7 @@ def build(
         proposal_density=proposal,
         swept=swept,
         chosen_from=widths_prefix(len(seq)) if choice.by_default or predicting else 0,
-        predicting=shapes.widths_of(stored) if stored is not None and predicting else None,
+        predicting=shapes.widths_of(stored, axes) if stored is not None and predicting else None,
     )
     if not len(seq):
         return built

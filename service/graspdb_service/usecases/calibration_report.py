@@ -23,7 +23,7 @@ from graspdb_density.calibration import (
     calibrate,
     reliability,
 )
-from graspdb_density.predicting import ShapedSuccessModel
+from graspdb_density.predicting import ShapedSuccessModel, Widths
 from graspdb_density.rows import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import alltrials, checks
@@ -55,13 +55,13 @@ _CHECKED_BINS = 5
 
 
 def _model(
-    everything: AllTrials, rows: NDArray[np.int64], kernel: IsotropicKernel, widths: tuple[float, ...] | None
+    everything: AllTrials, rows: NDArray[np.int64], kernel: IsotropicKernel, widths: Widths | None
 ) -> SuccessModel:
     """Of some attempts, under the widths that predict success where a kernel of that kind was asked for."""
     attempts = everything.position[rows], everything.quaternion[rows], everything.success[rows]
     symmetric = everything.symmetric[rows]
     if widths is not None:
-        return ShapedSuccessModel.shaped(*attempts, widths=widths, symmetric=symmetric)
+        return ShapedSuccessModel.under(widths, *attempts, symmetric=symmetric)
     return SuccessModel.build(*attempts, kernel=kernel, symmetric=symmetric)
 
 
@@ -193,7 +193,7 @@ def _checked(
     codes = np.concatenate([item.codes for item in found])
     assert built.density is not None
     kernel, widths = built.density.kernel, built.predicting
-    reach = max([kernel.sigma_position_m, *(() if widths is None else widths[:3])])
+    reach = max([kernel.sigma_position_m, *(() if widths is None else widths.sigmas[:3])])
     distance, _ = cKDTree(p).query(everything.position, distance_upper_bound=_REACH * reach)
     near = np.isfinite(distance)
     if test is not None:

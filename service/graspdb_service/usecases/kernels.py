@@ -32,6 +32,8 @@ from graspdb_service.usecases.idempotency import Created, replay_or, replayed
 
 Floats = NDArray[np.float64]
 
+#: Axes that kernels of a kind may lie along, where not all.
+_ALIGNED = {"sampled": ("gripper",), "probability": ("gripper", "object")}
 #: Farther along an axis no displacement between grasps of one object reaches.
 _MOST_SHIFT_M = 1.0
 #: Shares of a covariance's scale, and metres, below which an entry is none.
@@ -48,10 +50,10 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
         404 for the object, 422 for components that make no kernel, 409 where the trials don't suffice to fit
         one or the object's geometry does not have what it is to be aligned with.
     """
-    if request.kind != "anisotropic" and request.alignment != "gripper":
+    if request.alignment not in _ALIGNED.get(request.kind, (request.alignment,)):
+        ways = " or ".join(f"alignment={name}" for name in _ALIGNED[request.kind])
         raise invalid(
-            "alignment",
-            f"a kernel of kind {request.kind} lies along the gripper's axes: use alignment=gripper",
+            "alignment", f"a kernel of kind {request.kind} does not lie along those axes: use {ways}"
         )
     scope = "POST /kernels"
     # A fit takes a while, and the trials may have gone since.

@@ -1,4 +1,4 @@
-"""Kernels that predict success: a width for every axis of the gripper, chosen on an object's attempts."""
+"""Kernels that predict success: a width an axis, the gripper's or the object's, chosen on all attempts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance
 from graspdb_density import AnisotropicKernel
 from graspdb_density.predicting import fit_widths
 from graspdb_service.problems import conflict, invalid
-from graspdb_service.usecases import alltrials
+from graspdb_service.usecases import alltrials, shapes
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.selection import Filters
 
@@ -33,6 +33,9 @@ def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
     filters = Filters(request.gripper, request.protocol, request.source)
     with ctx.compute.admitted():
         row, selected = ctx.densities.current(request.object, filters)
+        # Said first: without axes no number of trials helps.
+        axes = shapes.axes(request.alignment, row, selected, ctx.scenes.features)
+        assert not callable(axes)
         everything = alltrials.read(ctx.database, row, selected)
         tested = ctx.scenes.test(row, selected) is not None
         kept = ~everything.collided if tested else np.ones(len(everything), dtype=bool)
@@ -42,6 +45,7 @@ def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
                     everything.position[kept],
                     everything.quaternion[kept],
                     everything.success[kept],
+                    axes=axes,
                     symmetric=everything.symmetric[kept],
                 )
             )

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, SuccessModel
-from graspdb_density.predicting import ShapedSuccessModel
+from graspdb_density.predicting import ShapedSuccessModel, Widths
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases import alltrials
 from graspdb_service.usecases.alltrials import AllTrials, Stored
@@ -79,7 +79,7 @@ class _Key:
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool
-    widths: tuple[float, ...] | None
+    widths: Widths | None
 
 
 class Successes:
@@ -199,7 +199,7 @@ def _fetch(
 
 
 def _extended(
-    old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel, widths: tuple[float, ...] | None
+    old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel, widths: Widths | None
 ) -> SuccessModel | None:
     if not len(new.success):
         return old
@@ -207,7 +207,7 @@ def _extended(
     if old is not None:
         return old.extend(*columns, symmetric=new.symmetric)
     if widths is not None:
-        return ShapedSuccessModel.shaped(*columns, widths=widths, symmetric=new.symmetric)
+        return ShapedSuccessModel.under(widths, *columns, symmetric=new.symmetric)
     return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
 
 
