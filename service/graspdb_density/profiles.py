@@ -136,8 +136,8 @@ class Profiles:
                 _sum_shares(found, self.step, _STEP * self.tolerance, each)
             else:
                 _sum_equations(found, fall, self.step, _AROUND * _STEP * self.tolerance, each)
-            part = weights[begin : begin + _BLOCK].T.astype(np.float64)
-            total += part @ each.reshape(len(found), total.shape[1])
+            part = each.reshape(len(found), total.shape[1]).astype(np.float32)
+            total += weights[begin : begin + _BLOCK].T @ part
         return total.reshape(-1, 3, rows, number)
 
 
