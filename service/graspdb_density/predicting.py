@@ -1,12 +1,13 @@
 """Success probabilities under widths for every axis, and widths chosen to predict success.
 
 What predicts success is not what shapes the density: closing fingers centre a free object, so attempts apart
-along the closing axis fare alike, while a few millimetres along the approach decide; along the axis of a
-round body attempts fare alike however the gripper is turned. So translations are along the gripper's axes, or
-along fixed ones of the object. Widths are chosen by the
-log loss of attempts whose block of space is left out; one half of them chooses, the other judges. Blocks are
-small: large ones would hide from the choice whatever changes within them, and blur. They hold what was tried
-at one position, so that repeated grasps and a grid's rotations do not predict themselves.
+along the closing axis fare alike, while a few millimetres along the approach decide. Translations are along
+the gripper's axes, or along fixed ones of the object: which predict better differs from object to object.
+
+Widths are chosen by the log loss of attempts whose block of space is left out; one half of them chooses, the
+other judges. Blocks are small: large ones would hide from the choice whatever changes within them, and blur.
+They hold what was tried at one position, so that repeated grasps and a grid's rotations do not predict
+themselves.
 """
 
 from __future__ import annotations

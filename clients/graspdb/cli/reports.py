@@ -393,7 +393,7 @@ def fit_kernel(
     context: typer.Context,
     id: ObjectId,
     alignment: Annotated[
-        str, typer.Option(help="anisotropic: gripper, object, edge or surface-pair.")
+        str, typer.Option(help="gripper; anisotropic: or object, edge, surface-pair; probability: or object.")
     ] = "gripper",
     components: Annotated[
         str | None, typer.Option(help="anisotropic: 1 to 16 Gaussians, or auto; sampled: displacements.")
