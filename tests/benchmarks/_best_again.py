@@ -67,9 +67,15 @@ def jeffreys(won: int, tried: int) -> tuple[float, float]:
     return min(low, won / tried), max(high, won / tried)
 
 
-def row(made: GraspObject, label: str, objective: str, count: int) -> str:
+def row(made: GraspObject, label: str, objective: str, options: Any) -> str:
     """Shares of the best grasps that succeed, the best first."""
-    found = made.best_grasps(count=count, objective=objective, collision_free=True)
+    found = made.best_grasps(
+        count=options.count,
+        objective=objective,
+        collision_free=True,
+        min_separation_m=options.separation_m,
+        min_separation_deg=options.separation_deg,
+    )
     check = made.sweep(poses=found.matrices, fidelity="fine", purpose="check").wait()
     outcomes = check.outcomes()
     held: list[bool] = outcomes.success[outcomes.pose_index.argsort()].tolist()
@@ -98,6 +104,8 @@ def arguments() -> Any:
     parser.add_argument("--successes", type=int, nargs="*", default=[1_000, 3_000])
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--grid", action="store_true")
+    parser.add_argument("--separation-m", type=float, help="distinct grasps are so far apart (0.01)")
+    parser.add_argument("--separation-deg", type=float, help="or turned by so much (20)")
     return parser.parse_args()
 
 
@@ -113,7 +121,7 @@ def main() -> None:
                 asked.append(db.objects.get(name))
             for made in asked:
                 for objective in OBJECTIVES:
-                    print(row(made, name, objective, options.count), flush=True)
+                    print(row(made, name, objective, options), flush=True)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from graspdb_density.matching import match_success
 
 ALIGNED = {"cone": "object", "screwdriver": "object", "elongated-d": "edge", "mug": "edge"}
 """What the paper's hypothesis aligns with: a long object's own axis, else the nearest edge."""
-WINDOWS = ((0.03, 45.0), (0.06, 60.0), (0.10, 60.0))
+WINDOWS = ((0.03, 45.0), (0.06, 60.0), (0.10, 60.0), (0.20, 60.0))
 """Displacements that shape a kernel, metres and degrees: the likeliest of these is taken."""
 RULES = ("determinants", "success", "likelihood")
 SIGMA_M, SIGMA_DEG = 0.015, 15.0
