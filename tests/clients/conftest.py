@@ -9,6 +9,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -22,10 +23,9 @@ def _command(name: str) -> str:
     return str(Path(sys.executable).with_name(name))
 
 
-@pytest.fixture(scope="session")
-def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """``graspdb-server serve`` on a scratch SQLite; its address."""
-    folder = tmp_path_factory.mktemp("service")
+@contextmanager
+def _served(folder: Path) -> Iterator[str]:
+    """``graspdb-server serve`` on a scratch SQLite in this folder; its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -59,13 +59,12 @@ def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             process.wait()
 
 
-@pytest.fixture(scope="session")
-def worker(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+@contextmanager
+def _worked(url: str, log: Path) -> Iterator[None]:
     """``graspdb-simworker run`` beside the service."""
-    log = tmp_path_factory.mktemp("worker") / "log"
     with log.open("wb") as output:
         process = subprocess.Popen(
-            [_command("graspdb-simworker"), "run", "--url", service_url, "--processes", "1"],
+            [_command("graspdb-simworker"), "run", "--url", url, "--processes", "1"],
             stdout=output,
             stderr=subprocess.STDOUT,
         )
@@ -79,6 +78,27 @@ def worker(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+@pytest.fixture(scope="session")
+def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A service; its address."""
+    with _served(tmp_path_factory.mktemp("service")) as url:
+        yield url
+
+
+@pytest.fixture(scope="session")
+def worker(service_url: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A worker of the service."""
+    with _worked(service_url, tmp_path_factory.mktemp("worker") / "log"):
+        yield
+
+
+@pytest.fixture
+def own_service_url(tmp_path: Path) -> Iterator[str]:
+    """A service with a worker, of this test's own: its objects may have any name."""
+    with _served(tmp_path) as url, _worked(url, tmp_path / "worker.log"):
+        yield url
 
 
 @pytest.fixture
