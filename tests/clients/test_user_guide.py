@@ -122,3 +122,27 @@ def test_the_shell_blocks_run(empty_postgres_url: str) -> None:
             check=False,
         )
         assert done.returncode == 0, done.stdout + done.stderr
+
+
+def commands() -> list[str]:
+    """What the guide tells to type, in its text and beside its code."""
+    text = GUIDE.read_text(encoding="utf-8")
+    inline = re.findall(r"`(graspdb(?:-[a-z]+)? [^`]+)`", text)
+    beside = re.findall(r"# (graspdb(?:-[a-z]+)? .+)$", text, re.MULTILINE)
+    return sorted({" ".join(command.split()) for command in (*inline, *beside)})
+
+
+def test_the_commands_it_names_take_what_it_gives_them() -> None:
+    named = commands()
+    assert len(named) >= 10
+    for command in named:
+        program, *arguments = command.split()
+        # Help is shown once all options before it are known to exist; nothing runs.
+        done = subprocess.run(
+            [str(Path(sys.executable).with_name(program)), *arguments, "--help"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, (command, done.stderr)
+        assert "usage" in done.stdout.lower(), command
