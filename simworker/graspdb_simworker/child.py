@@ -23,8 +23,10 @@ def main() -> int:
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)
     os.dup2(null, 1)
-    # An interrupt at the terminal is for the worker, who ends its children itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # An interrupt at the terminal, or a manager that stops the whole group, is for the worker, who ends its
+    # children itself: one that died before it would look like the work's fault.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     complaints = os.dup(2)
     os.dup2(null, 2)  # pybullet greets on the standard error

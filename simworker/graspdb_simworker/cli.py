@@ -93,7 +93,8 @@ def run(
         typer.Option(
             min=0,
             envvar="GRASPDB_DECOMPOSE_SECONDS",
-            help="Longest decomposition of a mesh into convex parts; 0 leaves them to other workers.",
+            help="Processor time that the decomposition of a mesh into convex parts may take;"
+            " 0 leaves them to other workers.",
         ),
     ] = 900.0,
     decompose_memory_mib: Annotated[

@@ -10,6 +10,7 @@ person), ``RESULT`` (a candidate as GLB, each finer than the one before) and ``E
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import signal
@@ -29,21 +30,23 @@ def main() -> int:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    # An interrupt at the terminal is for the worker, who ends its children itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # An interrupt at the terminal, or a manager that stops the whole group, is for the worker, who ends its
+    # children itself: one that died before it would look like the work's fault.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     try:
         _, body = messages.receive(source, poll_s=60.0)
         head, _, content = body.partition(b"\n")
         order = json.loads(head)
-        seconds = max(1, round(order["seconds"]))
-        for kind, limit in (
-            (resource.RLIMIT_AS, int(order["memory_bytes"])),
-            # A worker that dies leaves no child that runs for ever.
-            (resource.RLIMIT_CPU, seconds + 60),
-            (resource.RLIMIT_CORE, 0),
+        memory, seconds = int(order["memory_bytes"]), max(1, math.ceil(order["seconds"]))
+        for kind, soft, hard in (
+            (resource.RLIMIT_AS, memory, memory),
+            # The kernel ends it by SIGXCPU at the first, also if the worker is long dead.
+            (resource.RLIMIT_CPU, seconds, seconds + 5),
+            (resource.RLIMIT_CORE, 0, 0),
         ):
             with suppress(ValueError, OSError):  # an inherited limit may be tighter already
-                resource.setrlimit(kind, (limit, limit))
+                resource.setrlimit(kind, (soft, hard))
         _serve(order, content, sink)
     except messages.Closed:
         pass
@@ -67,7 +70,7 @@ def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
 
 
 def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    began = time.monotonic()
+    began = time.process_time()
     mesh = convexity.read(content, order["media_type"], order["unit"])
     target = convexity.target_m(mesh)
     best = float("inf")
@@ -80,7 +83,7 @@ def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tu
         note = f"{found.parts} parts at threshold {threshold:g}, {1000 * found.deviation_m:.2g} mm off"
         yield messages.NOTE, note.encode()
         # A finer one takes longer; what there is by now is worth more than nothing at the end.
-        if found.deviation_m <= target or time.monotonic() - began > order["seconds"] / 6:
+        if found.deviation_m <= target or time.process_time() - began > order["seconds"] / 6:
             return
 
 

@@ -21,6 +21,8 @@ COMMAND = (sys.executable, "-m", "graspdb_simworker.decompose_child")
 SEED = 0
 """CoACD searches at random; with one seed the same mesh gets the same parts."""
 
+PATIENCE = 3.0
+"""A decomposition may wait so many times as long as it works."""
 _WAY_OUT = "Simplify the mesh, or give its convex parts"
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -32,7 +34,9 @@ class Limits:
     Attributes
     ----------
     seconds
-        After which the best candidate so far is taken, or without one the job fails.
+        Processor time after which the best candidate so far is taken, or without one the job fails; by the
+        clock :data:`PATIENCE` times as long. On a busy machine the clock says little about the work, and the
+        parts should not depend on what else ran.
     memory_bytes
         Address space of the child, libraries (about 1 GB) included.
     """
@@ -85,7 +89,7 @@ def decompose(
     DecompositionFailed
         With the reason.
     """
-    deadline = time.monotonic() + limits.seconds
+    deadline = time.monotonic() + PATIENCE * limits.seconds
 
     def check() -> None:
         if not wanted():
@@ -122,10 +126,10 @@ def decompose(
                 raise DecompositionFailed(f"{body.decode(errors='replace')}. {_WAY_OUT}")
     except _Late:
         if best is None:
-            raise DecompositionFailed(
-                f"it takes more than {limits.seconds:g} s (the worker's --decompose-seconds). {_WAY_OUT}"
-            ) from None
+            raise _too_long(limits) from None
     except messages.Closed:
+        if best is None and process.wait() == -signal.SIGXCPU:
+            raise _too_long(limits) from None
         if best is None:
             raise DecompositionFailed(
                 f"{_cause(process)}: perhaps it needs more than {limits.memory_bytes / 2**20:.0f} MiB"
@@ -137,6 +141,12 @@ def decompose(
         process.stdin.close()
         process.stdout.close()
     return best
+
+
+def _too_long(limits: Limits) -> DecompositionFailed:
+    return DecompositionFailed(
+        f"it takes more than {limits.seconds:g} s (the worker's --decompose-seconds). {_WAY_OUT}"
+    )
 
 
 def _cause(process: subprocess.Popen[bytes]) -> str:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -70,6 +73,28 @@ def test_too_little_time_is_said_with_the_way_out() -> None:
         decomposition.decompose(PAYLOAD, angle_stl(), limits=Limits(seconds=0.05))
 
 
+def test_work_is_bounded_and_not_the_wait() -> None:
+    # The kernel ends what has used up its processor time, long before three minutes are over by the clock.
+    script = "import resource as r; r.setrlimit(r.RLIMIT_CPU, (1, 9))\nwhile True: pass"
+    with pytest.raises(DecompositionFailed, match=r"more than 60 s .*--decompose-seconds"):
+        decomposition.decompose(
+            PAYLOAD, angle_stl(), limits=Limits(seconds=60.0), command=(sys.executable, "-c", script)
+        )
+
+
+def test_a_signal_to_the_whole_group_is_left_to_the_worker() -> None:
+    def notice(note: str) -> None:
+        for child in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
+            if b"decompose_child" in Path(f"/proc/{child}/cmdline").read_bytes():
+                os.kill(int(child), signal.SIGTERM)
+                sent.append(note)
+
+    sent: list[str] = []
+
+    check_parts(decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notice))
+    assert sent
+
+
 def test_too_little_memory_is_said_with_the_way_out() -> None:
     with pytest.raises(DecompositionFailed, match="memory"):
         decomposition.decompose(PAYLOAD, angle_stl(), limits=Limits(120.0, 150 * 2**20))
@@ -92,7 +117,7 @@ def test_the_best_so_far_is_taken_when_time_is_over() -> None:
         "m.receive(0); m.send(1, m.RESULT, b'coarse'); m.send(1, m.RESULT, b'finer'); time.sleep(60)"
     )
     found = decomposition.decompose(
-        PAYLOAD, angle_stl(), limits=Limits(seconds=10.0), command=(sys.executable, "-c", script)
+        PAYLOAD, angle_stl(), limits=Limits(seconds=4.0), command=(sys.executable, "-c", script)
     )
     assert found == b"finer"
 
