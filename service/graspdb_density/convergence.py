@@ -12,6 +12,7 @@ every point of a curve carries both. N counts successes; a grasp and its twin un
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -311,12 +312,19 @@ def needed_ratio(
     curve: ConvergenceCurve,
     reference: ConvergenceCurve,
     *,
+    ends: Sequence[ConvergenceCurve] = (),
     target: float = TARGET,
     level: float = 0.9,
     seed: int = 0,
 ) -> tuple[float, float, float]:
     """Grasps one kernel needs over those the reference needs: value and interval; nan where neither can be
     told.
+
+    Parameters
+    ----------
+    ends
+        Curves under the reference's kernels at the ends of an interval of the same level, where its width is
+        known no better: what they need widens the ratio's, independent errors adding in squares.
     """
     _checked_target(target, level)
     values = []
@@ -331,6 +339,12 @@ def needed_ratio(
     if np.isnan(ratios).any():
         return float(ratio), math.nan, math.nan
     low, high = _interval(ratios, level)
+    if ends:
+        others = np.array([grasps_needed(end, target=target, level=level, seed=seed).grasps for end in ends])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shifts = np.log(base / others)
+            low = float(ratio) * math.exp(-math.hypot(np.log(ratio / low), min(0.0, *shifts)))
+            high = float(ratio) * math.exp(math.hypot(np.log(high / ratio), max(0.0, *shifts)))
     return float(ratio), low, high
 
 

@@ -17,10 +17,19 @@ from .kernels import POSITION_LIMITS_M, ROTATION_LIMITS, IsotropicKernel
 from .rows import Kernel
 from .se3 import Floats
 
-__all__ = ["Match", "match_determinants", "match_likelihood", "match_success", "overall_covariance", "scaled"]
+__all__ = [
+    "Match",
+    "match_determinants",
+    "match_likelihood",
+    "match_success",
+    "overall_covariance",
+    "scaled",
+    "success_ends",
+]
 
 #: Factors on both widths of the base kernel that a search tries, before it refines.
 FACTORS: tuple[float, ...] = tuple(float(f) for f in np.geomspace(0.4, 2.5, 11))
+_RESAMPLES = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +164,36 @@ def match_success(
     factor = math.exp(_falling_inverse(np.log(tried), smooth, target))
     achieved = float(np.interp(math.log(factor), np.log(tried), smooth))
     return Match("success", scaled(base, factor), target, achieved, True)
+
+
+def success_ends(
+    target: float,
+    base: IsotropicKernel,
+    success: ArrayLike,
+    *,
+    factors: Sequence[float],
+    draws: ArrayLike,
+    target_draws: int,
+    level: float = 0.9,
+    seed: int = 0,
+) -> tuple[IsotropicKernel, IsotropicKernel]:
+    """The narrowest and the widest kernel that `match_success` may mean, as draws are few: quantiles over
+    draws that succeed anew by chance, those of the target too. Arguments as there.
+    """
+    rates, counts = np.array(success, dtype=np.float64), np.array(draws, dtype=np.int64)
+    rng = np.random.default_rng(seed)
+    widths = [
+        match_success(
+            float(rng.binomial(target_draws, target)) / target_draws,
+            base,
+            rng.binomial(counts, rates) / counts,
+            factors=factors,
+            draws=counts,
+        ).kernel.sigma_position_m
+        for _ in range(_RESAMPLES)
+    ]
+    low, high = np.quantile(widths, [0.5 * (1.0 - level), 0.5 * (1.0 + level)]) / base.sigma_position_m
+    return scaled(base, float(low)), scaled(base, float(high))
 
 
 def _falling_inverse(x: Floats, y: Floats, target: float) -> float:

@@ -27,8 +27,6 @@ from graspdb.errors import ChecksNeeded, Conflict, NotFound
 from graspdb.objects import GraspObject
 from graspdb.reports import Convergence
 from graspdb.wire import StoredKernel
-from graspdb_density import IsotropicKernel
-from graspdb_density.matching import match_success
 
 ALIGNED = {"cone": "object", "screwdriver": "object", "elongated-d": "edge", "mug": "edge"}
 """What the paper's hypothesis aligns with: a long object's own axis, else the nearest edge."""
@@ -36,8 +34,6 @@ WINDOWS = ((0.03, 45.0), (0.06, 60.0), (0.10, 60.0), (0.20, 60.0))
 """Displacements that shape a kernel, metres and degrees: the likeliest of these is taken."""
 RULES = ("determinants", "success", "likelihood")
 SIGMA_M, SIGMA_DEG = 0.015, 15.0
-TARGET, LEVEL = 0.95, 0.90
-RESAMPLES = 400
 
 Floats = NDArray[np.float64]
 
@@ -146,52 +142,6 @@ def checked(judged: GraspObject, kernel: str, draws: int) -> Convergence:
     return judged.reports.convergence(kernel=kernel, matching="success")
 
 
-def spread_of_match(judged: GraspObject, kernel: str, widths: tuple[float, float]) -> tuple[float, float]:
-    """How much narrower and wider the isotropic kernel matched by success may be, as the draws are few: the
-    factors on its widths at the ends of the interval.
-    """
-    base = IsotropicKernel(SIGMA_M, math.radians(SIGMA_DEG))
-    drawn = judged.reports.bandwidth().raw.draws
-    own = next(item for item in drawn if item.kernel.id == kernel)
-    others = [item for item in drawn if item.kernel.id is None]
-    factors = [item.kernel.sigma_position_m / SIGMA_M for item in others]
-    rng = np.random.default_rng(0)
-    found = []
-    for _ in range(RESAMPLES):
-        target, *rates = (
-            rng.binomial(item.draws, item.success.value or 0.0) / item.draws for item in (own, *others)
-        )
-        match = match_success(target, base, rates, factors=factors, draws=[item.draws for item in others])
-        found.append(match.kernel.sigma_position_m / widths[0])
-    tail = 0.5 * (1.0 - LEVEL)
-    low, high = np.quantile(found, [tail, 1.0 - tail])
-    return float(low), float(high)
-
-
-def with_match(judged: GraspObject, report: Convergence, kernel: str) -> Count:
-    """The report's ratio, its interval widened by what is not known of the matched width."""
-    ratio = report.raw.ratio
-    assert ratio is not None
-    if ratio.value is None or ratio.low is None or ratio.high is None:
-        return Count(ratio.value, ratio.low, ratio.high)
-    matched = report.raw.curves[1].kernel
-    widths = matched.sigma_position_m, matched.sigma_rotation_deg
-    base = needed(report, 1).value
-    ends = []
-    for factor in spread_of_match(judged, kernel, widths):
-        other = needed(
-            judged.reports.convergence(
-                sigma_position_m=factor * widths[0], sigma_rotation_deg=factor * widths[1]
-            ),
-            0,
-        ).value
-        ends.append(0.0 if other is None or base is None else math.log(other / base))
-    # A narrower isotropic kernel needs more, so that the ratio falls; independent errors add in squares.
-    least = math.hypot(math.log(ratio.value / ratio.low), max(ends))
-    most = math.hypot(math.log(ratio.high / ratio.value), -min(ends))
-    return Count(ratio.value, ratio.value * math.exp(-least), ratio.value * math.exp(most))
-
-
 def rows(db: Client, name: str, options: Any) -> None:
     """Print what is found of an object as it comes."""
     learned, judged = split(db, name, options.learned, options.judged)
@@ -202,11 +152,10 @@ def rows(db: Client, name: str, options: Any) -> None:
         for rule in RULES:
             if rule == "success":
                 report = checked(judged, kernel.id, options.draws)
-                ratio = with_match(judged, report, kernel.id) if report.raw.matched else None
             else:
                 report = judged.reports.convergence(kernel=kernel.id, matching=rule)
-                found = report.raw.ratio
-                ratio = None if found is None else Count(found.value, found.low, found.high)
+            found = report.raw.ratio
+            ratio = None if found is None else Count(found.value, found.low, found.high)
             other = report.raw.curves[1].kernel
             width = f"{1e3 * other.sigma_position_m:.1f} mm, {other.sigma_rotation_deg:.1f} deg"
             cells = [name, f"{told}: {shape}", rule, str(needed(report, 0)), width, str(needed(report, 1))]

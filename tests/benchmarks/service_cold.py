@@ -3,8 +3,8 @@
 The object is the graspable ellipsoid of the query benchmark. Successes lie on its shell; failures are moved
 and turned at random about the same shell, a quarter of them collisions. The file is written once, through the
 storage layer; every round starts a new server process over it (imports and compiled code are loaded before
-``/readyz`` says so) and asks it once, by density and by success probability in turn. Memory is the server's own
-figure for the density.
+``/readyz`` says so) and asks it once, by density and by success probability in turn. Memory is the server's
+own figure for the density.
 
 ``--folder`` keeps the file for further runs; ``--trials`` makes it smaller.
 """

@@ -445,6 +445,44 @@ def test_noisy_rates_are_made_monotone() -> None:
     assert match.achieved == pytest.approx(0.25)
 
 
+def test_few_draws_tell_less_of_the_width_that_matches() -> None:
+    def rate(kernel: IsotropicKernel) -> float:
+        return float(math.exp(-kernel.sigma_position_m / 0.02))
+
+    factors = np.geomspace(0.4, 1.6, 7)
+    right = matching.match_success(0.4, KERNEL, rate, factors=factors).kernel.sigma_position_m
+    rng = np.random.default_rng(0)
+    spans, inside = [], 0
+    for draws in (200, 5_000):
+        for _ in range(30):
+            found = [rng.binomial(draws, rate(matching.scaled(KERNEL, f))) / draws for f in factors]
+            target = rng.binomial(draws, 0.4) / draws
+            low, high = matching.success_ends(
+                target, KERNEL, found, factors=list(factors), draws=[draws] * 7, target_draws=draws
+            )
+            inside += low.sigma_position_m <= right <= high.sigma_position_m
+            spans.append(high.sigma_position_m - low.sigma_position_m)
+    # 54 of 60 are expected.
+    assert inside >= 46
+    assert np.median(spans[30:]) < 0.4 * np.median(spans[:30])
+
+
+def test_a_ratio_knows_how_well_the_reference_is_known(shell: Shell) -> None:
+    p, q = shell(400, np.random.default_rng(3))
+    narrow, curve, wide = (
+        growing.convergence_curve(p, q, matching.scaled(KERNEL, factor), points=2_000, replicates=20)
+        for factor in (0.8, 1.0, 1.25)
+    )
+    value, low, high = cv.needed_ratio(curve, curve, target=0.9)
+    same = cv.needed_ratio(curve, curve, ends=(curve, curve), target=0.9)
+    assert same == pytest.approx((value, low, high))
+    widened = cv.needed_ratio(curve, curve, ends=(narrow, wide), target=0.9)
+    assert widened[0] == value
+    # A wider reference needs fewer, so that the other would need more of them, and the reverse.
+    assert widened[1] < min(low, cv.needed_ratio(curve, narrow, target=0.9)[0] * 1.01)
+    assert widened[2] > max(high, cv.needed_ratio(curve, wide, target=0.9)[0] * 0.99)
+
+
 @pytest.mark.parametrize("framed", [False, True])
 def test_a_curve_under_an_anisotropic_kernel(shell: Shell, framed: bool) -> None:
     """A Gaussian of the isotropic kernel's widths gives its curve, whatever the frames."""

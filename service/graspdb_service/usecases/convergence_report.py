@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,14 @@ from graspdb.wire.reports import Verdict as VerdictModel
 from graspdb_density import GraspDensity, IsotropicKernel
 from graspdb_density.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
 from graspdb_density.growing import GrowingCurve
-from graspdb_density.matching import Match, match_determinants, match_likelihood, match_success, scaled
+from graspdb_density.matching import (
+    Match,
+    match_determinants,
+    match_likelihood,
+    match_success,
+    scaled,
+    success_ends,
+)
 from graspdb_density.rows import Kernel, KernelRows, Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import checks
@@ -69,24 +77,30 @@ def convergence_report(
             "nothing-to-match", "matching compares an anisotropic kernel with an isotropic one: name kernel="
         )
     # Missing checks are said before anything is computed.
-    match = _by_success(sources, built) if matching == "success" and built.shaped is not None else None
+    match: Match | None = None
+    ends: tuple[Match, ...] = ()
+    if matching == "success" and built.shaped is not None:
+        match, ends = _by_success(sources, built)
     share = 1.0 if built.shaped is None else 0.5
     kernel: Kernel = density.kernel if built.shaped is None else built.shaped.kernel
     frames = None
     if built.shaped is not None and built.kernel.alignment not in (None, "gripper"):
         # As the density has them: those of new trials only were looked for.
         frames = built.shaped.frames
-    grown = _curve(sources, built, None, kernel, frames, lambda done: progress(share * done))
+    grown = _curve(sources, built, None, kernel, frames, _part_of(progress, 0.0, share))
     curve = grown.curve
     curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
     extra: dict[str, Any] = {}
     if built.shaped is not None:
         match = match or _matched(sources, density, grown, kernel, frames, str(matching))
-        base = _curve(
-            sources, built, match, match.kernel, None, lambda done: progress(0.5 + 0.5 * done)
-        ).curve
-        curves.append(_curve_model("isotropic, matched", _isotropic_info(match), base))
-        ratio = needed_ratio(curve, base, level=LEVEL)
+        others = []
+        # The matched kernel, and where its width is known by draws the narrowest and widest that may match.
+        for part, other in enumerate((match, *ends)):
+            each = 0.5 / (1 + len(ends))
+            told = _part_of(progress, 0.5 + each * part, each)
+            others.append(_curve(sources, built, other, other.kernel, None, told).curve)
+        curves.append(_curve_model("isotropic, matched", _isotropic_info(match), others[0]))
+        ratio = needed_ratio(curve, others[0], ends=others[1:], level=LEVEL)
         extra = {"matching": matching, "matched": match.reached, "ratio": interval(*ratio)}
     judged = curves[0].verdict
     warnings = (
@@ -109,6 +123,10 @@ def convergence_report(
         warnings=warnings,
         **extra,
     )
+
+
+def _part_of(progress: Progress, begin: float, share: float) -> Progress:
+    return lambda done: progress(begin + share * done)
 
 
 def _curve(
@@ -172,8 +190,9 @@ def _matched(
     )
 
 
-def _by_success(sources: Sources, built: Built) -> Match:
-    """The isotropic kernel whose simulated draws succeed as often as those of the stored one.
+def _by_success(sources: Sources, built: Built) -> tuple[Match, tuple[Match, ...]]:
+    """The isotropic kernel whose simulated draws succeed as often as those of the stored one, and the
+    narrowest and widest that may, as the draws are few; none where no width tried succeeds as often.
 
     Raises
     ------
@@ -208,14 +227,18 @@ def _by_success(sources: Sources, built: Built) -> Match:
             " and likelihood need none",
             calls=[call.model_dump(mode="json") for call in calls],
         )
-    factors = sorted(found)
-    return match_success(
-        target.success.value or 0.0,
-        base,
+    factors, aim = sorted(found), target.success.value or 0.0
+    rates, counts = (
         [found[f].success.value or 0.0 for f in factors],
-        factors=factors,
-        draws=[found[f].draws for f in factors],
+        [found[f].draws for f in factors],
     )
+    match = match_success(aim, base, rates, factors=factors, draws=counts)
+    if not match.reached:
+        return match, ()
+    kernels = success_ends(
+        aim, base, rates, factors=factors, draws=counts, target_draws=target.draws, level=LEVEL
+    )
+    return match, tuple(replace(match, kernel=kernel) for kernel in kernels)
 
 
 def _isotropic_info(match: Match) -> KernelInfo:
