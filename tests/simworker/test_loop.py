@@ -19,7 +19,7 @@ from graspdb.errors import Unreachable
 from graspdb.examples import example
 from graspdb.transport import Transport
 from graspdb.wire import OUTCOMES, ClaimedJob, ClaimRequest, SimulatePayload
-from graspdb_simworker import chunks
+from graspdb_simworker import chunks, loop
 from graspdb_simworker.loop import Lease, Worker, WorkerFailed
 from graspdb_simworker.supervisor import Child, ChunkFailed
 
@@ -237,9 +237,11 @@ def test_a_job_that_fails_is_reported_with_its_reason(
 
 
 def test_a_result_is_sent_again_until_the_service_answers(
-    http: httpx.Client, transport: Transport, plan: Plan
+    http: httpx.Client, transport: Transport, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sweep = plan(200, 200)
+    # Sooner than the heartbeat, which would be told that the job is done.
+    monkeypatch.setattr(loop, "_backoff", lambda failures: 0.05)
 
     class Cut(Transport):
         """The service takes the result, its answer is lost, and then the wire is cut for two more tries."""
