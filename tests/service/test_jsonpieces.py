@@ -47,6 +47,19 @@ def test_same_values(document: Any, indent: int | None, long: int, piece: int) -
     assert parsed(text, long=long, piece=piece) == orjson.loads(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (b'{"a": [   ]}', {"a": []}),
+        (b'{"a": {"b": [      ]}}', {"a": {"b": []}}),
+        (b'{"a": [  1,     ]}', "no JSON"),
+        (b'{"a": [    ,  1]}', "no JSON"),
+    ],
+)
+def test_blanks_in_long_arrays(text: bytes, expected: Any) -> None:
+    assert parsed(text, long=2, piece=3) == expected
+
+
 @settings(max_examples=500, deadline=None)
 @given(DOCUMENTS, st.data())
 def test_same_refusals(document: Any, data: st.DataObject) -> None:
