@@ -17,7 +17,9 @@ from graspdb_simworker.labels import SIMULATION_ERROR, Label
 
 COMMAND = (sys.executable, "-m", "graspdb_simworker.child")
 POSE_SECONDS = 10.0
-"""A closing takes milliseconds; after this long it hangs."""
+"""A closing takes milliseconds; after so much of the processor's time it hangs."""
+SILENT = 6.0
+"""A process that says nothing for this many times as long by the clock sleeps, however busy the machine."""
 START_SECONDS = 120.0
 """Loading pybullet and, the first time on a machine, compiling the collision test."""
 RECYCLE_CHUNKS = 64
@@ -50,7 +52,7 @@ class Child:
     command : sequence of str
         Starts the process that speaks :mod:`graspdb_simworker.messages`.
     pose_s : float
-        Longest closing, seconds.
+        Longest closing, seconds of the processor.
     recycle_chunks : int
         Chunks before the process is replaced.
     """
@@ -179,7 +181,7 @@ class Child:
         if code >= 0:
             return f"exit code {code}"
         name = signal.Signals(-code).name
-        return "a grasp took too long" if name == "SIGALRM" else name
+        return "a grasp took too long" if name == "SIGPROF" else name
 
 
 class _Attempt:
@@ -208,7 +210,7 @@ class _Attempt:
             messages.send(_fd(self._process.stdin), messages.CHUNK, messages.pack_chunk(chunk))
             while True:
                 # Before the first closing the prefilter runs: minutes at worst, for the largest chunks.
-                silence = START_SECONDS if self.simulating is None else self._pose_s + 5.0
+                silence = START_SECONDS if self.simulating is None else SILENT * self._pose_s + 5.0
                 kind, body = messages.receive(_fd(self._process.stdout), silence_s=silence, check=self._check)
                 self.heard += 1
                 # Here too: a busy child leaves no silence in which to ask.

@@ -127,7 +127,7 @@ def timed(call: Callable[[], httpx.Response]) -> float:
 
 def told(name: str, times: list[float], note: str = "") -> None:
     p50, p99 = np.percentile(times, [50, 99])
-    print(f"{name:58s} p50 {p50:9.1f} ms   p99 {p99:9.1f} ms   n {len(times):4d}   {note}", flush=True)
+    print(f"{name:61s} p50 {p50:9.1f} ms   p99 {p99:9.1f} ms   n {len(times):4d}   {note}", flush=True)
 
 
 def workspace(rng: np.random.Generator) -> dict[str, Any]:
@@ -251,7 +251,7 @@ def run(url: str, context: Context, slug: str, count: int, rng: np.random.Genera
         for name, times in asked.times.items():
             told(name, times, f"max {max(times):.0f} ms" if "livez" in name else "")
         info = http.get(f"/objects/{slug}/density").json()
-        print(f"{'density in memory':58s} {info['bytes'] / 2**20:.0f} MiB")
+        print(f"{'density in memory':61s} {info['bytes'] / 2**20:.0f} MiB")
     finally:
         asked.close()
 

@@ -132,3 +132,7 @@ def main() -> None:
     print(f"force test with eight contacts: {force_test():.1f} us")
     one, two = children(1), children(2)
     print(f"mug in children: one {one:,.0f} poses/s, two {two:,.0f} poses/s, ratio {two / one:.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""The real child, with one pose made deadly: ``faulty_child.py crash|hang|raise X Y Z``, or ``start``
+"""The real child, with one pose made deadly: ``faulty_child.py crash|hang|spin|raise X Y Z``, or ``start``
 to die at once."""
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ def main() -> int:
                 # As a hanging C call does: no handler of Python's gets a turn.
                 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
                 time.sleep(600.0)
+            elif how == "spin":
+                began = time.process_time()
+                while time.process_time() < began + 600.0:
+                    pass
             raise RuntimeError("the parts make no sense")
         return simulate(self, position, quaternion, travel_m)
 

@@ -68,7 +68,7 @@ def test_a_child_gives_the_bytes_of_this_process_and_so_does_the_next(
     assert seen == list(range(1, len(here.rows.pose_index) + 1)) * 3
 
 
-@pytest.mark.parametrize("how", ["crash", "hang"])
+@pytest.mark.parametrize("how", ["crash", "hang", "spin"])
 def test_a_deadly_pose_is_a_simulation_error_and_the_rest_goes_on(
     payload_of: MakePayload, physical_poses: FindPoses, mug_glb: bytes, how: str
 ) -> None:
@@ -77,7 +77,7 @@ def test_a_deadly_pose_is_a_simulation_error_and_the_rest_goes_on(
     with Child() as child:
         healthy = child.run(payload, mug_glb)
     deadly = poses[7][0]
-    with Child((*FAULTY, how, *map(repr, deadly)), pose_s=1.0) as child:
+    with Child((*FAULTY, how, *map(repr, deadly)), pose_s=0.5) as child:
         result = child.run(payload, mug_glb)
     hit = np.array([np.allclose(p, deadly) for p, _ in poses])
     found, expected = (np.frombuffer(r.outcomes, np.uint8) for r in (result, healthy))
