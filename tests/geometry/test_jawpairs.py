@@ -24,7 +24,11 @@ def of(mesh: trimesh.Trimesh, opening: float = 0.07) -> JawPairs:
     return pairs_of_mesh(mesh.vertices, mesh.faces, ridges, watertight=True, opening_m=opening)
 
 
-@given(st.tuples(*[st.floats(0.01, 0.12)] * 3), st.integers(0, 10_000))
+# As wide as the jaw to the last bit either fits or does not, once it is turned.
+SIDES = st.floats(0.01, 0.12).filter(lambda side: abs(side - 0.07) > 1e-6)
+
+
+@given(st.tuples(SIDES, SIDES, SIDES), st.integers(0, 10_000))
 @settings(max_examples=25, deadline=None)
 def test_a_box_has_its_opposite_faces_and_edges(size: tuple[float, float, float], seed: int) -> None:
     mesh = trimesh.creation.box(extents=size)
