@@ -32,8 +32,8 @@ from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
 
 # A machine's hiccup is no failure of the code: speed is measured in benchmarks.
-# The same examples every time, so that a change is judged by what it changed; to look for new ones:
-# HYPOTHESIS_RANDOM=1.
+# The same examples every time, so that a change is judged by what it changed; the variable HYPOTHESIS_RANDOM
+# has new ones looked for.
 settings.register_profile(
     "graspdb", deadline=None, derandomize=not os.environ.get("HYPOTHESIS_RANDOM"), print_blob=True
 )
