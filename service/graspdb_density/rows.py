@@ -293,14 +293,7 @@ class KernelRows:
         """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row."""
         p, q = se3.as_poses(positions, quaternions_xyzw)
         if isinstance(self.kernel, IsotropicKernel):
-            density = GraspDensity.build(
-                self.positions,
-                self.quaternions_xyzw,
-                kernel=self.kernel,
-                weights=self.weights,
-                symmetric=self.symmetric,
-            )
-            return density.log_density(p, q, cutoff=CUTOFF, threads=threads)
+            return self._isotropic(self.kernel).log_density(p, q, cutoff=CUTOFF, threads=threads)
         raw = (self.weights / self.weights.mean()).astype(np.float32)[:, None]
         sums = self.sums(p, q, raw, least=0.0, threads=threads)[:, 0].astype(np.float64)
         # Where little is left, what lies beyond the cut-off may count as much: those poses are taken again.
@@ -311,20 +304,23 @@ class KernelRows:
             out[~near] = self.exact_log_density(p[~near], q[~near], threads=threads)
         return out
 
+    def _isotropic(self, kernel: IsotropicKernel) -> GraspDensity:
+        """The same rows as a density."""
+        return GraspDensity.build(
+            self.positions,
+            self.quaternions_xyzw,
+            kernel=kernel,
+            weights=self.weights,
+            symmetric=self.symmetric,
+        )
+
     def exact_log_density(
         self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
     ) -> Floats:
         """As `log_density`, over all rows at every pose: for the few that are far from all of them."""
         p, q = se3.as_poses(positions, quaternions_xyzw)
         if isinstance(self.kernel, IsotropicKernel):
-            density = GraspDensity.build(
-                self.positions,
-                self.quaternions_xyzw,
-                kernel=self.kernel,
-                weights=self.weights,
-                symmetric=self.symmetric,
-            )
-            return density.log_density(p, q, cutoff=None, threads=threads)
+            return self._isotropic(self.kernel).log_density(p, q, cutoff=None, threads=threads)
         log_rows = np.log(self.weights * np.where(self.symmetric, 0.5, 1.0))
         frames = np.ascontiguousarray(self.frames.reshape(-1, 9))
         out = np.empty(len(p))
