@@ -1,18 +1,19 @@
 """Grasp densities: kernel density estimation on R^3 x SO(3). Arrays in, arrays out; no IO."""
 
-from . import reference, se3
+from . import se3
 from .analytic import AnalyticKernel
-from .anisotropic import AnisotropicKernel
-from .density import GraspDensity
-from .kernels import HAAR_VOLUME, IsotropicKernel
-from .maximum import Maximum, nearest
-from .mixture import MixtureDensity
-from .region import Region
-from .sampled import SampledKernel
-from .scored import PoseNoise, expected, search_scored
-from .success import SuccessEstimate, SuccessModel
-from .weights import effective_sample_size, importance_weights, mixture_weights
-from .widths import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
+from .bandwidth.selection import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
+from .kde import brute_force
+from .kde.importance_weights import effective_sample_size, importance_weights, mixture_weights
+from .kde.isotropic import GraspDensity
+from .kde.mixture import MixtureDensity
+from .kde.sample_kernel import SampledKernel
+from .kernels.gaussian_mixture import AnisotropicKernel
+from .kernels.isotropic import HAAR_VOLUME, IsotropicKernel
+from .search.evolution import PoseNoise, expected, search_scored
+from .search.mode_search import Maximum, nearest
+from .search.region import Region
+from .success.kernel_regression import SuccessEstimate, SuccessModel
 
 __all__ = [
     "DEFAULT_KERNEL",
@@ -29,13 +30,13 @@ __all__ = [
     "SuccessEstimate",
     "SuccessModel",
     "WidthChoice",
+    "brute_force",
     "choose_widths",
     "effective_sample_size",
     "expected",
     "importance_weights",
     "mixture_weights",
     "nearest",
-    "reference",
     "se3",
     "search_scored",
     "widths_prefix",

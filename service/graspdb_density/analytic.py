@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import quad
 
 from . import se3
-from .kernels import HAAR_VOLUME
+from .kernels.isotropic import HAAR_VOLUME
 from .se3 import Floats
 
 __all__ = ["AnalyticKernel"]

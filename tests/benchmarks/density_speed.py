@@ -37,15 +37,14 @@ from graspdb_density import (
     MixtureDensity,
     Region,
     SampledKernel,
-    compiled,
-    exponential,
-    fitting,
-    reference,
     se3,
 )
-from graspdb_density.density import CUTOFF, scaled_radius
+from graspdb_density._compiled import exp, isotropic
+from graspdb_density.bandwidth import mixture_fit
+from graspdb_density.kde import brute_force as reference
+from graspdb_density.kde.bhattacharyya import bhattacharyya, sampled_kernel_rows
+from graspdb_density.kde.isotropic import CUTOFF, scaled_radius
 from graspdb_density.shell import SEMI_AXES_M, shell
-from graspdb_density.similarity import bhattacharyya, sampled_kernel_rows
 
 Poses = tuple[se3.Floats, se3.Floats]
 ROUNDS = 5
@@ -202,7 +201,7 @@ def _bare_kernels(data, poses, kappa, out):
             dy = data[1, i] - py
             dz = data[2, i] - pz
             a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-            total += exponential.exp(abs(a) - kappa - (dx * dx + dy * dy + dz * dz))
+            total += exp.exp(abs(a) - kappa - (dx * dx + dy * dy + dz * dz))
         out[j] = total
 
 
@@ -227,7 +226,7 @@ def brute_force(rng: np.random.Generator) -> None:
 
     seconds = interleaved(
         4 * ROUNDS,
-        lambda: compiled.all_sums(
+        lambda: isotropic.all_sums(
             cells.data, cells.table, cells.centre, cells.scale, p, q, kernel.kappa, density.wide, out
         ),
         lambda: reached.log_density(p, q),
@@ -303,7 +302,7 @@ def replaced(rng: np.random.Generator) -> None:
     component = IsotropicKernel(0.01, math.radians(10.0))
     turns = se3.from_rotation_vector(xi[:, 3:])
     own = np.diag([component.sigma_position_m**2] * 3 + [component.sigma_rotation**2] * 3)
-    pair = fitting._fitted(xi, np.ones(900), 2, own, False)
+    pair = mixture_fit._fitted(xi, np.ones(900), 2, own, False)
     whole = sampled_kernel_rows(xi[:, :3], turns, component)
     one = MixtureDensity(np.zeros((1, 3)), se3.IDENTITY[None], kernel=pair, symmetric=False)
     found = bhattacharyya(one, whole, rng, points=20_000)

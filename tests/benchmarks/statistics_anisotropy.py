@@ -12,7 +12,8 @@ import time
 
 import numpy as np
 
-from graspdb_density import GraspDensity, IsotropicKernel, anisotropy, se3
+from graspdb_density import GraspDensity, IsotropicKernel, se3
+from graspdb_density.vicinity import anisotropy
 
 ROUNDS = 5
 

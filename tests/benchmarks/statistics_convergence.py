@@ -20,11 +20,11 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.convergence import bootstrap_similarity
-from graspdb_density.growing import GrowingCurve, convergence_curve
-from graspdb_density.rows import LEAST, Kernel, KernelRows
+from graspdb_density._compiled.threads import processors
+from graspdb_density.kde.weighted_sums import LEAST, Kernel, KernelRows
 from graspdb_density.shell import shell
-from graspdb_density.threads import processors
+from graspdb_density.statistics.convergence import bootstrap_similarity
+from graspdb_density.statistics.incremental_bootstrap import GrowingCurve, convergence_curve
 
 Poses = tuple[se3.Floats, se3.Floats]
 KERNEL = IsotropicKernel(0.015, math.radians(15.0))

@@ -11,13 +11,14 @@ import pytest
 from graspdb import AsyncClient, Client
 from graspdb.errors import Conflict
 from graspdb.wire.reports import ReportRun
-from graspdb_density import fitting, se3
+from graspdb_density import se3
+from graspdb_density.bandwidth import mixture_fit
 
 Serve = Callable[..., str]
 
 
 def test_fits_are_waited_for(sqlite_url: str, serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "_TRIED_COMPONENTS", (1, 2))
+    monkeypatch.setattr(mixture_fit, "_TRIED_COMPONENTS", (1, 2))
     url = serve(sqlite_url, report_wait_s=0)
     rng = np.random.default_rng(0)
     turns = se3.from_rotation_vector(0.2 * rng.standard_normal((60, 3)))

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from graspdb_density import AnalyticKernel, IsotropicKernel, reference, se3
+from graspdb_density import AnalyticKernel, IsotropicKernel, se3
+from graspdb_density.kde import brute_force
 
 COVARIANCE = np.array([[1.0, 0.2, 0.0], [0.2, 4.0, 0.0], [0.0, 0.0, 2.0]]) * 1e-4
 KERNEL = AnalyticKernel(COVARIANCE, np.array([0.2, 0.5, 0.3]), 0.6, 15.0)
@@ -27,7 +28,9 @@ def test_integrates_to_one(sigma_r: float) -> None:
     count = 200_000
     cover = IsotropicKernel(0.025, math.radians(70.0))
     p, q = cover.sample_displacements(count, rng)
-    ratio = np.exp(kernel.log_kernel(p, q) - reference.kernel_log_density(cover, p, q, ORIGIN, se3.IDENTITY))
+    ratio = np.exp(
+        kernel.log_kernel(p, q) - brute_force.kernel_log_density(cover, p, q, ORIGIN, se3.IDENTITY)
+    )
     error = ratio.std() / math.sqrt(count)
     assert error < 0.02
     assert abs(ratio.mean() - 1.0) < 4.5 * error
@@ -60,7 +63,7 @@ def test_small_equal_widths_are_the_isotropic_kernel() -> None:
     same = AnalyticKernel(1e-4 * np.eye(3), np.ones(3), 1.0, plain.kappa)
     t = rng.standard_normal((20, 3)) * 0.01
     near = se3.from_rotation_vector(rng.standard_normal((20, 3)) * 0.05)
-    own = reference.kernel_log_density(plain, t, near, ORIGIN, se3.IDENTITY)
+    own = brute_force.kernel_log_density(plain, t, near, ORIGIN, se3.IDENTITY)
     np.testing.assert_allclose(same.log_kernel(t, near), own, atol=0.02)
     np.testing.assert_allclose(same.kernel(t, near), np.exp(same.log_kernel(t, near)))
 

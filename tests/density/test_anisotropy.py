@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from graspdb_density import GraspDensity, IsotropicKernel, pairs, reference, se3
-from graspdb_density import anisotropy as an
-from graspdb_density.pairloops import composition_angles
+from graspdb_density import GraspDensity, IsotropicKernel, se3
+from graspdb_density._compiled.pairs import composition_angles
+from graspdb_density.kde import brute_force
 from graspdb_density.se3 import Floats
-from graspdb_density.tolerance import tolerances
+from graspdb_density.vicinity import anisotropy as an
+from graspdb_density.vicinity import pair_candidates
+from graspdb_density.vicinity.half_width import tolerances
 
 AXES = {"rx": np.eye(3)[0], "ry": np.eye(3)[1], "rz": np.eye(3)[2]}
 HALF_M = np.array([0.05, 0.03, 0.02])
@@ -235,7 +237,10 @@ def test_candidates_miss_nothing(seed: int, angle: float) -> None:
     p, q = rng.uniform(-0.05, 0.05, (300, 3)), se3.random_quaternions(300, rng)
     grasps = rng.permutation(300)[:20].astype(np.int64)
     reach = angle / 20.0
-    turned, moved = pairs.near_rotations(q, grasps, angle), pairs.near_positions(p, grasps, reach)
+    turned, moved = (
+        pair_candidates.near_rotations(q, grasps, angle),
+        pair_candidates.near_positions(p, grasps, reach),
+    )
     for a, i in enumerate(grasps):
         away = np.minimum(se3.angle_between(q[i], q), se3.angle_between(q[i], se3.jaw_twin(q)))
         for found, wanted in (
@@ -382,7 +387,7 @@ def test_smoothed_is_the_mean_of_the_definition(densities: tuple[GraspDensity, G
     share = []
     for row in range(0, n, 7):
         rest = np.delete(np.arange(n), row)
-        log = reference.log_density(
+        log = brute_force.log_density(
             successes.kernel, p[rest], q[rest], p[row : row + 1], q[row : row + 1], weights=np.ones(n - 1)
         )
         share.append(min(1.0, (n - 1) * float(np.exp(log[0])) / rho))

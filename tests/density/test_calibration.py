@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import brier_score_loss, roc_auc_score
 
-from graspdb_density import calibration as cal
+from graspdb_density.success import calibration as cal
 
 
 def _data(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

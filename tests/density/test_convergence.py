@@ -12,10 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from graspdb_density import IsotropicKernel, growing, matching, reference, se3
-from graspdb_density import convergence as cv
-from graspdb_density.rows import KernelRows, rotation_normaliser
+from graspdb_density import IsotropicKernel, se3
+from graspdb_density.bandwidth import matching
+from graspdb_density.kde import brute_force
+from graspdb_density.kde.weighted_sums import KernelRows, rotation_normaliser
 from graspdb_density.se3 import Floats
+from graspdb_density.statistics import convergence as cv
+from graspdb_density.statistics import incremental_bootstrap
 
 Poses = tuple[Floats, Floats]
 Shell = Callable[[int, np.random.Generator], Poses]
@@ -85,7 +88,7 @@ def test_isotropic_sums_equal_the_reference_under_every_weighting(shell: Shell, 
     sums = rows.sums(*at, weightings, least=0.0)
     for column in (0, 31, 36):
         w = weightings[:, column]
-        expected = reference.log_density(kernel, p, q, *at, weights=w, symmetric=symmetric)
+        expected = brute_force.log_density(kernel, p, q, *at, weights=w, symmetric=symmetric)
         got = np.log(sums[:, column] / w.sum()) + rows.log_unit
         assert np.max(np.abs(got - expected)) < 2e-3
         assert np.median(np.abs(got - expected)) < 1e-4
@@ -178,9 +181,9 @@ def _exact_similarity(rows: KernelRows, counts: Floats, points: int, rng: np.ran
     assert isinstance(rows.kernel, IsotropicKernel)
     at = rows.sample(points, rng)
     own = rows.positions, rows.quaternions_xyzw
-    whole = reference.log_density(rows.kernel, *own, *at, weights=rows.weights)
+    whole = brute_force.log_density(rows.kernel, *own, *at, weights=rows.weights)
     chosen = counts > 0
-    again = reference.log_density(
+    again = brute_force.log_density(
         rows.kernel, own[0][chosen], own[1][chosen], *at, weights=(rows.weights * counts)[chosen]
     )
     return float(np.exp(0.5 * (again - whole)).mean())
@@ -279,7 +282,9 @@ def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
 @pytest.fixture(scope="module")
 def curve(shell: Shell) -> cv.ConvergenceCurve:
     p, q = shell(1_600, np.random.default_rng(8))
-    return growing.convergence_curve(p, q, IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3)
+    return incremental_bootstrap.convergence_curve(
+        p, q, IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3
+    )
 
 
 def test_curve_rises_and_shows_its_parts(curve: cv.ConvergenceCurve) -> None:
@@ -295,7 +300,9 @@ def test_curve_rises_and_shows_its_parts(curve: cv.ConvergenceCurve) -> None:
 
 def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: cv.ConvergenceCurve) -> None:
     p, q = shell(1_600, np.random.default_rng(8))
-    wide = growing.convergence_curve(p, q, IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3)
+    wide = incremental_bootstrap.convergence_curve(
+        p, q, IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3
+    )
     assert all(w.similarity > n.similarity for w, n in zip(wide.points, curve.points, strict=True))
     assert wide.points[-1].log_likelihood < curve.points[-1].log_likelihood
     value, low, high = cv.needed_ratio(wide, curve, target=0.9)
@@ -305,7 +312,8 @@ def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: 
 def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
     p, q = shell(200, np.random.default_rng(9))
     one, two, other = (
-        growing.convergence_curve(p, q, KERNEL, points=200, replicates=5, seed=seed) for seed in (1, 1, 2)
+        incremental_bootstrap.convergence_curve(p, q, KERNEL, points=200, replicates=5, seed=seed)
+        for seed in (1, 1, 2)
     )
     assert [a.similarity for a in one.points] == [a.similarity for a in two.points]
     assert [a.log_likelihood for a in one.points] == [a.log_likelihood for a in two.points]
@@ -315,14 +323,14 @@ def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
 def test_too_few_grasps_say_how_many_are_needed(shell: Shell) -> None:
     p, q = shell(37, np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"at least 200 .* there are 37, so 163 more"):
-        growing.convergence_curve(p, q, KERNEL)
+        incremental_bootstrap.convergence_curve(p, q, KERNEL)
     with pytest.raises(ValueError, match="at least 200"):
-        growing.convergence_curve(p[:0], q[:0], KERNEL)
+        incremental_bootstrap.convergence_curve(p[:0], q[:0], KERNEL)
     p, q = shell(200, np.random.default_rng(0))
     with pytest.raises(ValueError, match="2 replicates and 2 points"):
-        growing.convergence_curve(p, q, KERNEL, replicates=1)
+        incremental_bootstrap.convergence_curve(p, q, KERNEL, replicates=1)
     with pytest.raises(ValueError, match="5 subsets"):
-        growing.convergence_curve(p, q, KERNEL, subsets=4)
+        incremental_bootstrap.convergence_curve(p, q, KERNEL, subsets=4)
 
 
 def _synthetic(exponent: float, scale: float, noise: float, seed: int = 0) -> cv.ConvergenceCurve:
@@ -470,7 +478,9 @@ def test_few_draws_tell_less_of_the_width_that_matches() -> None:
 def test_a_ratio_knows_how_well_the_reference_is_known(shell: Shell) -> None:
     p, q = shell(400, np.random.default_rng(3))
     narrow, curve, wide = (
-        growing.convergence_curve(p, q, matching.scaled(KERNEL, factor), points=2_000, replicates=20)
+        incremental_bootstrap.convergence_curve(
+            p, q, matching.scaled(KERNEL, factor), points=2_000, replicates=20
+        )
         for factor in (0.8, 1.0, 1.25)
     )
     value, low, high = cv.needed_ratio(curve, curve, target=0.9)
@@ -491,8 +501,8 @@ def test_a_curve_under_an_anisotropic_kernel(shell: Shell, framed: bool) -> None
     frames = se3.to_matrix(se3.random_quaternions(400, rng)) if framed else None
     kernel = IsotropicKernel(0.03, math.radians(12.0))
     gaussian = _gaussian(*[0.03] * 3, *[math.radians(12.0)] * 3)
-    one = growing.convergence_curve(p, q, kernel, points=2_000, replicates=20)
-    two = growing.convergence_curve(p, q, gaussian, frames=frames, points=2_000, replicates=20)
+    one = incremental_bootstrap.convergence_curve(p, q, kernel, points=2_000, replicates=20)
+    two = incremental_bootstrap.convergence_curve(p, q, gaussian, frames=frames, points=2_000, replicates=20)
     for a, b in zip(one.points, two.points, strict=True):
         assert a.similarity == pytest.approx(b.similarity, abs=0.03)
         assert a.log_likelihood == pytest.approx(b.log_likelihood, abs=0.3)

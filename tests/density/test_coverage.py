@@ -12,8 +12,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from graspdb_density import IsotropicKernel, SuccessModel, reference, se3
-from graspdb_density.success import SUCCESS_CUTOFF
+from graspdb_density import IsotropicKernel, SuccessModel, se3
+from graspdb_density.kde import brute_force
+from graspdb_density.success.kernel_regression import SUCCESS_CUTOFF
 
 Field = Callable[[se3.Floats, se3.Floats], se3.Floats]
 Poses = tuple[se3.Floats, se3.Floats]
@@ -55,8 +56,8 @@ def smoothed(field: Field, rows: Poses, poses: Poses) -> se3.Floats:
     chance, twins = field(*rows), se3.jaw_twin(rows[1])
     out = np.empty(len(poses[0]))
     for j, (p, q) in enumerate(zip(*poses, strict=True)):
-        own = reference.kernel_log_density(KERNEL, p, q, rows[0], rows[1]) - KERNEL.log_peak
-        other = reference.kernel_log_density(KERNEL, p, q, rows[0], twins) - KERNEL.log_peak
+        own = brute_force.kernel_log_density(KERNEL, p, q, rows[0], rows[1]) - KERNEL.log_peak
+        other = brute_force.kernel_log_density(KERNEL, p, q, rows[0], twins) - KERNEL.log_peak
         k = (np.exp(own) + np.exp(other)) * (np.maximum(own, other) >= -0.5 * SUCCESS_CUTOFF**2)
         out[j] = k @ chance / k.sum() if k.any() else np.nan
     return out

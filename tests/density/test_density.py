@@ -11,7 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from graspdb_density import HAAR_VOLUME, GraspDensity, IsotropicKernel, reference, se3
+from graspdb_density import HAAR_VOLUME, GraspDensity, IsotropicKernel, se3
+from graspdb_density.kde import brute_force
 
 Poses = tuple[se3.Floats, se3.Floats]
 Shell = Callable[[int, np.random.Generator], Poses]
@@ -40,7 +41,7 @@ def test_fast_path_equals_the_reference(
     extra = {} if plain else mixed(rng, rows)
     density = GraspDensity.build(*rows, kernel=kernel, **extra)
     poses = moved(rows, 200, kernel.sigma_position_m, kernel.sigma_rotation, rng)
-    expected = reference.log_density(kernel, *rows, *poses, **extra)
+    expected = brute_force.log_density(kernel, *rows, *poses, **extra)
     exact = density.log_density(*poses, cutoff=None)
     np.testing.assert_allclose(exact, expected, atol=2e-5)
     error = np.abs(np.expm1(density.log_density(*poses) - expected))
@@ -60,7 +61,7 @@ def test_without_a_cut_off_every_term_counts(width_deg: float, shell: Shell, mov
     density = GraspDensity.build(*rows, kernel=kernel, **extra)
     p, q = moved(rows, 150, 0.04, 1.0, rng)
     p[:20] += 0.5
-    expected = reference.log_density(kernel, *rows, p, q, **extra)
+    expected = brute_force.log_density(kernel, *rows, p, q, **extra)
     got = density.log_density(p, q, cutoff=None, threads=2)
     assert (np.abs(got - expected) < 2e-5 + 1e-6 * (kernel.log_peak - expected)).all()
     np.testing.assert_array_equal(density.log_density(p[:1], q[:1], cutoff=None), got[:1])
@@ -73,7 +74,7 @@ def test_log_density_is_right_far_from_data(kernel: IsotropicKernel, shell: Shel
     density = GraspDensity.build(*rows, kernel=kernel)
     far = rng.uniform(-3.0, 3.0, (100, 3))
     turns = se3.random_quaternions(100, rng)
-    expected = reference.log_density(kernel, *rows, far, turns)
+    expected = brute_force.log_density(kernel, *rows, far, turns)
     got = density.log_density(far, turns)
     assert np.isfinite(got).all()
     assert (expected < -1_000.0).any()
@@ -92,7 +93,7 @@ def test_sparse_and_odd_data(moved: Moved) -> None:
         density = GraspDensity.build(*rows, kernel=kernel)
         near = moved(rows, 50, 0.01, 0.1, rng)
         poses = np.concatenate([near[0], rows[0][:5]]), np.concatenate([near[1], rows[1][:5]])
-        expected = reference.log_density(kernel, *rows, *poses)
+        expected = brute_force.log_density(kernel, *rows, *poses)
         np.testing.assert_allclose(density.log_density(*poses), expected, atol=4e-3)
         np.testing.assert_allclose(density.log_density(*poses, cutoff=None), expected, atol=4e-3)
 
@@ -172,7 +173,7 @@ def test_rows_without_a_twin_are_told_from_far_away_and_half_a_turn(degrees: flo
     q = se3.multiply(q, se3.from_rotation_vector(0.1 * rng.standard_normal((200, 3))))
     density = GraspDensity.build(p, q, kernel=kernel, symmetric=False)
     poses = p[:40] + np.array([distance, 0.0, 0.0]), se3.jaw_twin(q[40:80])
-    expected = reference.log_density(kernel, p, q, *poses, symmetric=False)
+    expected = brute_force.log_density(kernel, p, q, *poses, symmetric=False)
     for cutoff in (4.0, None):
         np.testing.assert_allclose(density.log_density(*poses, cutoff=cutoff), expected, rtol=2e-6, atol=5e-3)
 
@@ -191,7 +192,7 @@ def test_gradient_against_finite_differences(
     step = 1e-4
 
     def value(at: se3.Floats, to: se3.Floats) -> se3.Floats:
-        return reference.log_density(kernel, *rows, at, to, symmetric=flags)
+        return brute_force.log_density(kernel, *rows, at, to, symmetric=flags)
 
     for axis in range(3):
         delta = np.zeros(3)

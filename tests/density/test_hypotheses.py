@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from graspdb_density import anisotropy as an
 from graspdb_density import se3
-from graspdb_density.hypotheses import Hypothesis, sharpened, wide_axes
-from graspdb_density.relations import shares
 from graspdb_density.se3 import Floats
-from graspdb_density.vicinity import Anisotropy
+from graspdb_density.success.block_bootstrap import shares
+from graspdb_density.vicinity import anisotropy as an
+from graspdb_density.vicinity.displacement_bins import Anisotropy
+from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 
 #: Half extents (m) in which grasps of a bar hold, along x, y and z, and half turns (deg) about them.
 BAR = ((0.05, 0.015, 0.03), (20.0, 60.0, 20.0))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspdb_density import GraspDensity, IsotropicKernel, Region, reference, se3
+from graspdb_density import GraspDensity, IsotropicKernel, Region, se3
+from graspdb_density.kde import brute_force
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
 
@@ -51,7 +52,7 @@ def fields(answer: httpx.Response, status: int = 422) -> set[str]:
 
 def exact(trials: Poses, grasp: dict[str, Any]) -> float:
     pose = np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]])
-    return float(reference.log_density(KERNEL, *trials, *pose)[0])
+    return float(brute_force.log_density(KERNEL, *trials, *pose)[0])
 
 
 @pytest.fixture
@@ -118,7 +119,7 @@ def test_constraints_hold_and_are_named(thing: httpx.Client, two_clusters: Poses
         inside = region.contains(*two_clusters)
         if inside.any():
             there = two_clusters[0][inside], two_clusters[1][inside]
-            rivals = reference.log_density(KERNEL, *two_clusters, *there)
+            rivals = brute_force.log_density(KERNEL, *two_clusters, *there)
             assert grasp["log_density"] >= rivals.max() - 1e-3
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspdb_density import GraspDensity, IsotropicKernel, reference
+from graspdb_density import GraspDensity, IsotropicKernel
+from graspdb_density.kde import brute_force
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
@@ -196,7 +197,7 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
         np.testing.assert_allclose(
             built.density.log_density(*two_clusters), fresh.log_density(*two_clusters), atol=1e-5
         )
-        exact = reference.log_density(KERNEL, *trials, *two_clusters, weights=weights)
+        exact = brute_force.log_density(KERNEL, *trials, *two_clusters, weights=weights)
         np.testing.assert_allclose(built.density.log_density(*two_clusters, cutoff=None), exact, atol=1e-4)
         np.testing.assert_allclose(built.density.weights, weights / weights.sum(), rtol=1e-9)
     assert len(reads) == len(steps)
@@ -267,7 +268,7 @@ def test_what_one_process_commits_is_in_the_others_next_answer(
         # Deleting a batch through one rebuilds in the other.
         assert one.delete(f"/objects/thing/batches/{batches[1]}").status_code in (200, 204)
         left = np.r_[0:100, 200:500]
-        exact = reference.log_density(KERNEL, two_clusters[0][left], two_clusters[1][left], *two_clusters)
+        exact = brute_force.log_density(KERNEL, two_clusters[0][left], two_clusters[1][left], *two_clusters)
         for client in (two, one):
             info = client.get("/objects/thing/density").json()
             assert info["size"] == 400

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb_density import se3
-from graspdb_density.growing import GrowingCurve
+from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases import convergence_report, reports

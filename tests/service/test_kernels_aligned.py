@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graspdb_density import AnisotropicKernel, MixtureDensity, se3
-from graspdb_density.predicting import ShapedSuccessModel
+from graspdb_density.success.axis_bandwidth import ShapedSuccessModel
 from graspdb_geometry.jawpairs import pairs_of_mesh
 from graspdb_geometry.ridges import ridges_of_mesh
 

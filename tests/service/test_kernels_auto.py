@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.wire.kernels import KernelCreate
-from graspdb_density import fitting, se3
+from graspdb_density import se3
+from graspdb_density.bandwidth import mixture_fit
 from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
@@ -42,7 +43,7 @@ def http(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[httpx.Client]:  # fmt: skip
     """A service that waits for nothing, and does not try more than two components."""
-    monkeypatch.setattr(fitting, "_TRIED_COMPONENTS", (1, 2))
+    monkeypatch.setattr(mixture_fit, "_TRIED_COMPONENTS", (1, 2))
     with httpx.Client(base_url=serve(database_url, report_wait_s=0), timeout=60) as client:
         make_object(client)
         post(client, "thing", grasps)

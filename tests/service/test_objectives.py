@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import BestGraspRequest
 from graspdb_density import GraspDensity, IsotropicKernel, PoseNoise, Region, SuccessModel, expected, se3
-from graspdb_density.maximum import Pool, Search
+from graspdb_density.search.mode_search import Pool, Search
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
 from graspdb_service.app import create_app

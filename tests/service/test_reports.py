@@ -15,10 +15,10 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, choose_widths, se3
-from graspdb_density.anisotropy import empirical
-from graspdb_density.calibration import area_under_curve, assign_blocks, calibrate
-from graspdb_density.convergence import verdict
-from graspdb_density.growing import convergence_curve
+from graspdb_density.statistics.convergence import verdict
+from graspdb_density.statistics.incremental_bootstrap import convergence_curve
+from graspdb_density.success.calibration import area_under_curve, assign_blocks, calibrate
+from graspdb_density.vicinity.anisotropy import empirical
 from graspdb_service.storage import objects, report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import Question

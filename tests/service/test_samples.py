@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import Selection
-from graspdb_density import IsotropicKernel, reference, se3
+from graspdb_density import IsotropicKernel, se3
+from graspdb_density.kde import brute_force
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.queries import draw
@@ -43,7 +44,9 @@ def test_repeatable_and_with_their_density(
 
     position, quaternion = np.array(first["position"]), np.array(first["quaternion_xyzw"])
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1, atol=1e-12)
-    exact = reference.log_density(IsotropicKernel(0.015, np.deg2rad(15)), *two_clusters, position, quaternion)
+    exact = brute_force.log_density(
+        IsotropicKernel(0.015, np.deg2rad(15)), *two_clusters, position, quaternion
+    )
     np.testing.assert_allclose(np.log(first["proposal_density"]), exact, atol=1e-3)
     # 300 of 500 successes are from above: within four standard deviations of the binomial.
     top = np.linalg.norm(position - [0, 0, 0.06], axis=1) < np.linalg.norm(position - [-0.08, 0, 0], axis=1)

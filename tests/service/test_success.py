@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES
-from graspdb_density import IsotropicKernel, reference, se3
+from graspdb_density import IsotropicKernel, se3
+from graspdb_density.kde import brute_force
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import PG70
@@ -31,10 +32,10 @@ COLLISION = OUTCOME_CODES["collision"]
 
 def by_definition(trials: Poses, success: Bools, queries: Poses) -> tuple[Floats, Floats, Floats, Floats]:
     """P, its interval's ends and n_e: the sums of the definition in float64, without a cut-off."""
-    first = reference.kernel_log_density(
+    first = brute_force.kernel_log_density(
         KERNEL, queries[0][:, None], queries[1][:, None], trials[0], trials[1]
     )
-    second = reference.kernel_log_density(
+    second = brute_force.kernel_log_density(
         KERNEL, queries[0][:, None], queries[1][:, None], trials[0], se3.jaw_twin(trials[1])
     )
     k = np.exp(first) + np.exp(second)

@@ -16,7 +16,8 @@ from graspdb.wire.reports import (
     AnisotropyTolerance,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
-from graspdb_density.anisotropy import (
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.vicinity.anisotropy import (
     LEAST_SUCCESSES,
     Anisotropy,
     Frames,
@@ -26,8 +27,7 @@ from graspdb_density.anisotropy import (
     empirical,
     smoothed,
 )
-from graspdb_density.hypotheses import Hypothesis, sharpened, wide_axes
-from graspdb_density.rows import Progress
+from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import relations, shapes
 from graspdb_service.usecases.alltrials import AllTrials

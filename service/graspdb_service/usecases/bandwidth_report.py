@@ -7,8 +7,8 @@ import math
 from graspdb.wire import KernelInfo
 from graspdb.wire.reports import BandwidthPoint, BandwidthReport, SimulatedDraws
 from graspdb_density import IsotropicKernel
-from graspdb_density.rows import Progress
-from graspdb_density.widths import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
+from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
+from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import checks
 from graspdb_service.usecases.densities import Built

@@ -21,7 +21,7 @@ from graspdb_density import (
     expected,
     se3,
 )
-from graspdb_density.scored import Score
+from graspdb_density.search.evolution import Score
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import searches
 from graspdb_service.usecases.constraints import Constraints, constraints

@@ -26,9 +26,9 @@ from graspdb_density import (
     importance_weights,
     widths_prefix,
 )
-from graspdb_density.predicting import Widths
-from graspdb_density.sampled import MOST_COMPONENTS
-from graspdb_density.widths import FIRST_CHOICE
+from graspdb_density.bandwidth.selection import FIRST_CHOICE
+from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
+from graspdb_density.success.axis_bandwidth import Widths
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage import trials
 from graspdb_service.storage.kernels import KernelRow

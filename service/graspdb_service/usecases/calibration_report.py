@@ -13,18 +13,16 @@ from graspdb.wire.reports import (
     CheckedGrasps,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, importance_weights
-from graspdb_density.anisotropy import (
-    LEAST_SUCCESSES,
-)
-from graspdb_density.calibration import (
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.success.axis_bandwidth import ShapedSuccessModel, Widths
+from graspdb_density.success.calibration import (
     ReliabilityBin,
     area_under_curve,
     assign_blocks,
     calibrate,
     reliability,
 )
-from graspdb_density.predicting import ShapedSuccessModel, Widths
-from graspdb_density.rows import Progress
+from graspdb_density.vicinity.anisotropy import LEAST_SUCCESSES
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import alltrials, checks
 from graspdb_service.usecases.alltrials import AllTrials

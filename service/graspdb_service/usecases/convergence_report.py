@@ -19,9 +19,7 @@ from graspdb.wire.reports import (
 )
 from graspdb.wire.reports import Verdict as VerdictModel
 from graspdb_density import GraspDensity, IsotropicKernel
-from graspdb_density.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
-from graspdb_density.growing import GrowingCurve
-from graspdb_density.matching import (
+from graspdb_density.bandwidth.matching import (
     Match,
     match_determinants,
     match_likelihood,
@@ -29,7 +27,9 @@ from graspdb_density.matching import (
     scaled,
     success_ends,
 )
-from graspdb_density.rows import Kernel, KernelRows, Progress
+from graspdb_density.kde.weighted_sums import Kernel, KernelRows, Progress
+from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
+from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.problems import conflict
 from graspdb_service.usecases import checks
 from graspdb_service.usecases.densities import Built

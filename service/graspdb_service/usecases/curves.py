@@ -1,6 +1,6 @@
 """Convergence curves kept from one report to the next, so that new trials are added to what was summed.
 
-What a kept curve was made of it tells itself (see :mod:`graspdb_density.growing`): after a deletion, other
+What a kept curve was made of it tells itself (see `incremental_bootstrap`): after a deletion, other
 weights or another process's commits it is extended or computed anew as its grasps demand, and reports of
 several processes agree.
 """
@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from graspdb_density.growing import GrowingCurve
-from graspdb_density.matching import Match
-from graspdb_density.rows import Progress
+from graspdb_density.bandwidth.matching import Match
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.usecases.cache import SingleFlightCache
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.selection import Filters

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graspdb.wire import KernelSpec, Selection
-from graspdb_density.density import CUTOFF
-from graspdb_density.kernels import POSITION_LIMITS_M, ROTATION_LIMITS
+from graspdb_density.kde.isotropic import CUTOFF
+from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import kernels, objects, trials
 from graspdb_service.storage.database import Database, Tx

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import GridPlan
-from graspdb_density.weights import pooled_density
+from graspdb_density.kde.importance_weights import pooled_density
 from graspdb_service.storage import attempts, sweeps
 from graspdb_service.storage.attempts import TriedGrid
 from graspdb_service.storage.database import Tx

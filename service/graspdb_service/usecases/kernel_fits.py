@@ -20,9 +20,9 @@ from graspdb.wire.kernels import (
     StoredKernel,
 )
 from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
-from graspdb_density.fitting import LEAST_DISPLACEMENTS, displacements, fit_kernel
-from graspdb_density.rows import Progress
-from graspdb_density.similarity import DisplacementWindow, bhattacharyya, sampled_kernel_rows
+from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacements, fit_kernel
+from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
+from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.usecases import shapes

@@ -9,7 +9,7 @@ import numpy as np
 
 from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance, KernelWidths
 from graspdb_density import AnisotropicKernel
-from graspdb_density.predicting import fit_widths
+from graspdb_density.success.axis_bandwidth import fit_widths
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases import alltrials, shapes
 from graspdb_service.usecases.context import Context

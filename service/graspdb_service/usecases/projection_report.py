@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from graspdb.wire.reports import ProjectionProfile, ProjectionReport
-from graspdb_density.marginal import Marginal, Orientation, Plane, marginal
-from graspdb_density.rows import Progress
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
 from graspdb_geometry import meshes
 from graspdb_service.problems import conflict
 from graspdb_service.storage import assets

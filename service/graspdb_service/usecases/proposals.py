@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graspdb.wire import ProposalsRequest
 from graspdb.wire.queries import Strategy
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
-from graspdb_density.success import PRIOR_TRIALS
+from graspdb_density.success.kernel_regression import PRIOR_TRIALS
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases import queries
 from graspdb_service.usecases.context import Context

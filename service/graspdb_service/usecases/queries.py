@@ -16,7 +16,7 @@ from graspdb.wire import (
 )
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density import GraspDensity, MixtureDensity, se3
-from graspdb_density.weights import LOW_EFFECTIVE_SHARE
+from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.densities import Built, kernel_of

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire.reports import AnisotropyRelation
-from graspdb_density.relations import shares
+from graspdb_density.success.block_bootstrap import shares
 from graspdb_geometry.jawpairs import KINDS, JawPairs
 from graspdb_service.usecases.alltrials import AllTrials
 from graspdb_service.usecases.reportparts import LEVEL, finite

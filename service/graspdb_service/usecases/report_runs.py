@@ -24,7 +24,7 @@ from typing import Any
 from graspdb.wire import Selection
 from graspdb.wire.kernels import KernelCreate
 from graspdb.wire.reports import ReportRun
-from graspdb_density.rows import Progress
+from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service import __version__
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.settings import Settings

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from graspdb.wire.reports import AnyReport
-from graspdb_density.rows import Progress
+from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.usecases.anisotropy_report import anisotropy_report
 from graspdb_service.usecases.bandwidth_report import bandwidth_report
 from graspdb_service.usecases.calibration_report import calibration_report

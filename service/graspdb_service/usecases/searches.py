@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, Maximum, MixtureDensity, se3, search_scored
-from graspdb_density.maximum import Admissible, distinct_from
-from graspdb_density.scored import Score
+from graspdb_density.search.evolution import Score
+from graspdb_density.search.mode_search import Admissible, distinct_from
 from graspdb_geometry.grippers import GripperShape
 from graspdb_service.usecases.constraints import Constraints, Poses
 from graspdb_service.usecases.densities import Built

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, KernelWidths
 from graspdb_density import AnisotropicKernel, IsotropicKernel, SampledKernel, se3
-from graspdb_density.anisotropic import mirror
-from graspdb_density.predicting import Widths
+from graspdb_density.kernels.gaussian_mixture import mirror
+from graspdb_density.success.axis_bandwidth import Widths
 from graspdb_service.problems import conflict
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow

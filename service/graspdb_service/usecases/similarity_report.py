@@ -8,10 +8,15 @@ import numpy as np
 
 from graspdb.wire.reports import KernelSimilarityReport, SimilarityPoint
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.fitting import LEAST_DISPLACEMENTS, LEAST_SUCCESSES, Displacements, displacements
-from graspdb_density.kernelcurve import mixture_curve
-from graspdb_density.rows import Progress
-from graspdb_density.similarity import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
+from graspdb_density.bandwidth.component_count import mixture_curve
+from graspdb_density.bandwidth.mixture_fit import (
+    LEAST_DISPLACEMENTS,
+    LEAST_SUCCESSES,
+    Displacements,
+    displacements,
+)
+from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
+from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities import Built
 from graspdb_service.usecases.reportparts import LEVEL, Sources, head

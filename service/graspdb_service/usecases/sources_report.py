@@ -18,9 +18,9 @@ from graspdb.wire.reports import (
     SourcesReport,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
-from graspdb_density.calibration import ReliabilityBin, calibrate
-from graspdb_density.rows import Progress
-from graspdb_density.similarity import bhattacharyya
+from graspdb_density.kde.bhattacharyya import bhattacharyya
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.success.calibration import ReliabilityBin, calibrate
 from graspdb_service.problems import conflict
 from graspdb_service.storage import trials
 from graspdb_service.usecases import alltrials

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, SuccessModel
-from graspdb_density.predicting import ShapedSuccessModel, Widths
+from graspdb_density.success.axis_bandwidth import ShapedSuccessModel, Widths
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases import alltrials
 from graspdb_service.usecases.alltrials import AllTrials, Stored

@@ -1,0 +1,1 @@
+"""Sums over kernels, compiled by Numba: arrays in, arrays out."""

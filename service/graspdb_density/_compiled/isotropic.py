@@ -1,0 +1,418 @@
+"""Compiled loops over kernels: the hot path of every density.
+
+Layout. Kernels are float32 structures of arrays, rows of ``data`` (8, N): x, y, z, then the quaternion's x,
+y, z, w, then the weight. Positions are centred and divided by ``sigma sqrt(2)``, so a squared distance is the
+exponent itself. Kernels are sorted by grid cell with z fastest, so that what a query reaches in one column of
+cells is one contiguous run.
+
+``table`` (S, COLUMNS) describes the segments: kernels are kept in a few independently sorted ranges, one for
+rows with the jaw's symmetry and one for rows without, each followed by a short tail of what came later.
+
+Accumulation is float32 within a block of at most ``BLOCK`` kernels and float64 across.
+"""
+
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from . import isotropic_runs
+from .options import fast
+
+F32 = np.float32
+BLOCK = 2048
+
+#: Columns of the segment table.
+OFFSET, COUNT, STARTS, NX, NY, NZ, OX, OY, OZ, EDGE, EDGE_Z, TWIN, LOW, HIGH = (
+    0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 15,
+)  # fmt: skip
+COLUMNS = 18
+#: Most columns of cells a query may reach; `cells.build` keeps edges wide enough for it.
+MAX_RUNS = 8192
+
+_ZERO = F32(0.0)
+#: Kernels in a block that every pose of a call passes over: its columns stay in the first-level cache.
+_TILE = 1024
+#: No sum is as large.
+_NEVER = 1e300
+
+
+@fast
+def runs_within(start, table, s, px, py, pz, radius, runs):
+    """Ranges of kernels in the cells of segment ``s`` that a ball reaches, into ``runs`` (MAX_RUNS, 2); their
+    number.
+
+    Cells at the border of the grid are unbounded outwards: they hold the outliers that the grid does not
+    span.
+    """
+    row = table[s]
+    for axis in range(3):
+        p = px if axis == 0 else (py if axis == 1 else pz)
+        if p < row[LOW + axis] - radius or p > row[HIGH + axis] + radius:
+            return 0
+    nx, ny, nz = int(row[NX]), int(row[NY]), int(row[NZ])
+    edge, edge_z = row[EDGE], row[EDGE_Z]
+    base, offset = int(row[STARTS]), int(row[OFFSET])
+    x, y, z = px - row[OX], py - row[OY], pz - row[OZ]
+    x0 = min(max(math.floor((x - radius) / edge), 0), nx - 1)
+    x1 = min(max(math.floor((x + radius) / edge), 0), nx - 1)
+    y0 = min(max(math.floor((y - radius) / edge), 0), ny - 1)
+    y1 = min(max(math.floor((y + radius) / edge), 0), ny - 1)
+    count = 0
+    for ix in range(x0, x1 + 1):
+        gap_x = 0.0
+        if ix > 0 and x < ix * edge:
+            gap_x = ix * edge - x
+        elif ix < nx - 1 and x > (ix + 1) * edge:
+            gap_x = x - (ix + 1) * edge
+        for iy in range(y0, y1 + 1):
+            gap_y = 0.0
+            if iy > 0 and y < iy * edge:
+                gap_y = iy * edge - y
+            elif iy < ny - 1 and y > (iy + 1) * edge:
+                gap_y = y - (iy + 1) * edge
+            left = radius * radius - gap_x * gap_x - gap_y * gap_y
+            if left < 0.0:
+                continue
+            reach = math.sqrt(left)
+            z0 = min(max(math.floor((z - reach) / edge_z), 0), nz - 1)
+            z1 = min(max(math.floor((z + reach) / edge_z), 0), nz - 1)
+            column = base + (ix * ny + iy) * nz
+            begin, end = start[column + z0], start[column + z1 + 1]
+            if end > begin and count < runs.shape[0]:
+                runs[count, 0] = offset + begin
+                runs[count, 1] = offset + end
+                count += 1
+    return count
+
+
+@fast
+def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
+    """Sum of weights times kernels (1 at a centre) within ``radius``, their k r^2, and how many were visited.
+
+    ``wide`` is 0 where the nearest of twins and antipodes stands for all, 1 where both twins count, 2 where
+    antipodes do too.
+    """
+    fx, fy, fz = F32(px), F32(py), F32(pz)
+    k = F32(kappa)
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    total, spread, visited = 0.0, 0.0, 0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, TWIN])
+        for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+            begin, end = runs[r, 0], runs[r, 1]
+            visited += end - begin
+            while begin < end:
+                stop = min(begin + BLOCK, end)
+                full = stop - (stop - begin) % isotropic_runs.LANES
+                if wide == 0 and twin > _ZERO and full + isotropic_runs.LANES <= data.shape[1]:
+                    if full > begin:
+                        part = isotropic_runs.run_narrow(data, begin, full, fx, fy, fz, q0, q1, q2, q3, k)
+                        total += part[0]
+                        spread += part[1]
+                    if stop > full:
+                        part = isotropic_runs.rest_narrow(data, full, stop, fx, fy, fz, q0, q1, q2, q3, k)
+                        total += part[0]
+                        spread += part[1]
+                else:
+                    part = isotropic_runs.run(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, wide)
+                    total += part[0]
+                    spread += part[1]
+                begin = stop
+    return total, spread, visited
+
+
+@fast
+def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums):
+    """Fill ``sums`` (9,) with the moments of `moments_wide` over the kernels within ``radius``."""
+    fx, fy, fz = F32(px), F32(py), F32(pz)
+    k = F32(kappa)
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    sums[:] = 0.0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, TWIN])
+        for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+            begin, end = runs[r, 0], runs[r, 1]
+            while begin < end:
+                stop = min(begin + BLOCK, end)
+                if wide > 0:
+                    isotropic_runs.moments_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, sums)
+                else:
+                    isotropic_runs.moments_narrow(
+                        data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, sums
+                    )
+                begin = stop
+
+
+@fast
+def exact_log_sum(data, blocks, boxes, px, py, pz, q, kappa, margin):
+    """Log of the sum over all kernels, without a cut-off; right however far the pose is from data.
+
+    Blocks of kernels whose bounding box proves every exponent to lie ``margin`` nats below the largest one
+    found are left out: with ``margin = 16 + log(total weight / least weight)`` the sum is short of less than
+    1.2e-7 of itself.
+
+    Parameters
+    ----------
+    blocks : (B, 3) int64, first and last + 1 of a block, 1 for rows with a twin
+    boxes : (B, 6) float32, lowest and highest corner of the positions, scaled units
+    """
+    q0, q1, q2, q3 = q[0] * kappa, q[1] * kappa, q[2] * kappa, q[3] * kappa
+    count = blocks.shape[0]
+    bound = np.empty(count)
+    first = 0
+    for j in range(count):
+        gx = max(max(boxes[j, 0] - px, px - boxes[j, 3]), 0.0)
+        gy = max(max(boxes[j, 1] - py, py - boxes[j, 4]), 0.0)
+        gz = max(max(boxes[j, 2] - pz, pz - boxes[j, 5]), 0.0)
+        bound[j] = -(gx * gx + gy * gy + gz * gz)
+        if bound[j] > bound[first]:
+            first = j
+    twin = float(blocks[first, 2])
+    top = isotropic_runs.top_of_run(
+        data, blocks[first, 0], blocks[first, 1], px, py, pz, q0, q1, q2, q3, kappa, twin
+    )
+    total = 0.0
+    for j in range(count):
+        if bound[j] < top - margin:
+            continue
+        twin = float(blocks[j, 2])
+        here = isotropic_runs.top_of_run(
+            data, blocks[j, 0], blocks[j, 1], px, py, pz, q0, q1, q2, q3, kappa, twin
+        )
+        if here > top:
+            total *= math.exp(top - here)
+            top = here
+        elif here < top - margin:
+            continue
+        total += isotropic_runs.sum_of_run(
+            data, blocks[j, 0], blocks[j, 1], px, py, pz, q0, q1, q2, q3, kappa, twin, top
+        )
+    return top + math.log(total)
+
+
+@fast
+def log_sums(
+    data, start, table, blocks, boxes, centre, scale, positions, quaternions, kappa, stages, wide, margin, out
+):
+    """Log of the weighted kernel sum at every pose into ``out`` (M,).
+
+    Parameters
+    ----------
+    stages : (T, 3)
+        Radii to try in turn, each with the largest mean exponent of position and the least mean kernel at
+        which what lies outside is too little to matter (see `density.stages`). A pose that passes none is
+        summed without a cut-off.
+    """
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        done = False
+        for t in range(stages.shape[0]):
+            total, spread, visited = _sum_at(
+                data, start, table, px, py, pz, quaternions[j], kappa, stages[t, 0], wide, runs
+            )
+            if total > 0.0 and spread <= stages[t, 1] * total and total >= stages[t, 2] * visited:
+                out[j] = math.log(total)
+                done = True
+                break
+        if not done:
+            out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
+
+
+@fast
+def all_sums(data, table, centre, scale, positions, quaternions, kappa, wide, out):
+    """The weighted sum over all kernels at every pose into ``out`` (M,), as brute force has it."""
+    k = F32(kappa)
+    out[:] = 0.0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, TWIN])
+        begin = int(table[s, OFFSET])
+        end = begin + int(table[s, COUNT])
+        while begin < end:
+            stop = min(begin + _TILE, end)
+            for j in range(positions.shape[0]):
+                px = F32((positions[j, 0] - centre[0]) * scale)
+                py = F32((positions[j, 1] - centre[1]) * scale)
+                pz = F32((positions[j, 2] - centre[2]) * scale)
+                q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+                q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+                out[j] += isotropic_runs.total(data, begin, stop, px, py, pz, q0, q1, q2, q3, k, twin, wide)
+            begin = stop
+
+
+@fast
+def all_log_sums(
+    data, table, blocks, boxes, centre, scale, positions, quaternions, kappa, wide, least, margin, out
+):
+    """Log of the weighted sum over all kernels at every pose into ``out`` (M,), without a cut-off.
+
+    By brute force, and where that gives less than ``least`` by `exact_log_sum`.
+    """
+    if least < _NEVER:
+        all_sums(data, table, centre, scale, positions, quaternions, kappa, wide, out)
+    else:
+        out[:] = 0.0
+    for j in range(positions.shape[0]):
+        if out[j] >= least:
+            out[j] = math.log(out[j])
+        else:
+            px = (positions[j, 0] - centre[0]) * scale
+            py = (positions[j, 1] - centre[1]) * scale
+            pz = (positions[j, 2] - centre[2]) * scale
+            out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
+
+
+@fast
+def sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
+    """The weighted kernel sum within ``radius`` at every pose, zero where nothing is in reach."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    k = F32(kappa)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        fx, fy, fz = F32(px), F32(py), F32(pz)
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        total = 0.0
+        for s in range(table.shape[0]):
+            twin = F32(table[s, TWIN])
+            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    stop = min(begin + BLOCK, end)
+                    total += isotropic_runs.total(
+                        data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, wide
+                    )
+                    begin = stop
+        out[j] = total
+
+
+@fast
+def reached(start, table, centre, scale, positions, radius, out):
+    """How many kernels a sum at each pose visits, into ``out`` (M,) int64."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        out[j] = 0
+        for s in range(table.shape[0]):
+            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+                out[j] += runs[r, 1] - runs[r, 0]
+
+
+@fast
+def moments(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
+    """The moments at every pose into ``out`` (M, 9)."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        moments_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs, out[j])
+
+
+@fast
+def scatter_sums(
+    data, start, table, centre, scale, positions, quaternions, weights, twins, kappa, radius, wide, out
+):
+    """Add the kernels of the given rows to the sums ``out`` (N,) at every sorted kernel's centre."""
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    every = F32(1.0) if wide > 0 else F32(0.0)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        twin = F32(1.0) if twins[j] else F32(0.0)
+        weight = F32(weights[j] * (0.5 if twins[j] else 1.0))
+        for s in range(table.shape[0]):
+            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+                isotropic_runs.scatter_run(
+                    data, runs[r, 0], runs[r, 1], F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin,
+                    every, weight, out,
+                )  # fmt: skip
+
+
+@fast
+def square_sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
+    """Sums of k and k^2 at every pose into ``out`` (M, 2), over kernels with an exponent of at most radius^2.
+
+    ``radius`` is the cut-off over sqrt 2: position and rotation share the allowance. The cut is exact,
+    because far from data it decides between an attempt and none.
+    """
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    k, cut = F32(kappa), F32(radius * radius)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        total, squares = 0.0, 0.0
+        for s in range(table.shape[0]):
+            twin = F32(table[s, TWIN])
+            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    stop = min(begin + BLOCK, end)
+                    if wide:
+                        part = isotropic_runs.squares_run(
+                            data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, k, twin, True, cut
+                        )
+                    else:
+                        part = isotropic_runs.squares_run(
+                            data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, k, twin, False, cut
+                        )
+                    total += part[0]
+                    squares += part[1]
+                    begin = stop
+        out[j, 0] = total
+        out[j, 1] = squares
+
+
+@fast
+def other_blocks_sums(
+    data, block, start, table, centre, scale, positions, quaternions, own, kappa, radius, out
+):
+    """Kernel sums at poses (M,) over the sorted kernels whose ``block`` (N,) int32 differs from ``own``
+    (M,).
+    """
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    k = F32(kappa)
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
+        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        total = 0.0
+        for s in range(table.shape[0]):
+            twin = F32(table[s, TWIN])
+            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+                total += isotropic_runs.other_blocks_run(
+                    data,
+                    block,
+                    own[j],
+                    runs[r, 0],
+                    runs[r, 1],
+                    F32(px),
+                    F32(py),
+                    F32(pz),
+                    q0,
+                    q1,
+                    q2,
+                    q3,
+                    k,
+                    twin,
+                )
+        out[j] = total

@@ -1,0 +1,256 @@
+"""Compiled loops over pairs of trials: what became of trials B displaced by so much from a successful A.
+
+A bin of a histogram is a row of ``tried`` and ``won`` (bins, R): column 0 counts with A's own weight, the
+others with its weight in every bootstrap resample of the grasps A. ``pairs`` (bins,) counts observations and
+``moved`` (bins,) sums their displacements, so that a profile knows where its data lie.
+
+Candidates B of the A at ``a`` are the rows ``order[run[0]:run[1]]`` of ``runs[first[a]:first[a + 1]]``.
+Only A's own row is left out: another trial of the same pose tells how repeatable success is.
+
+``nearby`` (A, 3, bins, 5) takes the pairs of profiles one grasp A at a time, see `profiles`, in the place of
+``line_tried`` and ``line_won``; with no grasps those are filled.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .options import exact, inlined
+
+__all__ = ["rotation_pairs", "translation_pairs"]
+
+_EDGE_M = 1e-9
+
+
+@inlined
+def _add(tried, won, pairs, bin_, success, weights):  # type: ignore[no-untyped-def]
+    pairs[bin_] += 1
+    for r in range(weights.shape[0]):
+        tried[bin_, r] += weights[r]
+    if success:
+        for r in range(weights.shape[0]):
+            won[bin_, r] += weights[r]
+
+
+@inlined
+def _note(nearby, bin_, success, at, off_u, off_v):  # type: ignore[no-untyped-def]
+    """A pair of one grasp in the profile of an axis (bins, 5)."""
+    if 0 <= bin_ < nearby.shape[0]:
+        nearby[bin_, 0] += 1.0
+        nearby[bin_, 1] += 1.0 if success else 0.0
+        nearby[bin_, 2] += at
+        nearby[bin_, 3] += abs(off_u)
+        nearby[bin_, 4] += abs(off_v)
+
+
+@exact
+def _own_and_twin(qa, qb):  # type: ignore[no-untyped-def]
+    """Cosines of half the angles from a to b and to b's twin under the jaw's turn."""
+    own = abs(qa[0] * qb[0] + qa[1] * qb[1] + qa[2] * qb[2] + qa[3] * qb[3])
+    twin = abs(qa[0] * qb[1] - qa[1] * qb[0] + qa[2] * qb[3] - qa[3] * qb[2])
+    return own, twin
+
+
+@exact
+def translation_pairs(  # type: ignore[no-untyped-def]
+    positions, quaternions, success, order, grasps, frames, weights, first, runs, symmetric, least_cosine,
+    extent, slices, slice_m, across, profile_m, profile_bins, tolerance_m,
+    tried, won, pairs, line_tried, line_won, line_pairs, line_moved, nearby,
+):  # fmt: skip
+    """Pairs of the same rotation into the histograms (slice, x, y) and the profiles (axis, bin); how many.
+
+    Parameters: ``least_cosine`` of half the angle for trials off the grid, -1 where runs hold one rotation
+    only; ``across`` bins span -extent .. extent in x and y; ``slices`` slices of ``slice_m`` in z; profiles
+    have ``profile_bins`` bins of ``profile_m``, the middle one about 0, the other axes within
+    ``tolerance_m``.
+    """
+    used = 0
+    half_depth = 0.5 * slices * slice_m
+    middle = profile_bins // 2
+    apart = nearby.shape[0] > 0
+    margin = (nearby.shape[2] - profile_bins) // 2
+    t = np.empty(3)
+    for a in range(grasps.shape[0]):
+        i = grasps[a]
+        f = frames[a]
+        for r in range(first[a], first[a + 1]):
+            for k in range(runs[r, 0], runs[r, 1]):
+                j = order[k]
+                if j == i:
+                    continue
+                d0 = positions[j, 0] - positions[i, 0]
+                d1 = positions[j, 1] - positions[i, 1]
+                d2 = positions[j, 2] - positions[i, 2]
+                if least_cosine > 0.0:
+                    own, twin = _own_and_twin(quaternions[i], quaternions[j])
+                    if own < least_cosine and (not symmetric or twin < least_cosine):
+                        continue
+                for axis in range(3):
+                    t[axis] = f[0, axis] * d0 + f[1, axis] * d1 + f[2, axis] * d2
+                hit = False
+                inside = abs(t[0]) <= extent + _EDGE_M and abs(t[1]) <= extent + _EDGE_M
+                if inside and abs(t[2]) <= half_depth + _EDGE_M:
+                    x = min(max(math.floor((t[0] + extent) / (2.0 * extent) * across), 0), across - 1)
+                    y = min(max(math.floor((t[1] + extent) / (2.0 * extent) * across), 0), across - 1)
+                    z = min(max(math.floor((t[2] + half_depth) / slice_m), 0), slices - 1)
+                    _add(tried, won, pairs, (z * across + x) * across + y, success[j], weights[a])
+                    hit = True
+                for axis in range(3):
+                    u, v = abs(t[(axis + 1) % 3]), abs(t[(axis + 2) % 3])
+                    if u <= tolerance_m + _EDGE_M and v <= tolerance_m + _EDGE_M:
+                        b = middle + math.floor(t[axis] / profile_m + 0.5)
+                        if apart:
+                            _note(nearby[a, axis], b + margin, success[j], t[axis], u, v)
+                        if 0 <= b < profile_bins:
+                            b += axis * profile_bins
+                            if apart:
+                                line_pairs[b] += 1
+                            else:
+                                _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
+                            line_moved[b] += t[axis]
+                            hit = True
+                used += hit
+    return used
+
+
+@exact
+def _product(a, b, out):  # type: ignore[no-untyped-def]
+    out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
+    out[1] = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
+    out[2] = a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3]
+    out[3] = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]
+
+
+@inlined
+def _wrapped(angle):  # type: ignore[no-untyped-def]
+    """Into [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@inlined
+def _plane_entries(q, plane):  # type: ignore[no-untyped-def]
+    """The entries a, b, c of a rotation's 2x2 matrix in a plane of two axes, see `composition_angles`."""
+    if plane == 0:
+        return q[0], q[1], q[2]
+    if plane == 1:
+        return q[0], q[2], -q[1]
+    return q[1], q[2], q[0]
+
+
+@exact
+def composition_angles(q, plane):  # type: ignore[no-untyped-def]
+    """The composition ``R_a(alpha) R_b(beta)`` nearest to a rotation: alpha, beta and the sine of the angle
+    left, for the planes 0: (x, y), 1: (x, z), 2: (y, z).
+
+    With ca = cos(alpha / 2) and so on, the composition's quaternion has w = ca cb, a-part sa cb, b-part ca sb
+    and, up to the sign of e_a e_b, third part sa sb: as a 2x2 matrix [[w, b], [a, c]] it has rank one. The
+    nearest is the best rank-one approximation; its angles follow from the sums and differences of the
+    entries, and twice the determinant is the sine of the angle left.
+    """
+    w = q[3]
+    a, b, c = _plane_entries(q, plane)
+    both = math.atan2(a + b, w - c)
+    apart = math.atan2(a - b, w + c)
+    return _wrapped(both + apart), _wrapped(both - apart), 2.0 * abs(w * c - a * b)
+
+
+@exact
+def rotation_pairs(  # type: ignore[no-untyped-def]
+    positions, quaternions, success, order, grasps, frames, weights, first, runs, symmetric, framed,
+    reach_m, bins, profile_bins, profile_step, tolerance,
+    tried, won, pairs, line_tried, line_won, line_pairs, line_moved, nearby,
+):  # fmt: skip
+    """Pairs at the same position into the histograms (plane, alpha, beta) and the profiles (axis, bin); how
+    many.
+
+    ``frames`` (A, 4): quaternions of the frames whose axes rotations are about, used where ``framed``, else
+    the gripper's own. ``reach_m``: distance for trials off the grid, negative where runs hold one position.
+    ``bins`` bins span the circle, the first centred on -pi, so that one is centred on 0. Of a symmetric jaw
+    both A and B stand for their twins too.
+    """
+    used = 0
+    sine = math.sin(tolerance)
+    least = math.cos(0.5 * tolerance) ** 2
+    middle = profile_bins // 2
+    apart = nearby.shape[0] > 0
+    margin = (nearby.shape[2] - profile_bins) // 2
+    step = 2.0 * math.pi / bins
+    turn = np.array([0.0, 0.0, 1.0, 0.0])
+    back = np.array([0.0, 0.0, -1.0, 0.0])
+    inverse, relative, other, left = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    right, twin_right = np.empty(4), np.empty(4)
+    for a in range(grasps.shape[0]):
+        i = grasps[a]
+        qa = quaternions[i]
+        inverse[0], inverse[1], inverse[2], inverse[3] = -qa[0], -qa[1], -qa[2], qa[3]
+        if framed:
+            f = frames[a]
+            left[0], left[1], left[2], left[3] = -f[0], -f[1], -f[2], f[3]
+            _product(inverse, f, right)
+            _product(turn, right, twin_right)
+        for r in range(first[a], first[a + 1]):
+            for k in range(runs[r, 0], runs[r, 1]):
+                j = order[k]
+                if j == i:
+                    continue
+                if reach_m >= 0.0:
+                    d0 = positions[j, 0] - positions[i, 0]
+                    d1 = positions[j, 1] - positions[i, 1]
+                    d2 = positions[j, 2] - positions[i, 2]
+                    if d0 * d0 + d1 * d1 + d2 * d2 > reach_m * reach_m:
+                        continue
+                qb = quaternions[j]
+                hit = False
+                variants = 1
+                if symmetric:
+                    variants = 2 if framed else 4
+                for variant in range(variants):
+                    if framed:
+                        # F^-1 q_b q_a^-1 F and F^-1 q_b M q_a^-1 F.
+                        _product(left, qb, other)
+                        if variant == 0:
+                            _product(other, right, relative)
+                        else:
+                            _product(other, twin_right, relative)
+                    else:
+                        _product(inverse, qb, relative)
+                        if variant & 1:
+                            other[:] = relative
+                            _product(other, turn, relative)
+                        if variant & 2:
+                            other[:] = relative
+                            _product(back, other, relative)
+                    for plane in range(3):
+                        e, g, h = _plane_entries(relative, plane)
+                        # Most are too far from every composition: told before any angle is taken.
+                        if 2.0 * abs(relative[3] * h - e * g) <= sine:
+                            alpha, beta, _ = composition_angles(relative, plane)
+                            x = math.floor((alpha + math.pi) / step + 0.5) % bins
+                            y = math.floor((beta + math.pi) / step + 0.5) % bins
+                            b = (plane * bins + x) * bins + y
+                            _add(tried, won, pairs, b, success[j], weights[a])
+                            hit = True
+                    for axis in range(3):
+                        w, v = relative[3], relative[axis]
+                        if w * w + v * v >= least:
+                            angle = _wrapped(2.0 * math.atan2(v, w))
+                            b = middle + math.floor(angle / profile_step + 0.5)
+                            if apart and variant < 2:
+                                # What turns the rest of the way, in A's axes.
+                                n = math.sqrt(w * w + v * v)
+                                e, g = relative[(axis + 1) % 3] / n, relative[(axis + 2) % 3] / n
+                                off_u = 2.0 * math.asin(min(1.0, abs(e * w - g * v)))
+                                off_v = 2.0 * math.asin(min(1.0, abs(g * w + e * v)))
+                                _note(nearby[a, axis], b + margin, success[j], angle, off_u, off_v)
+                            if 0 <= b < profile_bins:
+                                b += axis * profile_bins
+                                if apart:
+                                    line_pairs[b] += 1
+                                else:
+                                    _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
+                                line_moved[b] += angle
+                                hit = True
+                used += hit
+    return used

@@ -1,0 +1,325 @@
+"""Compiled loops that evaluate kernels row by row, for statistics that need every row's share and not only
+the sum: bootstrap replicates are many weightings of the same kernel values.
+
+Layout as in `compiled`: rows sorted by grid cell, float32 structures of arrays, positions centred and scaled.
+The values of a run of rows are written to a short buffer by a loop that turns into vector code; those above
+a threshold are then added to one accumulator a weighting.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from . import exp
+from . import isotropic as c
+from .options import exact, fast, inlined
+
+F32 = np.float32
+#: Rows evaluated at a time: the buffers stay in the first-level cache.
+BLOCK = 256
+#: Columns of weightings come in multiples of this.
+LANES = 32
+_ONE, _ZERO = F32(1.0), F32(0.0)
+
+
+def _angle_coefficients() -> tuple[np.float32, ...]:
+    """Power series in ``2 w - 1`` of the factor ``2 acos(w) / sqrt(1 - w^2)`` on [0, 1].
+
+    It turns a unit quaternion's vector part into the rotation vector. Analytic up to w = -1, so degree 10
+    leaves a relative error below float32's rounding.
+    """
+    w = 0.5 * (1.0 + np.cos(np.pi * (np.arange(64) + 0.5) / 64))
+    factor = 2.0 * np.arccos(w) / np.sqrt(1.0 - w * w)
+    series = np.polynomial.Chebyshev.fit(2.0 * w - 1.0, factor, 10, domain=[-1.0, 1.0])
+    return tuple(F32(v) for v in series.convert(kind=np.polynomial.Polynomial).coef)
+
+
+(_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10) = _angle_coefficients()
+_TURN = F32(2.0 * math.pi)
+#: Keeps the wrap of a rotation by nothing finite; far below float32 where the wrap matters.
+_TINY = F32(1e-6)
+
+
+@inlined
+def _angle_factor(w):  # type: ignore[no-untyped-def]
+    """Rotation angle over the sine of its half, for w = cos(angle / 2) in [0, 1]."""
+    t = w + w - _ONE
+    y = _A10 * t + _A9
+    y = y * t + _A8
+    y = y * t + _A7
+    y = y * t + _A6
+    y = y * t + _A5
+    y = y * t + _A4
+    y = y * t + _A3
+    y = y * t + _A2
+    y = y * t + _A1
+    return y * t + _A0
+
+
+@fast
+def _isotropic_values(data, begin, n, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, out):  # type: ignore[no-untyped-def]
+    """Kernels of rows ``begin .. begin + n``, 1 at a centre, both twins summed; (qx..qw) is kappa times the
+    quaternion.
+    """
+    for k in range(np.uint64(n)):
+        i = np.uint64(begin) + k
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
+        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        out[k] = exp.exp(max(a, b) - kappa - (dx * dx + dy * dy + dz * dz))
+    if wide:
+        for k in range(np.uint64(n)):
+            i = np.uint64(begin) + k
+            dx = data[0, i] - px
+            dy = data[1, i] - py
+            dz = data[2, i] - pz
+            base = -kappa - (dx * dx + dy * dy + dz * dz)
+            a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
+            b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz)
+            low = min(a, b)
+            # The nearest of the four is there already; the others are both antipodes and the farther twin.
+            out[k] += exp.exp(base - a) + twin * (exp.exp(base + low) + exp.exp(base - b))
+
+
+@fast
+def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi):  # type: ignore[no-untyped-def]
+    """Displacements (6, n) from rows (``turned``: from their twins) to a pose: translation in the row's frame
+    (metres), shortest rotation vector in its gripper's frame (radians).
+    """
+    px, py, pz = F32(p[0]), F32(p[1]), F32(p[2])
+    qx, qy, qz, qw = F32(q[0]), F32(q[1]), F32(q[2]), F32(q[3])
+    flip = F32(-1.0) if (turned and frame_turns) else _ONE
+    m = F32(metres)
+    for k in range(np.uint64(n)):
+        i = np.uint64(begin) + k
+        dx = (px - data[0, i]) * m
+        dy = (py - data[1, i]) * m
+        dz = (pz - data[2, i]) * m
+        xi[0, k] = flip * (frames[0, i] * dx + frames[3, i] * dy + frames[6, i] * dz)
+        xi[1, k] = flip * (frames[1, i] * dx + frames[4, i] * dy + frames[7, i] * dz)
+        xi[2, k] = frames[2, i] * dx + frames[5, i] * dy + frames[8, i] * dz
+        ax, ay, az, aw = -data[3, i], -data[4, i], -data[5, i], data[6, i]
+        vx = aw * qx + ax * qw + ay * qz - az * qy
+        vy = aw * qy - ax * qz + ay * qw + az * qx
+        vz = aw * qz + ax * qy - ay * qx + az * qw
+        w = aw * qw - ax * qx - ay * qy - az * qz
+        if turned:
+            # (q_i M)^-1 q = M^-1 v with M^-1 = (0, 0, -1, 0).
+            tx, ty, tz, tw = vy, -vx, -w, vz
+            vx, vy, vz, w = tx, ty, tz, tw
+        sign = _ONE if w >= _ZERO else -_ONE
+        f = sign * _angle_factor(min(abs(w), _ONE))
+        xi[3, k] = f * vx
+        xi[4, k] = f * vy
+        xi[5, k] = f * vz
+
+
+@fast
+def _add_component(xi, n, lower, log_weight, far, out):  # type: ignore[no-untyped-def]
+    """Add one Gaussian component at ``xi`` (6, n) to ``out``.
+
+    ``lower`` (27,): the whitening matrix over sqrt 2, rows of its lower triangle, then the whitened mean.
+    ``far``: the other wrap, the rotation by angle - 2 pi about the same axis.
+    """
+    l00 = lower[0]
+    l10, l11 = lower[1], lower[2]
+    l20, l21, l22 = lower[3], lower[4], lower[5]
+    l30, l31, l32, l33 = lower[6], lower[7], lower[8], lower[9]
+    l40, l41, l42, l43, l44 = lower[10], lower[11], lower[12], lower[13], lower[14]
+    l50, l51, l52, l53, l54, l55 = lower[15], lower[16], lower[17], lower[18], lower[19], lower[20]
+    b0, b1, b2, b3, b4, b5 = lower[21], lower[22], lower[23], lower[24], lower[25], lower[26]
+    other = _ONE if far else _ZERO
+    for k in range(np.uint64(n)):
+        x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
+        angle = math.sqrt(x3 * x3 + x4 * x4 + x5 * x5 + _TINY)
+        wrap = _ONE - other * _TURN / angle
+        x3, x4, x5 = x3 * wrap, x4 * wrap, x5 * wrap
+        z0 = l00 * x0 - b0
+        z1 = l10 * x0 + l11 * x1 - b1
+        z2 = l20 * x0 + l21 * x1 + l22 * x2 - b2
+        z3 = l30 * x0 + l31 * x1 + l32 * x2 + l33 * x3 - b3
+        z4 = l40 * x0 + l41 * x1 + l42 * x2 + l43 * x3 + l44 * x4 - b4
+        z5 = l50 * x0 + l51 * x1 + l52 * x2 + l53 * x3 + l54 * x4 + l55 * x5 - b5
+        square = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3 + z4 * z4 + z5 * z5
+        out[k] += exp.exp(log_weight - square)
+
+
+@fast
+def _mixture_values(  # type: ignore[no-untyped-def]
+    data, frames, begin, n, p, q, metres, twin, frame_turns, lowers, log_weights, wraps, xi, out
+):
+    """Mixture kernels of rows ``begin .. begin + n``, their largest component 1 at its mean, both twins
+    summed.
+    """
+    for k in range(np.uint64(n)):
+        out[k] = _ZERO
+    for t in range(2 if twin else 1):
+        _displacements(data, frames, begin, n, p, q, metres, t == 1, frame_turns, xi)
+        for j in range(lowers.shape[0]):
+            _add_component(xi, n, lowers[j], log_weights[j], False, out)
+            if wraps:
+                _add_component(xi, n, lowers[j], log_weights[j], True, out)
+
+
+@fast
+def _accumulate(values, n, begin, least, weights, index, kept_values, out):  # type: ignore[no-untyped-def]
+    """Add ``value * weights[row]`` for every value above ``least``; how many there were.
+
+    First a branch-free compaction, since which values count is hardly predictable, then four rows at a time
+    over columns in chunks of constant width, which stay in vector registers.
+    """
+    kept = 0
+    for k in range(np.uint64(n)):
+        v = values[k]
+        index[kept] = begin + k
+        kept_values[kept] = v
+        kept += 1 if v > least else 0
+    full = kept - kept % 4
+    for first in range(0, weights.shape[1], LANES):
+        f = np.uint64(first)
+        for e in range(0, full, 4):
+            i0, i1 = np.uint64(index[e]), np.uint64(index[e + 1])
+            i2, i3 = np.uint64(index[e + 2]), np.uint64(index[e + 3])
+            v0, v1, v2, v3 = kept_values[e], kept_values[e + 1], kept_values[e + 2], kept_values[e + 3]
+            for b in range(np.uint64(LANES)):
+                out[f + b] += (
+                    v0 * weights[i0, f + b]
+                    + v1 * weights[i1, f + b]
+                    + v2 * weights[i2, f + b]
+                    + v3 * weights[i3, f + b]
+                )
+        for e in range(full, kept):
+            i0, v0 = np.uint64(index[e]), kept_values[e]
+            for b in range(np.uint64(LANES)):
+                out[f + b] += v0 * weights[i0, f + b]
+    return kept
+
+
+@fast
+def isotropic_sums(  # type: ignore[no-untyped-def]
+    data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, least, weights, out
+):
+    """Kernel sums of poses (M,) under every weighting: ``out`` (M, B) = K weights (N, B); entries used.
+
+    Entries of K beyond ``radius`` (scaled) or not above ``least`` are zero.
+    """
+    runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
+    values = np.empty(BLOCK, dtype=np.float32)
+    kept_values = np.empty(BLOCK + 1, dtype=np.float32)
+    index = np.empty(BLOCK + 1, dtype=np.int64)
+    kept = 0
+    for j in range(positions.shape[0]):
+        px = (positions[j, 0] - centre[0]) * scale
+        py = (positions[j, 1] - centre[1]) * scale
+        pz = (positions[j, 2] - centre[2]) * scale
+        q = quaternions[j]
+        q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+        out[j, :] = _ZERO
+        for s in range(table.shape[0]):
+            twin = F32(table[s, c.TWIN])
+            for r in range(c.runs_within(start, table, s, px, py, pz, radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    n = min(BLOCK, end - begin)
+                    _isotropic_values(
+                        data, begin, n, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, wide,
+                        values,
+                    )  # fmt: skip
+                    kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
+                    begin += n
+    return kept
+
+
+@fast
+def mixture_sums(  # type: ignore[no-untyped-def]
+    data, start, table, centre, scale, frames, frame_turns, positions, quaternions, lowers, log_weights,
+    wraps, radius, least, weights, out,
+):  # fmt: skip
+    """As `isotropic_sums`, for a mixture of Gaussians over the displacement from each row."""
+    runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
+    values = np.empty(BLOCK, dtype=np.float32)
+    kept_values = np.empty(BLOCK + 1, dtype=np.float32)
+    index = np.empty(BLOCK + 1, dtype=np.int64)
+    xi = np.empty((6, BLOCK), dtype=np.float32)
+    p = np.empty(3)
+    metres = 1.0 / scale
+    kept = 0
+    for j in range(positions.shape[0]):
+        for axis in range(3):
+            p[axis] = (positions[j, axis] - centre[axis]) * scale
+        out[j, :] = _ZERO
+        for s in range(table.shape[0]):
+            twin = table[s, c.TWIN] > 0.5
+            for r in range(c.runs_within(start, table, s, p[0], p[1], p[2], radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    n = min(BLOCK, end - begin)
+                    _mixture_values(
+                        data, frames, begin, n, p, quaternions[j], metres, twin, frame_turns, lowers,
+                        log_weights, wraps, xi, values,
+                    )  # fmt: skip
+                    kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
+                    begin += n
+    return kept
+
+
+@exact
+def _component_exponent(x, lower):  # type: ignore[no-untyped-def]
+    """Half the squared Mahalanobis distance of one displacement (6,), in float64."""
+    square = 0.0
+    at = 0
+    for i in range(6):
+        z = -lower[21 + i]
+        for j in range(i + 1):
+            z += lower[at] * x[j]
+            at += 1
+        square += z * z
+    return square
+
+
+@exact
+def mixture_log_sum(  # type: ignore[no-untyped-def]
+    positions, quaternions, frames, symmetric, frame_turns, log_rows, lowers, log_weights, wraps, p, q
+):
+    """Log of the weighted mixture sum at one pose over all rows, in float64 and without a cut-off: for poses
+    so far from every row that the fast sums vanish.
+    """
+    top, total = -math.inf, 0.0
+    x = np.empty(6)
+    for i in range(positions.shape[0]):
+        dx, dy, dz = p[0] - positions[i, 0], p[1] - positions[i, 1], p[2] - positions[i, 2]
+        f = frames[i]
+        ax, ay, az, aw = -quaternions[i, 0], -quaternions[i, 1], -quaternions[i, 2], quaternions[i, 3]
+        vx = aw * q[0] + ax * q[3] + ay * q[2] - az * q[1]
+        vy = aw * q[1] - ax * q[2] + ay * q[3] + az * q[0]
+        vz = aw * q[2] + ax * q[1] - ay * q[0] + az * q[3]
+        w = aw * q[3] - ax * q[0] - ay * q[1] - az * q[2]
+        for t in range(2 if symmetric[i] else 1):
+            flip = -1.0 if (t == 1 and frame_turns) else 1.0
+            if t == 1:
+                ux, uy, uz, uw = vy, -vx, -w, vz
+            else:
+                ux, uy, uz, uw = vx, vy, vz, w
+            if uw < 0.0:
+                ux, uy, uz, uw = -ux, -uy, -uz, -uw
+            sine = math.sqrt(ux * ux + uy * uy + uz * uz)
+            angle = 2.0 * math.atan2(sine, uw)
+            x[0] = flip * (f[0] * dx + f[3] * dy + f[6] * dz)
+            x[1] = flip * (f[1] * dx + f[4] * dy + f[7] * dz)
+            x[2] = f[2] * dx + f[5] * dy + f[8] * dz
+            for wrap in range(2 if wraps else 1):
+                turn = angle - 2.0 * math.pi * wrap
+                scale = turn / sine if sine > 1e-12 else 2.0
+                x[3], x[4], x[5] = scale * ux, scale * uy, scale * uz
+                for j in range(lowers.shape[0]):
+                    value = log_rows[i] + log_weights[j] - _component_exponent(x, lowers[j])
+                    if value > top:
+                        total = total * math.exp(top - value) + 1.0 if total > 0.0 else 1.0
+                        top = value
+                    else:
+                        total += math.exp(value - top)
+    return top + math.log(total)

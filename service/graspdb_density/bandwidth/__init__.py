@@ -1,0 +1,1 @@
+"""Choosing kernel widths, and fitting kernels to trials."""

@@ -1,0 +1,1 @@
+"""Kernel density estimates on SE(3): evaluation, sampling, weights, similarity."""

@@ -1,0 +1,225 @@
+"""The Bhattacharyya coefficient ``BC = integral of sqrt(d1 d2)`` between densities: 1 where they are equal, 0
+where they share nothing.
+
+Sampled from ``(d1 + d2) / 2``, where the average of ``2 sqrt(d1 d2) / (d1 + d2)`` is the coefficient: that
+integrand stays within [0, 1], so that its variance is bounded whatever the densities, which sampling from one
+of them does not give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .. import se3
+from ..kernels.isotropic import IsotropicKernel
+from ..se3 import Floats
+from .weighted_sums import KernelRows
+
+__all__ = [
+    "Coefficient",
+    "Density",
+    "DisplacementWindow",
+    "SampledKernelPoint",
+    "bhattacharyya",
+    "mirrored_displacements",
+    "sampled_kernel_curve",
+    "sampled_kernel_rows",
+]
+
+
+class Density(Protocol):
+    """What can be evaluated and drawn from: `GraspDensity`, `KernelRows`."""
+
+    def log_density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
+        """(M,) nats of 1/(m^3 rad^3)."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """(count, 3) metres and (count, 4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coefficient:
+    """A Bhattacharyya coefficient and its Monte Carlo standard error."""
+
+    value: float
+    standard_error: float
+
+
+@dataclass(frozen=True, slots=True)
+class DisplacementWindow:
+    """Displacements considered: a cube of positions and a ball of rotations about the identity.
+
+    A similarity of kernels has no meaning without its window: most of what two of them differ in may lie far
+    out.
+
+    Parameters
+    ----------
+    position_m : float
+        Half edge of the cube, metres; ``math.inf`` for all.
+    rotation : float
+        Largest angle, radians; pi for all rotations.
+    """
+
+    position_m: float = 0.04
+    rotation: float = math.pi
+
+    def __post_init__(self) -> None:
+        if not self.position_m > 0.0 or not 0.0 < self.rotation <= math.pi:
+            raise ValueError("a window has a positive half edge and an angle in (0, pi]")
+
+    def holds(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> NDArray[np.bool_]:
+        """Whether displacements (M, 3), (M, 4) lie inside."""
+        p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions_xyzw, dtype=np.float64)
+        angle = 2.0 * np.arccos(np.minimum(np.abs(q[:, 3]), 1.0))
+        near: NDArray[np.bool_] = np.max(np.abs(p), axis=1) <= self.position_m
+        return near & (angle <= self.rotation + 1e-9)
+
+
+@dataclass(frozen=True, slots=True)
+class SampledKernelPoint:
+    """Similarity of a kernel sampled with ``samples`` displacements to the full statistics (figure 13)."""
+
+    samples: int
+    similarity: float
+    standard_error: float
+
+
+def bhattacharyya(
+    first: Density,
+    second: Density,
+    rng: np.random.Generator,
+    *,
+    points: int = 20_000,
+    window: DisplacementWindow | None = None,
+    threads: int = 1,
+) -> Coefficient:
+    """BC between two densities, or between two kernels as densities of displacements.
+
+    Parameters
+    ----------
+    points : int
+        Draws in all, half from each.
+    window : DisplacementWindow or None
+        Compare the two restricted to a window and normalised in it.
+
+    Raises
+    ------
+    ValueError
+        For fewer than 4 points, or where a density has no draw inside the window.
+    """
+    if points < 4:
+        raise ValueError("a coefficient needs at least 4 points")
+    half = points // 2
+    # Draws from each, so the mixture is stratified: exactly half of the points from either.
+    drawn = [density.sample(half, rng) for density in (first, second)]
+    p = np.concatenate([part[0] for part in drawn])
+    q = np.concatenate([part[1] for part in drawn])
+    inside = np.ones(2 * half, dtype=bool) if window is None else window.holds(p, q)
+    if not inside[:half].any() or not inside[half:].any():
+        raise ValueError("a density has no draw inside the window")
+    value = np.zeros(2 * half)
+    difference = first.log_density(p[inside], q[inside], threads=threads) - second.log_density(
+        p[inside], q[inside], threads=threads
+    )
+    # 2 sqrt(d1 d2) / (d1 + d2) = 1 / cosh((log d1 - log d2) / 2), without overflow.
+    decay = np.exp(-0.5 * np.abs(difference))
+    value[inside] = 2.0 * decay / (1.0 + decay * decay)
+    shares = [float(inside[:half].mean()), float(inside[half:].mean())]
+    scale = 1.0 / math.sqrt(shares[0] * shares[1])
+    coefficient = float(value.mean()) * scale
+    # Delta method, the strata independent: the shares of the window are estimated from the same draws.
+    variance = 0.0
+    for part, share in zip((slice(0, half), slice(half, None)), shares, strict=True):
+        influence = 0.5 * scale * value[part] - 0.5 * coefficient * inside[part] / share
+        variance += float(influence.var(ddof=1)) / half
+    return Coefficient(min(coefficient, 1.0), math.sqrt(variance))
+
+
+def mirrored_displacements(translations: Floats, quaternions_xyzw: Floats) -> tuple[Floats, Floats]:
+    """Displacements of the same grasps with the jaw mirrored: ``M^-1 xi M``, so x and y change sign in both
+    parts.
+    """
+    return translations * np.array([-1.0, -1.0, 1.0]), quaternions_xyzw * np.array([-1.0, -1.0, 1.0, 1.0])
+
+
+def sampled_kernel_rows(
+    translations: ArrayLike,
+    quaternions_xyzw: ArrayLike,
+    components: IsotropicKernel,
+    *,
+    window: DisplacementWindow | None = None,
+) -> KernelRows:
+    """The sampled kernel (eq 5) as a density of displacements: an isotropic component at every sample inside
+    the window and at its mirror image.
+
+    Raises
+    ------
+    ValueError
+        Where no displacement lies inside the window.
+    """
+    t, q = se3.as_poses(translations, quaternions_xyzw)
+    if window is not None:
+        kept = window.holds(t, q)
+        t, q = t[kept], q[kept]
+    if not len(t):
+        raise ValueError("no displacement lies inside the window")
+    other_t, other_q = mirrored_displacements(t, q)
+    return KernelRows(np.concatenate([t, other_t]), np.concatenate([q, other_q]), components, symmetric=False)
+
+
+def sampled_kernel_curve(
+    translations: ArrayLike,
+    quaternions_xyzw: ArrayLike,
+    *,
+    components: IsotropicKernel,
+    window: DisplacementWindow,
+    rng: np.random.Generator,
+    counts: Sequence[int] = (50, 100, 200, 400, 900, 1_800, 3_600),
+    reference: int = 20_000,
+    points: int = 8_000,
+    threads: int = 1,
+) -> list[SampledKernelPoint]:
+    """Similarity of the sampled kernel to the full statistics against the number of samples (figure 13).
+
+    Parameters
+    ----------
+    translations, quaternions_xyzw : (N, 3) metres, (N, 4)
+        Displacements between successful grasps, in the frame of the first.
+    components
+        Width of every sample's component; like the window, the answer depends on it.
+    counts
+        Samples of the kernels compared; those beyond what the window holds are left out.
+    reference : int
+        At most this many displacements stand for the full statistics.
+
+    Raises
+    ------
+    ValueError
+        Where the window holds fewer than 100 displacements.
+    """
+    t, q = se3.as_poses(translations, quaternions_xyzw)
+    kept = np.flatnonzero(window.holds(t, q))
+    if len(kept) < 100:
+        raise ValueError(
+            f"the window holds {len(kept)} displacements between successes; at least 100 are needed"
+        )
+    kept = rng.permutation(kept)
+    full = kept[:reference]
+    whole = sampled_kernel_rows(t[full], q[full], components)
+    # Samples are drawn anew from all displacements, as a kernel would be; overlap with the reference is part
+    # of comparing a sample with what it was drawn from.
+    result = []
+    for count in counts:
+        if not 1 <= count <= len(full):
+            continue
+        chosen = rng.choice(full, size=count, replace=False)
+        one = sampled_kernel_rows(t[chosen], q[chosen], components)
+        found = bhattacharyya(one, whole, rng, points=points, window=window, threads=threads)
+        result.append(SampledKernelPoint(count, found.value, found.standard_error))
+    return result

@@ -1,0 +1,296 @@
+"""Densities under an anisotropic kernel: a Gaussian or a mixture over displacements, fast and for queries.
+
+`KernelRows` evaluates the same kernels under many weightings at once; this is the one density that queries
+ask.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .. import se3
+from .._compiled import mixture
+from .._compiled.threads import for_blocks
+from .._compiled.weighted import mixture_log_sum
+from ..kernels.gaussian_mixture import AnisotropicKernel
+from ..kernels.isotropic import HAAR_VOLUME
+from ..se3 import Floats
+from ..search.evolution import search_scored
+from ..search.mode_search import Admissible, Maximum
+from ..search.region import Region
+from .cell_list import Cells
+from .isotropic import GraspDensity, row_values
+from .weighted_sums import KernelRows
+
+__all__ = ["NARROW", "MixtureDensity"]
+
+#: Largest rotation width at which a row's nearer twin stands for both.
+NARROW = math.radians(25.0)
+_CUTOFF = 4.0
+_QUERY_BLOCK = 512
+_SORTED_FROM = 256
+
+
+class MixtureDensity:
+    """Kernel density estimate with an anisotropic kernel; immutable, safe to use from several threads.
+
+    Parameters
+    ----------
+    positions, quaternions_xyzw : (N, 3), (N, 4), N at least 1
+    kernel
+    weights : (N,) positive, normalised here; None: equal
+    symmetric : bool or (N,)
+    frames : (N, 3, 3) or (3, 3)
+        Columns are the axes translations are measured along, object frame; required by a kernel whose frame
+        is ``fixed``, refused by one whose frame is the gripper.
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes or values, or frames that do not fit the kernel.
+    """
+
+    def __init__(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        kernel: AnisotropicKernel,
+        weights: ArrayLike | None = None,
+        symmetric: ArrayLike | bool = True,
+        frames: ArrayLike | None = None,
+    ) -> None:
+        if (frames is None) != (kernel.frame == "gripper"):
+            need = "takes no frames" if kernel.frame == "gripper" else "needs frames"
+            raise ValueError(f"a kernel in the {kernel.frame} frame {need}")
+        rows = KernelRows(
+            positions, quaternions_xyzw, kernel, weights=weights, symmetric=symmetric, frames=frames
+        )
+        # Weights are kept in the unit of those given, so that further rows can be added in it.
+        self._total = float(rows.size) if weights is None else float(np.sum(weights))
+        self._unit = self._total / rows.size
+        self._kernel = kernel
+        spread = math.sqrt(max(float(np.linalg.eigvalsh(s[:3, :3])[-1]) for s in kernel.covariances))
+        self._offset = float(np.linalg.norm(kernel.means[:, :3], axis=1).max())
+        self._spread = spread
+        raw = rows.weights * rows.size
+        self._hold(rows, Cells.build(rows.positions, rows.quaternions_xyzw, raw, rows.symmetric, spread))
+        peaks = kernel.log_peaks
+        self._log_unit = float(peaks.max())
+        self._log_weights = peaks - self._log_unit
+        whitening = np.linalg.inv(np.linalg.cholesky(kernel.covariances)) / math.sqrt(2.0)
+        row, column = np.tril_indices(6)
+        offset = np.einsum("cij,cj->ci", whitening, kernel.means)
+        self._lowers = np.concatenate([whitening[:, row, column], offset], axis=1)
+        turn = max(float(np.linalg.eigvalsh(s[3:, 3:])[-1]) for s in kernel.covariances) ** 0.5
+        mean_turn = float(np.linalg.norm(kernel.means[:, 3:], axis=1).max())
+        self._narrow = turn <= NARROW and mean_turn + 2.5 * turn <= math.radians(75.0)
+
+    def _hold(self, rows: KernelRows, cells: Cells) -> None:
+        self._rows, self._cells = rows, cells
+        self._frames = rows.frames.reshape(-1, 9)
+        if self._kernel.frame == "gripper":
+            # Turned by the rows' own quaternions in the loops.
+            self._sorted_frames = np.zeros((9, 1), dtype=np.float32)
+        else:
+            self._sorted_frames = np.ascontiguousarray(self._frames[cells.rows].T, dtype=np.float32)
+
+    def extend(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        weights: ArrayLike | None = None,
+        symmetric: ArrayLike | bool = True,
+        frames: ArrayLike | None = None,
+    ) -> MixtureDensity:
+        """A density with further rows, weights in the unit of the first ones (None: their mean).
+
+        Equal to building from all rows within 1e-5 of the density; what is sorted stays sorted. Searches that
+        this density has been asked for go on from what they knew.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        if not len(p):
+            return self
+        w, flags = row_values(weights, symmetric, len(p), fill=self._unit_mean)
+        more = KernelRows(p, q, self._kernel, weights=w, symmetric=flags, frames=frames)
+        old = self._rows
+        rows = KernelRows(
+            np.concatenate([old.positions, p]),
+            np.concatenate([old.quaternions_xyzw, q]),
+            self._kernel,
+            weights=np.concatenate([old.weights * self._total, w]),
+            symmetric=np.concatenate([old.symmetric, flags]),
+            frames=None if frames is None else np.concatenate([old.frames, more.frames]),
+        )
+        grown = copy.copy(self)
+        for name in ("isotropic", "_global"):
+            grown.__dict__.pop(name, None)
+        grown._total = self._total + float(w.sum())
+        grown._hold(rows, self._cells.extend(p, q, w / self._unit, flags))
+        if "isotropic" in self.__dict__:
+            grown.__dict__["isotropic"] = self.isotropic.extend(p, q, weights=w, symmetric=flags)
+        return grown
+
+    @property
+    def _unit_mean(self) -> float:
+        """Mean weight, in the unit of the weights given."""
+        return self._total / self.size
+
+    @property
+    def kernel(self) -> AnisotropicKernel:
+        return self._kernel
+
+    @property
+    def size(self) -> int:
+        """Rows; twins are not counted."""
+        return self._rows.size
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays held for evaluation, `isotropic` not counted."""
+        return self._rows.nbytes + self._cells.nbytes + self._sorted_frames.nbytes
+
+    @property
+    def effective_sample_size(self) -> float:
+        """(sum w)^2 / sum w^2."""
+        return float(1.0 / np.dot(self._rows.weights, self._rows.weights))
+
+    @cached_property
+    def isotropic(self) -> GraspDensity:
+        """The density under the isotropic kernel of equal determinants: where searches start."""
+        return GraspDensity.build(
+            self._rows.positions,
+            self._rows.quaternions_xyzw,
+            kernel=self._kernel.isotropic,
+            weights=self._rows.weights * self._total,
+            symmetric=self._rows.symmetric,
+        )
+
+    def log_density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
+        """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row.
+
+        Within 1e-3 of the float64 sum near data where rotation widths are at most `NARROW`; wider kernels sum
+        both twins and both wraps of every rotation.
+        """
+        if not self._narrow:
+            return self._rows.log_density(positions, quaternions_xyzw, threads=threads)
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        cells = self._cells
+        order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
+        p, q = p[order], q[order]
+        stages = self._stages()
+        rows, turning = self._rows, float(self._kernel.frame == "gripper")
+        log_rows = np.log(rows.weights * np.where(rows.symmetric, 0.5, 1.0))
+        lowers, log_weights = self._lowers.astype(np.float32), self._log_weights.astype(np.float32)
+        unit = math.log(self._total / self._unit)
+        out = np.empty(len(p))
+
+        def work(begin: int, end: int) -> None:
+            mixture.mixture_log_sums(
+                cells.data, cells.start, cells.table, self._sorted_frames, turning,
+                cells.centre, cells.scale, p[begin:end], q[begin:end], lowers, log_weights, stages, unit,
+                rows.positions, rows.quaternions_xyzw, self._frames, rows.symmetric, log_rows,
+                self._lowers, self._log_weights, True, out[begin:end],
+            )  # fmt: skip
+
+        for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
+        result = np.empty(len(p))
+        result[order] = out
+        return result + self._log_unit
+
+    def _stages(self) -> Floats:
+        """Radii and when to trust them, as `density.stages`."""
+        _, logdet = np.linalg.slogdet(self._kernel.overall_covariance[:3, :3])
+        # Mean of the rotation's factor over all rotations, relative to the peak of the largest component.
+        random = math.exp(-1.5 * math.log(2.0 * math.pi) - 0.5 * logdet - self._log_unit) / HAAR_VOLUME
+        rows = []
+        for reach in (_CUTOFF, 1.4 * _CUTOFF):
+            radius = (self._offset + reach * self._spread) * self._cells.scale
+            least = 0.04 * random * math.exp(8.0 - 0.5 * reach * reach)
+            rows.append((radius, max(0.5 * reach * reach - 5.8, 2.2), least))
+        return np.array(rows)
+
+    def density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
+        """Density at poses, 1/(m^3 rad^3)."""
+        return np.exp(self.log_density(positions, quaternions_xyzw, threads=threads))
+
+    def gradient(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> tuple[Floats, Floats]:
+        """Gradient of the log density by position (M, 3), 1/m, and by a rotation vector in the tool (M, 3).
+
+        Central differences of a thousandth of the kernel's widths in the exact float64 sum: meant for checks
+        and for few poses.
+        """
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        steps = 1e-3 * np.sqrt(np.diag(self._kernel.overall_covariance))
+        out = np.empty((2, len(p), 3))
+        for axis in range(3):
+            for kind in (0, 1):
+                move, turn = np.zeros(3), np.zeros(3)
+                (move if kind == 0 else turn)[axis] = steps[3 * kind + axis]
+                ahead = self.reference(p + move, se3.multiply(q, se3.from_rotation_vector(turn)))
+                behind = self.reference(p - move, se3.multiply(q, se3.from_rotation_vector(-turn)))
+                out[kind, :, axis] = (ahead - behind) / (2.0 * steps[3 * kind + axis])
+        return out[0], out[1]
+
+    def reference(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> Floats:
+        """Log density at poses (M,) in float64 over all rows, twins and wraps; M times N evaluations."""
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        rows = self._rows
+        log_rows = np.log(rows.weights * np.where(rows.symmetric, 0.5, 1.0))
+        values = [
+            mixture_log_sum(
+                rows.positions, rows.quaternions_xyzw, self._frames, rows.symmetric,
+                self._kernel.frame == "gripper", log_rows, self._lowers, self._log_weights, True, at, to,
+            )
+            for at, to in zip(p, q, strict=True)
+        ]  # fmt: skip
+        return self._log_unit + np.array(values)
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Draw grasps: positions (count, 3) and quaternions (count, 4)."""
+        return self._rows.sample(count, rng)
+
+    def maximum(
+        self,
+        region: Region | None = None,
+        *,
+        count: int = 1,
+        min_separation_m: float = 0.01,
+        min_separation: float = math.radians(20.0),
+        admissible: Admissible | None = None,
+        threads: int = 1,
+    ) -> list[Maximum]:
+        """The best distinct grasps inside a region, as `GraspDensity.maximum`."""
+        return search_scored(
+            self.isotropic,
+            lambda p, q: self.log_density(p, q, threads=threads),
+            region,
+            count=count,
+            min_separation_m=min_separation_m,
+            min_separation=min_separation,
+            admissible=admissible,
+            threads=threads,
+        )
+
+    @cached_property
+    def _global(self) -> Maximum:
+        return self.maximum()[0]
+
+    def global_maximum(self) -> Maximum:
+        """The highest point, computed once."""
+        return self._global
+
+    @property
+    def symmetric(self) -> NDArray[np.bool_]:
+        """(N,) whether a row has a twin."""
+        return self._rows.symmetric
+
+    @property
+    def frames(self) -> Floats:
+        """(N, 3, 3) columns are the axes along which a row's translations are measured, object frame."""
+        return np.broadcast_to(self._rows.frames, (self.size, 3, 3))

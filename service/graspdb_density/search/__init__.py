@@ -1,0 +1,1 @@
+"""Where a density is highest under constraints."""

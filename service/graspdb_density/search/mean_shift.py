@@ -1,0 +1,466 @@
+"""Compiled parts of the search for maxima: scoring kernel centres against a region, thinning, climbing.
+
+Climbing is projected mean shift. Every step maximises a lower bound of the log density that touches it at the
+present pose: a quadratic in position, whose maximiser over a convex set is the projection of the mean-shift
+point, and a linear form in the quaternion, whose maximiser over a set of rotations is the projection of the
+mean-shift rotation. So steps of length 1 never descend; longer ones (over-relaxation, which halves the number
+of steps) are taken back when they do.
+"""
+
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .._compiled import exp, isotropic
+from .._compiled.options import exact, fast
+from . import feasible_projection
+
+F32 = np.float32
+__all__ = ["climb", "nearest_each", "nearest_rows", "scatter", "score_centres", "thin"]
+
+
+#: Columns of a path: position, quaternion, kernel sum.
+PATH = 8
+#: Longest step as a multiple of the mean shift's, and in kernel widths where it is longer than that.
+_LONGEST, _FARTHEST = 40.0, 1.0
+#: A climb gathers kernels anew after so many kernel widths, and before it ends where it has moved more than
+#: the second.
+_STRAYED, _SETTLED = 0.8, 0.3
+_GATHERED = 512
+
+
+@exact
+def score_centres(landmarks, twins, planes, spheres, cones, sigma, kappa, reach_m, reach, scores, turned):
+    """Optimistic log density at the feasible pose nearest to every kernel centre, -inf where that is out of
+    reach.
+
+    ``log(sum) - excess^2 / (2 sigma^2) - kappa (1 - cos(angle / 2))``: the density at the centre less what
+    its own kernel loses on the way into the region. ``turned`` says where the jaw's twin is nearer to a
+    signed closing cone. ``landmarks`` (M, 8) are the centres' positions, quaternions and logs of their sums.
+    """
+    signed = cones[8] > 0.5 and cones[7] >= 0.0
+    linear = planes.shape[0] + spheres.shape[0] > 0
+    # Most centres are far outside a cone: a cosine tells without an arc cosine.
+    least_approach = math.cos(min(cones[3] + reach, math.pi)) if cones[3] >= 0.0 else -2.0
+    least_closing = math.cos(min(cones[7] + reach, math.pi)) if cones[7] >= 0.0 else -2.0
+    p = np.empty(3)
+    for j in range(landmarks.shape[0]):
+        scores[j] = -np.inf
+        turned[j] = False
+        away, angle = 0.0, 0.0
+        row = landmarks[j]
+        x, y, z, w = float(row[3]), float(row[4]), float(row[5]), float(row[6])
+        if cones[3] >= 0.0:
+            dot = (
+                cones[0] * 2.0 * (x * z + y * w)
+                + cones[1] * 2.0 * (y * z - x * w)
+                + cones[2] * (1.0 - 2.0 * (x * x + y * y))
+            )
+            if dot < least_approach:
+                continue
+            angle = math.acos(min(max(dot, -1.0), 1.0)) - cones[3]
+        if cones[7] >= 0.0:
+            dot = (
+                cones[4] * 2.0 * (x * y - z * w)
+                + cones[5] * (1.0 - 2.0 * (x * x + z * z))
+                + cones[6] * 2.0 * (y * z + x * w)
+            )
+            if dot < 0.0 and (not signed or twins[j]):
+                # Without a sign, or for a jaw whose fingers may be exchanged, the axis has two ends.
+                dot = -dot
+                turned[j] = signed
+            if dot < least_closing:
+                continue
+            angle = max(angle, math.acos(min(max(dot, -1.0), 1.0)) - cones[7])
+        if linear:
+            p[0], p[1], p[2] = row[0], row[1], row[2]
+            away = max(feasible_projection.position_excess(planes, spheres, p), 0.0)
+            if away > reach_m:
+                continue
+        loss = 0.5 * (away / sigma) ** 2
+        if angle > 0.0:
+            loss += kappa * (1.0 - math.cos(0.5 * angle))
+        scores[j] = row[7] - loss
+
+
+@exact
+def _same(p, q, other_p, other_q, separation_m, cosine, twins):
+    """Whether two grasps are within both separations; ``cosine`` is that of half the angle."""
+    squared = (p[0] - other_p[0]) ** 2 + (p[1] - other_p[1]) ** 2 + (p[2] - other_p[2]) ** 2
+    if squared > separation_m * separation_m:
+        return False
+    dot = abs(q[0] * other_q[0] + q[1] * other_q[1] + q[2] * other_q[2] + q[3] * other_q[3])
+    if twins:
+        dot = max(dot, abs(q[0] * other_q[1] - q[1] * other_q[0] + q[2] * other_q[3] - q[3] * other_q[2]))
+    return dot >= cosine
+
+
+@exact
+def thin(positions, quaternions, first, limit, separation_m, separation, twins, kept):
+    """Greedy choice of mutually distinct poses in the order given, after ``first`` that are chosen already.
+
+    ``kept`` (at least ``limit``) holds indices, the first ``first`` of them set; returns how many there are
+    now.
+    """
+    cosine = math.cos(0.5 * min(separation, math.pi))
+    count = first
+    for j in range(positions.shape[0]):
+        if count >= limit:
+            break
+        distinct = True
+        for k in range(count):
+            i = kept[k]
+            if _same(positions[j], quaternions[j], positions[i], quaternions[i], separation_m, cosine, twins):
+                distinct = False
+                break
+        if distinct:
+            kept[count] = j
+            count += 1
+    return count
+
+
+@fast
+def _exponents(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, out):
+    """Exponents of a run's nearest ends."""
+    for k in range(np.uint64(end - begin)):
+        i = np.uint64(begin) + k
+        dx = data[0, i] - px
+        dy = data[1, i] - py
+        dz = data[2, i] - pz
+        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        out[k] = max(abs(a), abs(b)) - kappa - (dx * dx + dy * dy + dz * dz)
+
+
+@fast
+def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
+    """Kernels whose exponent at a pose is above ``-cut``, into ``near`` (8, ...): as ``data``, but every end
+    (twin, antipode) a kernel of its own with the sign that faces the pose. Answers how many there are.
+    """
+    fx, fy, fz, k = F32(px), F32(py), F32(pz), F32(kappa)
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    least = F32(-cut)
+    count = 0
+    for s in range(table.shape[0]):
+        twin = F32(table[s, isotropic.TWIN])
+        for r in range(isotropic.runs_within(start, table, s, px, py, pz, math.sqrt(cut), runs)):
+            begin = runs[r, 0]
+            while begin < runs[r, 1]:
+                stop = min(begin + _GATHERED, runs[r, 1])
+                _exponents(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, buffer)
+                for i in range(stop - begin):
+                    if buffer[i] <= least:
+                        continue
+                    j = begin + i
+                    u0, u1, u2, u3 = data[3, j], data[4, j], data[5, j], data[6, j]
+                    dx, dy, dz = data[0, j] - fx, data[1, j] - fy, data[2, j] - fz
+                    base = -k - (dx * dx + dy * dy + dz * dz)
+                    for end in range(4 if twin > F32(0.0) else 2):
+                        if end == 2:
+                            # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z).
+                            u0, u1, u2, u3 = u1, -u0, u3, -u2
+                        elif end > 0:
+                            u0, u1, u2, u3 = -u0, -u1, -u2, -u3
+                        if base + u0 * q0 + u1 * q1 + u2 * q2 + u3 * q3 > least and count < near.shape[1]:
+                            near[0, count], near[1, count], near[2, count] = (
+                                data[0, j],
+                                data[1, j],
+                                data[2, j],
+                            )
+                            near[3, count], near[4, count] = u0, u1
+                            near[5, count], near[6, count] = u2, u3
+                            near[7, count] = data[7, j]
+                            count += 1
+                begin = stop
+    return count
+
+
+@fast
+def _moments(near, begin, end, px, py, pz, qx, qy, qz, qw, kappa, sums):
+    """Add to ``sums`` (8,) k, k (p_i - p) and the pull k mu_i of gathered kernels, scaled units."""
+    s = F32(0.0)
+    sx, sy, sz = F32(0.0), F32(0.0), F32(0.0)
+    m0, m1, m2, m3 = F32(0.0), F32(0.0), F32(0.0), F32(0.0)
+    for i in range(np.uint64(begin), np.uint64(end)):
+        dx = near[0, i] - px
+        dy = near[1, i] - py
+        dz = near[2, i] - pz
+        u0, u1, u2, u3 = near[3, i], near[4, i], near[5, i], near[6, i]
+        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
+        k = near[7, i] * exp.exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+        s += k
+        sx += k * dx
+        sy += k * dy
+        sz += k * dz
+        m0 += k * u0
+        m1 += k * u1
+        m2 += k * u2
+        m3 += k * u3
+    sums[0] += s
+    sums[1] += sx
+    sums[2] += sy
+    sums[3] += sz
+    sums[4] += m0
+    sums[5] += m1
+    sums[6] += m2
+    sums[7] += m3
+
+
+@fast
+def _sum(near, count, px, py, pz, qx, qy, qz, qw, kappa):
+    """Sum of gathered kernels at a pose; (qx..qw) is kappa times the quaternion."""
+    total = np.float64(0.0)
+    for begin in range(0, count, isotropic.BLOCK):
+        s = F32(0.0)
+        for i in range(np.uint64(begin), np.uint64(min(begin + isotropic.BLOCK, count))):
+            dx = near[0, i] - px
+            dy = near[1, i] - py
+            dz = near[2, i] - pz
+            a = near[3, i] * qx + near[4, i] * qy + near[5, i] * qz + near[6, i] * qw
+            s += near[7, i] * exp.exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+        total += s
+    return total
+
+
+@exact
+def _into(planes, spheres, cones, p, q):
+    """Project a pose in place; whether it got there."""
+    there = feasible_projection.project_position(planes, spheres, p)
+    return feasible_projection.project_rotation(cones, q) and there
+
+
+@exact
+def climb(
+    data, start, table, centre, scale, planes, spheres, cones, kappa, cut, positions, quaternions, gain,
+    path, lengths,
+):  # fmt: skip
+    """Climb from every pose (K, ...); ``path`` (K, steps, PATH) gets the feasible poses passed.
+
+    Kernels are gathered once around a pose and used while the climb stays near: those with an exponent above
+    ``-cut``. So sums are too low by what is farther, a per cent or so in dense data; it is flat and hardly
+    moves the maximum, but to compare poses of different climbs their sums have to be taken anew.
+
+    The last pose of a path is its best. A climb ends where the next step promises to raise the log density by
+    less than ``gain``.
+    """
+    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
+    buffer = np.empty(_GATHERED, dtype=np.float32)
+    near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
+    sums = np.empty(8)
+    # Poses and steps in units of the kernel's widths: position over sigma, sqrt(kappa) times the quaternion.
+    unit, turn = 1.0 / (scale * math.sqrt(2.0)), math.sqrt(kappa)
+    p, q, x, step, gathered = np.empty(3), np.empty(4), np.empty(7), np.empty(7), np.empty(7)
+    last_x, last_step, best_x, best_step = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
+    for j in range(positions.shape[0]):
+        p[:] = positions[j]
+        q[:] = quaternions[j]
+        best, top, known, plain, worst, older = -1.0, 0, False, True, 0.0, 0.0
+        count = -1
+        lengths[j] = 0
+        while lengths[j] < path.shape[1]:
+            px, py, pz = (p[0] - centre[0]) * scale, (p[1] - centre[1]) * scale, (p[2] - centre[2]) * scale
+            apart = 0.0
+            if count >= 0:
+                for i in range(3):
+                    apart += (p[i] / unit - gathered[i]) ** 2
+                for i in range(4):
+                    apart += (q[i] * turn - gathered[3 + i]) ** 2
+            if count < 0 or apart > _STRAYED * _STRAYED:
+                count = _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near)
+                gathered[0:3] = p / unit
+                gathered[3:7] = q * turn
+                apart = 0.0
+                # Other kernels, other sums: what was seen before is no measure.
+                best, known, plain, worst, older = -1.0, False, True, 0.0, 0.0
+            sums[:] = 0.0
+            for begin in range(0, count, isotropic.BLOCK):
+                _moments(
+                    near, begin, min(begin + isotropic.BLOCK, count), F32(px), F32(py), F32(pz),
+                    F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa), F32(kappa),
+                    sums,
+                )  # fmt: skip
+            here = sums[0]
+            if here <= 0.0:
+                break
+            row = path[j, lengths[j]]
+            row[0:3] = p
+            row[3:7] = q
+            row[7] = here
+            lengths[j] += 1
+            if here < min(worst, older):
+                # Too long a step: back to the best pose and from there by mean shift, which can't descend.
+                if plain:
+                    break
+                x[:] = best_x
+                step[:] = best_step
+                known, plain = False, True
+                worst, older = best, best
+            else:
+                worst, older = here, worst if best > 0.0 else here
+                x[0:3] = p / unit
+                x[3:7] = q * turn
+                length = math.sqrt(sums[4] ** 2 + sums[5] ** 2 + sums[6] ** 2 + sums[7] ** 2)
+                for i in range(3):
+                    p[i] += sums[1 + i] / (here * scale)
+                for i in range(4):
+                    q[i] = sums[4 + i] / length if length > 0.0 else q[i]
+                if not _into(planes, spheres, cones, p, q):
+                    break
+                step[0:3] = p / unit - x[0:3]
+                step[3:7] = q * turn - x[3:7]
+                if here > best:
+                    best, top = here, lengths[j] - 1
+                    best_x[:] = x
+                    best_step[:] = step
+                plain = False
+            # The inverse curvature that the last two poses saw along their difference (Barzilai, Borwein), of
+            # the projected step: along a curved limit, the limit's curvature counts.
+            ahead, moved, bent, size = 1.0, 0.0, 0.0, 0.0
+            for i in range(7):
+                size += step[i] * step[i]
+                if known:
+                    moved += (x[i] - last_x[i]) ** 2
+                    bent += (x[i] - last_x[i]) * (last_step[i] - step[i])
+            if known:
+                ahead = moved / bent if bent * _LONGEST > moved else _LONGEST
+                ahead = max(1.0, min(ahead, _FARTHEST / math.sqrt(size) if size > 0.0 else 1.0))
+            for i in range(3):
+                p[i] = (x[i] + ahead * step[i]) * unit
+            norm = 0.0
+            for i in range(4):
+                q[i] = x[3 + i] + ahead * step[3 + i]
+                norm += q[i] * q[i]
+            norm = math.sqrt(norm)
+            for i in range(4):
+                q[i] /= norm
+            if not _into(planes, spheres, cones, p, q):
+                break
+            # Half the slope times the way ahead, the gain of a parabola.
+            if 0.5 * ahead * size < gain:
+                if apart < _SETTLED * _SETTLED:
+                    break
+                # At rest among the kernels of a while ago: gather anew.
+                count = -1
+            last_x[:] = x
+            last_step[:] = step
+            known = True
+        if lengths[j] > 0 and best > 0.0 and top != lengths[j] - 1:
+            for i in range(PATH):
+                held = path[j, top, i]
+                path[j, top, i] = path[j, lengths[j] - 1, i]
+                path[j, lengths[j] - 1, i] = held
+
+
+@exact
+def _times(q, x, y, z, w, out):
+    """The product of two quaternions."""
+    out[0] = q[3] * x + q[0] * w + q[1] * z - q[2] * y
+    out[1] = q[3] * y - q[0] * z + q[1] * w + q[2] * x
+    out[2] = q[3] * z + q[0] * y - q[1] * x + q[2] * w
+    out[3] = q[3] * w - q[0] * x - q[1] * y - q[2] * z
+
+
+@exact
+def scatter(
+    data, start, table, centre, scale, planes, spheres, cones, kappa, cut, positions, quaternions, moves,
+    turns, tried_p, tried_q, values,
+):  # fmt: skip
+    """Feasible poses around each of some poses, with their sums.
+
+    Around pose k, the tries are its position plus ``moves[k, t]`` (metres) and its quaternion turned by the
+    rotation vectors ``turns[k, t]`` (radians, tool frame), both the other way where that is uphill, projected
+    into the region. ``values`` (K, 1 + T)
+    gets the sum at the pose itself and at every try, -1 where the projection failed. They are sums over the
+    kernels with an exponent above ``-cut`` at the pose: right for comparisons around one pose.
+    """
+    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
+    buffer = np.empty(_GATHERED, dtype=np.float32)
+    near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
+    sums, k32 = np.empty(8), F32(kappa)
+    for j in range(positions.shape[0]):
+        p, q = positions[j], quaternions[j]
+        px, py, pz = (p[0] - centre[0]) * scale, (p[1] - centre[1]) * scale, (p[2] - centre[2]) * scale
+        count = _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near)
+        sums[:] = 0.0
+        for begin in range(0, count, isotropic.BLOCK):
+            _moments(
+                near, begin, min(begin + isotropic.BLOCK, count), F32(px), F32(py), F32(pz),
+                F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa), k32, sums,
+            )  # fmt: skip
+        values[j, 0] = sums[0]
+        for t in range(moves.shape[1]):
+            at, to, v = tried_p[j, t], tried_q[j, t], turns[j, t]
+            slope = 0.0
+            for i in range(3):
+                slope += 2.0 * scale * sums[1 + i] * moves[j, t, i]
+            # Half of q (v, 0), the change of q to first order.
+            _times(q, v[0], v[1], v[2], 0.0, to)
+            for i in range(4):
+                slope += 0.5 * kappa * sums[4 + i] * to[i]
+            sign = -1.0 if slope < 0.0 else 1.0
+            for i in range(3):
+                at[i] = p[i] + sign * moves[j, t, i]
+            angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+            s = sign * (0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle)
+            _times(q, s * v[0], s * v[1], s * v[2], math.cos(0.5 * angle), to)
+            if not _into(planes, spheres, cones, at, to):
+                values[j, 1 + t] = -1.0
+                continue
+            values[j, 1 + t] = _sum(
+                near, count, F32((at[0] - centre[0]) * scale), F32((at[1] - centre[1]) * scale),
+                F32((at[2] - centre[2]) * scale), F32(to[0] * kappa), F32(to[1] * kappa), F32(to[2] * kappa),
+                F32(to[3] * kappa), k32,
+            )  # fmt: skip
+
+
+@fast
+def _insert(value, index, best, rows):
+    """Put a value into a descending list that is full, where it belongs."""
+    k = best.shape[0] - 1
+    while k > 0 and best[k - 1] < value:
+        best[k], rows[k] = best[k - 1], rows[k - 1]
+        k -= 1
+    best[k], rows[k] = value, index
+
+
+@fast
+def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, best, rows):
+    """The kernels within ``radius`` with the highest exponents at a pose: ``best`` (C,), descending, and
+    their places among the sorted kernels, ``rows`` (C,); -1e30 and -1 where there are no more.
+    """
+    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
+    buffer = np.empty(_GATHERED, dtype=np.float32)
+    px, py = (position[0] - centre[0]) * scale, (position[1] - centre[1]) * scale
+    pz = (position[2] - centre[2]) * scale
+    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    best[:] = -1e30
+    rows[:] = -1
+    last = best.shape[0] - 1
+    for s in range(table.shape[0]):
+        twin = F32(table[s, isotropic.TWIN])
+        for r in range(isotropic.runs_within(start, table, s, px, py, pz, radius, runs)):
+            begin = runs[r, 0]
+            while begin < runs[r, 1]:
+                stop = min(begin + _GATHERED, runs[r, 1])
+                _exponents(
+                    data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, buffer
+                )
+                for i in range(stop - begin):
+                    if buffer[i] > best[last]:
+                        _insert(buffer[i], begin + i, best, rows)
+                begin = stop
+
+
+@fast
+def nearest_each(data, start, table, centre, scale, positions, quaternions, kappa, radius, best, rows):
+    """Of every pose, the highest exponent (M,) within ``radius`` and whose it is, as `nearest_rows`."""
+    for j in range(positions.shape[0]):
+        nearest_rows(
+            data, start, table, centre, scale, positions[j], quaternions[j], kappa, radius, best[j : j + 1],
+            rows[j : j + 1],
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Have we tried enough: convergence of densities, and what is marginal of them."""

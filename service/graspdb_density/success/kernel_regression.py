@@ -1,0 +1,288 @@
+"""How likely a grasp is to succeed, and how sure that is.
+
+``P = (a m0 + n p) / (a + n)`` with ``p = sum k s / sum k`` over the attempts within reach (s is 1 for a
+success), n the effective number of attempts ``(sum k)^2 / sum k^2``, m0 the share of successes among all
+attempts and a = 1. Kernels count once an attempt whatever its proposal density: a share of attempts needs no
+weighting. The interval is that of the Beta distribution with mean P and n + a trials.
+
+It covers the truth smoothed by the kernel, not the truth at a point: compare with half the widths
+(`smoothing_bias`) to see how much smoothing hides.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import betaincinv
+
+from .. import se3
+from .._compiled import isotropic
+from .._compiled.threads import for_blocks
+from ..kde.cell_list import Cells
+from ..kde.isotropic import TWIN_ROTATION, scaled_radius
+from ..kernels.isotropic import IsotropicKernel
+from ..se3 import Floats
+
+__all__ = ["PRIOR_TRIALS", "SUCCESS_CUTOFF", "SuccessEstimate", "SuccessModel"]
+
+#: Trials the prior share is worth.
+PRIOR_TRIALS = 1.0
+#: An attempt is within reach when position and rotation together are within this many standard deviations.
+SUCCESS_CUTOFF = 5.0
+_QUERY_BLOCK = 256
+_SORTED_FROM = 256
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SuccessEstimate:
+    """Estimates at M poses.
+
+    Attributes
+    ----------
+    probability, low, high : (M,)
+        Success probability and the ends of its interval.
+    effective_trials : (M,)
+        0 where no attempt is within reach; there the probability is the share of successes of all attempts.
+    level : float
+        Probability the interval holds.
+    """
+
+    probability: Floats
+    low: Floats
+    high: Floats
+    effective_trials: Floats
+    level: float
+
+
+class SuccessModel:
+    """Attempts, sorted for evaluation; immutable. Use `build` and `extend`."""
+
+    def __init__(
+        self, kernel: IsotropicKernel, succeeded: Cells | None, failed: Cells | None, counts: tuple[int, int]
+    ) -> None:
+        self._kernel = kernel
+        self._succeeded = succeeded
+        self._failed = failed
+        self._counts = counts
+
+    @classmethod
+    def build(
+        cls,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        success: ArrayLike,
+        *,
+        kernel: IsotropicKernel,
+        symmetric: ArrayLike | bool = True,
+    ) -> SuccessModel:
+        """Sort attempts.
+
+        Parameters
+        ----------
+        positions, quaternions_xyzw : (N, 3), (N, 4)
+            Every attempt, failures included; attempts that broke off for reasons of their own are left out.
+        success : (N,) bool
+        kernel
+        symmetric : bool or (N,)
+            Whether the row's jaw is mirror-symmetric.
+
+        Raises
+        ------
+        ValueError
+            For wrong shapes or values that are not finite.
+        """
+        p, q, won, flags = _attempts(positions, quaternions_xyzw, success, symmetric)
+        parts: list[Cells | None] = []
+        for chosen in (won, ~won):
+            if chosen.any():
+                ones = np.ones(int(chosen.sum()))
+                parts.append(Cells.build(p[chosen], q[chosen], ones, flags[chosen], kernel.sigma_position_m))
+            else:
+                parts.append(None)
+        return cls(kernel, parts[0], parts[1], (int(won.sum()), int((~won).sum())))
+
+    def extend(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        success: ArrayLike,
+        symmetric: ArrayLike | bool = True,
+    ) -> SuccessModel:
+        """A model with further attempts; what is present is not sorted again."""
+        p, q, won, flags = _attempts(positions, quaternions_xyzw, success, symmetric)
+        parts: list[Cells | None] = []
+        for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
+            ones = np.ones(int(chosen.sum()))
+            if not len(ones):
+                parts.append(present)
+            elif present is None:
+                parts.append(
+                    Cells.build(p[chosen], q[chosen], ones, flags[chosen], self._kernel.sigma_position_m)
+                )
+            else:
+                parts.append(present.extend(p[chosen], q[chosen], ones, flags[chosen]))
+        counts = (self._counts[0] + int(won.sum()), self._counts[1] + int((~won).sum()))
+        return SuccessModel(self._kernel, parts[0], parts[1], counts)
+
+    @property
+    def kernel(self) -> IsotropicKernel:
+        return self._kernel
+
+    @property
+    def size(self) -> int:
+        """Attempts."""
+        return sum(self._counts)
+
+    @property
+    def successes(self) -> int:
+        return self._counts[0]
+
+    @property
+    def prior_share(self) -> float:
+        """Share of successes among all attempts, nan without any."""
+        return self._counts[0] / self.size if self.size else math.nan
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays held."""
+        return sum(part.nbytes for part in (self._succeeded, self._failed) if part is not None)
+
+    def evaluate(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        level: float = 0.9,
+        cutoff: float = SUCCESS_CUTOFF,
+        threads: int = 1,
+    ) -> SuccessEstimate:
+        """Success probability with its interval at poses (M, 3), (M, 4).
+
+        Raises
+        ------
+        ValueError
+            Without any attempt, for a level outside (0, 1) or a cut-off outside 2 to 10.
+        """
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"level must be between 0 and 1, not {level!r}")
+        probability, trials, alpha, beta = self._beta(positions, quaternions_xyzw, cutoff, threads)
+        tail = 0.5 * (1.0 - level)
+        low = _quantiles(alpha, beta, tail, threads)
+        high = _quantiles(alpha, beta, 1.0 - tail, threads)
+        return SuccessEstimate(probability, low, high, trials, level)
+
+    def probability(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        cutoff: float = SUCCESS_CUTOFF,
+        threads: int = 1,
+    ) -> Floats:
+        """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""
+        return self._beta(positions, quaternions_xyzw, cutoff, threads)[0]
+
+    def lower_end(
+        self,
+        positions: ArrayLike,
+        quaternions_xyzw: ArrayLike,
+        *,
+        level: float = 0.9,
+        cutoff: float = SUCCESS_CUTOFF,
+        threads: int = 1,
+    ) -> Floats:
+        """The lower end of `evaluate` alone, (M,)."""
+        _, _, alpha, beta = self._beta(positions, quaternions_xyzw, cutoff, threads)
+        return _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
+
+    def _beta(
+        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, cutoff: float, threads: int
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
+        if not self.size:
+            raise ValueError("a success probability needs at least one attempt")
+        p, q = se3.as_poses(positions, quaternions_xyzw)
+        won = self._sums(self._succeeded, p, q, cutoff, threads)
+        lost = self._sums(self._failed, p, q, cutoff, threads)
+        total = won[:, 0] + lost[:, 0]
+        squares = won[:, 1] + lost[:, 1]
+        reached = total > 0.0
+        safe = np.where(reached, total, 1.0)
+        share = np.where(reached, won[:, 0] / safe, 0.0)
+        trials = np.where(reached, safe * (safe / np.where(reached, squares, 1.0)), 0.0)
+        prior = self.prior_share
+        alpha = PRIOR_TRIALS * prior + trials * share
+        beta = PRIOR_TRIALS * (1.0 - prior) + trials * (1.0 - share)
+        probability = alpha / (PRIOR_TRIALS + trials)
+        # Without any success, or any failure, the matching Beta would be a point: the interval then starts
+        # from the share that half a trial more of either would give.
+        if prior in (0.0, 1.0):
+            softened = (self._counts[0] + 0.5) / (self.size + 1.0)
+            alpha, beta = alpha + (softened - prior), beta - (softened - prior)
+        return probability, trials, alpha, beta
+
+    def smoothing_bias(
+        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
+    ) -> Floats:
+        """Probability here less that of a kernel half as wide, (M,): what smoothing moved, noise included."""
+        half = IsotropicKernel(0.5 * self._kernel.sigma_position_m, 0.5 * self._kernel.sigma_rotation)
+        narrow = SuccessModel(
+            half, _rescaled(self._succeeded, 2.0), _rescaled(self._failed, 2.0), self._counts
+        )
+        own = self.evaluate(positions, quaternions_xyzw, threads=threads).probability
+        return np.asarray(
+            own - narrow.evaluate(positions, quaternions_xyzw, threads=threads).probability, dtype=np.float64
+        )
+
+    def _sums(self, cells: Cells | None, p: Floats, q: Floats, cutoff: float, threads: int) -> Floats:
+        """Sums of k and k^2 (M, 2)."""
+        out = np.zeros((len(p), 2))
+        radius = scaled_radius(cutoff)
+        if cells is None or not len(p):
+            return out
+        order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
+        p, q = p[order], q[order]
+        wide = self._kernel.sigma_rotation > TWIN_ROTATION
+
+        def work(begin: int, end: int) -> None:
+            isotropic.square_sums(
+                cells.data, cells.start, cells.table, cells.centre, cells.scale,
+                p[begin:end], q[begin:end], self._kernel.kappa, radius, wide, out[begin:end],
+            )  # fmt: skip
+
+        for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
+        result = np.empty_like(out)
+        result[order] = out
+        return result
+
+
+def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Floats:
+    """Quantiles (M,) of Beta distributions."""
+    out = np.empty(len(alpha))
+
+    def work(begin: int, end: int) -> None:
+        out[begin:end] = betaincinv(alpha[begin:end], beta[begin:end], level)
+
+    for_blocks(work, len(alpha), block=4_096, threads=threads)
+    return out
+
+
+def _attempts(
+    positions: ArrayLike, quaternions_xyzw: ArrayLike, success: ArrayLike, symmetric: ArrayLike | bool
+) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    p, q = se3.as_poses(positions, quaternions_xyzw)
+    won = np.asarray(success)
+    if won.shape != (len(p),) or won.dtype != np.bool_:
+        raise ValueError(f"success must be bools of shape ({len(p)},), not {won.dtype} of shape {won.shape}")
+    flags = np.asarray(symmetric, dtype=bool)
+    if flags.ndim and flags.shape != (len(p),):
+        raise ValueError(f"symmetric is one flag or has shape ({len(p)},), not {flags.shape}")
+    return p, q, won, np.broadcast_to(flags, (len(p),))
+
+
+def _rescaled(cells: Cells | None, factor: float) -> Cells | None:
+    """The same rows for a kernel narrower by ``factor`` in position."""
+    return None if cells is None else cells.rescaled(factor)

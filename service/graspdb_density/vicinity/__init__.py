@@ -1,0 +1,1 @@
+"""How success falls off around a successful grasp."""

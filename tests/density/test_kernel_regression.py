@@ -1,0 +1,133 @@
+"""Success probability: against brute force of its definition, extension, calibration on a known field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import beta
+
+from graspdb_density import IsotropicKernel, SuccessModel, se3
+from graspdb_density.kde import brute_force
+
+Poses = tuple[se3.Floats, se3.Floats]
+Shell = Callable[[int, np.random.Generator], Poses]
+
+KERNELS = [IsotropicKernel(0.015, math.radians(15.0)), IsotropicKernel(0.02, math.radians(30.0))]
+
+
+def by_definition(
+    kernel: IsotropicKernel, rows: Poses, won: NDArray[np.bool_], flags: NDArray[np.bool_], poses: Poses
+) -> tuple[se3.Floats, se3.Floats]:
+    """P and effective trials with every kernel above e^-12.5 of its peak, in float64."""
+    probability, trials = np.empty(len(poses[0])), np.empty(len(poses[0]))
+    twins = se3.jaw_twin(rows[1])
+    for j, (p, q) in enumerate(zip(*poses, strict=True)):
+        own = brute_force.kernel_log_density(kernel, p, q, rows[0], rows[1]) - kernel.log_peak
+        other = brute_force.kernel_log_density(kernel, p, q, rows[0], twins) - kernel.log_peak
+        top = np.where(flags, np.maximum(own, other), own)
+        k = np.where(flags, 0.5 * (np.exp(own) + np.exp(other)), np.exp(own)) * (top >= -12.5)
+        share = won.mean()
+        trials[j] = k.sum() ** 2 / (k @ k) if k.any() else 0.0
+        p_here = (k @ won) / k.sum() if k.any() else 0.0
+        probability[j] = (share + trials[j] * p_here) / (1.0 + trials[j])
+    return probability, trials
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
+@pytest.mark.parametrize("parts", [1, 3])
+def test_equals_its_definition(kernel: IsotropicKernel, parts: int, shell: Shell) -> None:
+    rng = np.random.default_rng(0)
+    rows = shell(4_000, rng)
+    won = rng.random(4_000) < 0.3
+    flags = rng.random(4_000) < 0.8
+    first, *rest = np.array_split(np.arange(4_000), parts)
+    model = SuccessModel.build(
+        rows[0][first], rows[1][first], won[first], kernel=kernel, symmetric=flags[first]
+    )
+    for chunk in rest:
+        model = model.extend(rows[0][chunk], rows[1][chunk], won[chunk], flags[chunk])
+    assert (model.size, model.successes) == (4_000, int(won.sum()))
+    poses = shell(300, rng)
+    poses[0][:20] += 5.0
+    estimate = model.evaluate(*poses, threads=2)
+    probability, trials = by_definition(kernel, rows, won, flags, poses)
+    np.testing.assert_allclose(estimate.effective_trials, trials, rtol=3e-3, atol=1e-6)
+    np.testing.assert_allclose(estimate.probability, probability, atol=1e-3)
+    np.testing.assert_array_equal(estimate.effective_trials[:20], 0.0)
+    np.testing.assert_allclose(estimate.probability[:20], model.prior_share)
+    a, b = probability * (1 + trials), (1 - probability) * (1 + trials)
+    np.testing.assert_allclose(estimate.low, beta.ppf(0.05, a, b), atol=2e-3)
+    np.testing.assert_allclose(estimate.high, beta.ppf(0.95, a, b), atol=2e-3)
+
+
+def test_interval_covers_the_smoothed_truth() -> None:
+    """A smooth field of success; what the interval claims to cover is the field under the same kernel."""
+    rng = np.random.default_rng(1)
+    kernel = KERNELS[0]
+    side = 0.08
+
+    def field(p: se3.Floats, q: se3.Floats) -> se3.Floats:
+        tilt = se3.rotate(q, [0.0, 0.0, 1.0])[:, 2]
+        return np.asarray(0.5 + 0.45 * np.sin(p[:, 0] * 60.0) * tilt, dtype=np.float64)
+
+    covered, count = 0, 0
+    for _ in range(4):
+        rows = rng.uniform(-side, side, (60_000, 3)), se3.random_quaternions(60_000, rng)
+        truth = field(*rows)
+        model = SuccessModel.build(*rows, rng.random(60_000) < truth, kernel=kernel)
+        poses = rng.uniform(-side / 2, side / 2, (150, 3)), se3.random_quaternions(150, rng)
+        # The field smoothed over the attempts: sin is odd in p and the jaw's turn keeps the approach.
+        smoothed = np.empty(150)
+        for j in range(150):
+            dp, dq = kernel.sample_displacements(4_000, rng)
+            smoothed[j] = field(poses[0][j] + dp, se3.multiply(poses[1][j], dq)).mean()
+        estimate = model.evaluate(*poses)
+        covered += int(np.sum((estimate.low <= smoothed) & (smoothed <= estimate.high)))
+        count += 150
+    assert 0.85 <= covered / count <= 0.97
+
+
+def test_without_successes_the_interval_is_not_a_point() -> None:
+    rows = np.zeros((20, 3)), np.tile(se3.IDENTITY, (20, 1))
+    model = SuccessModel.build(*rows, np.zeros(20, dtype=bool), kernel=KERNELS[0])
+    estimate = model.evaluate(rows[0][:1], rows[1][:1])
+    assert estimate.probability[0] == 0.0
+    assert 0.0 < estimate.high[0] < 0.2
+    assert estimate.effective_trials[0] == pytest.approx(20.0, rel=1e-5)
+    sure = SuccessModel.build(*rows, np.ones(20, dtype=bool), kernel=KERNELS[0]).evaluate(
+        rows[0][:1], rows[1][:1]
+    )
+    assert sure.probability[0] == 1.0
+    assert 0.8 < sure.low[0] < 1.0
+
+
+def test_smoothing_bias_shows_at_an_edge() -> None:
+    """Success on one side of a plane: the wide kernel blurs the edge, the half-wide less."""
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(40_000, 3)) * 0.02, se3.random_quaternions(40_000, rng)
+    model = SuccessModel.build(*rows, rows[0][:, 0] > 0.0, kernel=IsotropicKernel(0.015, math.radians(60.0)))
+    inside = np.array([[0.012, 0.0, 0.0]]), se3.IDENTITY[None]
+    bias = model.smoothing_bias(*inside)
+    half = IsotropicKernel(0.0075, math.radians(30.0))
+    direct = SuccessModel.build(*rows, rows[0][:, 0] > 0.0, kernel=half).evaluate(*inside).probability
+    np.testing.assert_allclose(model.evaluate(*inside).probability - bias, direct, atol=1e-5)
+    assert bias[0] < -0.05
+
+
+def test_bad_input_is_refused() -> None:
+    p, q = np.zeros((2, 3)), np.tile(se3.IDENTITY, (2, 1))
+    with pytest.raises(ValueError, match="success must be bools"):
+        SuccessModel.build(p, q, [1.0, 0.0], kernel=KERNELS[0])
+    with pytest.raises(ValueError, match="symmetric"):
+        SuccessModel.build(p, q, [True, False], kernel=KERNELS[0], symmetric=[True])
+    model = SuccessModel.build(p, q, [True, False], kernel=KERNELS[0])
+    with pytest.raises(ValueError, match="level"):
+        model.evaluate(p, q, level=1.0)
+    with pytest.raises(ValueError, match="cutoff"):
+        model.evaluate(p, q, cutoff=1.0)
+    with pytest.raises(ValueError, match="at least one attempt"):
+        SuccessModel.build(p[:0], q[:0], np.zeros(0, dtype=bool), kernel=KERNELS[0]).evaluate(p, q)
