@@ -43,8 +43,8 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectGone
-from graspdb_service.usecases.context import Context
 from graspdb_service.usecases.grippers import seed
+from graspdb_service.usecases.runtime.context import Context
 
 log = logging.getLogger("graspdb")
 

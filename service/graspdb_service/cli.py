@@ -69,7 +69,7 @@ def serve(
 
 def _warm_up(app: Any) -> None:
     """Load what queries need while the server already answers."""
-    from graspdb_service.usecases.warmup import warm_up
+    from graspdb_service.usecases.runtime.warmup import warm_up
 
     threading.Thread(target=warm_up, args=(app.state.context.compute,), daemon=True).start()
 

@@ -36,8 +36,8 @@ from graspdb.wire import BestGraspRequest
 from graspdb_density import shell as shells
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
-from graspdb_service.usecases import bestgrasp
-from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.grasps import question
+from graspdb_service.usecases.runtime.context import Context
 
 Floats = NDArray[np.float64]
 AXES = np.array([0.06, 0.03, 0.03])
@@ -171,7 +171,7 @@ class Asked:
         }
         request = BestGraspRequest(**(asked | more))
         started, busy = time.perf_counter(), time.process_time()
-        bestgrasp.best_grasps(self.context, self.slug, request)
+        question.best_grasps(self.context, self.slug, request)
         return (time.perf_counter() - started) * 1000, (time.process_time() - busy) * 1000
 
     def likelihoods(self, name: str, body: bytes, times: int) -> None:

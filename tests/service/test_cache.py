@@ -18,12 +18,12 @@ from graspdb_density.kde import brute_force
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
-from graspdb_service.usecases import densities as densities_module
-from graspdb_service.usecases.cache import SingleFlightCache
-from graspdb_service.usecases.compute import MAX_QUERIES, Compute
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.densities import Built, KernelChoice
-from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.densities import cache as densities_module
+from graspdb_service.usecases.densities.cache import Built, KernelChoice
+from graspdb_service.usecases.runtime.cache import SingleFlightCache
+from graspdb_service.usecases.runtime.compute import MAX_QUERIES, Compute
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]

@@ -14,11 +14,11 @@ from graspdb_density import se3
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases import convergence_report, reports
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.densities import KernelChoice
-from graspdb_service.usecases.reports import Asked
-from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.densities.cache import KernelChoice
+from graspdb_service.usecases.reports import convergence, registry
+from graspdb_service.usecases.reports.registry import Asked
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -36,7 +36,7 @@ def _grasps(count: int) -> Poses:
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many grasps every curve took over from the one before; with few points, to be quick."""
-    monkeypatch.setattr(convergence_report, "POINTS", 2_000)
+    monkeypatch.setattr(convergence, "POINTS", 2_000)
     found: list[int] = []
     plain = GrowingCurve.grown
 
@@ -65,7 +65,7 @@ def _at_once(url: str, kernel: str | None, options: dict[str, str]) -> dict[str,
     try:
         _, selected = context.densities.current("thing", Filters())
         asked = Asked("convergence", selected.filters, KernelChoice(stored=kernel), options)
-        found = reports.compute(context.reports._sources, "thing", asked, lambda _: None)
+        found = registry.compute(context.reports._sources, "thing", asked, lambda _: None)
     finally:
         context.close()
     return found.model_dump(mode="json")

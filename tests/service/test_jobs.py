@@ -35,8 +35,9 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage import assets, objects, schema
 from graspdb_service.storage import jobs as job_rows
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases import grippers, jobs, sweeps
-from graspdb_service.usecases.context import Context
+from graspdb_service.usecases import grippers
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.simulation import jobs, sweeps
 
 BOX = {"lower": [-0.02, -0.02, -0.05], "upper": [0.02, 0.02, 0.05]}
 GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "margin_m": 0.0}

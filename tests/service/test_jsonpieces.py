@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from graspdb_service.api.jsonpieces import LongArray, loads
+from graspdb_service.formats.json_pieces import LongArray, loads
 
 SCALARS = (
     st.none() | st.booleans() | st.integers(-1000, 1000) | st.floats(allow_nan=False, allow_infinity=False)

@@ -17,8 +17,8 @@ from graspdb_density.bandwidth import mixture_fit
 from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]

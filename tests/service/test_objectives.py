@@ -20,8 +20,9 @@ from graspdb_geometry.grippers import PG70
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
-from graspdb_service.usecases import bestgrasp, searches, success
-from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.densities import success_models
+from graspdb_service.usecases.grasps import question, search
+from graspdb_service.usecases.runtime.context import Context
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -102,8 +103,8 @@ def test_a_sample_of_many_attempts_finds_nearly_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     http = sqlite_http
-    monkeypatch.setattr(success, "_LARGE", 900)
-    monkeypatch.setattr(success, "_SAMPLE", 500)
+    monkeypatch.setattr(success_models, "_LARGE", 900)
+    monkeypatch.setattr(success_models, "_SAMPLE", 500)
     make_object(http)
     (p, q), outcomes = lucky
     model = SuccessModel.build(p, q, np.array(outcomes) == "success", kernel=KERNEL)
@@ -216,7 +217,7 @@ def test_scores_of_chance_come_where_they_cost_little_or_are_asked_for(
     assert all(grasp[name] is not None for name in names)
     (grasp,) = ask(http, include="density,relative")["grasps"]
     assert all(grasp[name] is None for name in names)
-    monkeypatch.setattr(bestgrasp, "FEW_ATTEMPTS", 999)
+    monkeypatch.setattr(question, "FEW_ATTEMPTS", 999)
     (grasp,) = ask(http)["grasps"]
     assert all(grasp[name] is None for name in names)
     for query in ({"include": "success_probability"}, {"objective": "success_probability"}):
@@ -330,7 +331,7 @@ def compare(
             query, region = random_request(rng, scene=seed % 3 == 2)
             tested = scene if query["collision_free"] else None
             try:
-                answer, _ = bestgrasp.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+                answer, _ = question.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
             except ProblemError:
                 assert region.is_empty(), seed
                 continue
@@ -370,7 +371,7 @@ class Field:
         self.scene = scene
         self.model = SuccessModel.build(self.positions, self.quaternions, self.won, kernel=KERNEL)
         self.density = GraspDensity.build(self.positions[self.won], self.quaternions[self.won], kernel=KERNEL)
-        self.near = searches.near_successes(self.density, 2.0, 2)
+        self.near = search.near_successes(self.density, 2.0, 2)
 
     def chance(self, column: str) -> Callable[[Floats, Floats], Floats]:
         def score(p: Floats, q: Floats) -> Floats:
@@ -458,7 +459,7 @@ def compare_scores(
                 query["objective"] = "success_probability"
                 rough = score = field.chance("low")
             try:
-                answer, _ = bestgrasp.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+                answer, _ = question.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
             except ProblemError:
                 assert region.is_empty(), seed
                 continue

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_geometry.collision import Scene, box_part
 from graspdb_geometry.grippers import PG70
-from graspdb_service.usecases.proposals import uncertain
-from graspdb_service.usecases.scenes import CollisionTest
+from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.grasps.proposals import uncertain
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]

@@ -16,9 +16,9 @@ from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, s
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.densities import Built, KernelChoice
-from graspdb_service.usecases.selection import Filters
+from graspdb_service.usecases.densities.cache import Built, KernelChoice
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 Field = Callable[[Floats], NDArray[np.bool_]]

@@ -30,7 +30,8 @@ from graspdb_service.api.routing import (
     scope,
 )
 from graspdb_service.problems import ProblemError
-from graspdb_service.usecases import jobs, meshes
+from graspdb_service.usecases.geometry import meshes
+from graspdb_service.usecases.simulation import jobs
 
 router = APIRouter(tags=["jobs"])
 

@@ -21,7 +21,7 @@ from graspdb_service.api.routing import (
     scope,
     tagged_json,
 )
-from graspdb_service.usecases import kernels
+from graspdb_service.usecases.kernels import stored
 
 router = APIRouter(tags=["kernels"])
 
@@ -41,7 +41,7 @@ def create_kernel(
     With ``components: "auto"`` this may take longer than a request should: then the answer is 202 with the
     run that fits it, whose ``result`` is the kernel.
     """
-    made = kernels.create(ctx, request, key=key, body=body)
+    made = stored.create(ctx, request, key=key, body=body)
     if made.status == 202:
         return JSONResponse(made.body, 202, headers={"Location": made.location, "Retry-After": "2"})
     response.headers["Location"] = made.location
@@ -57,17 +57,17 @@ def list_kernels(
     gripper: Annotated[Slug | None, Query(description="Only those for this gripper.")] = None,
 ) -> Page[StoredKernel]:
     """The kernels, oldest first."""
-    items, after = kernels.page(ctx, after=number_cursor(cursor), limit=limit, object=object, gripper=gripper)
+    items, after = stored.page(ctx, after=number_cursor(cursor), limit=limit, object=object, gripper=gripper)
     return Page(items=items, next=encode_cursor(after))
 
 
 @router.get("/kernels/{id}", response_model=StoredKernel, **scope("read"))
 def get_kernel(ctx: Ctx, id: str, request: Request) -> Response:
     """One kernel: components, widths, and what it was fitted on."""
-    return tagged_json(request, kernels.get(ctx, id))
+    return tagged_json(request, stored.get(ctx, id))
 
 
 @router.delete("/kernels/{id}", status_code=204, **scope("admin"))
 def delete_kernel(ctx: Ctx, id: str) -> None:
     """Delete a kernel; queries that name it are answered 404 from then on."""
-    kernels.remove(ctx, id)
+    stored.remove(ctx, id)

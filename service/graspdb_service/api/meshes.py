@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request, Response
 
 from graspdb.wire import MeshInfo, PartsInfo
 from graspdb_service.api.routing import Ctx, RawBody, media_type, not_modified, scope
-from graspdb_service.usecases import meshes
+from graspdb_service.usecases.geometry import meshes
 
 router = APIRouter(tags=["objects"])
 

@@ -27,7 +27,9 @@ from graspdb.wire import (
 from graspdb.wire.base import Position, Quaternion
 from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn
 from graspdb_service import __version__
-from graspdb_service.api.columns import (
+from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
+from graspdb_service.formats.arrow import ARROW
+from graspdb_service.formats.columns import (
     BINARY,
     accepted,
     columns_arrow,
@@ -36,15 +38,14 @@ from graspdb_service.api.columns import (
     read_object,
     read_poses,
 )
-from graspdb_service.api.jsonpieces import LongArray
-from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
+from graspdb_service.formats.json_pieces import LongArray
+from graspdb_service.formats.trial_json import JSON
 from graspdb_service.problems import ProblemError
-from graspdb_service.usecases import bestgrasp, proposals, queries
-from graspdb_service.usecases.arrow import ARROW
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.selection import Filters
-from graspdb_service.usecases.success import LEVEL
-from graspdb_service.usecases.trial_bodies import JSON
+from graspdb_service.usecases.densities.success_models import LEVEL
+from graspdb_service.usecases.grasps import likelihood, proposals
+from graspdb_service.usecases.grasps import question as bestgrasp
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials.selection import Filters
 
 router = APIRouter(tags=["queries"])
 
@@ -95,7 +96,7 @@ def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQ
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
-    info, object_id = queries.density_info(ctx, id, query)
+    info, object_id = likelihood.density_info(ctx, id, query)
     return _json(info, _tag(object_id, info.revision, query))
 
 
@@ -111,7 +112,7 @@ def get_likelihood(
     positions, quaternions = read_poses(
         {"position": [list(query.position)], "quaternion_xyzw": [list(query.quaternion_xyzw)]}
     )
-    answer = queries.likelihood(ctx, id, query, positions, quaternions, query.include)
+    answer = likelihood.likelihood(ctx, id, query, positions, quaternions, query.include)
     return _likelihoods(answer, {"ETag": _tag(answer.object_id, answer.revision, query)})
 
 
@@ -137,7 +138,7 @@ def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
         poses = content.pop("poses", None)
         options = _validated(LikelihoodOptions, content)
         positions, quaternions = read_poses(poses)
-    answer = queries.likelihood(ctx, id, options, positions, quaternions, options.include)
+    answer = likelihood.likelihood(ctx, id, options, positions, quaternions, options.include)
     return _likelihoods(answer, {"Vary": "Accept"}, arrow=kind == ARROW)
 
 
@@ -169,7 +170,7 @@ def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
 @router.post("/objects/{id}/samples", response_model=Samples, **scope("read"))
 def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
     """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
-    drawn = queries.draw(ctx, id, query, query.count, query.seed)
+    drawn = likelihood.draw(ctx, id, query, query.count, query.seed)
     return _drawn(drawn, {})
 
 
@@ -187,7 +188,7 @@ def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
     return _drawn(drawn, {"strategy": query.strategy, "criterion": criterion})
 
 
-def _drawn(drawn: queries.Draw, more: dict[str, Any]) -> Response:
+def _drawn(drawn: likelihood.Draw, more: dict[str, Any]) -> Response:
     return columns_json(
         {"revision": drawn.revision, "kernel": drawn.kernel.model_dump(), "seed": drawn.seed, **more},
         {
@@ -199,7 +200,7 @@ def _drawn(drawn: queries.Draw, more: dict[str, Any]) -> Response:
 
 
 def _likelihoods(
-    answer: queries.LikelihoodAnswer, headers: dict[str, str] | None = None, *, arrow: bool = False
+    answer: likelihood.LikelihoodAnswer, headers: dict[str, str] | None = None, *, arrow: bool = False
 ) -> Response:
     columns: dict[str, Any] = {
         name: getattr(answer, name)

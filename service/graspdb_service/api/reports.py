@@ -36,8 +36,8 @@ from graspdb_service.api.queries import SelectionQuery
 from graspdb_service.api.routing import Ctx, etag, not_modified, scope
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.report_runs import RunRow
-from graspdb_service.usecases import report_runs, summary_report
-from graspdb_service.usecases.context import Context
+from graspdb_service.usecases.reports import runs, summary
+from graspdb_service.usecases.runtime.context import Context
 
 router = APIRouter(tags=["reports"])
 
@@ -245,7 +245,7 @@ def get_sources(ctx: Ctx, id: str, request: Request, query: Annotated[SourcesQue
 def get_summary(ctx: Ctx, request: Request) -> Response:
     """What was tried on every object, by outcome, with the success rate by each way of counting (table I)."""
     wanted = _format(request)
-    found = summary_report.summary(ctx.database)
+    found = summary.summary(ctx.database)
     content = found.model_dump_json().encode()
     tag = etag(hashlib.sha256(content).hexdigest()[:24], wanted, __version__)
     headers = {"ETag": tag, "Vary": "Accept"}
@@ -259,13 +259,13 @@ def get_summary(ctx: Ctx, request: Request) -> Response:
 @router.get("/report-runs/{id}", **scope("read"))
 def get_run(ctx: Ctx, id: str) -> ReportRun:
     """A report's computation: state, progress, and the report once it is done."""
-    return report_runs.model(ctx.reports.get(id))
+    return runs.model(ctx.reports.get(id))
 
 
 @router.post("/report-runs/{id}/cancel", **scope("read"))
 def cancel_run(ctx: Ctx, id: str) -> ReportRun:
     """Stop computing; a run that has ended stays as it is."""
-    return report_runs.model(ctx.reports.cancel(id))
+    return runs.model(ctx.reports.cancel(id))
 
 
 def _answer(
@@ -280,7 +280,7 @@ def _answer(
     run = ctx.reports.report(slug, report, query, options)
     if run.state == "running":
         return Response(
-            report_runs.model(run).model_dump_json(),
+            runs.model(run).model_dump_json(),
             status_code=202,
             media_type="application/json",
             headers={"Location": f"/report-runs/{run.id}", "Retry-After": "2"},

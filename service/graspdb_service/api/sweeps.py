@@ -10,7 +10,6 @@ from fastapi.responses import StreamingResponse
 
 from graspdb.wire import OUTCOMES, Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.sweeps import SweepState
-from graspdb_service.api.columns import BINARY, accepted, columns_json
 from graspdb_service.api.jobs import parse
 from graspdb_service.api.routing import (
     Ctx,
@@ -22,9 +21,10 @@ from graspdb_service.api.routing import (
     name_cursor,
     scope,
 )
-from graspdb_service.usecases import sweeps
-from graspdb_service.usecases.arrow import ARROW
-from graspdb_service.usecases.trial_bodies import JSON
+from graspdb_service.formats.arrow import ARROW
+from graspdb_service.formats.columns import BINARY, accepted, columns_json
+from graspdb_service.formats.trial_json import JSON
+from graspdb_service.usecases.simulation import sweeps
 
 router = APIRouter(tags=["sweeps"])
 

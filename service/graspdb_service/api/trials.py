@@ -10,7 +10,6 @@ from fastapi.responses import StreamingResponse
 
 from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, TrialIn, TrialOut, TrialsIn
 from graspdb.wire.trials import TrialColumnsIn
-from graspdb_service.api.columns import BINARY, accepted
 from graspdb_service.api.routing import (
     Ctx,
     Cursor,
@@ -25,9 +24,11 @@ from graspdb_service.api.routing import (
     scope,
     tagged_json,
 )
-from graspdb_service.usecases import batches, objects, trials
-from graspdb_service.usecases.arrow import ARROW
-from graspdb_service.usecases.trial_bodies import JSON, NDJSON
+from graspdb_service.formats.arrow import ARROW
+from graspdb_service.formats.columns import BINARY, accepted
+from graspdb_service.formats.trial_json import JSON, NDJSON
+from graspdb_service.usecases import objects
+from graspdb_service.usecases.trials import batches, posting
 
 router = APIRouter(tags=["trials"])
 
@@ -48,7 +49,7 @@ def add_trials(
     ctx: Ctx, id: str, request: Request, response: Response, body: RawBody, key: IdempotencyKey
 ) -> object:
     """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all."""
-    made = trials.add(ctx, id, body=body, media=media_type(request), key=key)
+    made = posting.add(ctx, id, body=body, media=media_type(request), key=key)
     response.headers["Location"] = made.location
     return made.body
 
@@ -79,7 +80,7 @@ def list_trials(
 ) -> Response:
     """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) or an Arrow
     stream (`Accept: application/vnd.apache.arrow.stream`) all of them."""
-    chosen = trials.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
+    chosen = posting.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
     kind = accepted(request, JSON, NDJSON, ARROW)
     after = number_cursor(cursor)
     row, _ = objects.get(ctx, id)
@@ -89,14 +90,14 @@ def list_trials(
         return fresh
     headers = {"ETag": tag, "Vary": "Accept"}
     if kind == NDJSON and limit is None:
-        lines = trials.stream(ctx, id, chosen, after=after)
+        lines = posting.stream(ctx, id, chosen, after=after)
         return StreamingResponse(lines, media_type=NDJSON, headers=headers)
     if kind == ARROW and limit is None:
-        stream = trials.stream_arrow(ctx, id, chosen, after=after)
+        stream = posting.stream_arrow(ctx, id, chosen, after=after)
         return StreamingResponse(stream, media_type=ARROW, headers=headers)
-    items, last = trials.page(ctx, id, chosen, after=after, limit=limit or 100)
+    items, last = posting.page(ctx, id, chosen, after=after, limit=limit or 100)
     if kind == ARROW:
-        body = trials.page_arrow(items, encode_cursor(last))
+        body = posting.page_arrow(items, encode_cursor(last))
     elif kind == NDJSON:
         body = b"".join(orjson.dumps(item, option=orjson.OPT_APPEND_NEWLINE) for item in items)
     else:

@@ -8,10 +8,10 @@ from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.idempotency import Created, replay_or
-from graspdb_service.usecases.scenes import shape_of
-from graspdb_service.usecases.slugs import is_slug
+from graspdb_service.usecases.geometry.collision import shape_of
+from graspdb_service.usecases.identifiers import is_slug
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.runtime.idempotency import Created, replay_or
 
 
 def seed(database: Database) -> None:

@@ -9,9 +9,9 @@ from graspdb_service.problems import conflict, not_found
 from graspdb_service.storage import assets, objects, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.usecases.context import Context
-from graspdb_service.usecases.idempotency import Created, replay_or
-from graspdb_service.usecases.slugs import is_slug
+from graspdb_service.usecases.identifiers import is_slug
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.runtime.idempotency import Created, replay_or
 
 
 def create(ctx: Context, request: ObjectCreate, *, key: str | None, body: bytes) -> Created:

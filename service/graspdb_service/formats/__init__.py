@@ -1,0 +1,1 @@
+"""Bodies in and out: JSON, NDJSON, columns, Arrow IPC."""

@@ -1,0 +1,369 @@
+"""Densities made of trials: built from all of them, or extended by those that came since.
+
+Weights (eq 1). A success that a grid tried has the weight 1 / g of all the selection's grids seen as one
+strategy (`proposal_density`); where nothing else is selected, that is the balance
+heuristic ``1 / sum n_k g_k``. Other strategies can't be evaluated at poses that they did not draw: theirs
+have ``1 / g_own``. Who tells no proposal density takes the mean weight of the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import KernelInfo, WeightsInfo
+from graspdb_density import (
+    DEFAULT_KERNEL,
+    GraspDensity,
+    IsotropicKernel,
+    MixtureDensity,
+    SampledKernel,
+    choose_widths,
+    importance_weights,
+    widths_prefix,
+)
+from graspdb_density.bandwidth.selection import FIRST_CHOICE
+from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
+from graspdb_density.success.axis_bandwidth import Widths
+from graspdb_service.problems import ProblemError
+from graspdb_service.storage import trials
+from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.densities.proposal_density import Exposure
+from graspdb_service.usecases.geometry.features import Axes
+from graspdb_service.usecases.kernels import load
+from graspdb_service.usecases.trials.selection import Selected
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Poses = tuple[Floats, Floats, Bools]
+"""Positions (n, 3), quaternions (n, 4), and whether the jaw is symmetric (n,)."""
+
+_DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
+_DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
+#: Weights are told apart in float32: a row that counts less than this share of the heaviest gets this share.
+_LEAST_SHARE = 1e-30
+#: Weights that differ by less count as the same.
+_SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class KernelChoice:
+    """The kernel a request asks for; all None: isotropic, widths by the default rule.
+
+    ``stored`` is a stored kernel's id, or ``anisotropic`` for the newest of the object and gripper.
+    """
+
+    sigma_position_m: float | None = None
+    sigma_rotation_deg: float | None = None
+    stored: str | None = None
+
+    @property
+    def by_default(self) -> bool:
+        return self.sigma_position_m is None and self.sigma_rotation_deg is None and self.stored is None
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A density and what it was built of, immutable.
+
+    Attributes
+    ----------
+    density
+        None where no trial of the selection succeeded. With a stored kernel the density under the isotropic
+        one of equal determinants.
+    shaped, sampled
+        The density under the stored kernel, where one was asked for: of Gaussians, or of sampled components.
+    seq
+        (N,) sequence numbers of its rows, ascending.
+    proposal_density
+        (N,) as they came with the trials, NaN where unknown.
+    swept
+        (N,) whether a grid tried it.
+    chosen_from
+        How many of the first rows the widths were chosen from.
+    predicting
+        Widths (6) that success probabilities are estimated with, where a kernel for those was asked for.
+    """
+
+    revision: int
+    epoch: int
+    last_seq: int
+    object_row: ObjectRow
+    selected: Selected
+    exposure: Exposure
+    kernel: KernelInfo
+    density: GraspDensity | None
+    seq: NDArray[np.int64]
+    proposal_density: Floats
+    swept: Bools
+    chosen_from: int = 0
+    shaped: MixtureDensity | None = None
+    sampled: GraspDensity | None = None
+    predicting: Widths | None = None
+
+    @property
+    def asked(self) -> GraspDensity | MixtureDensity | None:
+        """The density under the kernel that was asked for."""
+        return self.shaped or self.sampled or self.density
+
+    @property
+    def nbytes(self) -> int:
+        own = self.seq.nbytes + self.proposal_density.nbytes + self.swept.nbytes
+        held = sum(part.nbytes for part in (self.density, self.shaped, self.sampled) if part is not None)
+        return own + held + 4_096
+
+    @property
+    def weights_info(self) -> WeightsInfo:
+        """By which rule its rows were weighted."""
+        own = ~self.swept & ~np.isnan(self.proposal_density)
+        unknown = int((~self.swept & np.isnan(self.proposal_density)).sum())
+        grids = len(self.exposure.lattices) if self.swept.any() else 0
+        mixed = bool(self.swept.any()) and self.exposure.several
+        kind = "equal"
+        rule = "all equal: nothing tells that some grasps were tried more densely than others"
+        if grids:
+            rule = "all equal: their grid tried every pose of its region once"
+        if mixed:
+            kind = "mixture"
+            rule = (
+                "1 / sum n_k g_k(x) over the grids, n_k the distinct poses tried and g_k uniform over the"
+                " grid's region"
+            )
+        if own.any():
+            kind = "mixture-and-own" if self.swept.any() else "own"
+            rule = "1 / g of each trial's own proposal density"
+            if self.swept.any():
+                rule += "; grids as one strategy, g = sum n_k g_k(x) / sum n_k, n_k the distinct poses tried"
+        if unknown and kind != "equal":
+            rule += "; trials without a proposal density take the mean weight of the rest"
+        return WeightsInfo(
+            kind=kind,
+            rule=rule,
+            poses_tried=self.exposure.tried if grids else None,
+            without_proposal_density=unknown,
+        )
+
+
+def build(
+    choice: KernelChoice,
+    stored: KernelRow | None,
+    axes: Axes,
+    row: ObjectRow,
+    selected: Selected,
+    exposure: Exposure,
+    rows: trials.Columns,
+    before: Built | None,
+    threads: int,
+) -> Built:
+    """The density of the rows there were and those that came since; ``axes`` are those of a stored kernel.
+
+    Raises
+    ------
+    ProblemError
+        413 for more components than a density may have.
+    """
+    assert rows.batch is not None
+    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
+    fresh = rows.position, rows.quaternion_xyzw, symmetric
+    seq, proposal = rows.seq, rows.proposal_density
+    swept = np.isin(rows.batch, sorted(exposure.batches))
+    old = None if before is None else before.density
+    if before is not None and old is not None:
+        seq = np.concatenate([before.seq, seq])
+        proposal = np.concatenate([before.proposal_density, proposal])
+        swept = np.concatenate([before.swept, swept])
+    # A kernel that predicts success shapes no density: that one is as if none was asked for.
+    predicting = stored is not None and stored.kind == "probability"
+    built = Built(
+        revision=row.revision,
+        epoch=row.epoch,
+        last_seq=row.last_seq,
+        object_row=row,
+        selected=selected,
+        exposure=exposure,
+        kernel=_info(choice) if stored is None else load.info_of(stored, _info(KernelChoice())),
+        density=None,
+        seq=seq,
+        proposal_density=proposal,
+        swept=swept,
+        chosen_from=widths_prefix(len(seq)) if choice.by_default or predicting else 0,
+        predicting=load.widths_of(stored, axes) if stored is not None and predicting else None,
+    )
+    if not len(seq):
+        return built
+
+    def everything() -> Poses:
+        if old is None:
+            return fresh
+        of_old = old.positions, old.quaternions_xyzw, old.symmetric
+        position, quaternion, flags = (np.concatenate(pair) for pair in zip(of_old, fresh, strict=True))
+        return position, quaternion, flags
+
+    weights = _weights(built, everything)
+    added = None if old is None else _in_units_of(old, weights, len(rows))
+    if stored is not None and not predicting:
+        return _shaped(stored, axes, built, before, everything, fresh, weights, added)
+    if before is not None and before.chosen_from == built.chosen_from:
+        built = replace(built, kernel=before.kernel)
+        if old is not None and added is not None:
+            return replace(built, density=old.extend(*fresh[:2], weights=added, symmetric=symmetric))
+    elif built.chosen_from:
+        chosen = _choose(everything(), proposal, built.chosen_from, threads)
+        built = replace(built, kernel=chosen if stored is None else load.info_of(stored, chosen))
+    return replace(built, density=_isotropic(built.kernel, everything(), weights))
+
+
+def _isotropic(kernel: KernelInfo, poses: Poses, weights: Floats | None) -> GraspDensity:
+    position, quaternion, symmetric = poses
+    return GraspDensity.build(
+        position,
+        quaternion,
+        kernel=IsotropicKernel(kernel.sigma_position_m, math.radians(kernel.sigma_rotation_deg)),
+        weights=weights,
+        symmetric=symmetric,
+    )
+
+
+def _shaped(
+    stored: KernelRow,
+    axes: Axes,
+    built: Built,
+    before: Built | None,
+    everything: Callable[[], Poses],
+    fresh: Poses,
+    weights: Floats | None,
+    added: Floats | None,
+) -> Built:
+    """The density under a stored kernel."""
+    if stored.kind == "sampled":
+        kernel = load.load_sampled(stored)
+        position, quaternion, symmetric = everything()
+        _check_components(kernel, len(position), len(position) + int(symmetric.sum()))
+        old = None if before is None else before.density
+        if before is not None and old is not None and before.sampled is not None and added is not None:
+            alike = old.extend(*fresh[:2], weights=added, symmetric=fresh[2])
+            return replace(built, density=alike, sampled=_placed(before.sampled, kernel, fresh, added))
+        return replace(
+            built,
+            density=_isotropic(built.kernel, (position, quaternion, symmetric), weights),
+            sampled=kernel.placed(position, quaternion, weights=weights, symmetric=symmetric),
+        )
+    if before is not None and before.shaped is not None and added is not None:
+        frames = load.axes_at(axes, *fresh[:2])
+        shaped = before.shaped.extend(*fresh[:2], weights=added, symmetric=fresh[2], frames=frames)
+    else:
+        position, quaternion, symmetric = everything()
+        shaped = MixtureDensity(
+            position,
+            quaternion,
+            kernel=load.load(stored),
+            weights=weights,
+            symmetric=symmetric,
+            frames=load.axes_at(axes, position, quaternion),
+        )
+    return replace(built, density=shaped.isotropic, shaped=shaped)
+
+
+def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Poses, added: Floats) -> GraspDensity:
+    """The density of a sampled kernel's components with those of further grasps."""
+    if not len(added):
+        return old
+    more = kernel.placed(*fresh[:2], weights=added, symmetric=fresh[2])
+    total = float(added.sum())
+    return old.extend(
+        more.positions, more.quaternions_xyzw, weights=more.weights * total, symmetric=more.symmetric
+    )
+
+
+def _check_components(kernel: SampledKernel, rows: int, placed: int) -> None:
+    """413 for more components than a density may have; ``placed`` counts the turns of symmetric jaws, too."""
+    many = kernel.size * placed
+    if many <= MOST_COMPONENTS:
+        return
+    fit = MOST_COMPONENTS // placed
+    raise ProblemError(
+        413,
+        "too-many-components",
+        f"{rows:,} successes under a kernel of {kernel.size:,} components, at both turns of a symmetric jaw,"
+        f" are {many:,} components; a density may have {MOST_COMPONENTS:,}. Fit a kernel of kind anisotropic,"
+        ' a mixture of a few that follows the same statistics (POST /kernels {"kind": "anisotropic"})'
+        + (f", take at most {fit:,} components" if fit else "")
+        + ", or select fewer trials (gripper, protocol, source)",
+        errors=[("kernel", f"at most {fit:,} components for {rows:,} successes")],
+        extra={"limit": MOST_COMPONENTS},
+    )
+
+
+# -- weights -----------------------------------------------------------------------------------------------
+
+
+def _weights(built: Built, everything: Callable[[], Poses]) -> Floats | None:
+    """Weights (N,) of eq 1, their mean 1, no row lost to rounding; None where all are equal."""
+    g, swept = built.proposal_density, built.swept
+    if swept.any():
+        positions = everything()[0] if built.exposure.several else None
+        g = g.copy()
+        g[swept] = built.exposure.uniform if positions is None else built.exposure.density(positions[swept])
+    known = g[~np.isnan(g)]
+    if not len(known) or (known == known[0]).all():
+        return None
+    weights = importance_weights(g)
+    weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
+    return np.asarray(weights / weights.mean(), dtype=np.float64)
+
+
+def _in_units_of(old: GraspDensity, weights: Floats | None, count: int) -> Floats | None:
+    """Weights (count,) of rows after those of a density, in its unit; None where those of its own changed.
+
+    Every density is built with weights of mean 1, so its raw ones are in the unit that it is extended in.
+    """
+    raw = old.raw_weights
+    if weights is None:
+        return None if np.ptp(raw) > _SAME * raw[0] else np.full(count, raw[0])
+    factor = raw / weights[: len(raw)]
+    if np.ptp(factor) > _SAME * factor[0]:
+        return None
+    added = weights[len(raw) :] * factor[0]
+    return added if np.isfinite(added).all() and (added > 0.0).all() else None
+
+
+def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelInfo:
+    """Widths chosen from the first rows.
+
+    By their own proposal densities: how much else was tried since must not change what they choose.
+    """
+    first = slice(0, count)
+    weights = None
+    if not np.isnan(proposal[first]).all():
+        weights = importance_weights(proposal[first])
+        weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
+    position, quaternion, symmetric = (column[first] for column in poses)
+    found = choose_widths(position, quaternion, weights=weights, symmetric=symmetric, threads=threads)
+    return KernelInfo(
+        kind="isotropic",
+        sigma_position_m=found.kernel.sigma_position_m,
+        sigma_rotation_deg=math.degrees(found.kernel.sigma_rotation),
+        rule=f"default: {found.rule} likelihood of the first {found.rows} successes",
+    )
+
+
+def _info(choice: KernelChoice) -> KernelInfo:
+    position, rotation = choice.sigma_position_m, choice.sigma_rotation_deg
+    default = f"{_DEFAULT_POSITION_M * 1000:g} mm and {_DEFAULT_ROTATION_DEG:g} degrees"
+    if choice.by_default:
+        rule = f"default: {default} until there are {FIRST_CHOICE} successes"
+    elif position is None or rotation is None:
+        rule = f"as asked; the width not named by default ({default})"
+    else:
+        rule = "as asked"
+    return KernelInfo(
+        kind="isotropic",
+        sigma_position_m=_DEFAULT_POSITION_M if position is None else position,
+        sigma_rotation_deg=_DEFAULT_ROTATION_DEG if rotation is None else rotation,
+        rule=rule,
+    )

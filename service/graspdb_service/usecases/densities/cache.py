@@ -1,0 +1,242 @@
+"""Densities built on demand and kept: extended when trials come, rebuilt when the past changes."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graspdb.wire import KernelSpec, Selection
+from graspdb_density.kde.isotropic import CUTOFF
+from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
+from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.storage import kernels, objects, trials
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.densities import build, proposal_density
+from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.geometry.features import Features
+from graspdb_service.usecases.identifiers import is_slug
+from graspdb_service.usecases.kernels import load
+from graspdb_service.usecases.runtime.cache import SingleFlightCache
+from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.trials.selection import Filters, Selected, resolve
+
+__all__ = ["Built", "Densities", "KernelChoice", "kernel_of", "require_object"]
+
+#: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
+_LARGEST_CUTOFF = 10.0
+_RESOLVED = 4_096
+
+
+def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
+    """The kernel and the cut-off (None: exact) that a request asks for.
+
+    Raises
+    ------
+    ProblemError
+        422 for widths given twice, or beside a stored kernel.
+    """
+    choice, cutoff = _choice(request)
+    for name, value, (low, high) in (
+        ("sigma_position_m", choice.sigma_position_m, POSITION_LIMITS_M),
+        ("sigma_rotation_deg", choice.sigma_rotation_deg, np.degrees(ROTATION_LIMITS)),
+    ):
+        if value is not None and not low <= value <= high:
+            raise invalid(name, f"a width must be between {low:g} and {high:g}")
+    return choice, cutoff
+
+
+def _choice(request: Selection) -> tuple[KernelChoice, float | None]:
+    beside = KernelChoice(request.sigma_position_m, request.sigma_rotation_deg)
+    kernel = request.kernel
+    if isinstance(kernel, KernelSpec):
+        inside = KernelChoice(kernel.sigma_position_m, kernel.sigma_rotation_deg)
+        twice = [
+            name
+            for name in ("sigma_position_m", "sigma_rotation_deg")
+            if getattr(inside, name) is not None and getattr(beside, name) is not None
+        ]
+        if twice:
+            raise ProblemError(
+                422,
+                "invalid-request",
+                "A width is given both in kernel and beside it",
+                errors=[(name, "give it once, in kernel or beside it") for name in twice],
+            )
+        choice = KernelChoice(
+            inside.sigma_position_m if beside.sigma_position_m is None else beside.sigma_position_m,
+            inside.sigma_rotation_deg if beside.sigma_rotation_deg is None else beside.sigma_rotation_deg,
+        )
+        if "cutoff" not in kernel.model_fields_set:
+            return choice, CUTOFF
+        exact = kernel.cutoff is None or kernel.cutoff > _LARGEST_CUTOFF
+        return choice, None if exact else kernel.cutoff
+    if kernel in (None, "isotropic"):
+        return beside, CUTOFF
+    given = [name for name in ("sigma_position_m", "sigma_rotation_deg") if getattr(beside, name) is not None]
+    if given:
+        raise ProblemError(
+            422,
+            "invalid-request",
+            "A stored kernel has its own widths",
+            errors=[(name, "only the isotropic kernel takes widths") for name in given],
+        )
+    return KernelChoice(stored=kernel), CUTOFF
+
+
+@dataclass(frozen=True)
+class _Key:
+    object_id: int
+    filters: Filters
+    kernel: KernelChoice
+
+
+class Densities:
+    """The densities of one service process, over a database that others may share.
+
+    Every query reads the object's revision, one indexed row. Trials that came since are read as a tail and
+    extend the density; any other change (a new epoch) rebuilds it. So what another process committed is in
+    the next answer of this one. Nothing is computed inside a transaction.
+    """
+
+    def __init__(self, database: Database, compute: Compute, features: Features, max_bytes: int) -> None:
+        self._database = database
+        self._compute = compute
+        self._features = features
+        self._cache: SingleFlightCache[_Key, Built] = SingleFlightCache(max_bytes, lambda b: b.nbytes)
+        self._resolved: OrderedDict[tuple[int, Filters], tuple[int, Selected]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def current(self, slug: str, filters: Filters) -> tuple[ObjectRow, Selected]:
+        """The object as it is now, and which of its trials the filters select.
+
+        Raises
+        ------
+        ProblemError
+            404 for the object or gripper, 409 for an ambiguous selection.
+        """
+        with self._database.read() as tx:
+            row = require_object(tx, slug)
+            with self._lock:
+                known = self._resolved.get((row.id, filters))
+            if known is not None and known[0] == row.revision:
+                return row, known[1]
+            selected = resolve(tx, row.id, filters)
+        with self._lock:
+            self._resolved[row.id, filters] = row.revision, selected
+            self._resolved.move_to_end((row.id, filters))
+            while len(self._resolved) > _RESOLVED:
+                self._resolved.popitem(last=False)
+        return row, selected
+
+    def get(self, slug: str, filters: Filters, kernel: KernelChoice) -> Built:
+        """The density at least as new as the object is now.
+
+        Raises
+        ------
+        ProblemError
+            As :meth:`current`.
+        """
+        row, selected = self.current(slug, filters)
+        stored = None
+        if kernel.stored is not None:
+            stored = self.stored(row, selected, kernel.stored)
+            kernel = KernelChoice(stored=stored.id)
+        key = _Key(row.id, selected.filters, kernel)
+        return self._cache.get(
+            key,
+            lambda built: built.revision >= row.revision,
+            lambda before: self._refresh(key, slug, before, stored),
+        )
+
+    def stored(self, row: ObjectRow, selected: Selected, name: str) -> KernelRow:
+        """The stored kernel with this id, or the newest of the object and gripper for ``anisotropic``.
+
+        Raises
+        ------
+        ProblemError
+            404 without such a kernel; 409 where none was fitted, or for another gripper's.
+        """
+        with self._database.read() as tx:
+            if name == "anisotropic":
+                newest = kernels.newest(tx, row.id, selected.gripper)
+                found = None if newest is None else kernels.find(tx, newest)
+            else:
+                found = kernels.find(tx, name)
+            others = [] if found else kernels.page(tx, after=0, limit=20, object_id=row.id, gripper=None)
+        names = ["isotropic", *(kernel.id for kernel in others)]
+        if found is None and name == "anisotropic":
+            gripper = f', "gripper": "{selected.gripper}"' if selected.gripper else ""
+            raise conflict(
+                "kernel-not-fitted",
+                "No anisotropic kernel has been fitted for this object and gripper: fit one with"
+                f' POST /kernels {{"object": "{row.slug}"{gripper}}}; kernels there are: {", ".join(names)}',
+                kernels=names,
+            )
+        if found is None:
+            raise not_found("kernel", name, f"kernels there are: {', '.join(names)} (GET /kernels)")
+        if found.gripper not in (None, selected.gripper) and selected.gripper is not None:
+            raise conflict(
+                "kernel-of-another-gripper",
+                f"Kernel {found.id} was fitted for the gripper {found.gripper!r}, these trials are of"
+                f" {selected.gripper!r}: fit one for it with POST /kernels",
+            )
+        return found
+
+    @property
+    def nbytes(self) -> int:
+        return self._cache.nbytes
+
+    def __len__(self) -> int:
+        return len(self._cache)
+
+    def _refresh(self, key: _Key, slug: str, before: Built | None, stored: KernelRow | None) -> Built:
+        with self._database.read() as tx:
+            row = require_object(tx, slug, key.object_id)
+            selected = resolve(tx, row.id, key.filters)
+            if before is not None and before.epoch != row.epoch:
+                before = None
+            exposure = proposal_density.read(tx, row.id, selected)
+            rows = trials.read(
+                tx,
+                row.id,
+                provenance_ids=list(selected.provenances),
+                successes_only=True,
+                after_seq=0 if before is None else before.last_seq,
+                batches=True,
+            )
+        # Failures of one grid change no weight, those of several do.
+        if before is not None and not len(rows) and (exposure == before.exposure or not exposure.several):
+            return replace(
+                before,
+                revision=row.revision,
+                last_seq=row.last_seq,
+                object_row=row,
+                selected=selected,
+                exposure=exposure,
+            )
+        threads = self._compute.threads
+        axes = None if stored is None else load.axes(stored.alignment, row, selected, self._features)
+        return self._compute.run(
+            lambda: build.build(key.kernel, stored, axes, row, selected, exposure, rows, before, threads)
+        )
+
+
+def require_object(tx: Tx, slug: str, object_id: int | None = None) -> ObjectRow:
+    """The object with this slug, and with this internal id where one is given.
+
+    Raises
+    ------
+    ProblemError
+        404 without such an object, 409 where it is another one by now.
+    """
+    row = objects.find(tx, slug) if is_slug(slug) else None
+    if row is None:
+        raise not_found("object", slug[:80], "GET /objects lists those there are")
+    if object_id is not None and row.id != object_id:
+        raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
+    return row

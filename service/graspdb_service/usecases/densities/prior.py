@@ -1,0 +1,160 @@
+"""Where an object can be grasped as far as its shape tells: a density before any success.
+
+Its rows are grasps that close on pairs of surfaces and edges (:mod:`graspdb_geometry.jawpairs`) and on
+opposed points of the surface (:mod:`graspdb_geometry.antipodal`), half of either, at every angle about the
+closing axis; those at which the open gripper collides, or closes on nothing, are left out. A kernel about
+every row makes it a density over R^3 x SO(3) like any other: it integrates to 1, both twins of a symmetric
+jaw, and what is drawn from it may be weighted by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graspdb.wire import KernelInfo
+from graspdb_density import GraspDensity, IsotropicKernel
+from graspdb_geometry.jawpairs import JawPairs
+from graspdb_service.problems import ProblemError, conflict
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.densities.build import KernelChoice
+from graspdb_service.usecases.geometry.collision import CollisionTest, Scenes
+from graspdb_service.usecases.runtime.cache import SingleFlightCache
+from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.trials.selection import Selected
+
+__all__ = ["Prior", "Priors"]
+
+_POSITION_M, _ROTATION_DEG = 0.01, 15.0
+#: Grasps looked at; more where too few of them are free, as on an object that hardly fits the jaw.
+_LOOKED_AT, _MOST, _ENOUGH = 16_384, 131_072, 1_024
+_MAX_BYTES = 128 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The density, and its kernel in words."""
+
+    density: GraspDensity
+    kernel: KernelInfo
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """None where every grasp on a pair collides."""
+
+    density: GraspDensity | None
+    pairs: int
+
+    @property
+    def nbytes(self) -> int:
+        return 4_096 + (0 if self.density is None else self.density.nbytes)
+
+
+@dataclass(frozen=True)
+class _Key:
+    mesh: str | None
+    unit: str
+    parts: str | None
+    profile: str
+    kernel: IsotropicKernel
+
+
+class Priors:
+    """The priors of one service process, by the content of geometry and gripper."""
+
+    def __init__(self, compute: Compute, scenes: Scenes) -> None:
+        self._compute = compute
+        self._scenes = scenes
+        self._cache: SingleFlightCache[_Key, _Made] = SingleFlightCache(_MAX_BYTES, lambda m: m.nbytes)
+
+    def get(self, row: ObjectRow, selected: Selected, choice: KernelChoice) -> Prior:
+        """The prior of an object for a gripper.
+
+        Parameters
+        ----------
+        choice
+            Widths, where they are not to be 10 mm and 15 degrees; the isotropic kernel's only.
+
+        Raises
+        ------
+        ProblemError
+            409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no gripper is named,
+            ``no-surface-pairs`` where the jaw finds nothing to close on, ``edges-unreachable`` where it can't
+            come near.
+        """
+        metres = _POSITION_M if choice.sigma_position_m is None else choice.sigma_position_m
+        degrees = _ROTATION_DEG if choice.sigma_rotation_deg is None else choice.sigma_rotation_deg
+        kernel = IsotropicKernel(metres, math.radians(degrees))
+        opposed = self._scenes.features.opposed(row, selected)
+        test = self._scenes.require(row, selected)
+        assert selected.profile is not None
+        if not opposed:
+            raise conflict(
+                "no-surface-pairs",
+                f"No two surfaces of object {row.slug!r} are opposed within"
+                f" {1e3 * selected.profile.max_opening_m:.0f} mm, as far as the jaw opens: name a wider"
+                " gripper",
+            )
+        key = _Key(
+            row.mesh_sha256,
+            "" if row.mesh_info is None else str(row.mesh_info["unit"]),
+            row.parts_sha256,
+            selected.profile.model_dump_json(),
+            kernel,
+        )
+        symmetric = selected.jaw_symmetric
+
+        def make(_: _Made | None) -> _Made:
+            threads = self._compute.threads
+            density = self._compute.run(lambda: density_on(opposed, test, kernel, symmetric, threads=threads))
+            return _Made(density, sum(len(pairs) for pairs in opposed))
+
+        made = self._cache.get(key, lambda _: True, make)
+        if made.density is None:
+            raise conflict(
+                "edges-unreachable",
+                f"The open gripper collides wherever it could close on two surfaces or edges of {row.slug!r}:"
+                " name another gripper, or sweep a grid",
+            )
+        rule = f"about {made.density.size:,} grasps on {made.pairs:,} pairs of surfaces, edges and points"
+        info = KernelInfo(
+            kind="isotropic", sigma_position_m=metres, sigma_rotation_deg=degrees, rule=f"edges: {rule}"
+        )
+        return Prior(made.density, info)
+
+    def known(self, row: ObjectRow, selected: Selected, choice: KernelChoice) -> Prior | None:
+        """As :meth:`get`, None where there is none or it can't be known."""
+        try:
+            return self.get(row, selected, choice)
+        except ProblemError as problem:
+            if problem.status != 409:
+                raise
+            return None
+
+
+def density_on(
+    opposed: Sequence[JawPairs],
+    test: CollisionTest,
+    kernel: IsotropicKernel,
+    symmetric: bool,
+    *,
+    threads: int = 1,
+) -> GraspDensity | None:
+    """The density of grasps on pairs that the open gripper can take and hold something at, each kind of pairs
+    alike; None without any.
+    """
+    count = _LOOKED_AT
+    while True:
+        found = [pairs.grasps(count // len(opposed)) for pairs in opposed]
+        p, q, weights = (np.concatenate(column) for column in zip(*found, strict=True))
+        held = test.holds(p, q, threads=threads)
+        if held.sum() >= _ENOUGH or count >= _MOST:
+            break
+        count = _MOST
+    if not held.any():
+        return None
+    return GraspDensity.build(p[held], q[held], kernel=kernel, weights=weights[held], symmetric=symmetric)

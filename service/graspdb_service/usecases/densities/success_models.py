@@ -1,0 +1,231 @@
+"""How likely a grasp is to succeed: models of all attempts, kept and extended like the densities.
+
+Every attempt counts, packed ones of sweeps included; ``simulation_error`` is none, and every other outcome
+but ``success`` is a failure. Where the geometry is known, a pose at which the open gripper collides has the
+probability 0 and attempts that collided tell nothing of the others; where it is not, they are failures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb_density import IsotropicKernel, SuccessModel
+from graspdb_density.success.axis_bandwidth import ShapedSuccessModel, Widths
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.usecases.densities.cache import Built, require_object
+from graspdb_service.usecases.runtime.cache import SingleFlightCache
+from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.trials import attempts
+from graspdb_service.usecases.trials.attempts import AllTrials, Stored
+from graspdb_service.usecases.trials.selection import Filters, Selected, resolve
+
+Floats = NDArray[np.float64]
+
+LEVEL = 0.9
+#: Attempts of the random sample that searches feel their way by where a model has far more of them.
+_SAMPLE, _LARGE = 100_000, 400_000
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Columns (n,); NaN where nothing is known."""
+
+    probability: Floats
+    low: Floats
+    high: Floats
+    effective_trials: Floats
+
+    @classmethod
+    def unknown(cls, count: int) -> Estimates:
+        """Before any attempt."""
+        nothing = np.full(count, np.nan)
+        return cls(nothing, nothing.copy(), nothing.copy(), np.zeros(count))
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempts:
+    """A model as of a revision, and the repeat key of every sweep in it; ``sample`` of a large one."""
+
+    revision: int
+    epoch: int
+    last_seq: int
+    tried: frozenset[int]
+    sweeps: Mapping[str, str]
+    model: SuccessModel | None
+    sample: SuccessModel | None
+
+    @property
+    def nbytes(self) -> int:
+        return 4_096 + sum(part.nbytes for part in (self.model, self.sample) if part is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """All attempts, and the ones to search by: a random sample where all would take too long."""
+
+    whole: SuccessModel
+    quick: SuccessModel
+
+
+@dataclass(frozen=True)
+class _Key:
+    object_id: int
+    filters: Filters
+    sigma_position_m: float
+    sigma_rotation_deg: float
+    collisions_known: bool
+    widths: Widths | None
+
+
+class Successes:
+    """The success models of one service process; as fresh and as bounded as the densities."""
+
+    def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
+        self._database = database
+        self._compute = compute
+        self._cache: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
+
+    def model(self, slug: str, built: Built, *, collisions_known: bool) -> Model | None:
+        """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
+
+        Parameters
+        ----------
+        collisions_known
+            Whether geometry and gripper are known: then attempts that collided are left out.
+        """
+        key = _Key(
+            built.object_row.id,
+            built.selected.filters,
+            built.kernel.sigma_position_m,
+            built.kernel.sigma_rotation_deg,
+            collisions_known,
+            built.predicting,
+        )
+        found = self._cache.get(
+            key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
+        )
+        if found.model is None or not found.model.size:
+            return None
+        return Model(found.model, found.sample or found.model)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all models kept."""
+        return self._cache.nbytes
+
+    def estimate(
+        self, slug: str, built: Built, positions: Floats, quaternions: Floats, free: NDArray[np.bool_] | None
+    ) -> Estimates:
+        """Success probability of poses (n, 3), (n, 4) under the kernel of a density.
+
+        Parameters
+        ----------
+        free : (n,) bool or None
+            Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
+        """
+        model = self.model(slug, built, collisions_known=free is not None)
+        return self.under(model, positions, quaternions, free)
+
+    def under(
+        self,
+        model: Model | None,
+        positions: Floats,
+        quaternions: Floats,
+        free: NDArray[np.bool_] | None,
+    ) -> Estimates:
+        """As :meth:`estimate`, under a model from :meth:`model`."""
+        estimates = Estimates.unknown(len(positions))
+        if model is not None:
+
+            def work(part: slice) -> None:
+                answer = model.whole.evaluate(
+                    positions[part], quaternions[part], level=LEVEL, threads=self._compute.threads
+                )
+                estimates.probability[part] = answer.probability
+                estimates.low[part], estimates.high[part] = answer.low, answer.high
+                estimates.effective_trials[part] = answer.effective_trials
+
+            self._compute.blocks(len(positions), 16_384, work)
+        if free is not None:
+            for column in (estimates.probability, estimates.low, estimates.high):
+                column[~free] = 0.0
+        return estimates
+
+    def _refresh(self, key: _Key, slug: str, before: _Attempts | None) -> _Attempts:
+        without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]
+        with self._database.read() as tx:
+            row = require_object(tx, slug, key.object_id)
+            selected = resolve(tx, row.id, key.filters)
+            # A source whose first failure has come counts from now on with all it has posted.
+            if before is not None and (before.epoch != row.epoch or before.tried != selected.tried):
+                before = None
+            stored = _fetch(tx, row.id, selected, without, before)
+            names = {**({} if before is None else before.sweeps), **stored.repeat_keys}
+            if before is not None and len(set(names.values())) < len(names):
+                # Two sweeps of one grid share poses, which count once: looked at together.
+                before = None
+                stored = _fetch(tx, row.id, selected, without, None)
+        kernel = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
+        old, sample = (None, None) if before is None else (before.model, before.sample)
+        new = self._compute.run(lambda: _Columns.of(attempts.joined(stored)))
+        size = len(new.success) + (0 if old is None else old.size)
+        if old is not None and sample is None and size > _LARGE:
+            # It has outgrown being searched itself: a sample needs what came before, too.
+            return self._refresh(key, slug, None)
+        model = self._compute.run(lambda: _extended(old, new, kernel, key.widths))
+        if size > _LARGE:
+            share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
+            chosen = np.random.default_rng(row.revision).random(len(new.success)) < share
+            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel, key.widths))
+        return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
+
+
+def _fetch(
+    tx: Tx, object_id: int, selected: Selected, without: Sequence[int], before: _Attempts | None
+) -> Stored:
+    return attempts.fetch(
+        tx,
+        object_id,
+        selected,
+        without=without,
+        after_seq=0 if before is None else before.last_seq,
+        after_revision=0 if before is None else before.revision,
+    )
+
+
+def _extended(
+    old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel, widths: Widths | None
+) -> SuccessModel | None:
+    if not len(new.success):
+        return old
+    columns = new.position, new.quaternion, new.success
+    if old is not None:
+        return old.extend(*columns, symmetric=new.symmetric)
+    if widths is not None:
+        return ShapedSuccessModel.under(widths, *columns, symmetric=new.symmetric)
+    return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Attempts (n,): pose, whether it succeeded, whether its jaw is symmetric."""
+
+    position: Floats
+    quaternion: Floats
+    success: NDArray[np.bool_]
+    symmetric: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, found: AllTrials) -> _Columns:
+        """What a model of success needs of them."""
+        return cls(found.position, found.quaternion, found.success, found.symmetric)
+
+    def take(self, chosen: NDArray[np.bool_]) -> _Columns:
+        return _Columns(
+            self.position[chosen], self.quaternion[chosen], self.success[chosen], self.symmetric[chosen]
+        )

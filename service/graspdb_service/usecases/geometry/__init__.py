@@ -1,0 +1,1 @@
+"""What the object's mesh says: collisions, edges, pairs of surfaces."""

@@ -1,0 +1,290 @@
+"""Meshes and convex parts: checked in a bounded child process, stored by their SHA-256."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from graspdb.wire import BoundingBox, MeshInfo, PartsInfo
+from graspdb_geometry import meshes
+from graspdb_geometry.deviation import deviation
+from graspdb_geometry.meshes import Inspection, Mesh, MeshError, Part
+from graspdb_service.problems import ProblemError, conflict, not_found
+from graspdb_service.storage import assets, objects, trials
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.simulation import decompositions
+
+GLB = "model/gltf-binary"
+MEDIA_TYPES = meshes.MEDIA_TYPES
+
+# Parts come from the mesh, rounded or slightly inflated: within this they describe the same object.
+_FIT_M = 1e-3
+_FIT_SHARE = 0.02
+# Surfaces farther apart than this are worth a warning: a decomposition is always a little off.
+_NEAR_SHARE = 0.01
+
+
+def put_mesh(ctx: Context, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
+    """Check and store an object's mesh; a convex one becomes its own convex part.
+
+    Raises
+    ------
+    ProblemError
+        413, 415 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
+    """
+    sha256 = hashlib.sha256(content).hexdigest()
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        if _is_stored(row, sha256, media, unit):
+            return MeshInfo.model_validate(row.mesh_info)
+        _refuse_another_mesh(tx, row)
+    inspection = _inspect(ctx, content, media, unit)
+    info = _mesh_info(inspection, sha256, media, unit, len(content))
+    own = None
+    if inspection.properties.convex:
+        parts: list[Part] = [(inspection.mesh.vertices, inspection.mesh.faces)]
+        own = (meshes.parts_to_glb(parts), parts)
+    with ctx.database.write() as tx:
+        row = require(tx, slug, lock=True)
+        if _is_stored(row, sha256, media, unit):
+            return MeshInfo.model_validate(row.mesh_info)
+        _refuse_another_mesh(tx, row)
+        objects.advance(tx, row.id, append=False)
+        assets.put(tx, content, media)
+        values: dict[str, Any] = {"mesh_sha256": sha256, "mesh_info": info.model_dump(mode="json")}
+        if own is not None:
+            values |= _parts_values(tx, own[0], _parts_info(own[0], own[1], info))
+        elif row.mesh_sha256 is not None:
+            # The parts were those of the mesh before.
+            values |= {"parts_sha256": None, "parts_info": None}
+        objects.change(tx, row.id, values)
+    _drop_unused(ctx, row)
+    return info
+
+
+def put_parts(ctx: Context, slug: str, content: bytes, *, media: str) -> PartsInfo:
+    """Check and store an object's convex parts, a GLB in metres with one geometry a part.
+
+    Raises
+    ------
+    ProblemError
+        413, 415 and 422 for what can't be used; 409 for other parts once a sweep exists.
+    """
+    if media != GLB:
+        raise _unsupported((GLB,), media)
+    sha256 = hashlib.sha256(content).hexdigest()
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        if row.parts_sha256 == sha256:
+            return PartsInfo.model_validate(row.parts_info)
+        _refuse_other_parts(tx, row)
+    info = check_parts(ctx, row, content)
+    with ctx.database.write() as tx:
+        locked = require(tx, slug, lock=True)
+        if locked.parts_sha256 == sha256:
+            return PartsInfo.model_validate(locked.parts_info)
+        if (locked.id, locked.mesh_sha256, locked.mesh_info) != (row.id, row.mesh_sha256, row.mesh_info):
+            raise conflict(
+                "object-changed", f"The mesh of {slug!r} was changed at the same moment: try again"
+            )
+        _refuse_other_parts(tx, locked)
+        objects.advance(tx, locked.id, append=False)
+        store_parts(tx, locked, content, info)
+    _drop_unused(ctx, locked)
+    return info
+
+
+def check_parts(ctx: Context, row: ObjectRow, content: bytes) -> PartsInfo:
+    """Check convex parts, wherever they come from, and measure them against their object's mesh.
+
+    Raises
+    ------
+    ProblemError
+        413 and 422 for what can't be used.
+    """
+    # The child's limits first: what passed them is safe to read here.
+    _inspect(ctx, content, GLB, "m", field="parts")
+    try:
+        parts = meshes.parts_from_glb(content)
+    except MeshError as error:
+        raise _refused(error) from None
+    mesh = None if row.mesh_info is None else MeshInfo.model_validate(row.mesh_info)
+    info = _parts_info(content, parts, mesh)
+    if mesh is None:
+        return info
+    with ctx.database.read() as tx:
+        found = assets.get(tx, mesh.sha256)
+    if found is None:
+        raise conflict(
+            "object-changed", f"The mesh of {row.slug!r} was changed at the same moment: try again"
+        )
+    own = meshes.load(found[0], mesh.media_type, mesh.unit)
+    apart = ctx.compute.run(lambda: deviation(own, parts)).largest_m
+    longest = max(np.subtract(mesh.bounding_box.upper, mesh.bounding_box.lower))
+    warnings = list(info.warnings)
+    if not warnings and apart > _FIT_M + _NEAR_SHARE * longest:
+        share = (
+            ""
+            if mesh.volume_m3 is None
+            else f", their volume is {info.volume_m3 / mesh.volume_m3:.1%} of its"
+        )
+        warnings.append(f"the parts' surface is up to {1000 * apart:.3g} mm off the mesh's{share}")
+    return info.model_copy(update={"deviation_m": apart, "warnings": warnings})
+
+
+def store_parts(tx: Tx, row: ObjectRow, content: bytes, info: PartsInfo) -> None:
+    """Keep checked parts, for the sweeps that waited for them too; under the object's lock, its revision
+    advanced."""
+    values = _parts_values(tx, content, info)
+    objects.change(tx, row.id, values)
+    decompositions.settle(tx, replace(row, **values))
+
+
+def get_mesh(ctx: Context, slug: str) -> tuple[bytes, str, str]:
+    """The mesh as it came: bytes, media type, SHA-256."""
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        found = None if row.mesh_sha256 is None else assets.get(tx, row.mesh_sha256)
+    if found is None or row.mesh_info is None or row.mesh_sha256 is None:
+        raise not_found("mesh of object", slug, f"PUT /objects/{slug}/mesh stores one")
+    # By the object, for the same bytes may have come for another one under another media type.
+    return found[0], str(row.mesh_info["media_type"]), row.mesh_sha256
+
+
+def get_parts(ctx: Context, slug: str) -> tuple[bytes, str, str]:
+    """The convex parts: GLB bytes, media type, SHA-256."""
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        found = None if row.parts_sha256 is None else assets.get(tx, row.parts_sha256)
+    if found is None or row.parts_sha256 is None:
+        raise not_found("set of convex parts of object", slug, f"PUT /objects/{slug}/convex-parts stores it")
+    return found[0], GLB, row.parts_sha256
+
+
+def _inspect(ctx: Context, content: bytes, media: str, unit: str, *, field: str = "mesh") -> Inspection:
+    if media not in MEDIA_TYPES:
+        raise _unsupported(MEDIA_TYPES, media)
+    limit = ctx.settings.max_mesh_bytes
+    if len(content) > limit:
+        raise ProblemError(
+            413,
+            "body-too-large",
+            f"A mesh may have {limit:,} bytes and this one has {len(content):,}: simplify it first",
+            extra={"limit": limit},
+        )
+    try:
+        # Each child may take the memory limit, so few run at once.
+        with ctx.mesh_children:
+            return meshes.inspect_in_child(
+                content,
+                media,
+                unit,
+                memory_bytes=ctx.settings.max_mesh_memory_bytes,
+                seconds=ctx.settings.max_mesh_seconds,
+            )
+    except MeshError as error:
+        if error.field == "mesh":
+            error.field = field
+        raise _refused(error) from None
+
+
+def _unsupported(allowed: tuple[str, ...], media: str) -> ProblemError:
+    return ProblemError(
+        415,
+        "unsupported-media-type",
+        f"Send {' or '.join(allowed)} and say which by Content-Type",
+        detail=f"Content-Type was {media or 'missing'}",
+    )
+
+
+def _refused(error: MeshError) -> ProblemError:
+    return ProblemError(
+        422, "mesh-not-usable", f"Not usable: {error.message}", errors=[(error.field, error.message)]
+    )
+
+
+def _is_stored(row: ObjectRow, sha256: str, media: str, unit: str) -> bool:
+    info = row.mesh_info
+    return (
+        row.mesh_sha256 == sha256 and info is not None and (info["media_type"], info["unit"]) == (media, unit)
+    )
+
+
+def _refuse_another_mesh(tx: Tx, row: ObjectRow) -> None:
+    if row.mesh_sha256 is None:
+        return
+    if objects.has_sweeps(tx, row.id) or any(trials.outcome_counts(tx, [row.id])[row.id].values()):
+        raise conflict(
+            "mesh-in-use",
+            f"{row.slug!r} has trials or sweeps made with its mesh: register another object for another mesh",
+        )
+
+
+def _refuse_other_parts(tx: Tx, row: ObjectRow) -> None:
+    if row.parts_sha256 is not None and objects.has_sweeps(tx, row.id):
+        raise conflict(
+            "convex-parts-in-use",
+            f"{row.slug!r} has sweeps simulated with its convex parts: register another object for others",
+        )
+
+
+def _mesh_info(inspection: Inspection, sha256: str, media: str, unit: str, size: int) -> MeshInfo:
+    measured = inspection.properties
+    return MeshInfo.model_validate(
+        {
+            "sha256": sha256,
+            "media_type": media,
+            "unit": unit,
+            "bytes": size,
+            "vertices": len(inspection.mesh.vertices),
+            "faces": len(inspection.mesh.faces),
+            "bounding_box": {"lower": measured.lower, "upper": measured.upper},
+            "volume_m3": measured.volume_m3,
+            "watertight": measured.watertight,
+            "convex": measured.convex,
+            "centre_of_mass": measured.centre_of_mass,
+            "inertia_m5": measured.inertia,
+            "warnings": measured.warnings,
+        }
+    )
+
+
+def _parts_info(content: bytes, parts: list[Part], mesh: MeshInfo | None) -> PartsInfo:
+    measured = [meshes.properties(Mesh(vertices, faces)) for vertices, faces in parts]
+    lower = np.min([part.lower for part in measured], axis=0)
+    upper = np.max([part.upper for part in measured], axis=0)
+    warnings = []
+    if mesh is not None:
+        box = mesh.bounding_box
+        extent = np.subtract(box.upper, box.lower)
+        off = np.maximum(np.abs(lower - box.lower), np.abs(upper - box.upper))
+        if np.any(off > _FIT_M + _FIT_SHARE * extent):
+            warnings.append(
+                f"the parts' bounding box is up to {float(off.max()):.3g} m off the mesh's:"
+                " are they of this mesh, and in metres?"
+            )
+    return PartsInfo(
+        sha256=hashlib.sha256(content).hexdigest(),
+        parts=len(parts),
+        volume_m3=sum(part.volume_m3 or 0.0 for part in measured),
+        bounding_box=BoundingBox.model_validate({"lower": lower.tolist(), "upper": upper.tolist()}),
+        warnings=warnings,
+    )
+
+
+def _parts_values(tx: Tx, content: bytes, info: PartsInfo) -> dict[str, Any]:
+    assets.put(tx, content, GLB)
+    return {"parts_sha256": info.sha256, "parts_info": info.model_dump(mode="json")}
+
+
+def _drop_unused(ctx: Context, before: ObjectRow) -> None:
+    old = {sha256 for sha256 in (before.mesh_sha256, before.parts_sha256) if sha256}
+    if old:
+        with ctx.database.write() as tx:
+            assets.drop_unused(tx, old)

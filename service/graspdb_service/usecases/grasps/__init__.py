@@ -1,0 +1,1 @@
+"""Questions about grasps: the best, how likely, which to try."""

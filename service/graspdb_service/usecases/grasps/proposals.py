@@ -1,0 +1,160 @@
+"""Which grasps to try next, drawn so that their successes can be weighted.
+
+Every strategy draws from a density that integrates to 1 over R^3 x SO(3), both twins of a symmetric jaw, and
+tells it at each draw: sent back with the trial, it undoes the choice (eq 1).
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import ProposalsRequest
+from graspdb.wire.queries import Strategy
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
+from graspdb_density.success.kernel_regression import PRIOR_TRIALS
+from graspdb_service.problems import conflict, invalid
+from graspdb_service.usecases.densities.cache import kernel_of
+from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.grasps import likelihood
+from graspdb_service.usecases.grasps.likelihood import Draw
+from graspdb_service.usecases.grasps.search import near_successes
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials.selection import Filters
+
+Floats = NDArray[np.float64]
+
+#: Poses whose uncertainty is asked for.
+_PLACES = 2_048
+#: They are drawn from the density of successes with a kernel this much wider, to reach its fringes, ...
+_WIDER = 2.0
+#: ... and kept within so many standard deviations of a success: beyond, nothing tells how little is known.
+_REACH = 3.0
+#: Width of the kernels drawn from, as a share of the density's own.
+_NARROWER = 0.5
+
+CRITERIA: dict[Strategy, str] = {
+    "density": "draws from the density of successes",
+    "uncertainty": (
+        "where one more trial is expected to lower the posterior variance of the success probability most,"
+        " P (1 - P) / (n + 2)^2 for n effective trials, times the density of successes under a kernel twice"
+        " as wide; poses that collide are left out"
+    ),
+    "edges": (
+        "about grasps that close on opposed surfaces, edges or points, at any angle about the closing axis,"
+        " without those at which the open gripper collides; the draws themselves are not tested, and some"
+        " collide"
+    ),
+}
+
+
+def propose(ctx: Context, slug: str, request: ProposalsRequest) -> tuple[Draw, str]:
+    """Poses to try next, and how they were chosen; the same revision, request and seed give the same ones.
+
+    Raises
+    ------
+    ProblemError
+        409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.likelihood.draw`.
+    """
+    if request.strategy == "density":
+        return likelihood.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]
+    if request.strategy == "edges":
+        return _from_edges(ctx, slug, request), CRITERIA["edges"]
+    likelihood.check_count(ctx, request.count)
+    seed = secrets.randbits(63) if request.seed is None else request.seed
+    with ctx.compute.admitted():
+        built = likelihood.built_for(ctx, slug, request)
+        density = built.density
+        if density is None:
+            raise likelihood.no_successes(slug)
+        test = ctx.scenes.test(built.object_row, built.selected)
+        model = ctx.successes.model(slug, built, collisions_known=test is not None)
+        if model is None:
+            raise conflict(
+                "no-attempts",
+                "Only successes are known, so nothing tells where a trial would teach most:"
+                " post failures, too, or use strategy=density",
+            )
+        quick, threads = model.quick, ctx.compute.threads
+        proposal = ctx.compute.run(lambda: uncertain(density, quick, test, threads=threads))
+        if proposal is None:
+            raise conflict(
+                "nothing-uncertain",
+                "Every pose near the successes collides or is known: use strategy=density, or sweep a grid",
+            )
+        chosen = proposal
+        position, quaternion = ctx.compute.run(
+            lambda: chosen.sample(request.count, np.random.default_rng(seed))
+        )
+        densities = likelihood.density_at(ctx, proposal, position, quaternion)
+    draw = Draw(
+        object_id=built.object_row.id,
+        revision=built.revision,
+        kernel=built.kernel,
+        seed=seed,
+        position=position,
+        quaternion_xyzw=se3.canonical(quaternion),
+        proposal_density=densities,
+    )
+    return draw, CRITERIA["uncertainty"]
+
+
+def _from_edges(ctx: Context, slug: str, request: ProposalsRequest) -> Draw:
+    """Draws from the prior: no trial is needed, nor does any change it."""
+    likelihood.check_count(ctx, request.count)
+    choice, _ = kernel_of(request)
+    if choice.stored is not None:
+        raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
+    seed = secrets.randbits(63) if request.seed is None else request.seed
+    with ctx.compute.admitted():
+        row, selected = ctx.densities.current(slug, Filters.of(request))
+        prior = ctx.priors.get(row, selected, choice)
+        position, quaternion = ctx.compute.run(
+            lambda: prior.density.sample(request.count, np.random.default_rng(seed))
+        )
+        densities = likelihood.density_at(ctx, prior.density, position, quaternion)
+    return Draw(
+        object_id=row.id,
+        revision=row.revision,
+        kernel=prior.kernel,
+        seed=seed,
+        position=position,
+        quaternion_xyzw=se3.canonical(quaternion),
+        proposal_density=densities,
+    )
+
+
+def uncertain(
+    density: GraspDensity, model: SuccessModel, test: CollisionTest | None, *, threads: int = 1
+) -> GraspDensity | None:
+    """A density to draw trials from that teach most; None where nothing is left to learn.
+
+    The success probability P at a pose is that of a Beta distribution worth nu = a + n trials, whose variance
+    P (1 - P) / (nu + 1) one more trial is expected to lower by the share 1 / (nu + 1).
+    """
+    kernel = density.kernel
+    rng = np.random.default_rng(0)
+    extra = math.sqrt(_WIDER**2 - 1.0)
+    p, q = density.sample(_PLACES, rng)
+    p = p + rng.standard_normal(p.shape) * extra * kernel.sigma_position_m
+    turns = se3.from_rotation_vector(rng.standard_normal(p.shape) * extra * kernel.sigma_rotation)
+    q = se3.multiply(q, turns)
+    kept = near_successes(density, _REACH, threads)(p, q)
+    if test is not None:
+        kept &= test.free(p, q, threads=threads)
+    p, q = p[kept], q[kept]
+    if not len(p):
+        return None
+    found = model.evaluate(p, q, threads=threads)
+    trials = PRIOR_TRIALS + found.effective_trials
+    gain = found.probability * (1.0 - found.probability) / (trials + 1.0) ** 2
+    # Weights are told apart in float32.
+    taught = gain > 1e-6 * gain.max(initial=0.0)
+    if not taught.any():
+        return None
+    narrow = IsotropicKernel(_NARROWER * kernel.sigma_position_m, _NARROWER * kernel.sigma_rotation)
+    symmetric = bool(density.symmetric.all())
+    return GraspDensity.build(p[taught], q[taught], kernel=narrow, weights=gain[taught], symmetric=symmetric)

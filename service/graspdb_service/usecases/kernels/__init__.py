@@ -1,0 +1,1 @@
+"""Kernels fitted on trials or given, stored and loaded."""

@@ -1,0 +1,107 @@
+"""Kernels that predict success: a width an axis, the gripper's or the object's, chosen on all attempts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance, KernelWidths
+from graspdb_density import AnisotropicKernel
+from graspdb_density.success.axis_bandwidth import fit_widths
+from graspdb_service.problems import conflict, invalid
+from graspdb_service.usecases.kernels import load
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials import attempts
+from graspdb_service.usecases.trials.selection import Filters
+
+#: A correlation beyond this is one.
+_CORRELATED = 1e-9
+
+
+def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
+    """Widths chosen by held-out log loss, as :func:`graspdb_service.storage.kernels.create` takes them.
+
+    Attempts that collided are left out where collisions are tested, as they are when success is predicted.
+
+    Raises
+    ------
+    ProblemError
+        404 for the object, 409 for too few successes or failures, or attempts all in one place.
+    """
+    assert request.object is not None
+    filters = Filters(request.gripper, request.protocol, request.source)
+    with ctx.compute.admitted():
+        row, selected = ctx.densities.current(request.object, filters)
+        # Said first: without axes no number of trials helps.
+        axes = load.axes(request.alignment, row, selected, ctx.scenes.features)
+        assert not callable(axes)
+        everything = attempts.read(ctx.database, row, selected)
+        tested = ctx.scenes.test(row, selected) is not None
+        kept = ~everything.collided if tested else np.ones(len(everything), dtype=bool)
+        try:
+            fit = ctx.compute.run(
+                lambda: fit_widths(
+                    everything.position[kept],
+                    everything.quaternion[kept],
+                    everything.success[kept],
+                    axes=axes,
+                    symmetric=everything.symmetric[kept],
+                )
+            )
+        except ValueError as error:
+            text = str(error)
+            raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
+    provenance = KernelProvenance(
+        origin="fitted",
+        object=row.slug,
+        revision=row.revision,
+        protocol=selected.protocol,
+        source=selected.source,
+        attempts=fit.attempts,
+        judged=fit.judged,
+        log_loss=fit.log_loss,
+        isotropic_log_loss=fit.isotropic_log_loss,
+        brier_skill=fit.skill if math.isfinite(fit.skill) else None,
+        isotropic_brier_skill=fit.isotropic_skill if math.isfinite(fit.isotropic_skill) else None,
+        isotropic_widths=KernelWidths(
+            sigma_position_m=fit.isotropic.sigma_position_m,
+            sigma_rotation_deg=min(40.0, math.degrees(fit.isotropic.sigma_rotation)),
+        ),
+    )
+    component = KernelComponent(covariance=np.diag(fit.widths**2).tolist())
+    return {
+        "kind": request.kind,
+        "alignment": request.alignment,
+        "gripper": selected.gripper,
+        "object_id": row.id,
+        "components": [component.model_dump(mode="json")],
+        "provenance": provenance.model_dump(mode="json", exclude_none=True),
+    }
+
+
+def checked(request: KernelCreate) -> list[dict[str, Any]]:
+    """The one component of a kernel that is given.
+
+    Raises
+    ------
+    ProblemError
+        422 for more than one, one off the centre, or correlations.
+    """
+    assert isinstance(request.components, list)
+    if len(request.components) != 1:
+        raise invalid("components", "a kernel that predicts success has one component")
+    item = request.components[0]
+    if item.covariance is None or any(item.mean):
+        raise invalid("components.0", "it has a covariance and no mean")
+    given = np.array(item.covariance)
+    spread = np.sqrt(np.maximum(np.diag(given), 0.0))
+    if np.any(np.abs(given - np.diag(np.diag(given))) > _CORRELATED * np.outer(spread, spread)):
+        raise invalid("components.0.covariance", "one width an axis: entries off the diagonal are zero")
+    try:
+        kernel = AnisotropicKernel.gaussian(given)
+    except ValueError as error:
+        raise invalid("components.0.covariance", str(error)) from None
+    component = KernelComponent(covariance=kernel.covariances[0].tolist())
+    return [component.model_dump(mode="json")]

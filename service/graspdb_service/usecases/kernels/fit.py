@@ -1,0 +1,232 @@
+"""Kernels fitted on an object's trials: within the request, or as runs where that takes longer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from graspdb.wire.kernels import (
+    MAX_FITTED,
+    MAX_SAMPLED,
+    SAMPLED,
+    KernelComponent,
+    KernelCreate,
+    KernelProvenance,
+    KernelWidths,
+    KernelWindow,
+    StoredKernel,
+)
+from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
+from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacements, fit_kernel
+from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_service.problems import conflict, invalid
+from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice
+from graspdb_service.usecases.geometry.features import Axes, Features
+from graspdb_service.usecases.kernels import load
+from graspdb_service.usecases.trials.selection import Filters
+
+Fitted = tuple[list[dict[str, Any]], dict[str, Any]]
+"""A kernel's components, and what is told of the fit."""
+
+#: Displacements that stand for all of them where a sample is compared with them.
+_WHOLE = 20_000
+
+
+def check(request: KernelCreate) -> None:
+    """422 where a request asks for a fit that there is none of."""
+    sampled, count = request.kind == "sampled", request.components
+    assert not isinstance(count, list)
+    if sampled and count == "auto":
+        raise invalid(
+            "components", f"how many displacements to draw: 1 to {MAX_SAMPLED}, {SAMPLED} by default"
+        )
+    if not sampled and isinstance(count, int) and count > MAX_FITTED:
+        raise invalid(
+            "components", f"at most {MAX_FITTED} Gaussians, or auto; kind sampled takes {MAX_SAMPLED}"
+        )
+    if request.alignment != "gripper" and count not in (None, 1, "auto"):
+        raise invalid(
+            "components",
+            "axes that do not turn with the jaw have no sign: a kernel aligned with them has 1",
+        )
+
+
+def filters_of(request: KernelCreate) -> Filters:
+    """Which trials a kernel is fitted on."""
+    return Filters(request.gripper, request.protocol, request.source)
+
+
+def fitted(
+    densities: Densities,
+    features: Features,
+    request: KernelCreate,
+    *,
+    threads: int,
+    computed: Callable[[Callable[[], Fitted]], Fitted],
+    progress: Progress,
+) -> dict[str, Any]:
+    """A kernel learned from an object's successes, as :func:`graspdb_service.storage.kernels.create` takes
+    it; ``computed`` is where numbers are.
+
+    Raises
+    ------
+    ProblemError
+        404 for the object, 409 where the trials don't suffice or the object's geometry does not have what the
+        kernel is to be aligned with.
+    """
+    assert request.object is not None
+    window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
+    built = densities.get(request.object, filters_of(request), KernelChoice())
+    # Said first: without axes no number of trials helps.
+    axes = load.axes(request.alignment, built.object_row, built.selected, features)
+    if built.density is None:
+        raise conflict(
+            "too-few-trials",
+            "No trial of this selection succeeded, so there is nothing to fit a kernel on:"
+            f" post trials (POST /objects/{request.object}/trials) or sweep a grid first",
+        )
+    try:
+        components, told = computed(
+            lambda: (
+                _sample(request, built, window, widths, threads)
+                if request.kind == "sampled"
+                else _fit(request, built, axes, window, widths, threads, progress)
+            )
+        )
+    except ValueError as error:
+        raise conflict("too-few-trials", f"No kernel can be fitted: {error}") from None
+    provenance = KernelProvenance(
+        origin="fitted",
+        object=built.object_row.slug,
+        revision=built.revision,
+        protocol=built.selected.protocol,
+        source=built.selected.source,
+        window=window,
+        component_widths=widths,
+        **told,
+    )
+    return {
+        "kind": request.kind,
+        "alignment": request.alignment,
+        "gripper": built.selected.gripper,
+        "object_id": built.object_row.id,
+        "components": components,
+        "provenance": provenance.model_dump(mode="json", exclude_none=True),
+    }
+
+
+def _fit(
+    request: KernelCreate,
+    built: Built,
+    axes: Axes,
+    window: KernelWindow,
+    widths: KernelWidths,
+    threads: int,
+    progress: Progress,
+) -> Fitted:
+    """A Gaussian, or a mixture of a few: its components and what is told of the fit."""
+    density, count = built.density, request.components
+    assert density is not None
+    assert not isinstance(count, list)
+    fit = fit_kernel(
+        density.positions,
+        density.quaternions_xyzw,
+        window=_window(window),
+        widths=_isotropic(widths),
+        compared=density.kernel,
+        components=None if count == "auto" else count or 1,
+        weights=density.weights,
+        symmetric=density.symmetric,
+        frame=load.axes_at(axes, density.positions, density.quaternions_xyzw),
+        threads=threads,
+        progress=progress,
+    )
+    return components_of(fit.kernel), {
+        "successes": fit.successes,
+        "displacements": fit.displacements,
+        "scale": fit.scale,
+        "log_likelihood": _finite(fit.log_likelihood),
+        "isotropic_log_likelihood": _finite(fit.isotropic_log_likelihood),
+        "similarity": fit.similarity.value,
+        "likelihood_by_components": {str(k): v for k, v in fit.likelihoods.items()} or None,
+    }
+
+
+def _sample(
+    request: KernelCreate, built: Built, window: KernelWindow, widths: KernelWidths, threads: int
+) -> Fitted:
+    """Displacements drawn from those between successes (eq 5), and their likeness to all of them."""
+    density, rng = built.density, np.random.default_rng(0)
+    assert density is not None
+    count = request.components if isinstance(request.components, int) else SAMPLED
+    found = displacements(
+        density.positions,
+        density.quaternions_xyzw,
+        window=_window(window),
+        rng=rng,
+        weights=density.weights,
+        symmetric=density.symmetric,
+    )
+    if len(found.vectors) < LEAST_DISPLACEMENTS:
+        raise ValueError(
+            f"the window holds {len(found.vectors)} displacements between successes, and a kernel is sampled"
+            f" from at least {LEAST_DISPLACEMENTS}: widen the window or add trials"
+        )
+    share = found.weights / found.weights.sum()
+    chosen = found.vectors[rng.choice(len(share), size=count, p=share)]
+    whole = found.vectors[rng.choice(len(share), size=min(_WHOLE, len(share)), p=share)]
+    one, every = (
+        sampled_kernel_rows(part[:, :3], se3.from_rotation_vector(part[:, 3:]), _isotropic(widths))
+        for part in (chosen, whole)
+    )
+    similarity = bhattacharyya(one, every, rng, points=4_000, window=_window(window), threads=threads)
+    return [{"weight": 1.0, "mean": vector.tolist()} for vector in chosen], {
+        "successes": density.size,
+        "displacements": len(found.vectors),
+        "similarity": similarity.value,
+    }
+
+
+def _window(window: KernelWindow) -> DisplacementWindow:
+    return DisplacementWindow(window.position_m, math.radians(window.rotation_deg))
+
+
+def _isotropic(widths: KernelWidths) -> IsotropicKernel:
+    return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def components_of(kernel: AnisotropicKernel) -> list[dict[str, Any]]:
+    """As a row keeps them."""
+    return [
+        {"weight": float(w), "mean": m.tolist(), "covariance": s.tolist()}
+        for w, m, s in zip(kernel.weights, kernel.means, kernel.covariances, strict=True)
+    ]
+
+
+def info(row: KernelRow) -> StoredKernel:
+    """As the wire has it."""
+    used = load.info_of(row)
+    assert used.widths_m is not None
+    assert used.widths_deg is not None
+    return StoredKernel(
+        id=row.id,
+        kind=row.kind,
+        alignment=row.alignment,
+        gripper=row.gripper,
+        sigma_position_m=used.sigma_position_m,
+        sigma_rotation_deg=used.sigma_rotation_deg,
+        widths_m=used.widths_m,
+        widths_deg=used.widths_deg,
+        components=[KernelComponent.model_validate(item) for item in row.components],
+        provenance=KernelProvenance.model_validate(row.provenance),
+        created_at=row.created_at,
+    )

@@ -1,0 +1,156 @@
+"""Stored kernels as the maths takes them, and the axes of an object they may be aligned with."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import KernelInfo, KernelWidths
+from graspdb_density import AnisotropicKernel, IsotropicKernel, SampledKernel, se3
+from graspdb_density.kernels.gaussian_mixture import mirror
+from graspdb_density.success.axis_bandwidth import Widths
+from graspdb_service.problems import conflict
+from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.geometry.features import Axes, Features
+from graspdb_service.usecases.trials.selection import Selected
+
+Floats = NDArray[np.float64]
+
+
+def load(row: KernelRow) -> AnisotropicKernel:
+    """The kernel of a stored row, which was checked when it came."""
+    return AnisotropicKernel(
+        np.array([item["weight"] for item in row.components]),
+        np.array([item["mean"] for item in row.components]),
+        np.array([item["covariance"] for item in row.components]),
+        "gripper" if row.alignment == "gripper" else "fixed",
+    )
+
+
+def load_sampled(row: KernelRow) -> SampledKernel:
+    """The kernel of a stored row of the kind ``sampled``, which was checked when it came."""
+    means = np.array([item["mean"] for item in row.components])
+    return SampledKernel(
+        means[:, :3],
+        se3.from_rotation_vector(means[:, 3:]),
+        _component(row),
+        np.array([item["weight"] for item in row.components]),
+    )
+
+
+def _component(row: KernelRow) -> IsotropicKernel:
+    widths = KernelWidths.model_validate(row.provenance["component_widths"])
+    return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
+
+
+def axes(alignment: str, row: ObjectRow, selected: Selected, features: Features) -> Axes:
+    """The axes that translations are along on an object.
+
+    Raises
+    ------
+    ProblemError
+        409 where the object's geometry does not tell them, or has none to tell.
+    """
+    if alignment == "gripper":
+        return None
+    if alignment == "object":
+        return principal_axes(row)
+    return features.frames(alignment, row, selected)
+
+
+def axes_at(found: Axes, positions: Floats, quaternions: Floats) -> Floats | None:
+    """Those of grasps (n, 3), (n, 4): (3, 3) or (n, 3, 3), the gripper's where one has none of its own."""
+    if not callable(found):
+        return found
+    own = found(positions, quaternions)
+    known = np.asarray(np.isfinite(own).all(axis=(1, 2)), dtype=bool)
+    return np.where(known[:, None, None], own, se3.to_matrix(quaternions))
+
+
+def covariance_of(row: KernelRow) -> Floats:
+    """(6, 6) of a kernel's displacements, the spread of its components' means included."""
+    if row.kind != "sampled":
+        return load(row).overall_covariance
+    means = np.array([item["mean"] for item in row.components])
+    weights = np.array([item["weight"] for item in row.components])
+    # With the mirror images, as it is used.
+    both = np.concatenate([means, means * mirror("gripper")])
+    share = np.concatenate([weights, weights]) / (2.0 * weights.sum())
+    off = both - share @ both
+    component = _component(row)
+    own = [component.sigma_position_m**2] * 3 + [component.sigma_rotation**2] * 3
+    return np.asarray(np.einsum("c,ci,cj->ij", share, off, off) + np.diag(own), dtype=np.float64)
+
+
+def widths_of(row: KernelRow, along: Axes) -> Widths:
+    """Those of a kernel that predicts success, along the object's axes (3, 3) or, without, the gripper's."""
+    sigmas = tuple(float(width) for width in np.sqrt(np.diag(covariance_of(row))))
+    assert not callable(along)
+    return Widths(sigmas, None if along is None else tuple(along.ravel().tolist()))
+
+
+def info_of(row: KernelRow, plain: KernelInfo | None = None) -> KernelInfo:
+    """What a query says of the kernel it used.
+
+    Parameters
+    ----------
+    plain
+        The isotropic kernel that the density has where the stored one is for success probabilities only.
+    """
+    covariance = covariance_of(row)
+    widths = np.sqrt(np.diag(covariance))
+    # Of the isotropic kernel whose position and rotation blocks have the same determinants.
+    position, rotation = (
+        float(np.linalg.det(block) ** (1.0 / 6.0)) for block in (covariance[:3, :3], covariance[3:, 3:])
+    )
+    fitted = row.provenance.get("object")
+    origin = f"fitted on {fitted!r}" if fitted else "given by its components"
+    rule = f"stored kernel, {origin}; success_probability uses the isotropic kernel of equal determinants"
+    if row.kind == "probability":
+        rule = f"success_probability by the stored kernel's widths, {origin}"
+        if plain is not None:
+            position, rotation = plain.sigma_position_m, math.radians(plain.sigma_rotation_deg)
+            rule += f"; the density's isotropic kernel by {plain.rule}"
+    return KernelInfo(
+        kind=row.kind,
+        id=row.id,
+        alignment=row.alignment,
+        sigma_position_m=position,
+        sigma_rotation_deg=math.degrees(rotation),
+        widths_m=_triple(widths[:3]),
+        widths_deg=_triple(np.degrees(widths[3:])),
+        rule=rule,
+    )
+
+
+def principal_axes(row: ObjectRow) -> Floats:
+    """The object's principal axes as columns (3, 3), right-handed, the longest way first.
+
+    An axis has no sign of its own: the largest component of the first two is made positive.
+
+    Raises
+    ------
+    ProblemError
+        409 ``mesh-missing`` without a closed mesh to take them from.
+    """
+    inertia = None if row.mesh_info is None else row.mesh_info.get("inertia_m5")
+    if inertia is None:
+        why = "has no mesh" if row.mesh_info is None else "has a mesh that is not watertight"
+        raise conflict(
+            "mesh-missing",
+            f"Object {row.slug!r} {why}, so its principal axes are not known:"
+            f" PUT /objects/{row.slug}/mesh with a closed mesh, or use alignment=gripper",
+        )
+    _, axes = np.linalg.eigh(np.array(inertia, dtype=np.float64))
+    for column in (0, 1):
+        axes[:, column] *= np.sign(axes[np.argmax(np.abs(axes[:, column])), column])
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    return np.asarray(axes, dtype=np.float64)
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

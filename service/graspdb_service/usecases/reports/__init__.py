@@ -1,0 +1,1 @@
+"""Reports: what was learned of an object, in words and figures."""

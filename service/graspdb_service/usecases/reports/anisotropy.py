@@ -1,0 +1,296 @@
+"""What a success tells about its vicinity: the anisotropy report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire.reports import (
+    AnisotropyHistogram,
+    AnisotropyHypothesis,
+    AnisotropyReport,
+    AnisotropyTolerance,
+)
+from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.vicinity.anisotropy import (
+    LEAST_SUCCESSES,
+    Anisotropy,
+    Frames,
+    Histogram,
+    Tolerance,
+    attempt_density,
+    empirical,
+    smoothed,
+)
+from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
+from graspdb_service.problems import conflict
+from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.kernels import load
+from graspdb_service.usecases.reports import surface_pairs
+from graspdb_service.usecases.reports.common import (
+    LEVEL,
+    Sources,
+    attempts_of,
+    finite,
+    head,
+    need_failures,
+    said,
+)
+from graspdb_service.usecases.trials.attempts import AllTrials
+
+Floats = NDArray[np.float64]
+
+#: Attempts that stand for all where their density is asked for.
+_LOCAL_ATTEMPTS = 200_000
+#: What x, y and z are, by alignment.
+_AXES = {
+    "gripper": "the gripper's axes: x sideways, y the way the fingers close, z the approach",
+    "object": "the object's principal axes, the longest first; rotations the gripper's",
+    "edge": "x along the nearest edge, y across it, z outwards; rotations the gripper's",
+    "surface-pair": (
+        "y from one side to the other of the pair of surfaces or edges that the jaw closes on, x and z along"
+        " it; rotations the gripper's"
+    ),
+}
+_EXPECTED = {
+    "x-wide": "x forgives {} as much as y",
+    "z-wide": "z forgives {} as much as y",
+    "ry-wide": "turns about y are forgiven {} as much as about x or z",
+    "alignment-sharpens": "the widest differs from the narrowest {} as much as along the gripper's axes",
+}
+#: The middle bin of a profile, whose pairs hardly differ, ends before this share of its reach.
+_MIDDLE = 0.03
+
+
+def anisotropy_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> AnisotropyReport:
+    """The report by ``method`` and ``alignment``.
+
+    Raises
+    ------
+    ProblemError
+        409 for too few trials, no failures, or an alignment that the object's geometry does not have.
+    """
+    method, alignment = options["method"], options["alignment"]
+    frames = _frames(sources, built, alignment)
+    successes = built.selected.successes
+    if successes < LEAST_SUCCESSES:
+        raise conflict(
+            "too-few-trials",
+            f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
+            f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
+        )
+    everything = attempts_of(sources, built)
+    need_failures(everything, "What a success tells about its vicinity", 1)
+    measure = _measure(sources, built, method, everything)
+    # The same grasps along the gripper's axes, for what alignment changes.
+    share = 1.0 if alignment == "gripper" else 0.5
+    found = said(lambda: measure(alignment, frames, lambda done: progress(share * done)))
+    expected = [] if alignment == "object" else wide_axes(found)
+    if alignment != "gripper":
+        blurred = said(lambda: measure("gripper", None, lambda done: progress(share * (1.0 + done))))
+        expected.append(sharpened(found, blurred))
+    pairs = sources.scenes.features.known_pairs(built.object_row, built.selected)
+    related = [] if pairs is None else surface_pairs.relations(everything, pairs)
+    tolerances, warnings = _told(found, built)
+    if found.aligned < found.grasps and alignment != "gripper":
+        what = (
+            "no edge lies within 30 mm of them, or two do" if alignment == "edge" else "they are at no pair"
+        )
+        warnings.append(
+            f"{found.grasps - found.aligned:,} of {found.grasps:,} grasps were displaced along the gripper's"
+            f" axes: {what}"
+        )
+    return AnisotropyReport.model_validate(
+        {
+            **head(built),
+            "text": _tolerances_text(tolerances, alignment)
+            + _hypotheses_text(expected)
+            + surface_pairs.in_words(related),
+            "warnings": warnings,
+            "method": method,
+            "alignment": alignment,
+            "level": LEVEL,
+            "grasps": found.grasps,
+            "attempts": len(everything),
+            "translation_pairs": found.translation_pairs,
+            "rotation_pairs": found.rotation_pairs,
+            "kernel": None if method == "empirical" else built.kernel,
+            "tolerances": tolerances,
+            "translations": [_histogram(item) for item in found.translations],
+            "rotations": [_histogram(item) for item in found.rotations],
+            "aligned": found.aligned,
+            "hypotheses": [_hypothesis(item) for item in expected],
+            "relations": related,
+        }
+    )
+
+
+def _frames(sources: Sources, built: Built, alignment: str) -> Frames | None:
+    return load.axes(alignment, built.object_row, built.selected, sources.scenes.features)
+
+
+def _measure(
+    sources: Sources, built: Built, method: str, everything: AllTrials
+) -> Callable[[str, Frames | None, Progress], Anisotropy]:
+    """The method, ready for any alignment; the same grasps and resamples every time."""
+    if method == "density":
+        density = built.density
+        assert density is not None
+        local = _local_attempts(everything, density.kernel)
+        return lambda alignment, frames, progress: smoothed(
+            density,
+            local,
+            alignment=_alignment(alignment),
+            frames=frames,
+            level=LEVEL,
+            threads=sources.threads,
+            progress=progress,
+        )
+    weights = None
+    if not np.isnan(everything.proposal).all() and np.nanstd(everything.proposal[everything.success]) > 0.0:
+        weights = importance_weights(everything.proposal)
+    keys = everything.keys
+    symmetric = bool(everything.symmetric.all())
+    return lambda alignment, frames, progress: empirical(
+        everything.position,
+        everything.quaternion,
+        everything.success,
+        rotation_keys=None if keys is None else keys[0],
+        position_keys=None if keys is None else keys[1],
+        alignment=_alignment(alignment),
+        frames=frames,
+        symmetric=symmetric,
+        weights=weights,
+        level=LEVEL,
+        progress=progress,
+    )
+
+
+def _told(found: Anisotropy, built: Built) -> tuple[list[AnisotropyTolerance], list[str]]:
+    """Tolerances, and what to mind of them."""
+    tolerances = [_tolerance(item) for item in found.tolerances]
+    hidden = [item.axis for item in tolerances if item.within] if found.method == "density" else []
+    if hidden:
+        # Smoothed shares that start below one half bound nothing.
+        tolerances = [
+            item.model_copy(update={"half_width": None, "minus": None, "plus": None}) if item.within else item
+            for item in tolerances
+        ]
+    unknown = [item.axis for item in tolerances if item.half_width is None and item.axis not in hidden]
+    warnings = []
+    if unknown:
+        warnings.append(
+            f"nothing was tried displaced along or about {', '.join(unknown)} alone: a grid's trials, or many"
+            " more, tell that"
+        )
+    if hidden:
+        kernel = built.kernel
+        warnings.append(
+            f"the kernel ({1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f} deg)"
+            f" smooths more than a grasp forgives along or about {', '.join(hidden)}: shares stay below one"
+            " half even beside a success; method=empirical or a narrower kernel tells more"
+        )
+    return tolerances, warnings
+
+
+def _alignment(name: str) -> Any:
+    return name
+
+
+def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Floats, Floats], Floats]:
+    """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
+    rows = np.arange(len(everything))
+    if len(rows) > _LOCAL_ATTEMPTS:
+        rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_LOCAL_ATTEMPTS, replace=False))
+    density = GraspDensity.build(
+        everything.position[rows],
+        everything.quaternion[rows],
+        kernel=kernel,
+        symmetric=everything.symmetric[rows],
+    )
+    local, share = attempt_density(density), len(everything) / len(rows)
+    return lambda p, q: share * local(p, q)
+
+
+def _tolerance(item: Tolerance) -> AnisotropyTolerance:
+    # Where even the nearest trials mostly fail the crossing lies between them and the grasp itself.
+    distance = np.abs(item.displacement)
+    off = distance > _MIDDLE * distance.max(initial=0.0)
+    nearest = float(distance[off].min()) if off.any() else math.nan
+    within = bool(math.isfinite(item.half_width) and item.half_width < nearest)
+    return AnisotropyTolerance(
+        axis=item.axis,
+        unit="rad" if item.axis.startswith("r") else "m",
+        half_width=finite(nearest if within else item.half_width),
+        low=None if within else finite(item.low),
+        high=None if within else finite(item.high),
+        minus=finite(item.minus),
+        plus=finite(item.plus),
+        beyond=item.beyond,
+        within=within,
+        displacement=item.displacement.tolist(),
+        probability=item.probability.tolist(),
+        profile_low=item.profile_low.tolist(),
+        profile_high=item.profile_high.tolist(),
+        count=item.count.tolist(),
+    )
+
+
+def _histogram(item: Histogram) -> AnisotropyHistogram:
+    def numbers(values: Floats) -> list[list[float | None]]:
+        return [[finite(value) for value in row] for row in values.tolist()]
+
+    return AnisotropyHistogram(
+        axes=item.axes,
+        edges=(item.edges[0].tolist(), item.edges[1].tolist()),
+        slice_m=item.slice_m,
+        probability=numbers(item.probability),
+        low=numbers(item.low),
+        high=numbers(item.high),
+        count=item.count.tolist(),
+    )
+
+
+def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> str:
+    parts = []
+    for item in tolerances:
+        if item.half_width is None:
+            continue
+        turn = item.unit == "rad"
+        factor, unit = (180.0 / math.pi, "deg") if turn else (1e3, "mm")
+        more = "more than " if item.beyond else "less than " if item.within else ""
+        between = ""
+        if item.low is not None and item.high is not None and not more:
+            between = f" ({factor * item.low:.0f} to {factor * item.high:.0f})"
+        way = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
+        parts.append(f"{more}{factor * item.half_width:.0f} {unit}{between} {way}")
+    if not parts:
+        return "No tolerance can be told from these trials; the warnings say why."
+    return f"A good grasp forgives {', '.join(parts)} ({_AXES[alignment]})."
+
+
+def _hypothesis(item: Hypothesis) -> AnisotropyHypothesis:
+    return AnisotropyHypothesis(
+        name=item.name,
+        ratio=finite(item.ratio),
+        low=finite(item.low),
+        high=finite(item.high),
+        verdict=item.verdict,
+        bound=item.bound,
+    )
+
+
+def _hypotheses_text(found: list[Hypothesis]) -> str:
+    parts = []
+    for item in found:
+        if math.isfinite(item.ratio):
+            times = f"{item.ratio:.2g} times ({item.low:.2g} to {item.high:.2g})"
+            parts.append(f"{_EXPECTED[item.name].format(times)} ({item.verdict})")
+    return f" What grasps are expected to do: {'; '.join(parts)}." if parts else ""

@@ -1,0 +1,261 @@
+"""Can the numbers be believed? The calibration report."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graspdb.wire import OUTCOME_CODES
+from graspdb.wire.reports import (
+    CalibrationBin,
+    CalibrationReport,
+    CheckedGrasps,
+)
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, importance_weights
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.success.axis_bandwidth import ShapedSuccessModel, Widths
+from graspdb_density.success.calibration import (
+    ReliabilityBin,
+    area_under_curve,
+    assign_blocks,
+    calibrate,
+    reliability,
+)
+from graspdb_density.vicinity.anisotropy import LEAST_SUCCESSES
+from graspdb_service.problems import conflict
+from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.reports import verification
+from graspdb_service.usecases.reports.common import (
+    LEVEL,
+    Sources,
+    finite,
+    head,
+    interval,
+    need_failures,
+    said,
+)
+from graspdb_service.usecases.trials import attempts as alltrials
+from graspdb_service.usecases.trials.attempts import AllTrials
+
+Floats = NDArray[np.float64]
+
+#: Outcomes judged: of those that collided fewer, for nearly all are right.
+_JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
+#: Of those that collided, about so many are read: enough to judge, and to tell where blocks lie.
+_KEPT_COLLIDED = 100_000
+LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
+_FOLDS = 5
+#: Kernels end at this many standard deviations of position.
+_REACH = 5.0
+#: Bins of grasps that were simulated again: there are few of them.
+_CHECKED_BINS = 5
+
+
+def _model(
+    everything: AllTrials, rows: NDArray[np.int64], kernel: IsotropicKernel, widths: Widths | None
+) -> SuccessModel:
+    """Of some attempts, under the widths that predict success where a kernel of that kind was asked for."""
+    attempts = everything.position[rows], everything.quaternion[rows], everything.success[rows]
+    symmetric = everything.symmetric[rows]
+    if widths is not None:
+        return ShapedSuccessModel.under(widths, *attempts, symmetric=symmetric)
+    return SuccessModel.build(*attempts, kernel=kernel, symmetric=symmetric)
+
+
+def calibration_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> CalibrationReport:
+    test = sources.scenes.test(built.object_row, built.selected)
+    # Where geometry tells them apart, those that collided are only judged, and few of them.
+    most = None if test is None else _KEPT_COLLIDED
+    everything = alltrials.read(sources.database, built.object_row, built.selected, most_collided=most)
+    successes = int(everything.success.sum())
+    if everything.attempts < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
+        raise conflict(
+            "too-few-trials",
+            f"Calibration needs at least {LEAST_ATTEMPTS} attempts and {LEAST_SUCCESSES} successes in them,"
+            f" of sources that post failures, too; there are {everything.attempts} and {successes}",
+        )
+    need_failures(everything, "Calibration", LEAST_FAILURES)
+    density = built.density
+    assert density is not None
+    kernel = density.kernel
+    edge = 3.0 * kernel.sigma_position_m
+    blocks = said(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
+    judged, weights = _judged(everything)
+    p, q = everything.position[judged], everything.quaternion[judged]
+    won, collided = everything.success[judged], everything.collided[judged]
+    free = None if test is None else test.free(p, q, threads=sources.threads)
+    predicted, ranked = np.zeros(len(judged)), np.full(len(judged), -np.inf)
+    learned = everything.collided if test is not None else np.zeros(len(everything), dtype=bool)
+    proposal_known = not np.isnan(everything.proposal).all()
+    for fold in range(blocks.folds):
+        train = np.flatnonzero((blocks.fold != fold) & ~learned)
+        held = np.flatnonzero(blocks.fold[judged] == fold)
+        progress(fold / blocks.folds)
+        if not held.size or not train.size:
+            continue
+        model = _model(everything, train, kernel, built.predicting)
+        progress((fold + 0.5) / blocks.folds)
+        predicted[held] = model.evaluate(p[held], q[held], threads=sources.threads).probability
+        kept = train[everything.success[train]]
+        if kept.size:
+            own = GraspDensity.build(
+                everything.position[kept],
+                everything.quaternion[kept],
+                kernel=kernel,
+                weights=importance_weights(everything.proposal[kept]) if proposal_known else None,
+                symmetric=everything.symmetric[kept],
+            )
+            ranked[held] = own.log_density(p[held], q[held], threads=sources.threads)
+    if free is not None:
+        predicted[~free] = 0.0
+    block = blocks.block[judged]
+    whole = calibrate(predicted, won, weights=weights, blocks=block, level=LEVEL)
+    apart = None
+    if test is not None and collided.any() and won[~collided].any() and not won[~collided].all():
+        alone = calibrate(
+            predicted[~collided],
+            won[~collided],
+            weights=weights[~collided],
+            blocks=block[~collided],
+            level=LEVEL,
+        )
+        apart = interval(alone.skill, alone.skill_low, alone.skill_high)
+    share = float(np.average(won, weights=weights))
+    checked = _checked(sources, built, everything, test)
+    warnings = []
+    if test is None:
+        warnings.append(
+            "mesh or gripper is not known: collisions count as ordinary failures, which costs much skill"
+        )
+    if checked is None:
+        slug = built.object_row.slug
+        warnings.append(
+            "no best grasps have been simulated again: ask for some and simulate them with"
+            f' POST /objects/{slug}/best-grasp {{"count": 25}} and POST /objects/{slug}/sweeps'
+            ' {"poses": [...], "fidelity": "fine", "purpose": "check"}, as best_grasps(count=25, verify=True)'
+            f" and `graspdb best-grasp {slug} --count 25 --verify` do"
+        )
+    report = CalibrationReport(
+        **head(built),
+        text="",
+        level=LEVEL,
+        kernel=built.kernel,
+        attempts=everything.attempts,
+        successes=successes,
+        judged=len(judged),
+        blocks=blocks.count,
+        block_edge_m=edge,
+        folds=blocks.folds,
+        collisions_known=test is not None,
+        share=share,
+        brier=whole.brier,
+        skill=interval(whole.skill, whole.skill_low, whole.skill_high),
+        free_skill=apart,
+        ece=finite(whole.ece),
+        auc_probability=finite(whole.auc),
+        auc_density=finite(area_under_curve(ranked, won, weights=weights)),
+        bins=[_bin(item) for item in whole.bins],
+        checked=checked,
+        warnings=warnings,
+    )
+    return report.model_copy(update={"text": _calibration_text(report)})
+
+
+def _bin(item: ReliabilityBin) -> CalibrationBin:
+    return CalibrationBin(
+        lower=item.lower,
+        upper=item.upper,
+        count=item.count,
+        weight=item.weight,
+        predicted=finite(item.predicted),
+        observed=finite(item.observed),
+        low=finite(item.low),
+        high=finite(item.high),
+    )
+
+
+def _checked(
+    sources: Sources, built: Built, everything: AllTrials, test: CollisionTest | None
+) -> CheckedGrasps | None:
+    """Grasps given to checks against what is predicted of them: no prediction rests on a check's outcome."""
+    found = [
+        item
+        for item in verification.read(sources.database, built)
+        if item.plan == "poses" and len(item.codes)
+    ]
+    if not found:
+        return None
+    p = np.concatenate([item.position for item in found])
+    q = np.concatenate([item.quaternion for item in found])
+    codes = np.concatenate([item.codes for item in found])
+    assert built.density is not None
+    kernel, widths = built.density.kernel, built.predicting
+    reach = max([kernel.sigma_position_m, *(() if widths is None else widths.sigmas[:3])])
+    distance, _ = cKDTree(p).query(everything.position, distance_upper_bound=_REACH * reach)
+    near = np.isfinite(distance)
+    if test is not None:
+        # Those that collided tell nothing of the others.
+        near &= ~everything.collided
+    predicted = np.zeros(len(p))
+    if near.any():
+        model = _model(everything, np.flatnonzero(near), kernel, widths)
+        predicted = model.evaluate(p, q, threads=sources.threads).probability.copy()
+    if test is not None:
+        predicted[~test.free(p, q, threads=sources.threads)] = 0.0
+    outcomes = verification.tally(codes)
+    won = outcomes.get("success", 0)
+    success = np.isin(codes, [OUTCOME_CODES["success"]])
+    return CheckedGrasps(
+        grasps=len(codes),
+        successes=won,
+        rate=verification.share(won, len(codes)),
+        predicted=float(predicted.mean()),
+        outcomes=outcomes,
+        bins=[_bin(item) for item in reliability(predicted, success, bins=_CHECKED_BINS, level=LEVEL)],
+    )
+
+
+def _judged(everything: AllTrials) -> tuple[NDArray[np.int64], Floats]:
+    """Rows to judge and what each stands for: drawn at random from those that collided and from the rest."""
+    rng = np.random.default_rng(0)
+    rows, weights = [], []
+    for chosen, most, more in (
+        (~everything.collided, _JUDGED_FREE, 0),
+        (everything.collided, _JUDGED_COLLIDED, everything.left_out),
+    ):
+        members = np.flatnonzero(chosen)
+        if not members.size:
+            continue
+        drawn = members if members.size <= most else np.sort(rng.choice(members, size=most, replace=False))
+        rows.append(drawn)
+        weights.append(np.full(drawn.size, (members.size + more) / drawn.size))
+    return np.concatenate(rows), np.concatenate(weights)
+
+
+def _calibration_text(report: CalibrationReport) -> str:
+    skill = report.skill
+    if skill.value is None:
+        text = "Every judged attempt had the same outcome, so there is nothing to predict."
+    else:
+        between = "" if skill.low is None or skill.high is None else f" ({skill.low:.2f} to {skill.high:.2f})"
+        text = f"Brier skill {skill.value:.2f}{between} on {report.judged:,} attempts it had not seen"
+        text += f" ({report.blocks} blocks of {1e3 * report.block_edge_m:.0f} mm)."
+    if report.ece is not None:
+        text += f" Where it predicts more than 0.1 it is off by {report.ece:.2f} on average."
+    if report.auc_probability is not None and report.auc_density is not None:
+        text += (
+            f" A success ranks above a failure with {report.auc_probability:.2f} by probability, with"
+            f" {report.auc_density:.2f} by density."
+        )
+    again = report.checked
+    if again is not None and again.rate.low is not None and again.rate.high is not None:
+        text += (
+            f" Simulated again, {again.successes:,} of {again.grasps:,} given grasps succeed"
+            f" ({100.0 * again.rate.low:.0f} to {100.0 * again.rate.high:.0f} %, predicted"
+            f" {100.0 * again.predicted:.0f} %)."
+        )
+    return text

@@ -1,0 +1,128 @@
+"""How many samples does a kernel need? Figure 13: the report on a kernel's similarity to its statistics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from graspdb.wire.reports import KernelSimilarityReport, SimilarityPoint
+from graspdb_density import IsotropicKernel, se3
+from graspdb_density.bandwidth.component_count import mixture_curve
+from graspdb_density.bandwidth.mixture_fit import (
+    LEAST_DISPLACEMENTS,
+    LEAST_SUCCESSES,
+    Displacements,
+    displacements,
+)
+from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_service.problems import conflict
+from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.reports.common import LEVEL, Sources, head
+
+#: Displacements that stand for the full statistics, and what the paper limits a kernel to.
+_REFERENCE, _PAPER = 20_000, 900
+
+
+def kernel_similarity_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> KernelSimilarityReport:
+    """The report.
+
+    Raises
+    ------
+    ProblemError
+        409 for too few successes, or displacements between them, saying how many are needed.
+    """
+    window = DisplacementWindow(
+        float(options["window_position_m"]), math.radians(float(options["window_rotation_deg"]))
+    )
+    widths = IsotropicKernel(
+        float(options["component_position_m"]), math.radians(float(options["component_rotation_deg"]))
+    )
+    found = _displacements(built, window)
+    progress(0.1)
+    rng = np.random.default_rng(0)
+    share = found.weights / found.weights.sum()
+    kept = rng.choice(len(share), size=min(2 * _REFERENCE, len(share)), replace=False, p=share)
+    samples = sampled_kernel_curve(
+        found.vectors[kept, :3],
+        se3.from_rotation_vector(found.vectors[kept, 3:]),
+        components=widths,
+        window=window,
+        rng=rng,
+        reference=_REFERENCE,
+        threads=sources.threads,
+    )
+    progress(0.4)
+    mixtures = mixture_curve(
+        found,
+        components=widths,
+        window=window,
+        rng=rng,
+        reference=_REFERENCE,
+        threads=sources.threads,
+        progress=lambda done: progress(0.4 + 0.6 * done),
+    )
+    report = KernelSimilarityReport(
+        **head(built),
+        text="",
+        level=LEVEL,
+        window_position_m=window.position_m,
+        window_rotation_deg=math.degrees(window.rotation),
+        component_position_m=widths.sigma_position_m,
+        component_rotation_deg=math.degrees(widths.sigma_rotation),
+        successes=built.selected.successes,
+        displacements=len(found.vectors),
+        reference=min(_REFERENCE, len(found.vectors)),
+        samples=[_point(item) for item in samples],
+        mixtures=[_point(item) for item in mixtures],
+    )
+    return report.model_copy(update={"text": _text(report)})
+
+
+def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
+    density = built.density
+    count = 0 if density is None else density.size
+    if density is None or count < LEAST_SUCCESSES:
+        raise conflict(
+            "too-few-trials",
+            f"The similarity of kernels needs at least {LEAST_SUCCESSES} successes; there are {count}, so"
+            f" {LEAST_SUCCESSES - count} more are needed",
+        )
+    found = displacements(
+        density.positions,
+        density.quaternions_xyzw,
+        window=window,
+        rng=np.random.default_rng(0),
+        weights=density.weights,
+        symmetric=density.symmetric,
+    )
+    if len(found.vectors) < LEAST_DISPLACEMENTS:
+        raise conflict(
+            "too-few-trials",
+            f"The window holds {len(found.vectors)} displacements between successes; at least"
+            f" {LEAST_DISPLACEMENTS} are needed: widen window_position_m or"
+            " window_rotation_deg, or add trials",
+        )
+    return found
+
+
+def _point(item: SampledKernelPoint) -> SimilarityPoint:
+    return SimilarityPoint(count=item.samples, similarity=item.similarity, error=item.standard_error)
+
+
+def _text(report: KernelSimilarityReport) -> str:
+    window = f"{1e3 * report.window_position_m:.0f} mm and {report.window_rotation_deg:.0f} deg"
+    widths = f"{1e3 * report.component_position_m:.0f} mm and {report.component_rotation_deg:.0f} deg"
+    parts = []
+    nearest = min(report.samples, key=lambda item: abs(item.count - _PAPER))
+    parts.append(f"{nearest.count:,} samples have a similarity of {nearest.similarity:.2f}")
+    best = max(report.mixtures, key=lambda item: item.similarity)
+    first = report.mixtures[0]
+    enough = next(item for item in report.mixtures if item.similarity >= best.similarity - 0.01)
+    parts.append(f"1 Gaussian {first.similarity:.2f}")
+    if enough.count > 1:
+        parts.append(f"a mixture of {enough.count} {enough.similarity:.2f}")
+    return f"{', '.join(parts)} (window {window}, components {widths})."

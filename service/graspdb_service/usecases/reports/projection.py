@@ -1,0 +1,200 @@
+"""Where on the object do grasps succeed? The density on a plane: the projection report."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from graspdb.wire.reports import ProjectionProfile, ProjectionReport
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
+from graspdb_geometry import meshes
+from graspdb_service.problems import conflict
+from graspdb_service.storage import assets
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.reports.common import LEVEL, Sources, head, interval
+
+Floats = NDArray[np.float64]
+
+#: Normals by the names of planes: towards the viewer, so that the first letter runs to the right.
+PLANES = {"xy": (0.0, 0.0, 1.0), "xz": (0.0, -1.0, 0.0), "yz": (1.0, 0.0, 0.0)}
+#: Fewer grasps than this make a picture, but no statement.
+_FEW = 50
+
+
+def projection_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> ProjectionReport:
+    """The density on a plane.
+
+    Parameters
+    ----------
+    options
+        ``plane`` (a key of :data:`PLANES` or a normal as JSON; none: the one that shows most of the grasps),
+        ``approach`` and ``direction`` (vectors as JSON) with ``*_cone_deg``.
+
+    Raises
+    ------
+    ProblemError
+        409 without a success, or where none points the way asked for.
+    """
+    density = built.asked
+    if density is None or built.density is None:
+        raise conflict(
+            "too-few-trials",
+            "A projection needs at least 1 successful trial, and there is none: post trials"
+            f" (POST /objects/{built.object_row.slug}/trials) or sweep a grid first",
+        )
+    name, plane = _plane(options.get("plane"), built.density.positions)
+    approach, direction = _vector(options.get("approach")), _vector(options.get("direction"))
+    cones = {key: float(options[key]) for key in ("approach_cone_deg", "direction_cone_deg")}
+    wanted = Orientation(
+        approach=approach,
+        approach_cone=math.radians(cones["approach_cone_deg"]),
+        direction=direction,
+        direction_cone=math.radians(cones["direction_cone_deg"]),
+    )
+    found = marginal(density, plane, wanted, level=LEVEL)
+    progress(0.8)
+    peak = float(found.value.max())
+    if not peak > 0.0:
+        raise conflict(
+            "no-such-grasps",
+            f"None of the {built.density.size:,} successful grasps points that way: widen approach_cone_deg"
+            " or direction_cone_deg, or leave approach or direction out",
+        )
+    warnings = []
+    if found.passing < _FEW:
+        warnings.append(f"the picture rests on {found.passing:,} grasps: single ones show")
+    report = ProjectionReport(
+        **head(built),
+        text="",
+        warnings=warnings,
+        level=LEVEL,
+        kernel=built.kernel,
+        grasps=built.density.size,
+        passing=found.passing,
+        share=interval(found.share, found.share_low, found.share_high),
+        plane=name,
+        normal=_triple(plane.normal),
+        across=_triple(plane.across),
+        upward=_triple(plane.upward),
+        approach=None if approach is None else _triple(approach),
+        approach_cone_deg=None if approach is None else cones["approach_cone_deg"],
+        direction=None if direction is None else _triple(direction),
+        direction_cone_deg=None if direction is None else cones["direction_cone_deg"],
+        across_m=_rounded(found.across_edges, 6),
+        upward_m=_rounded(found.upward_edges, 6),
+        values=np.round(found.value / peak, 4).tolist(),
+        peak_per_m2=peak,
+        profiles=_profiles(found, plane),
+        outline=_outline(sources, built, plane),
+        drawn=found.drawn,
+    )
+    return report.model_copy(update={"text": _text(report, found)})
+
+
+def _plane(given: str | None, positions: Floats) -> tuple[str, Plane]:
+    if given is None:
+        extent = np.ptp(positions, axis=0)
+        hidden = int(np.argmin(extent))
+        given = "".join(letter for i, letter in enumerate("xyz") if i != hidden)
+    if given in PLANES:
+        return given, Plane.facing(np.array(PLANES[given]))
+    normal = np.array(json.loads(given), dtype=np.float64)
+    return "facing " + ",".join(f"{x:.3g}" for x in normal), Plane.facing(normal)
+
+
+def _vector(given: str | None) -> Floats | None:
+    return None if given is None else np.array(json.loads(given), dtype=np.float64)
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 9) + 0.0 for value in values)
+    return x, y, z
+
+
+def _rounded(values: Floats, digits: int) -> list[float]:
+    found: list[float] = np.round(values, digits).tolist()
+    return found
+
+
+def _axis(vector: Floats) -> str:
+    """``x``, ``y`` or ``z`` where it is one, ``-x`` where it is its opposite, else its components."""
+    for i, letter in enumerate("xyz"):
+        if abs(abs(vector[i]) - 1.0) < 1e-9:
+            return letter if vector[i] > 0 else f"-{letter}"
+    return "(" + ", ".join(f"{value:.2f}" for value in vector) + ")"
+
+
+def _profiles(found: Marginal, plane: Plane) -> list[ProjectionProfile]:
+    return [
+        ProjectionProfile(
+            axis=_axis(axis),
+            at_m=_rounded(item.at, 6),
+            density_per_m=_rounded(item.value, 5),
+            low=_rounded(item.low, 5),
+            high=_rounded(item.high, 5),
+        )
+        for item, axis in zip(found.profiles, (plane.across, plane.upward), strict=True)
+    ]
+
+
+def _outline(sources: Sources, built: Built, plane: Plane) -> list[list[tuple[float, float]]]:
+    """The silhouette of every convex part, or of the mesh's hull; nothing without geometry."""
+    polygons = []
+    for corners in _corners(sources.database, built.object_row):
+        flat = np.stack([corners @ plane.across, corners @ plane.upward], axis=1)
+        try:
+            hull = flat[ConvexHull(flat).vertices]
+        except (QhullError, ValueError):
+            # Seen edge-on it has no area.
+            continue
+        polygons.append([(round(float(x), 6), round(float(y), 6)) for x, y in hull])
+    return polygons
+
+
+def _corners(database: Database, row: ObjectRow) -> list[Floats]:
+    """Corners (n, 3) of every convex part, of the mesh without any, or nothing."""
+    sha256 = row.parts_sha256 or row.mesh_sha256
+    if sha256 is None:
+        return []
+    with database.read() as tx:
+        found = assets.get(tx, sha256)
+    if found is None:
+        return []
+    if row.parts_sha256 is not None:
+        return [np.asarray(part[0], dtype=np.float64) for part in meshes.parts_from_glb(found[0])]
+    assert row.mesh_info is not None
+    return [np.asarray(meshes.load(*found, row.mesh_info["unit"]).vertices, dtype=np.float64)]
+
+
+def _text(report: ProjectionReport, found: Marginal) -> str:
+    i, j = np.unravel_index(int(np.argmax(found.value)), found.value.shape)
+    at = [
+        1e3 * 0.5 * float(edges[k] + edges[k + 1])
+        for edges, k in ((found.across_edges, int(i)), (found.upward_edges, int(j)))
+    ]
+    first, second = (item.axis for item in report.profiles)
+    where = f"densest at {first} = {at[0]:.0f} mm, {second} = {at[1]:.0f} mm"
+    if report.approach is None and report.direction is None:
+        return f"{report.grasps:,} successful grasps, {where}."
+    parts = []
+    if report.approach is not None:
+        cone = f"{report.approach_cone_deg:g} deg"
+        parts.append(f"approaches within {cone} of {_axis(np.array(report.approach))}")
+    if report.direction is not None:
+        cone = f"{report.direction_cone_deg:g} deg"
+        parts.append(f"lies with tool x within {cone} of {_axis(np.array(report.direction))}")
+    share = report.share
+    value, low, high = (f"{100.0 * (v or 0.0):.1f} %" for v in (share.value, share.low, share.high))
+    return (
+        f"{value} ({low} to {high}) of the density {' and '.join(parts)}, {where};"
+        f" {report.passing:,} of {report.grasps:,} successful grasps do."
+    )

@@ -1,0 +1,393 @@
+"""Report runs: computed once for a revision and its parameters, whoever asks and of whichever replica.
+
+Fits of kernels that take long are runs, too: each makes the kernel of its own id.
+
+A run is a row with a lease. Who asks first takes it and computes; others, of other processes too, wait for
+the row or are told where it will be. A holder that dies stops renewing, and the next who asks takes over.
+Reports are computed one at a time on a thread of their own beside the compute pool: a minute's work must not
+hold a query's place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+from graspdb.wire import Selection
+from graspdb.wire.kernels import KernelCreate
+from graspdb.wire.reports import ReportRun
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_service import __version__
+from graspdb_service.problems import ProblemError, conflict, not_found
+from graspdb_service.settings import Settings
+from graspdb_service.storage import checks, kernels, report_runs
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.report_runs import Question, RunRow
+from graspdb_service.usecases.densities.cache import Densities, KernelChoice, kernel_of
+from graspdb_service.usecases.geometry.collision import Scenes
+from graspdb_service.usecases.kernels import fit
+from graspdb_service.usecases.reports import registry
+from graspdb_service.usecases.reports.common import Sources
+from graspdb_service.usecases.reports.convergence_cache import KeptCurves
+from graspdb_service.usecases.reports.registry import Asked
+from graspdb_service.usecases.trials.selection import Filters
+
+log = logging.getLogger("graspdb")
+
+#: Runs that a process holds at most, computing or waiting their turn.
+MAX_HELD = 16
+#: Requests that may wait for a result at a time; the others are told at once where it will be.
+_MAX_WAITING = 8
+_LEASE_S = 30.0
+_TICK_S = 2.0
+_POLL_S = 0.1
+#: Kept convergence curves may take this part of what densities may.
+_CURVES_SHARE = 4
+#: What the request is to blame for, and would be again: kept as the run's answer.
+_KEPT_STATUSES = (404, 409, 413, 422)
+
+
+#: What runs that fit a kernel are called where others have their report's name.
+FIT = "kernel"
+#: Reports that say what became of simulated checks.
+_OF_CHECKS = ("bandwidth", "calibration")
+
+
+class Cancelled(Exception):
+    """A run was cancelled, or taken over, while it was computed."""
+
+
+@dataclass(eq=False)
+class _Held:
+    """A run that this process computes, or will."""
+
+    lease_id: str
+    progress: float = 0.0
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+class ReportRuns:
+    """The report runs of one service process, over a database that others may share."""
+
+    def __init__(self, settings: Settings, database: Database, densities: Densities, scenes: Scenes) -> None:
+        self._database = database
+        self._densities = densities
+        self._wait_s = settings.report_wait_s
+        curves = KeptCurves(settings.max_density_cache_bytes // _CURVES_SHARE)
+        self._sources = Sources(database, densities, scenes, settings.threads, curves)
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspdb-report")
+        self._waiting = threading.BoundedSemaphore(_MAX_WAITING)
+        self._held: dict[str, _Held] = {}
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        self._closed = threading.Event()
+        self._ticker: threading.Thread | None = None
+
+    # -- what the routes ask
+
+    def report(
+        self, slug: str, report: str, selection: Selection, options: Mapping[str, str | None]
+    ) -> RunRow:
+        """The run of a report: done, or under way after the wait.
+
+        Raises
+        ------
+        ProblemError
+            404 and 409 as the selection; what the report itself was refused for; 429 where too many are
+            under way.
+        """
+        choice, _ = kernel_of(selection)
+        row, selected = self._densities.current(slug, Filters.of(selection))
+        if choice.stored is not None:
+            choice = KernelChoice(stored=self._densities.stored(row, selected, choice.stored).id)
+        given = {name: value for name, value in options.items() if value is not None}
+        if report in _OF_CHECKS or given.get("matching") == "success":
+            # Checks change no revision: what of them there is belongs to the question.
+            with self._database.read() as tx:
+                given[report_runs.CHECKS] = checks.stamp(tx, row.id)
+        asked = Asked(report, selected.filters, choice, given)
+        document = asked.document()
+        digest = hashlib.sha256(json.dumps([document, __version__], sort_keys=True).encode()).hexdigest()
+        question = Question(row.id, row.revision, report, digest, document)
+        with self._database.read() as tx:
+            run = report_runs.find(tx, question)
+        if run is None or not _settled(run):
+            run = self._joined(question)
+        return self._answered(run)
+
+    def enter_fit(self, tx: Tx, id: str, lease_id: str, row: ObjectRow, request: KernelCreate) -> None:
+        """Enter the run that fits a kernel, of the same id; `follow` it once the transaction is through."""
+        # Every request makes a kernel of its own: its run is nobody else's.
+        document = {"report": FIT, "run": id, "request": request.model_dump(mode="json", exclude_unset=True)}
+        digest = hashlib.sha256(id.encode()).hexdigest()
+        question = Question(row.id, row.revision, FIT, digest, document)
+        report_runs.ask(tx, question, id=id, lease_id=lease_id, lease_s=_LEASE_S)
+
+    def follow(self, id: str, lease_id: str | None) -> RunRow:
+        """A run done, or under way after the wait; computed here where this process holds its lease.
+
+        Raises
+        ------
+        ProblemError
+            As :meth:`report`.
+        """
+        run = self._row(id)
+        if lease_id is not None:
+            self._start(run, lease_id)
+        return self._answered(run)
+
+    def _answered(self, run: RunRow) -> RunRow:
+        """The run once it has ended well, or as it is when the wait is over."""
+        if run.state == "running":
+            run = self._waited(run)
+        what = "fit" if run.report == FIT else "report"
+        if run.state == "cancelled":
+            raise conflict("report-cancelled", f"The {what} was cancelled: ask again to compute it anew")
+        if run.problem is not None:
+            raise _problem(run.problem)
+        if run.state == "failed":
+            raise ProblemError(
+                500, "internal-error", f"The {what} failed; the service's log says more: ask again to retry"
+            )
+        return run
+
+    def get(self, id: str) -> RunRow:
+        """A run as it is; one whose holder is gone is taken over."""
+        run = self._row(id)
+        if run.state == "running" and not run.live:
+            lease = str(uuid.uuid4())
+            with self._database.write() as tx:
+                taken = report_runs.take_over(tx, id, lease_id=lease, lease_s=_LEASE_S)
+            if taken:
+                self._start(run, lease)
+            run = self._row(id)
+        return run
+
+    def cancel(self, id: str) -> RunRow:
+        """End a run; one that has ended stays as it is."""
+        with self._database.write() as tx:
+            report_runs.cancel(tx, id)
+        run = self._row(id)
+        if run.state == "cancelled":
+            with self._lock:
+                held = self._held.get(id)
+                if held is not None:
+                    held.stop.set()
+                self._changed.notify_all()
+        return run
+
+    def close(self) -> None:
+        """Stop, and leave what is under way to others."""
+        self._closed.set()
+        with self._lock:
+            held = dict(self._held)
+            self._changed.notify_all()
+        for item in held.values():
+            item.stop.set()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for id, item in held.items():
+            with self._database.write() as tx:
+                report_runs.release(tx, id, item.lease_id)
+
+    # -- joining and waiting
+
+    def _row(self, id: str) -> RunRow:
+        with self._database.read() as tx:
+            run = report_runs.get(tx, id)
+        if run is None:
+            raise not_found("report run", id[:80], "runs of a past revision are deleted: ask for the report")
+        return run
+
+    def place(self) -> str:
+        """A lease for a run that this process is to compute.
+
+        Raises
+        ------
+        ProblemError
+            429 where it has too many.
+        """
+        with self._lock:
+            if len(self._held) >= MAX_HELD:
+                raise ProblemError(
+                    429,
+                    "busy",
+                    f"{MAX_HELD} reports are under way already: try again when some are done",
+                    headers={"Retry-After": "5"},
+                )
+        return str(uuid.uuid4())
+
+    def _joined(self, question: Question) -> RunRow:
+        """The question's run, taken by this process where nobody has it."""
+        lease = self.place()
+        with self._database.write() as tx:
+            mine = report_runs.ask(tx, question, id=str(uuid.uuid4()), lease_id=lease, lease_s=_LEASE_S)
+            run = report_runs.find(tx, question)
+        if run is None:
+            # A newer revision's run has swept this one away meanwhile.
+            raise conflict("object-changed", "The object has just changed: ask again")
+        if mine:
+            self._start(run, lease)
+        return run
+
+    def _waited(self, run: RunRow) -> RunRow:
+        """The run once it has ended, or as it is when the wait is over."""
+        if not self._waiting.acquire(blocking=False):
+            return run
+        try:
+            deadline = time.monotonic() + self._wait_s
+            while run.state == "running" and time.monotonic() < deadline and not self._closed.is_set():
+                with self._changed:
+                    if run.id in self._held:
+                        self._changed.wait(min(1.0, max(0.0, deadline - time.monotonic())))
+                    else:
+                        # Another process computes it.
+                        self._changed.wait(min(_POLL_S, max(0.0, deadline - time.monotonic())))
+                run = self.get(run.id)
+            return run
+        finally:
+            self._waiting.release()
+
+    # -- computing
+
+    def _start(self, run: RunRow, lease_id: str) -> None:
+        held = _Held(lease_id)
+        with self._lock:
+            self._held[run.id] = held
+            if self._ticker is None:
+                self._ticker = threading.Thread(target=self._renew, name="graspdb-report-leases", daemon=True)
+                self._ticker.start()
+        try:
+            self._pool.submit(self._run, run, held)
+        except RuntimeError:
+            # The service is shutting down: close() releases what is held.
+            log.info("report run %s is left to another process", run.id)
+
+    def _run(self, run: RunRow, held: _Held) -> None:
+        def progress(share: float) -> None:
+            held.progress = min(max(share, 0.0), 1.0)
+            if held.stop.is_set():
+                raise Cancelled
+
+        made: Callable[[Tx], str] | None = None
+        problem: dict[str, Any] | None = None
+        try:
+            progress(0.0)
+            made = self._computed(run, progress)
+        except Cancelled:
+            self._drop(run.id)
+            return
+        except ProblemError as error:
+            if error.status in _KEPT_STATUSES:
+                problem = {
+                    "status": error.status,
+                    "kind": error.kind,
+                    "title": error.title,
+                    "errors": error.errors,
+                    "extra": error.extra,
+                }
+            else:
+                log.warning("report run %s: %s", run.id, error.title)
+        except Exception:
+            log.exception("report run %s failed", run.id)
+        try:
+            with self._database.write() as tx:
+                result = None if made is None else made(tx)
+                if not report_runs.finish(tx, run.id, held.lease_id, result=result, problem=problem):
+                    # Cancelled, or somebody else's by now: nothing of it is stored.
+                    raise Cancelled
+        except Cancelled:
+            log.info("report run %s ended before it was done", run.id)
+        except Exception:
+            # Its lease runs out, and the next who asks computes it again.
+            log.exception("report run %s could not be stored", run.id)
+        finally:
+            self._drop(run.id)
+
+    def _computed(self, run: RunRow, progress: Progress) -> Callable[[Tx], str]:
+        """What a run asks for, computed; in the transaction that ends the run, its result."""
+        if run.report != FIT:
+            asked = Asked.of(run.parameters)
+            result = registry.compute(self._sources, run.object, asked, progress).model_dump_json()
+            return lambda tx: result
+        sources = self._sources
+        fields = fit.fitted(
+            sources.densities,
+            sources.scenes.features,
+            KernelCreate.model_validate(run.parameters["request"]),
+            threads=sources.threads,
+            computed=lambda work: work(),
+            progress=progress,
+        )
+        return lambda tx: fit.info(kernels.create(tx, run.id, **fields)).model_dump_json()
+
+    def _drop(self, id: str) -> None:
+        with self._changed:
+            self._held.pop(id, None)
+            self._changed.notify_all()
+
+    def _renew(self) -> None:
+        """Keep the leases of what is held, and stop what was cancelled or taken over elsewhere."""
+        while not self._closed.wait(_TICK_S):
+            with self._lock:
+                held = dict(self._held)
+            if not held:
+                continue
+            try:
+                with self._database.write() as tx:
+                    kept = report_runs.renew(
+                        tx,
+                        {id: (item.lease_id, item.progress) for id, item in held.items()},
+                        lease_s=_LEASE_S,
+                    )
+            except Exception:
+                log.exception("leases of report runs could not be renewed")
+                continue
+            for id, item in held.items():
+                if id not in kept:
+                    item.stop.set()
+
+
+def _settled(run: RunRow) -> bool:
+    """Whether a run needs nobody to start it."""
+    if run.state == "running":
+        return run.live
+    return run.state == "done" or run.problem is not None
+
+
+def _problem(document: dict[str, Any]) -> ProblemError:
+    return ProblemError(
+        document["status"],
+        document["kind"],
+        document["title"],
+        errors=[(name, message) for name, message in document["errors"]],
+        extra=document["extra"],
+    )
+
+
+def model(run: RunRow) -> ReportRun:
+    """As the wire has it, the result included."""
+    problem = None if run.problem is None else _problem(run.problem)
+    return ReportRun.model_validate(
+        {
+            "id": run.id,
+            "object": run.object,
+            "report": run.report,
+            "revision": run.revision,
+            "parameters": run.parameters,
+            "state": run.state,
+            "progress": run.progress,
+            "result": None if run.result is None else json.loads(run.result),
+            "problem": None if problem is None else problem.document(""),
+            "created_at": run.created_at,
+            "finished_at": run.finished_at,
+        }
+    )

@@ -1,0 +1,337 @@
+"""Does simulation tell what real trials find? The sources report."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from graspdb.wire import OUTCOMES, KernelInfo
+from graspdb.wire.reports import (
+    CalibrationBin,
+    ReportRange,
+    SourceComparison,
+    SourceSimilarity,
+    SourcesReport,
+)
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
+from graspdb_density.kde.bhattacharyya import bhattacharyya
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.success.calibration import ReliabilityBin, calibrate
+from graspdb_service.problems import conflict
+from graspdb_service.storage import trials
+from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.reports.common import LEVEL, Sources, finite, head, interval
+from graspdb_service.usecases.reports.verification import share
+from graspdb_service.usecases.trials import attempts
+from graspdb_service.usecases.trials.attempts import AllTrials
+from graspdb_service.usecases.trials.selection import Selected
+
+Floats = NDArray[np.float64]
+
+REAL = ("robot", "human", "import")
+#: Fewest trials for a calibration and for a density's similarity, and attempts to predict from.
+LEAST_TRIALS, LEAST_SUCCESSES, LEAST_SIMULATED = 20, 20, 100
+_BINS = 5
+#: Predictions from fewer simulated attempts than this, by kernel weights, rest on next to nothing.
+_WITHIN_REACH = 1.0
+#: Kernels end at this many standard deviations of position.
+_REACH = 5.0
+#: Subsets of simulated successes that tell what chance alone would do.
+_SUBSETS = 10
+_POINTS = 8_000
+
+
+def sources_report(
+    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+) -> SourcesReport:
+    """Compare each source of real trials with simulation.
+
+    Parameters
+    ----------
+    built
+        Of the simulated trials.
+
+    Raises
+    ------
+    ProblemError
+        409 where simulation has too few attempts, or no other source has any trial, saying what is needed.
+    """
+    simulated = attempts.read(sources.database, built.object_row, built.selected)
+    slug = built.object_row.slug
+    if len(simulated) < LEAST_SIMULATED or built.density is None:
+        raise conflict(
+            "too-few-trials",
+            f"A comparison needs at least {LEAST_SIMULATED} simulated attempts and 1 success in them; there"
+            f" are {len(simulated)} and {built.selected.successes}: sweep a grid"
+            f" (POST /objects/{slug}/sweeps)",
+        )
+    real = {source: found for source in REAL if (found := _selected(sources, built, source)) is not None}
+    if not real:
+        raise conflict(
+            "too-few-trials",
+            "There are no trials of a robot, a human or an import to compare simulation with: post at least"
+            f" {LEAST_TRIALS} (POST /objects/{slug}/trials with source robot)",
+        )
+    kernel = built.density.kernel
+    test = sources.scenes.test(built.object_row, built.selected)
+    trials_of = {source: _all(sources, built, selected) for source, selected in real.items()}
+    progress(0.3)
+    model = _model(simulated, list(trials_of.values()), kernel, collisions_known=test is not None)
+    progress(0.5)
+    compared = []
+    for number, (source, selected) in enumerate(real.items()):
+        progress(0.5 + 0.5 * number / len(real))
+        everything = trials_of[source]
+        predicted = np.zeros(len(everything))
+        reached = np.zeros(len(everything), dtype=bool)
+        if model is not None:
+            answer = model.evaluate(everything.position, everything.quaternion, threads=sources.threads)
+            predicted = answer.probability.copy()
+            reached = answer.effective_trials >= _WITHIN_REACH
+        if test is not None:
+            free = test.free(everything.position, everything.quaternion, threads=sources.threads)
+            predicted[~free] = 0.0
+            # Geometry tells of a collision wherever it is.
+            reached |= ~free
+        compared.append(_compared(sources, built, source, selected, everything, predicted, reached))
+    report = SourcesReport(
+        **{**head(built), "source": None},
+        text="",
+        warnings=_warnings(compared, collisions_known=test is not None),
+        level=LEVEL,
+        kernel=built.kernel,
+        attempts=len(simulated),
+        successes=int(simulated.success.sum()),
+        simulation_outcomes=dict(built.selected.outcomes),
+        collisions_known=test is not None,
+        sources=compared,
+    )
+    return report.model_copy(update={"text": _text(report)})
+
+
+def _model(
+    simulated: AllTrials, real: list[AllTrials], kernel: IsotropicKernel, *, collisions_known: bool
+) -> SuccessModel | None:
+    """What simulation knows within reach of the real trials: of millions of attempts few are near them."""
+    tree = cKDTree(np.concatenate([item.position for item in real]))
+    distance, _ = tree.query(simulated.position, distance_upper_bound=_REACH * kernel.sigma_position_m)
+    near = np.isfinite(distance)
+    if collisions_known:
+        # Those that collided tell nothing of the others.
+        near &= ~simulated.collided
+    if not near.any():
+        return None
+    return SuccessModel.build(
+        simulated.position[near],
+        simulated.quaternion[near],
+        simulated.success[near],
+        kernel=kernel,
+        symmetric=simulated.symmetric[near],
+    )
+
+
+def _selected(sources: Sources, built: Built, source: str) -> Selected | None:
+    """A source's trials with the gripper of the simulated ones, of their protocol where it has any, else all;
+    None without trials.
+    """
+    chosen = built.selected
+    with sources.database.read() as tx:
+        counts: dict[int, dict[str, int]] = {}
+        for provenance, code, rows, packed in trials.tallies(tx, built.object_row.id):
+            if rows + packed:
+                counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
+        own = [
+            item
+            for item in trials.provenances(tx, built.object_row.id)
+            if item.id in counts and item.source == source and item.gripper in (None, chosen.gripper)
+        ]
+    if any(item.protocol == chosen.protocol for item in own):
+        own = [item for item in own if item.protocol in (None, chosen.protocol)]
+    if not own:
+        return None
+    outcomes: dict[str, int] = {}
+    for item in own:
+        for name, count in counts[item.id].items():
+            outcomes[name] = outcomes.get(name, 0) + count
+    tells = bool(outcomes.keys() - {"success", "simulation_error"})
+    return Selected(
+        gripper=chosen.gripper,
+        protocol=", ".join(sorted({item.protocol for item in own if item.protocol is not None})) or None,
+        source=source,
+        profile=chosen.profile,
+        provenances={item.id: item.gripper is None or chosen.jaw_symmetric for item in own},
+        outcomes={name: outcomes[name] for name in OUTCOMES if name in outcomes},
+        tried=frozenset(item.id for item in own) if tells else frozenset(),
+    )
+
+
+def _all(sources: Sources, built: Built, selected: Selected) -> AllTrials:
+    """Every trial of a source, of one that posts successes only, too."""
+    whole = replace(selected, tried=frozenset(selected.provenances))
+    return attempts.read(sources.database, built.object_row, whole)
+
+
+def _compared(
+    sources: Sources,
+    built: Built,
+    source: str,
+    selected: Selected,
+    everything: AllTrials,
+    predicted: Floats,
+    reached: NDArray[np.bool_],
+) -> SourceComparison:
+    won = everything.success
+    count = len(everything)
+    successes = int(won.sum())
+    known = reached & np.isfinite(predicted)
+    comparison = SourceComparison(
+        source=source,
+        protocols=[] if selected.protocol is None else selected.protocol.split(", "),
+        trials=count,
+        successes=successes,
+        outcomes=dict(selected.outcomes),
+        share=share(successes, count),
+        predicted=finite(float(predicted[known].mean())) if known.any() else None,
+        predicted_at_successes=float(predicted[known & won].mean()) if (known & won).any() else None,
+        within_reach=int(known.sum()),
+        similarity=_similarity(sources, built, everything),
+    )
+    tells = bool(selected.tried)
+    if not tells or int(known.sum()) < LEAST_TRIALS:
+        return comparison
+    p, y = predicted[known], won[known]
+    whole = calibrate(p, y, bins=_BINS, level=LEVEL)
+    said = p > 0.5
+    cells = {
+        f"{one}-{other}": int(((said == (one == "success")) & (y == (other == "success"))).sum())
+        for one in ("success", "failure")
+        for other in ("success", "failure")
+    }
+    right = cells["success-success"] + cells["failure-failure"]
+    return comparison.model_copy(
+        update={
+            "agreement": share(right, len(y)),
+            "confusion": cells,
+            "brier": whole.brier,
+            "skill": interval(whole.skill, whole.skill_low, whole.skill_high),
+            "auc": finite(whole.auc),
+            "bins": [_bin(item) for item in whole.bins],
+        }
+    )
+
+
+def _bin(item: ReliabilityBin) -> CalibrationBin:
+    return CalibrationBin(
+        lower=item.lower,
+        upper=item.upper,
+        count=item.count,
+        weight=item.weight,
+        predicted=finite(item.predicted),
+        observed=finite(item.observed),
+        low=finite(item.low),
+        high=finite(item.high),
+    )
+
+
+def _similarity(sources: Sources, built: Built, everything: AllTrials) -> SourceSimilarity | None:
+    """Of the densities of both, under one kernel, and of as many simulated successes drawn at random."""
+    density = built.density
+    won = np.flatnonzero(everything.success)
+    if density is None or len(won) < LEAST_SUCCESSES or density.size < LEAST_SUCCESSES:
+        return None
+    # A few grasps would be islands under a kernel chosen for many: as wide as is the rule for a few.
+    sigma = max(density.kernel.sigma_position_m, 0.015)
+    kernel = IsotropicKernel(sigma, max(density.kernel.sigma_rotation, math.radians(15.0)))
+    rng = np.random.default_rng(0)
+
+    def under(rows: NDArray[np.int64]) -> GraspDensity:
+        return GraspDensity.build(
+            density.positions[rows],
+            density.quaternions_xyzw[rows],
+            kernel=kernel,
+            weights=density.weights[rows],
+            symmetric=density.symmetric[rows],
+        )
+
+    whole = under(np.arange(density.size))
+    real = GraspDensity.build(
+        everything.position[won],
+        everything.quaternion[won],
+        kernel=kernel,
+        symmetric=everything.symmetric[won],
+    )
+    found = bhattacharyya(real, whole, rng, points=_POINTS, threads=sources.threads)
+    count = min(len(won), density.size)
+    alone = []
+    for _ in range(_SUBSETS):
+        rows = rng.choice(density.size, size=count, replace=True, p=density.weights)
+        one = GraspDensity.build(
+            density.positions[rows],
+            density.quaternions_xyzw[rows],
+            kernel=kernel,
+            symmetric=density.symmetric[rows],
+        )
+        alone.append(bhattacharyya(one, whole, rng, points=_POINTS, threads=sources.threads).value)
+    return SourceSimilarity(
+        kernel=KernelInfo(
+            kind="isotropic",
+            sigma_position_m=sigma,
+            sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
+            rule="that of simulation, at least 15 mm and 15 deg",
+        ),
+        value=found.value,
+        error=found.standard_error,
+        expected=ReportRange(value=float(np.mean(alone)), low=min(alone), high=max(alone)),
+    )
+
+
+def _warnings(found: list[SourceComparison], *, collisions_known: bool) -> list[str]:
+    warnings = []
+    for item in found:
+        away = item.trials - item.within_reach
+        if away:
+            warnings.append(
+                f"{item.source}: {away:,} of {item.trials:,} trials lie where nothing was simulated nearby;"
+                " they are not judged"
+            )
+        if item.agreement is None:
+            need = max(LEAST_TRIALS - item.within_reach, 0)
+            why = (
+                f"{need} more trials within reach of simulated ones are needed"
+                if need
+                else "it posts successes only: post the trials that failed, too"
+            )
+            warnings.append(f"{item.source}: agreement can't be told: {why}")
+        if item.similarity is None:
+            warnings.append(
+                f"{item.source}: the densities' similarity can't be told from {item.successes} successes;"
+                f" {LEAST_SUCCESSES} of it and of simulation are needed"
+            )
+    if not collisions_known:
+        warnings.append("mesh or gripper is not known: collisions count as ordinary failures")
+    return warnings
+
+
+def _text(report: SourcesReport) -> str:
+    parts = []
+    for item in report.sources:
+        told = f"{item.trials:,} {item.source} trials succeed {_percent(item.share)}"
+        if item.predicted is not None:
+            told += f", simulation predicts {100.0 * item.predicted:.0f} % at their poses"
+        if item.agreement is not None:
+            told += f" and agrees on {_percent(item.agreement)}"
+        if item.similarity is not None:
+            s, e = item.similarity, item.similarity.expected
+            told += f"; densities alike to {s.value:.2f} (by chance alone {e.low:.2f} to {e.high:.2f})"
+        parts.append(told)
+    return ". ".join(parts) + "."
+
+
+def _percent(value: ReportRange) -> str:
+    if value.value is None or value.low is None or value.high is None:
+        return "nothing known"
+    return f"{100.0 * value.value:.0f} % ({100.0 * value.low:.0f} to {100.0 * value.high:.0f})"

@@ -1,0 +1,97 @@
+"""What was tried on every object, and what share succeeded by each way of counting: the summary (table I)."""
+
+from __future__ import annotations
+
+from graspdb.wire import OUTCOMES
+from graspdb.wire.reports import SummaryRate, SummaryReport, SummaryRow
+from graspdb_service.storage import grippers, objects, trials
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.reports.common import LEVEL
+from graspdb_service.usecases.reports.verification import share
+
+#: What each way of counting leaves out, by its name.
+_LEFT_OUT: dict[str, tuple[str, ...]] = {
+    "attempts": (),
+    "free": ("collision",),
+    "met": ("collision", "missed"),
+}
+RULES = {
+    "attempts": "all attempts; a collision or a miss is a failure",
+    "free": "attempts whose open gripper did not collide",
+    "met": "attempts that neither collided nor missed the object",
+}
+#: Tells neither success nor failure.
+_NO_ATTEMPT = "simulation_error"
+_PAGE = 500
+
+
+def summary(database: Database) -> SummaryReport:
+    """Every object's trials by gripper, protocol and source."""
+    rows: list[SummaryRow] = []
+    empty: list[str] = []
+    after = ""
+    while True:
+        with database.read() as tx:
+            page = objects.page(tx, after=after, limit=_PAGE)
+            for item in page:
+                found = _rows(tx, item)
+                rows += found
+                if not found:
+                    empty.append(item.slug)
+        if len(page) < _PAGE:
+            break
+        after = page[-1].slug
+    warnings = [f"no trials yet: {', '.join(empty)}"] if empty else []
+    return SummaryReport(text=_text(rows), level=LEVEL, rules=RULES, rows=rows, warnings=warnings)
+
+
+def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
+    counts: dict[int, dict[str, int]] = {}
+    for provenance, code, stored, packed in trials.tallies(tx, item.id):
+        if stored + packed:
+            counts.setdefault(provenance, {})[OUTCOMES[code]] = stored + packed
+    symmetric: dict[str | None, bool] = {None: True}
+    rows = []
+    for origin in trials.provenances(tx, item.id):
+        if origin.id not in counts:
+            continue
+        if origin.gripper not in symmetric:
+            assert origin.gripper is not None
+            gripper = grippers.find(tx, origin.gripper)
+            symmetric[origin.gripper] = gripper is None or bool(gripper.profile.get("symmetric", True))
+        own = counts[origin.id]
+        outcomes: dict[str, int] = {name: own[name] for name in OUTCOMES if name in own}
+        tried = sum(outcomes.values()) - outcomes.get(_NO_ATTEMPT, 0)
+        won = outcomes.get("success", 0)
+        twins = 2 if symmetric[origin.gripper] else 1
+        rows.append(
+            SummaryRow(
+                object=item.slug,
+                revision=item.revision,
+                gripper=origin.gripper,
+                protocol=origin.protocol,
+                source=origin.source,
+                outcomes=outcomes,
+                trials=tried,
+                successes=won,
+                rates=[_rate(rule, outcomes, tried, won) for rule in RULES],
+                doubled_successes=twins * won,
+                doubled_failures=twins * (tried - won),
+            )
+        )
+    return rows
+
+
+def _rate(rule: str, outcomes: dict[str, int], tried: int, won: int) -> SummaryRate:
+    counted = tried - sum(outcomes.get(name, 0) for name in _LEFT_OUT[rule])
+    return SummaryRate(rule=rule, trials=counted, rate=share(won, counted))
+
+
+def _text(rows: list[SummaryRow]) -> str:
+    if not rows:
+        return "No object has trials yet."
+    tried, won = sum(row.trials for row in rows), sum(row.successes for row in rows)
+    names = {row.object for row in rows}
+    many = f"{len(names):,} objects" if len(names) > 1 else f"1 object ({next(iter(names))})"
+    return f"{tried:,} trials of {many}, {won:,} of them successes."

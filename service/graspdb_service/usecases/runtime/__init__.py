@@ -1,0 +1,1 @@
+"""What all use cases run on: compute threads, caches, idempotency."""

@@ -1,0 +1,107 @@
+"""Creating things at most once: an Idempotency-Key is kept in the transaction that creates."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from graspdb_service.problems import ProblemError, conflict
+from graspdb_service.storage import idempotency
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.idempotency import Remembered
+from graspdb_service.usecases.runtime.context import Context
+
+
+@dataclass(frozen=True)
+class Created:
+    """What a creating request is answered: a JSON body that can be kept, and where the new thing is.
+
+    ``batch_key`` names the batch whose deletion makes the request unrepeatable.
+    """
+
+    body: dict[str, Any]
+    location: str
+    status: int = 201
+    batch_key: str | None = None
+
+
+def replay_or(
+    ctx: Context,
+    *,
+    scope: str,
+    key: str | None,
+    request: bytes,
+    create: Callable[[Tx], Created],
+) -> Created:
+    """Create in one transaction with the key, or answer what the same request was answered before.
+
+    Parameters
+    ----------
+    scope
+        Method and path, e.g. ``POST /objects/mug/trials``.
+    key
+        The Idempotency-Key header; None creates anyway.
+    request
+        What the request asked for: its body, and whatever else changes its meaning.
+    create
+        Does the work inside the transaction; parse and compute before.
+
+    Raises
+    ------
+    ProblemError
+        422 where the key was used with another body, 409 where what it made has since been deleted.
+    """
+    with ctx.database.write() as tx:
+        if key is None:
+            return create(tx)
+        digest = hashlib.sha256(request).hexdigest()
+        earlier = idempotency.claim(tx, scope, key, digest)
+        if earlier is None:
+            made = create(tx)
+            idempotency.remember(
+                tx,
+                scope,
+                key,
+                status=made.status,
+                location=made.location,
+                answer=made.body,
+                batch_key=made.batch_key,
+            )
+            return made
+    return _answer(earlier, digest)
+
+
+def replayed(ctx: Context, *, scope: str, key: str | None, request: bytes) -> Created | None:
+    """What the same request was answered before, or None.
+
+    For requests whose checks may turn out otherwise the second time, or whose work is long: looked up before
+    both. Only :func:`replay_or` takes the key.
+
+    Raises
+    ------
+    ProblemError
+        As :func:`replay_or`.
+    """
+    if key is None:
+        return None
+    with ctx.database.read() as tx:
+        earlier = idempotency.find(tx, scope, key)
+    return None if earlier is None else _answer(earlier, hashlib.sha256(request).hexdigest())
+
+
+def _answer(earlier: Remembered, digest: str) -> Created:
+    if earlier.request_sha256 != digest:
+        raise ProblemError(
+            422,
+            "idempotency-key-reused",
+            "This Idempotency-Key came before with another body: send a new key for a new request",
+            errors=[("Idempotency-Key", "already used with another body")],
+        )
+    if earlier.revoked:
+        raise conflict(
+            "idempotency-key-revoked",
+            "What this request made has been deleted since: to make it again, send a new Idempotency-Key",
+        )
+    return Created(earlier.answer, earlier.location or "", earlier.status)

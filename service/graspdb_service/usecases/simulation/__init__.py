@@ -1,0 +1,1 @@
+"""Sweeps, and the jobs that workers claim."""

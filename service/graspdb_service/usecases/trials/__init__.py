@@ -1,0 +1,1 @@
+"""Trials posted, listed, withdrawn; every attempt of a selection."""

@@ -1,0 +1,88 @@
+"""Batches: what one request, or one sweep, stored; deleting one undoes it."""
+
+from __future__ import annotations
+
+from graspdb.wire import OUTCOMES, BatchInfo
+from graspdb_service.problems import ProblemError, conflict, not_found
+from graspdb_service.storage import batches, objects
+from graspdb_service.storage.batches import BatchRow
+from graspdb_service.storage.database import Tx
+from graspdb_service.usecases.identifiers import is_uuid
+from graspdb_service.usecases.objects import require as require_object
+from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.trials import batch_removal
+
+#: Sweeps over one grid that finish chunks meanwhile make a deletion look again.
+_MAX_LOOKS = 20
+
+
+def get(ctx: Context, slug: str, key: str) -> BatchInfo:
+    """One batch, with everything it holds by outcome."""
+    with ctx.database.read() as tx:
+        row = require_object(tx, slug)
+        return _info(tx, slug, _require(tx, row.id, key))
+
+
+def page(ctx: Context, slug: str, *, after: int, limit: int) -> tuple[list[BatchInfo], int | None]:
+    """A page of batches in the order of their making, and where the next one starts."""
+    with ctx.database.read() as tx:
+        row = require_object(tx, slug)
+        rows = batches.page(tx, row.id, after=after, limit=limit + 1)
+        items = [_info(tx, slug, batch) for batch in rows[:limit]]
+    return items, rows[limit - 1].id if len(rows) > limit else None
+
+
+def remove(ctx: Context, slug: str, key: str) -> None:
+    """Delete a batch with its trials and packed outcomes; 409 while its sweep runs, which would write on.
+
+    Poses that another sweep over the same grid has simulated as well stay, as that sweep's.
+    """
+    for _ in range(_MAX_LOOKS):
+        with ctx.database.read() as tx:
+            left = batch_removal.of(tx, _require(tx, require_object(tx, slug).id, key))
+        with ctx.database.write() as tx:
+            row = require_object(tx, slug, lock=True)
+            batch = _require(tx, row.id, key)
+            if batch.sweep_id is not None and objects.has_running_sweep(tx, row.id, sweep_id=batch.sweep_id):
+                raise conflict(
+                    "sweep-running",
+                    f"The batch is being written by sweep {batch.sweep_id}:"
+                    f" cancel it (POST /sweeps/{batch.sweep_id}/cancel) or wait for its end",
+                )
+            if left is not None and not left.holds(tx):
+                continue
+            if batch.purpose != "check":
+                # The outcomes of a check never entered anything that a revision stands for.
+                objects.advance(tx, row.id, append=False)
+            if left is not None:
+                left.hand_over(tx, batch)
+            batches.remove(tx, batch)
+            return
+    raise ProblemError(
+        503,
+        "busy",
+        "Sweeps over the same grid keep finishing chunks meanwhile; send it again",
+        headers={"Retry-After": "1"},
+    )
+
+
+def _require(tx: Tx, object_id: int, key: str) -> BatchRow:
+    batch = batches.find(tx, object_id, key) if is_uuid(key) else None
+    if batch is None:
+        raise not_found("batch", key[:80], "GET /objects/{id}/batches lists them")
+    return batch
+
+
+def _info(tx: Tx, slug: str, batch: BatchRow) -> BatchInfo:
+    counts = batches.outcome_counts(tx, batch)
+    return BatchInfo(
+        batch=batch.key,
+        object=slug,
+        revision=batch.revision,
+        inserted=batch.inserted,
+        packed=batch.packed,
+        sweep=batch.sweep_id,
+        metadata=batch.metadata,
+        outcomes={OUTCOMES[code]: number for code, number in sorted(counts.items()) if number},
+        created_at=batch.created_at,
+    )
