@@ -100,13 +100,13 @@ class Report(Generic[R]):
 
 
 def _rendered(raw: Any, path: str | Path) -> bytes:
-    from graspdb.figures import rendered
+    from graspdb.figures import render
 
     suffix = Path(path).suffix.lower()
     if suffix == ".png":
-        return rendered(raw, "png")
+        return render(raw, "png")
     if suffix == ".svg":
-        return rendered(raw, "svg")
+        return render(raw, "svg")
     raise ValueError(f"figures are .png or .svg files, not {suffix or path!r}")
 
 

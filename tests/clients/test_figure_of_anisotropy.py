@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspdb.figures import draw, rendered
+from graspdb.figures import draw, render
 from graspdb.wire.reports import AnisotropyReport
 
 
@@ -148,6 +148,6 @@ def test_what_can_not_be_told_is_left_out() -> None:
 
 
 def test_the_files_are_what_they_are_called_and_alike_every_time() -> None:
-    assert rendered(report(), "png").startswith(b"\x89PNG")
-    assert b"<svg" in rendered(report(), "svg")[:500]
-    assert rendered(report(), "png") == rendered(report(), "png")
+    assert render(report(), "png").startswith(b"\x89PNG")
+    assert b"<svg" in render(report(), "svg")[:500]
+    assert render(report(), "png") == render(report(), "png")

@@ -349,4 +349,4 @@ def _figure(run: RunRow, wanted: Literal["png", "svg"]) -> bytes:
 def _drawn(report: AnyReport | SummaryReport, wanted: Literal["png", "svg"]) -> bytes:
     from graspdb import figures
 
-    return figures.rendered(report, wanted)
+    return figures.render(report, wanted)

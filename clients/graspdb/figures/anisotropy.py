@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.figures_style import BLUE, GREEN, GREY, ORANGE, plain, title
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, new_figure, show_grid, title
 from graspdb.wire.reports import (
     AnisotropyHistogram,
     AnisotropyHypothesis,
@@ -21,8 +21,6 @@ from graspdb.wire.reports import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["anisotropy"]
 
 #: Inches: the figure's width, left and right of the panels, a line of the words above them.
 _WIDTH, _LEFT, _RIGHT, _LINE = 10.0, 0.75, 0.25, 0.19
@@ -49,8 +47,9 @@ _RELATIONS = {
 }
 
 
-def anisotropy(figure: Figure, report: AnisotropyReport) -> None:
+def draw_anisotropy(report: AnisotropyReport) -> Figure:
     """Draw it, from above: the words, histograms, profiles by axis, expectations, relations."""
+    figure = new_figure()
     frame = "gripper" if report.alignment == "gripper" else f"{report.alignment}'s axes"
     figure.set_size_inches(_WIDTH, 10.0)
     lines = title(figure, report, f"what a success tells about its vicinity ({report.method}, {frame})")
@@ -59,7 +58,7 @@ def anisotropy(figure: Figure, report: AnisotropyReport) -> None:
     flat = _span(len(report.translations))
     heights = [flat, _SQUARE, *(_PROFILE for _ in range(0, len(report.tolerances), 3))]
     heights += [_rows(len(judged) * 1.6)] if judged else []
-    heights += [_rows(len(related) + len({item.relation for item in related}))] if related else []
+    heights += [_rows(_lines(related))] if related else []
     total = _LINE * (lines + 1) + sum(heights) + len(heights) * (_ABOVE + _BELOW)
     figure.set_size_inches(_WIDTH, total)
     # Placed by hand, in inches: a layout that measures every label takes seconds for as many axes.
@@ -99,15 +98,22 @@ def anisotropy(figure: Figure, report: AnisotropyReport) -> None:
             below -= _ABOVE if i == 0 else _PROFILE + _BELOW + _ABOVE
         _profile(placed(_LEFT + i % 3 * step, step - 0.25, _PROFILE), item, report.level, first=i % 3 == 0)
     below -= _PROFILE + _BELOW
-    if judged:
-        below -= _ABOVE
-        height = _rows(len(judged) * 1.6)
-        _forest(placed(_LEFT + 1.45, _WIDTH - _LEFT - 1.45 - 2.6, height), judged, report.level)
-        below -= height + _BELOW
-    if related:
-        below -= _ABOVE
-        height = _rows(len(related) + len({item.relation for item in related}))
-        _shares(placed(_LEFT + 1.45, _WIDTH - _LEFT - 1.45 - 2.6, height), related, report.level)
+    panels: list[tuple[list[Any], float, Callable[[Axes, list[Any], float], None]]] = [
+        (judged, len(judged) * 1.6, _forest),
+        (related, _lines(related), _shares),
+    ]
+    for items, rows, show in panels:
+        if items:
+            below -= _ABOVE
+            height = _rows(rows)
+            show(placed(_LEFT + 1.45, _WIDTH - _LEFT - 1.45 - 2.6, height), items, report.level)
+            below -= height + _BELOW
+    return figure
+
+
+def _lines(related: list[AnisotropyRelation]) -> int:
+    """Every relation has a heading."""
+    return len(related) + len({item.relation for item in related})
 
 
 def _span(count: int) -> float:
@@ -189,7 +195,7 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
         axes.set_ylabel("share that succeeds\n(others unchanged)", fontsize=8)
     else:
         axes.set_yticklabels([])
-    plain(axes)
+    show_grid(axes)
 
 
 def _forest(axes: Axes, found: list[AnisotropyHypothesis], level: float) -> None:
@@ -233,7 +239,7 @@ def _forest(axes: Axes, found: list[AnisotropyHypothesis], level: float) -> None
     axes.set_title(
         "what the paper expects  (\u25cf confirmed, \u2716 denied, \u25c7 undecided)", fontsize=9, loc="left"
     )
-    plain(axes)
+    show_grid(axes)
 
 
 def _shares(axes: Axes, found: list[AnisotropyRelation], level: float) -> None:
@@ -289,4 +295,4 @@ def _shares(axes: Axes, found: list[AnisotropyRelation], level: float) -> None:
     axes.set_xlabel(f"share that succeeded, {level:.0%} intervals", fontsize=8)
     axes.set_title("by what the jaw closes on", fontsize=9, loc="left")
     axes.legend(fontsize=7.5, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
-    plain(axes)
+    show_grid(axes)

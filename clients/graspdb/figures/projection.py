@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graspdb.figures_style import BLUE, GREY, plain, title
+from graspdb.figures.style import BLUE, GREY, new_figure, show_grid, title
 from graspdb.wire.reports import ProjectionProfile, ProjectionReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["projection"]
 
 #: Inches: the plane's longer side and its shorter one at least, the profiles, and what is left around them.
 _LONGEST, _SHORTEST, _ABOVE, _BESIDE, _GAP = 5.2, 2.4, 1.1, 1.3, 0.15
@@ -22,8 +20,9 @@ _NARROWEST = 5.4
 _LEFT, _BELOW, _TITLE = 0.85, 0.6, 0.95
 
 
-def projection(figure: Figure, report: ProjectionReport) -> None:
+def draw_projection(report: ProjectionReport) -> Figure:
     """Draw it: the plane, and the profiles above and beside it."""
+    figure = new_figure()
     from matplotlib.patches import Polygon
 
     which = "grasps that point one way" if report.approach or report.direction else "all grasps"
@@ -77,6 +76,7 @@ def projection(figure: Figure, report: ProjectionReport) -> None:
     corner = placed(_LEFT + size[0] + _GAP, _BELOW + size[1] + _GAP, beside_inches, _ABOVE)
     corner.axis("off")
     corner.text(0.0, 1.0, _key(report), transform=corner.transAxes, va="top", fontsize=8)
+    return figure
 
 
 def _reach(report: ProjectionReport, across: Any, upward: Any) -> tuple[float, float, float, float]:
@@ -99,7 +99,7 @@ def _profile(axes: Axes, item: ProjectionProfile, *, upright: bool) -> None:
     (axes.set_xlim if upright else axes.set_ylim)(0.0, None)
     (axes.set_xlabel if upright else axes.set_ylabel)("% of all\ngrasps per mm", fontsize=8)
     (axes.xaxis if upright else axes.yaxis).set_major_locator(MaxNLocator(3, prune="lower"))
-    plain(axes)
+    show_grid(axes)
 
 
 def _key(report: ProjectionReport) -> str:

@@ -1,4 +1,4 @@
-"""Figures of the reports on kernels' widths and on sampled kernels."""
+"""The figure of the bandwidth report: likelihood by width, and what became of simulated draws."""
 
 from __future__ import annotations
 
@@ -6,24 +6,33 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from graspdb.figures_style import BLUE, COLOURS, GREEN, GREY, ORANGE, bars, plain, title
-from graspdb.wire.reports import BandwidthReport, KernelSimilarityReport, SimulatedDraws
+from graspdb.figures.style import (
+    BLUE,
+    COLOURS,
+    GREEN,
+    GREY,
+    MARKERS,
+    ORANGE,
+    error_bars,
+    new_figure,
+    show_grid,
+    show_ticks,
+    title,
+)
+from graspdb.wire.reports import BandwidthReport, SimulatedDraws
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["bandwidth", "kernel_similarity"]
 
-_MARKERS = "osD^v"
-
-
-def bandwidth(figure: Figure, report: BandwidthReport) -> None:
+def draw_bandwidth(report: BandwidthReport) -> Figure:
     """Draw the likelihood of left-out grasps by width, and what became of simulated draws."""
+    figure = new_figure(11.0, 5.6)
     title(figure, report, "how wide should the kernel be?")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1) if report.draws else (3, 1))
     turns = sorted({point.sigma_rotation_deg for point in report.grid})
-    for turn, colour, marker in zip(turns, COLOURS, _MARKERS, strict=False):
+    for turn, colour, marker in zip(turns, COLOURS, MARKERS, strict=False):
         points = [p for p in report.grid if p.sigma_rotation_deg == turn and p.log_likelihood is not None]
         left.errorbar(
             [1e3 * p.sigma_position_m for p in points],
@@ -44,10 +53,11 @@ def bandwidth(figure: Figure, report: BandwidthReport) -> None:
     left.set_ylabel("log density of left-out grasps\n[nats of 1/(m³ rad³)]")
     left.set_title("bars: error of the difference to the best;\nband: not told from the best", fontsize=8)
     left.legend(title="rotation width", fontsize=8, title_fontsize=8, loc="lower left", framealpha=0.9)
-    _ticks(left, sorted({1e3 * p.sigma_position_m for p in report.grid if p.log_likelihood is not None}))
+    show_ticks(left, sorted({1e3 * p.sigma_position_m for p in report.grid if p.log_likelihood is not None}))
     _draws(right, report.draws, report.level)
     for axes in (left, right):
-        plain(axes)
+        show_grid(axes)
+    return figure
 
 
 def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
@@ -69,7 +79,7 @@ def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
         axes.errorbar(
             at[known] + shift,
             [item.value or 0.0 for item in shown],
-            yerr=bars(shown),
+            yerr=error_bars(shown),
             color=colour,
             marker=marker,
             markersize=5,
@@ -91,44 +101,3 @@ def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
     axes.set_ylabel("share of simulated draws")
     axes.set_title(f"draws simulated as checks, {level:.0%} intervals", fontsize=8)
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
-
-
-def kernel_similarity(figure: Figure, report: KernelSimilarityReport) -> None:
-    """Draw figure 13: similarity to the full statistics by number of samples, and of Gaussians."""
-    title(figure, report, "how many samples does a kernel need?")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    for axes, points, colour, marker in (
-        (left, report.samples, BLUE, "o"),
-        (right, report.mixtures, ORANGE, "s"),
-    ):
-        axes.errorbar(
-            [point.count for point in points],
-            [point.similarity for point in points],
-            yerr=[1.64 * point.error for point in points],
-            color=colour,
-            marker=marker,
-            markersize=4,
-            capsize=3,
-            linewidth=1.5,
-        )
-        axes.set_ylim(0.0, 1.02)
-        plain(axes)
-    left.set_xscale("log")
-    _ticks(left, [float(point.count) for point in report.samples])
-    right.set_xticks([point.count for point in report.mixtures if point.count % 2 == 0 or point.count == 1])
-    left.axvline(900, color=GREY, linestyle=":", linewidth=1.2)
-    left.annotate("900: the paper", (900, 0.03), xytext=(-3, 0), textcoords="offset points",
-                  fontsize=8, color=GREY, ha="right", rotation=90)  # fmt: skip
-    left.set_xlabel(f"samples, of {report.reference:,} displacements")
-    right.set_xlabel("Gaussians of a mixture")
-    right.set_title("mixtures in the place of samples", fontsize=8)
-    left.set_ylabel(f"similarity to the full statistics\n(Bhattacharyya; {report.level:.0%} intervals)")
-    window = f"{1e3 * report.window_position_m:.0f} mm, {report.window_rotation_deg:.0f}°"
-    widths = f"{1e3 * report.component_position_m:.0f} mm, {report.component_rotation_deg:.0f}°"
-    left.set_title(f"window {window}; components {widths}", fontsize=8)
-
-
-def _ticks(axes: Axes, values: list[float]) -> None:
-    axes.set_xticks(values)
-    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values])
-    axes.minorticks_off()

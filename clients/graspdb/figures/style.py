@@ -11,23 +11,31 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "BLUE",
-    "COLOURS",
-    "GREEN",
-    "GREY",
-    "ORANGE",
-    "YELLOW",
-    "bars",
-    "heading",
-    "plain",
-    "title",
-    "told",
-]
-
 #: Okabe and Ito's, which colour-blind readers tell apart.
 BLUE, ORANGE, GREEN, YELLOW, GREY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#666666"
 COLOURS = (BLUE, ORANGE, GREEN, YELLOW, "#CC79A7", "#56B4E9", GREY)
+
+
+MARKERS = "osD^v"
+
+
+def new_figure(width: float | None = None, height: float | None = None) -> Figure:
+    """A figure of this size in inches, laid out by itself; without a size, whoever draws places its axes.
+
+    Made without pyplot, so that a server may draw from its threads.
+
+    Raises
+    ------
+    ImportError
+        Without matplotlib; the message says how to install it.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("figures need matplotlib: pip install 'graspdb[plot]'") from error
+    if width is None or height is None:
+        return Figure()
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def title(figure: Figure, report: Any, kind: str) -> int:
@@ -53,7 +61,7 @@ def _wrapped(text: str, width: int) -> str:
     return "\n".join(lines)
 
 
-def plain(axes: Axes) -> None:
+def show_grid(axes: Axes) -> None:
     """A grid behind, ticks that can be read, and no frame above and to the right."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="0.9", linewidth=0.6)
@@ -61,12 +69,12 @@ def plain(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def told(value: float | None) -> str:
+def number(value: float | None) -> str:
     """Two decimals, or that it is not known."""
     return "unknown" if value is None else f"{value:.2f}"
 
 
-def bars(ranges: Sequence[ReportRange]) -> list[list[float]]:
+def error_bars(ranges: Sequence[ReportRange]) -> list[list[float]]:
     """Lengths of error bars below and above, as matplotlib wants them."""
     below, above = [], []
     for item in ranges:
@@ -74,3 +82,10 @@ def bars(ranges: Sequence[ReportRange]) -> list[list[float]]:
         below.append(max(value - (value if item.low is None else item.low), 0.0))
         above.append(max((value if item.high is None else item.high) - value, 0.0))
     return [below, above]
+
+
+def show_ticks(axes: Axes, values: list[float]) -> None:
+    """Ticks at these values only."""
+    axes.set_xticks(values)
+    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values])
+    axes.minorticks_off()

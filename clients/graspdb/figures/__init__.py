@@ -1,0 +1,57 @@
+"""Figures of reports: one drawing for the service's PNG and SVG and for ``.plot()`` in a notebook.
+
+A report's figure is a function ``draw_<report>`` in the file of its name. Colours are Okabe and Ito's, which
+colour-blind readers tell apart; heat maps are viridis. What has no data is white and hatched, never a colour.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+from graspdb.figures.anisotropy import draw_anisotropy
+from graspdb.figures.bandwidth import draw_bandwidth
+from graspdb.figures.calibration import draw_calibration
+from graspdb.figures.convergence import draw_convergence
+from graspdb.figures.kernel_similarity import draw_kernel_similarity
+from graspdb.figures.projection import draw_projection
+from graspdb.figures.sources import draw_sources
+from graspdb.figures.summary import draw_summary
+from graspdb.wire import reports
+from graspdb.wire.reports import AnyReport, SummaryReport
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["draw", "render"]
+
+_DRAW: dict[type[Any], Callable[[Any], Figure]] = {
+    reports.AnisotropyReport: draw_anisotropy,
+    reports.BandwidthReport: draw_bandwidth,
+    reports.CalibrationReport: draw_calibration,
+    reports.ConvergenceReport: draw_convergence,
+    reports.KernelSimilarityReport: draw_kernel_similarity,
+    reports.ProjectionReport: draw_projection,
+    reports.SourcesReport: draw_sources,
+    reports.SummaryReport: draw_summary,
+}
+_DPI = 120
+# Matplotlib shares its font cache and text paths between figures.
+_LOCK = threading.Lock()
+
+
+def render(report: AnyReport | SummaryReport, format: Literal["png", "svg"]) -> bytes:
+    """The figure of a report as a file's bytes."""
+    with _LOCK:
+        target = io.BytesIO()
+        # No date: the same report gives the same bytes.
+        metadata = {"Date": None} if format == "svg" else {"Software": None}
+        draw(report).savefig(target, format=format, dpi=_DPI, metadata=metadata)
+        return target.getvalue()
+
+
+def draw(report: AnyReport | SummaryReport) -> Figure:
+    """The figure of a report; needs matplotlib (extra ``plot``)."""
+    return _DRAW[type(report)](report)

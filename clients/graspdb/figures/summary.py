@@ -1,0 +1,101 @@
+"""The figure of all objects' trials: outcomes, and success rates by each way of counting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.figures.style import (
+    BLUE,
+    COLOURS,
+    GREEN,
+    GREY,
+    MARKERS,
+    ORANGE,
+    error_bars,
+    heading,
+    new_figure,
+    show_grid,
+)
+from graspdb.wire import OUTCOMES
+from graspdb.wire.reports import SummaryReport, SummaryRow
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Okabe and Ito's, success the darkest.
+_OUTCOME_COLOURS = dict(
+    zip(
+        OUTCOMES,
+        (GREY, BLUE, ORANGE, "#56B4E9", "#E69F00", "#F0E442", GREEN, "#CC79A7", "#BBBBBB"),
+        strict=True,
+    )
+)
+#: On which white is read best, and the share of trials from which it is written down.
+_DARK, _LEAST_WRITTEN = ("failure", "success", "collision", "dropped"), 0.06
+
+
+def draw_summary(report: SummaryReport) -> Figure:
+    """Draw trials by outcome beside the success rates by each way of counting."""
+    figure = new_figure(12.0, 2.8 + 0.62 * max(len(report.rows), 2))
+    heading(figure, "what was tried, and what succeeded", report.text)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    at = np.arange(len(report.rows))[::-1].astype(float)
+    _outcomes(left, report.rows, at)
+    _rates(right, report, at)
+    for axes, columns in ((left, 4), (right, 1)):
+        if report.rows:
+            axes.legend(
+                fontsize=8, ncols=columns, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False
+            )
+        show_grid(axes)
+    return figure
+
+
+def _outcomes(axes: Axes, rows: Sequence[SummaryRow], at: NDArray[np.float64]) -> None:
+    start = np.zeros(len(rows))
+    total = np.array([max(sum(row.outcomes.values()), 1) for row in rows], dtype=float)
+    for name in OUTCOMES:
+        share = np.array([row.outcomes.get(name, 0) for row in rows], dtype=float) / total
+        if not share.any():
+            continue
+        axes.barh(at, share, left=start, color=_OUTCOME_COLOURS[name], edgecolor="white", linewidth=0.5,
+                  height=0.7, label=name.replace("_", " "))  # fmt: skip
+        for y, part, begin in zip(at, share, start, strict=True):
+            if part >= _LEAST_WRITTEN:
+                axes.text(begin + 0.5 * part, y, f"{100 * part:.0f} %", fontsize=8, ha="center", va="center",
+                          color="white" if name in _DARK else "0.1")  # fmt: skip
+        start += share
+    axes.set_yticks(at)
+    axes.set_yticklabels([_name(row) for row in rows], fontsize=8)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
+    axes.set_xlim(0.0, 1.0)
+    axes.set_xlabel("share of the trials, by outcome")
+
+
+def _rates(axes: Axes, report: SummaryReport, at: NDArray[np.float64]) -> None:
+    for number, (rule, colour, marker) in enumerate(zip(report.rules, COLOURS, MARKERS, strict=False)):
+        rates = [next(item.rate for item in row.rates if item.rule == rule) for row in report.rows]
+        known = [i for i, rate in enumerate(rates) if rate.value is not None]
+        shown = [rates[i] for i in known]
+        height = at[known] + 0.2 * (1 - number)
+        axes.errorbar(
+            [rate.value or 0.0 for rate in shown], height, xerr=error_bars(shown), color=colour,
+            marker=marker, markersize=5, capsize=2, linestyle="none", label=report.rules[rule],
+        )  # fmt: skip
+        for y, rate in zip(height, shown, strict=True):
+            axes.annotate(f"{100 * (rate.value or 0.0):.2f} %", (rate.high or 0.0, y), xytext=(6, 0),
+                          textcoords="offset points", fontsize=8, va="center")  # fmt: skip
+    # Room for the numbers beside the markers.
+    axes.set_xlim(0.0, 1.2)
+    axes.set_xticks(np.linspace(0.0, 1.0, 6))
+    axes.set_xlabel(f"share that succeeded, {report.level:.0%} intervals")
+
+
+def _name(row: SummaryRow) -> str:
+    parts = [part for part in (row.gripper, row.protocol, row.source) if part]
+    return f"{row.object}\n{', '.join(parts) or 'no source'}; n = {row.trials:,}"
