@@ -18,13 +18,14 @@ import anyio
 import anyio.to_thread
 
 from graspdb import wire
-from graspdb.client import Client, Grippers
-from graspdb.kernels import Kernels
-from graspdb.objects import GraspObject, Objects
-from graspdb.pages import PAGE, Item, Listing
+from graspdb.client import Client
 from graspdb.reports import AllReports, Reports
-from graspdb.sweeps import ProgressCallback, Sweep, Sweeps
-from graspdb.trials import Batches, TrialListing, Trials
+from graspdb.resources.grippers import Grippers
+from graspdb.resources.kernels import Kernels
+from graspdb.resources.objects import GraspObject, Objects
+from graspdb.resources.pages import PAGE, Item, Listing
+from graspdb.resources.sweeps import ProgressCallback, Sweep, Sweeps
+from graspdb.resources.trials import Batches, TrialListing, Trials
 
 __all__ = [
     "AsyncAllReports",
@@ -113,7 +114,7 @@ def _same(item: R) -> R:
 
 
 class AsyncSweep(Mirror[Sweep]):
-    """:class:`graspdb.sweeps.Sweep`."""
+    """:class:`graspdb.resources.sweeps.Sweep`."""
 
     @property
     def info(self) -> wire.SweepInfo:
@@ -153,7 +154,7 @@ class AsyncSweep(Mirror[Sweep]):
     async def wait(
         self, *, progress: bool | ProgressCallback = False, timeout: float | None = None
     ) -> AsyncSweep:
-        """As :meth:`graspdb.sweeps.Sweep.wait`; no thread waits meanwhile."""
+        """As :meth:`graspdb.resources.sweeps.Sweep.wait`; no thread waits meanwhile."""
         pauses = self.sync.pauses(progress=progress, timeout=timeout)
         while (pause := await _in_thread(next, pauses, None)) is not None:
             await anyio.sleep(pause)
@@ -164,14 +165,14 @@ class AsyncSweep(Mirror[Sweep]):
 
 
 class AsyncSweeps(Mirror[Sweeps]):
-    """:class:`graspdb.sweeps.Sweeps`."""
+    """:class:`graspdb.resources.sweeps.Sweeps`."""
 
     get = _mirrored(Sweeps.get, AsyncSweep)
     list = _iterated(Sweeps.list, AsyncSweep)
 
 
 class AsyncListing(Mirror[Listing[Item]], Generic[Item]):
-    """:class:`graspdb.pages.Listing`: ``async for``, or :meth:`first`."""
+    """:class:`graspdb.resources.pages.Listing`: ``async for``, or :meth:`first`."""
 
     def __aiter__(self) -> AsyncIterator[Item]:
         return _each(self.sync)
@@ -182,7 +183,7 @@ class AsyncListing(Mirror[Listing[Item]], Generic[Item]):
 
 
 class AsyncTrialListing(AsyncListing[wire.TrialOut]):
-    """:class:`graspdb.trials.TrialListing`."""
+    """:class:`graspdb.resources.trials.TrialListing`."""
 
     sync: TrialListing
 
@@ -191,14 +192,14 @@ class AsyncTrialListing(AsyncListing[wire.TrialOut]):
 
 
 class AsyncTrials(Mirror[Trials]):
-    """:class:`graspdb.trials.Trials`."""
+    """:class:`graspdb.resources.trials.Trials`."""
 
     add = _awaited(Trials.add)
     add_records = _awaited(Trials.add_records)
     to_pandas = _awaited(Trials.to_pandas)
 
     def list(self, **filters: Any) -> AsyncTrialListing:
-        """The stored trials that match; filters as in :meth:`graspdb.trials.Trials.list`."""
+        """The stored trials that match; filters as in :meth:`graspdb.resources.trials.Trials.list`."""
         return AsyncTrialListing(self.sync.list(**filters))
 
     def __aiter__(self) -> AsyncIterator[wire.TrialOut]:
@@ -206,7 +207,7 @@ class AsyncTrials(Mirror[Trials]):
 
 
 class AsyncBatches(Mirror[Batches]):
-    """:class:`graspdb.trials.Batches`."""
+    """:class:`graspdb.resources.trials.Batches`."""
 
     get = _awaited(Batches.get)
     delete = _awaited(Batches.delete)
@@ -239,7 +240,7 @@ class AsyncAllReports(Mirror[AllReports]):
 
 
 class AsyncGraspObject(Mirror[GraspObject]):
-    """:class:`graspdb.objects.GraspObject`."""
+    """:class:`graspdb.resources.objects.GraspObject`."""
 
     def __init__(self, sync: GraspObject) -> None:
         super().__init__(sync)
@@ -287,7 +288,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
 
 
 class AsyncObjects(Mirror[Objects]):
-    """:class:`graspdb.objects.Objects`."""
+    """:class:`graspdb.resources.objects.Objects`."""
 
     create = _mirrored(Objects.create, AsyncGraspObject)
     get = _mirrored(Objects.get, AsyncGraspObject)
@@ -299,7 +300,7 @@ class AsyncObjects(Mirror[Objects]):
 
 
 class AsyncGrippers(Mirror[Grippers]):
-    """:class:`graspdb.client.Grippers`."""
+    """:class:`graspdb.resources.grippers.Grippers`."""
 
     create = _awaited(Grippers.create)
     get = _awaited(Grippers.get)
@@ -310,7 +311,7 @@ class AsyncGrippers(Mirror[Grippers]):
 
 
 class AsyncKernels(Mirror[Kernels]):
-    """:class:`graspdb.kernels.Kernels`."""
+    """:class:`graspdb.resources.kernels.Kernels`."""
 
     fit = _awaited(Kernels.fit)
     create = _awaited(Kernels.create)

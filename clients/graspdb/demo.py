@@ -28,9 +28,9 @@ from rich.markup import escape
 
 from graspdb.client import Client
 from graspdb.errors import Conflict, GraspDBError, Infeasible
-from graspdb.objects import GraspObject
+from graspdb.resources.objects import GraspObject
+from graspdb.resources.sweeps import OutcomeArrays, Sweep, SweepBar, duration
 from graspdb.results import Grasp
-from graspdb.sweeps import OutcomeArrays, Sweep, SweepBar, duration
 
 __all__ = ["Children", "DemoFailed", "demo", "wilson_interval"]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
-from graspdb.runs import RunProgress, finished
-from graspdb.selection import Selection, TrialSelection, query, taken
-from graspdb.sweeps import Sweep
+from graspdb.resources.runs import RunProgress, finished
+from graspdb.resources.selection import Selection, TrialSelection, query, taken
+from graspdb.resources.sweeps import Sweep
 from graspdb.transport import Transport
 from graspdb.wire.reports import (
     REPORTS,
@@ -263,7 +263,7 @@ def _column(values: Any) -> Floats:
 
 class Reports:
     """``mug.reports``. They take the selection of trials, most of them the kernel, too: see
-    :class:`graspdb.selection.Selection`.
+    :class:`Selection`.
 
     They wait until the report is computed; ``progress`` is called with its run meanwhile, and ``timeout_s``
     ends the wait, not the computation: asking again goes on waiting.

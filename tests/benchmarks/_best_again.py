@@ -20,7 +20,7 @@ from scipy.special import betaincinv
 
 from graspdb import Client
 from graspdb.errors import NotFound
-from graspdb.objects import GraspObject
+from graspdb.resources.objects import GraspObject
 
 SHARES = {"cone": 0.0094, "elongated-d": 0.0072, "screwdriver": 0.135, "mug": 0.0139}
 """Successes per pose of the whole grid."""

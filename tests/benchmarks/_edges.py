@@ -17,7 +17,7 @@ import numpy as np
 from graspdb import Client
 from graspdb.errors import NotFound
 from graspdb.examples import EXAMPLES
-from graspdb.objects import GraspObject
+from graspdb.resources.objects import GraspObject
 
 
 def main() -> None:

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from graspdb import Client
 from graspdb.errors import ChecksNeeded, Conflict, NotFound
-from graspdb.objects import GraspObject
 from graspdb.reports import Convergence
+from graspdb.resources.objects import GraspObject
 from graspdb.wire import StoredKernel
 
 ALIGNED = {"cone": "object", "screwdriver": "object", "elongated-d": "edge", "mug": "edge"}

@@ -13,13 +13,13 @@ import pytest
 import trimesh
 
 from graspdb import AsyncClient, Client, GraspDBError, Infeasible, asynchronous
-from graspdb.client import Grippers
-from graspdb.kernels import Kernels
-from graspdb.objects import GraspObject, Objects
-from graspdb.pages import Listing
 from graspdb.reports import AllReports, Reports
-from graspdb.sweeps import Sweep, Sweeps
-from graspdb.trials import Batches, TrialListing, Trials
+from graspdb.resources.grippers import Grippers
+from graspdb.resources.kernels import Kernels
+from graspdb.resources.objects import GraspObject, Objects
+from graspdb.resources.pages import Listing
+from graspdb.resources.sweeps import Sweep, Sweeps
+from graspdb.resources.trials import Batches, TrialListing, Trials
 
 MIRRORS = {
     Client: asynchronous.AsyncClient,

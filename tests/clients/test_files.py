@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspdb.files import read_poses, read_trials
+from graspdb.files.trials import read_poses, read_trials
 
 HEADER = "x,y,z,qx,qy,qz,qw"
 POSE = {"position": [0.1, 0.2, 0.3], "quaternion_xyzw": [0, 0, 0, 1]}

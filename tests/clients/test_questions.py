@@ -14,9 +14,9 @@ import trimesh
 
 from graspdb import Client, Infeasible, cli, wire
 from graspdb.errors import Conflict, InvalidInput
-from graspdb.objects import GraspObject
 from graspdb.reports import Reports
-from graspdb.selection import Constraints, Selection, TrialSelection
+from graspdb.resources.objects import GraspObject
+from graspdb.resources.selection import Constraints, Selection, TrialSelection
 
 DOWN = [1.0, 0.0, 0.0, 0.0]
 

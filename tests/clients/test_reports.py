@@ -13,8 +13,8 @@ import pytest
 
 from graspdb import Client, cli
 from graspdb.errors import ChecksNeeded, Conflict, NotFound
-from graspdb.objects import GraspObject
 from graspdb.reports import Report
+from graspdb.resources.objects import GraspObject
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -21,8 +21,8 @@ from graspdb.errors import (
     Unreachable,
     error_for,
 )
-from graspdb.objects import GraspObject
 from graspdb.poses import as_poses, matrices
+from graspdb.resources.objects import GraspObject
 
 DOWN = [1.0, 0.0, 0.0, 0.0]
 SIDE = [0.0, 0.5**0.5, 0.0, 0.5**0.5]

@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 
 from graspdb import __version__
-from graspdb.cli import objects, queries, reports, sweeps, trials
+from graspdb.cli import kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
 from graspdb.demo import demo
 from graspdb.errors import GraspDBError
@@ -69,7 +69,7 @@ app.command("likelihood")(queries.likelihood)
 app.command("samples")(queries.samples)
 app.command("proposals")(queries.proposals)
 app.command("report")(reports.report)
-app.add_typer(reports.kernels, name="kernels")
+app.add_typer(kernels.kernels, name="kernels")
 app.command("sweep")(sweeps.sweep)
 app.add_typer(sweeps.sweeps, name="sweeps")
 app.command("workers")(sweeps.workers)

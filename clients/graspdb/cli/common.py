@@ -8,16 +8,19 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from pydantic import BaseModel
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from graspdb.client import Client
+from graspdb.wire.reports import ReportRun
 
 __all__ = ["State", "out", "selecting", "show_rows", "show_table", "state_of", "vector"]
 
@@ -171,3 +174,25 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, empty: 
 def numbers(values: Any, digits: int = 4) -> str:
     """A vector in a cell."""
     return " ".join(f"{float(value):+.{digits}f}" for value in values)
+
+
+def number(value: float | None) -> str:
+    """Two decimals, or that it is not known."""
+    return "unknown" if value is None else f"{value:.2f}"
+
+
+@contextmanager
+def run_bar(title: str) -> Iterator[Callable[[ReportRun], None]]:
+    """How far a run is, for a person to see, once it is told."""
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
+    )
+    with bar:
+        task: Any = None
+
+        def show(run: ReportRun) -> None:
+            nonlocal task
+            task = bar.add_task(title, total=1.0) if task is None else task
+            bar.update(task, completed=run.progress)
+
+        yield show

@@ -10,7 +10,7 @@ import typer
 
 from graspdb.cli.common import ERRORS, ObjectId, out, show_rows, show_table, state_of
 from graspdb.errors import Conflict
-from graspdb.objects import GraspObject
+from graspdb.resources.objects import GraspObject
 
 objects = typer.Typer(no_args_is_help=True, help="Create, list, show and delete objects.")
 grippers = typer.Typer(no_args_is_help=True, help="Create, list and show gripper profiles.")

@@ -20,9 +20,9 @@ from graspdb.cli.common import (
     vector_option,
 )
 from graspdb.errors import Infeasible
-from graspdb.files import read_poses
+from graspdb.files.trials import read_poses
+from graspdb.resources.selection import Selection
 from graspdb.results import SampledPoses
-from graspdb.selection import Selection
 
 
 @selecting

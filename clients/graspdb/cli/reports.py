@@ -1,24 +1,20 @@
-"""``graspdb report`` and ``graspdb kernels``."""
+"""``graspdb report``."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from graspdb.cli.common import (
     ERRORS,
-    Gripper,
     ObjectId,
-    Protocol,
-    Source,
     State,
+    number,
     out,
+    run_bar,
     selecting,
     show_rows,
     show_table,
@@ -35,11 +31,7 @@ from graspdb.reports import (
     Summary,
 )
 from graspdb.wire import OUTCOMES
-from graspdb.wire.kernels import KernelProvenance
-from graspdb.wire.reports import REPORTS, ReportRange, ReportRun
-
-kernels = typer.Typer(help="Stored kernels.", no_args_is_help=True)
-
+from graspdb.wire.reports import REPORTS, ReportRange
 
 #: What each report takes, by the names of the SDK.
 _SELECTION = ("gripper", "protocol", "source")
@@ -181,25 +173,8 @@ def _computed(state: State, id: str, name: str, options: dict[str, Any], simulat
 
 
 def _asked(reports: Reports, id: str, name: str, options: dict[str, Any]) -> Any:
-    with _bar(f"{name} of {id}") as show:
+    with run_bar(f"{name} of {id}") as show:
         return getattr(reports, name.replace("-", "_"))(**options, progress=show)
-
-
-@contextmanager
-def _bar(title: str) -> Iterator[Callable[[ReportRun], None]]:
-    """How far a run is, for a person to see, once it is told."""
-    bar = Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
-    )
-    with bar:
-        task: Any = None
-
-        def show(run: ReportRun) -> None:
-            nonlocal task
-            task = bar.add_task(title, total=1.0) if task is None else task
-            bar.update(task, completed=run.progress)
-
-        yield show
 
 
 def _show(found: Any) -> None:
@@ -211,13 +186,13 @@ def _show(found: Any) -> None:
         rows |= {
             "Brier skill": _range(raw.skill),
             "over attempts that did not collide": _range(raw.free_skill),
-            "calibration error above 0.1": _number(raw.ece),
-            "AUC of probability and density": f"{_number(raw.auc_probability)}, {_number(raw.auc_density)}",
+            "calibration error above 0.1": number(raw.ece),
+            "AUC of probability and density": f"{number(raw.auc_probability)}, {number(raw.auc_density)}",
         }
         if raw.checked is not None:
             rows["simulated again"] = (
                 f"{raw.checked.successes:,} of {raw.checked.grasps:,} succeeded: {_range(raw.checked.rate)},"
-                f" predicted {_number(raw.checked.predicted)}"
+                f" predicted {number(raw.checked.predicted)}"
             )
     show_rows(rows)
     for table in _tables(found):
@@ -251,9 +226,9 @@ def _tables(found: Any) -> list[Table]:
                 ("predicted", "came true", "interval", "attempts"),
                 [
                     (
-                        _number(b.predicted),
-                        _number(b.observed),
-                        f"{_number(b.low)} to {_number(b.high)}",
+                        number(b.predicted),
+                        number(b.observed),
+                        f"{number(b.low)} to {number(b.high)}",
                         b.count,
                     )
                     for b in raw.bins
@@ -270,8 +245,8 @@ def _tables(found: Any) -> list[Table]:
                     (
                         f"{1e3 * p.sigma_position_m:.1f}",
                         f"{p.sigma_rotation_deg:.1f}",
-                        _number(p.log_likelihood),
-                        f"{_number(p.below_best)} ± {_number(p.below_best_error)}",
+                        number(p.log_likelihood),
+                        f"{number(p.below_best)} ± {number(p.below_best_error)}",
                     )
                     for p in best
                 ],
@@ -320,7 +295,7 @@ def _tables(found: Any) -> list[Table]:
                         item.source,
                         item.trials,
                         _range(item.share),
-                        _number(item.predicted),
+                        number(item.predicted),
                         _range(item.agreement),
                         _range(item.skill),
                         "unknown"
@@ -364,109 +339,4 @@ def _percent(value: ReportRange) -> str:
 def _range(value: ReportRange | None) -> str:
     if value is None or value.value is None:
         return "unknown"
-    return f"{value.value:.2f} ({_number(value.low)} to {_number(value.high)})"
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f}"
-
-
-def _fitted_on(source: KernelProvenance) -> dict[str, str]:
-    """What a kernel was fitted on, and how well it does on what it has not seen."""
-    if source.attempts is not None:
-        skill, isotropic = _number(source.brier_skill), _number(source.isotropic_brier_skill)
-        return {
-            "fitted on": f"{source.attempts:,} attempts",
-            "Brier skill": f"{skill} (isotropic {isotropic})",
-            "log loss": f"{_number(source.log_loss)} (isotropic {_number(source.isotropic_log_loss)})",
-        }
-    told = {"fitted on": f"{source.successes:,} successes, {source.displacements:,} displacements"}
-    if source.log_likelihood is not None:
-        told["held-out log density"] = (
-            f"{_number(source.log_likelihood)} (isotropic {_number(source.isotropic_log_likelihood)})"
-        )
-    return told
-
-
-@kernels.command("fit")
-def fit_kernel(
-    context: typer.Context,
-    id: ObjectId,
-    alignment: Annotated[
-        str, typer.Option(help="gripper; anisotropic: or object, edge, surface-pair; probability: or object.")
-    ] = "gripper",
-    components: Annotated[
-        str | None, typer.Option(help="anisotropic: 1 to 16 Gaussians, or auto; sampled: displacements.")
-    ] = None,
-    kind: Annotated[str, typer.Option(help="anisotropic, sampled or probability.")] = "anisotropic",
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-) -> None:
-    """Fit a kernel on an object's successes, or widths that predict success on all its attempts."""
-    state = state_of(context)
-    count = int(components) if components is not None and components.isdigit() else components
-    given: dict[str, Any] = {
-        "gripper": gripper,
-        "protocol": protocol,
-        "source": source,
-        "components": count,
-    }
-    with state.client() as db, _bar(f"kernel of {id}") as show:
-        made = db.kernels.fit(
-            id,
-            kind=kind,
-            alignment=alignment,
-            progress=show,
-            **{name: value for name, value in given.items() if value is not None},
-        )
-    if state.json:
-        out(made)
-        return
-    source_of = made.provenance
-    show_rows(
-        {
-            "id": made.id,
-            "widths": _widths(made.widths_m, 1e3, "mm") + "; " + _widths(made.widths_deg, 1.0, "°"),
-            **_fitted_on(source_of),
-        }
-    )
-
-
-@kernels.command("list")
-def list_kernels(context: typer.Context) -> None:
-    """List stored kernels."""
-    state = state_of(context)
-    with state.client() as db:
-        found = list(db.kernels)
-    if state.json:
-        out(found)
-        return
-    show_table(
-        ("id", "object", "gripper", "alignment", "widths [mm]", "widths [°]"),
-        [
-            (
-                k.id,
-                k.provenance.object,
-                k.gripper,
-                k.alignment,
-                _widths(k.widths_m, 1e3, ""),
-                _widths(k.widths_deg, 1.0, ""),
-            )
-            for k in found
-        ],
-        empty="No kernels: fit one with graspdb kernels fit OBJECT.",
-    )
-
-
-@kernels.command("delete")
-def delete_kernel(
-    context: typer.Context, kernel: Annotated[str, typer.Argument(help="The kernel's id.")]
-) -> None:
-    """Delete a stored kernel."""
-    with state_of(context).client() as db:
-        db.kernels.delete(kernel)
-
-
-def _widths(values: tuple[float, ...], factor: float, unit: str) -> str:
-    return ", ".join(f"{factor * value:.1f}" for value in values) + (f" {unit}" if unit else "")
+    return f"{value.value:.2f} ({number(value.low)} to {number(value.high)})"

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from graspdb.cli.common import ObjectId, Vector, out, show_rows, show_table, state_of, vector_option
-from graspdb.files import read_poses
-from graspdb.sweeps import Sweep
+from graspdb.files.trials import read_poses
+from graspdb.resources.sweeps import Sweep
 
 sweeps = typer.Typer(no_args_is_help=True, help="List, show, cancel and retry sweeps.")
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from graspdb.cli.common import ObjectId, numbers, out, show_rows, show_table, state_of
-from graspdb.files import read_trials
-from graspdb.trials import CHUNK_TRIALS
+from graspdb.files.trials import read_trials
+from graspdb.resources.trials import CHUNK_TRIALS
 
 trials = typer.Typer(no_args_is_help=True, help="Add and list grasp trials.")
 batches = typer.Typer(no_args_is_help=True, help="List and delete what arrived together.")

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from graspdb import wire
-from graspdb.pages import checked
 from graspdb.poses import as_poses, as_vector7
+from graspdb.resources.pages import checked
 
 __all__ = ["Constraints", "Kernel", "Selection", "TrialSelection", "best_grasp_request", "query", "taken"]
 
@@ -97,7 +97,7 @@ class Constraints(Selection, total=False):
     min_separation_m, min_separation_deg
         How far apart two grasps are, in either, to count as distinct.
     include
-        Scores to compute, as in :meth:`~graspdb.objects.GraspObject.likelihood`. By default the success
+        Scores to compute, as in `GraspObject.likelihood`. By default the success
         probability comes along where the objective needs it or there are at most 500,000 attempts.
     prior
         Whether an object with geometry and no success yet may answer from its edges; such grasps have

@@ -17,8 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
-from graspdb.pages import Listing, segment
 from graspdb.poses import as_poses
+from graspdb.resources.pages import Listing, segment
 from graspdb.results import TrialArrays
 from graspdb.transport import Transport
 

@@ -10,28 +10,28 @@ from numpy.typing import ArrayLike
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
-from graspdb.meshes import GLB, MeshLike, read_mesh, scene_of
-from graspdb.pages import Listing, checked, segment
-from graspdb.questions import Questions
+from graspdb.files.meshes import GLB, MeshLike, read_mesh, scene_of
 from graspdb.reports import Reports
+from graspdb.resources.grasp_queries import GraspQueries
+from graspdb.resources.pages import Listing, checked, segment
+from graspdb.resources.selection import numbers
+from graspdb.resources.sweeps import Sweep, Sweeps, create_sweep
+from graspdb.resources.trials import Batches, Trials
 from graspdb.results import table_html
-from graspdb.selection import numbers
-from graspdb.sweeps import Sweep, Sweeps, create_sweep
 from graspdb.transport import Transport
-from graspdb.trials import Batches, Trials
 
 __all__ = ["GraspObject", "Objects"]
 
 
-class GraspObject(Questions):
+class GraspObject(GraspQueries):
     """An object on the service.
 
     ``info`` is what the service said last; :meth:`refresh` asks again. ``trials`` and ``batches`` hold what
     has been tried, the questions ask what follows from it, and ``reports`` whether that was enough. All poses
     are of the tool frame in the object frame, in metres, quaternions xyzw.
 
-    Questions and reports take the *selection* of trials that a density is built from: ``gripper``,
-    ``protocol``, ``source``, and the ``kernel`` (:class:`graspdb.selection.Selection`).
+    GraspQueries and reports take the *selection* of trials that a density is built from: ``gripper``,
+    ``protocol``, ``source``, and the ``kernel`` (:class:`Selection`).
     """
 
     def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:

@@ -22,8 +22,8 @@ from rich.progress import (
 
 from graspdb import wire
 from graspdb.errors import SweepFailed
-from graspdb.pages import Listing, checked, segment
 from graspdb.poses import as_poses, matrices
+from graspdb.resources.pages import Listing, checked, segment
 from graspdb.results import pose_columns, table_html, to_pandas
 from graspdb.transport import Transport
 
@@ -257,7 +257,7 @@ def create_sweep(
     sample: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Sweep:
-    """Queue a sweep: POST /objects/{object_id}/sweeps; see :meth:`graspdb.objects.GraspObject.sweep`."""
+    """Queue a sweep: POST /objects/{object_id}/sweeps; see `GraspObject.sweep`."""
     columns = None
     if poses is not None:
         position, quaternion = as_poses(poses)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from graspdb import wire
-from graspdb.pages import Listing, checked, segment
-from graspdb.runs import RunProgress, finished
+from graspdb.resources.pages import Listing, checked, segment
+from graspdb.resources.runs import RunProgress, finished
 from graspdb.transport import Transport
 
 __all__ = ["Kernels"]

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 
 from graspdb import wire
 from graspdb.errors import Infeasible
-from graspdb.pages import checked, segment
 from graspdb.poses import as_poses
-from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
-from graspdb.selection import (
+from graspdb.resources.pages import checked, segment
+from graspdb.resources.selection import (
     Constraints,
     Selection,
     TrialSelection,
@@ -22,20 +21,21 @@ from graspdb.selection import (
     query,
     taken,
 )
-from graspdb.sweeps import create_sweep
+from graspdb.resources.sweeps import create_sweep
+from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.transport import Transport
 
-__all__ = ["Questions"]
+__all__ = ["GraspQueries"]
 
 QUERY_POSES = 100_000
 """Poses a likelihood request: some 15 MB of JSON, well under the service's default body limit."""
 
 
-class Questions:
+class GraspQueries:
     """The questions about one object.
 
     They take the selection of trials that a density is built from, and the kernel: see
-    :class:`graspdb.selection.Selection`. All poses are of the tool frame in the object frame, in metres,
+    :class:`Selection`. All poses are of the tool frame in the object frame, in metres,
     quaternions xyzw.
     """
 
@@ -47,7 +47,7 @@ class Questions:
     def density(self, **selection: Unpack[Selection]) -> wire.DensityInfo:
         """The grasp density: kernel, widths and how they were chosen, counts, effective sample size.
 
-        Takes the :class:`~graspdb.selection.Selection`.
+        Takes the :class:`Selection`.
         """
         params = query(taken(Selection, selection, "density"))
         return wire.DensityInfo.model_validate(
@@ -74,7 +74,7 @@ class Questions:
         chunk
             Poses a request.
         **selection
-            :class:`~graspdb.selection.Selection`.
+            :class:`Selection`.
         """
         options = taken(Selection, selection, "likelihood")
         position, quaternion = as_poses(poses)
@@ -138,8 +138,8 @@ class Questions:
         verify_timeout_s
             How long to wait for that.
         **constraints
-            :class:`~graspdb.selection.Constraints`: workspace, directions, collisions, objective; and the
-            :class:`~graspdb.selection.Selection` of trials.
+            :class:`Constraints`: workspace, directions, collisions, objective; and the
+            :class:`Selection` of trials.
 
         Raises
         ------
@@ -200,7 +200,7 @@ class Questions:
     ) -> SampledPoses:
         """Poses drawn from the density; the same seed and revision give the same poses.
 
-        Takes the :class:`~graspdb.selection.Selection`.
+        Takes the :class:`Selection`.
         """
         fields = {**taken(Selection, selection, "samples"), "count": count, "seed": seed}
         request = checked(wire.SamplesRequest, fields)
@@ -224,7 +224,7 @@ class Questions:
             ``edges`` needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on
             opposed surfaces, edges or points. Some of what it draws collides.
         **selection
-            :class:`~graspdb.selection.Selection`.
+            :class:`Selection`.
         """
         fields = {
             **taken(Selection, selection, "proposals"),

@@ -1,0 +1,1 @@
+"""What there is on the service, a class a noun: objects with their trials, sweeps, grippers, kernels."""

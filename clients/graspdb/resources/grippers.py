@@ -1,0 +1,36 @@
+"""Gripper profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from graspdb import wire
+from graspdb.resources.pages import Listing, checked, segment
+from graspdb.transport import Transport
+
+__all__ = ["Grippers"]
+
+
+class Grippers:
+    """``db.grippers``: ``pg70``, ``panda`` and your own."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+
+    def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
+        """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
+        request = checked(wire.GripperCreate, {"id": id, "name": name, **profile})
+        answer = self._transport.json("POST", "/grippers", body=request, idempotent=True)
+        return wire.GripperInfo.model_validate(answer)
+
+    def get(self, id: str) -> wire.GripperInfo:
+        """The gripper with this id."""
+        return wire.GripperInfo.model_validate(self._transport.json("GET", f"/grippers/{segment(id)}"))
+
+    def list(self) -> Iterator[wire.GripperInfo]:
+        """All grippers."""
+        return iter(Listing(self._transport, "/grippers", wire.GripperInfo))
+
+    def __iter__(self) -> Iterator[wire.GripperInfo]:
+        return self.list()
