@@ -15,7 +15,8 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from graspdb_geometry import _convex_kernels, _surface_kernels, _width_kernels
+from graspdb_geometry._compiled import convex, surface
+from graspdb_geometry._compiled.widths import surface_extents
 from graspdb_geometry.grippers import GripperShape
 
 FloatArray = npt.NDArray[np.float64]
@@ -99,9 +100,7 @@ class Scene:
         extents = np.empty((len(p), 2))
 
         def run(block: slice) -> None:
-            _convex_kernels.classify(
-                p[block], q[block], boxes, self._model, True, codes[block], extents[block]
-            )
+            convex.classify(p[block], q[block], boxes, self._model, True, codes[block], extents[block])
 
         _in_blocks(run, len(p), threads)
         half = shape.max_opening_m / 2.0
@@ -139,9 +138,7 @@ class Scene:
         extents = np.empty((len(p), 2))
 
         def run(block: slice) -> None:
-            _convex_kernels.classify(
-                p[block], q[block], boxes, self._model, False, codes[block], extents[block]
-            )
+            convex.classify(p[block], q[block], boxes, self._model, False, codes[block], extents[block])
 
         _in_blocks(run, len(p), threads)
         hits: npt.NDArray[np.bool_] = codes == COLLIDES
@@ -215,7 +212,7 @@ class Surface:
         hits = np.empty(len(p), dtype=np.bool_)
 
         def run(block: slice) -> None:
-            _surface_kernels.collides(p[block], q[block], boxes, self._tree, self.watertight, hits[block])
+            surface.collides(p[block], q[block], boxes, self._tree, self.watertight, hits[block])
 
         _in_blocks(run, len(p), threads)
         return hits
@@ -229,7 +226,7 @@ class Surface:
         met = np.empty(len(p), dtype=np.bool_)
 
         def run(block: slice) -> None:
-            _surface_kernels.collides(p[block], q[block], column, self._tree, False, met[block])
+            surface.collides(p[block], q[block], column, self._tree, False, met[block])
 
         _in_blocks(run, len(p), threads)
         return met & ~self.collides(p, q, shape, threads=threads)
@@ -243,7 +240,7 @@ class Surface:
         extents = np.empty((len(p), 2))
 
         def run(block: slice) -> None:
-            _width_kernels.surface_extents(p[block], q[block], column, self._tree, extents[block])
+            surface_extents(p[block], q[block], column, self._tree, extents[block])
 
         _in_blocks(run, len(p), threads)
         width: FloatArray = extents[:, 1] - extents[:, 0]
@@ -254,7 +251,7 @@ class Surface:
         """Whether points (n, 3) lie in the solid; in the union, where several closed pieces overlap."""
         x = np.ascontiguousarray(points, dtype=np.float64)
         found = np.empty(len(x), dtype=np.bool_)
-        _surface_kernels.contains(x, self._tree, found)
+        surface.contains(x, self._tree, found)
         return found
 
     @classmethod
@@ -322,9 +319,7 @@ class PointCloud:
         hits = np.empty(len(p), dtype=np.bool_)
 
         def run(block: slice) -> None:
-            _surface_kernels.points_collide(
-                p[block], q[block], boxes, self.points, self.radius_m, hits[block]
-            )
+            surface.points_collide(p[block], q[block], boxes, self.points, self.radius_m, hits[block])
 
         _in_blocks(run, len(p), threads)
         return hits

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
-from graspdb_geometry._formats import FaceArray, FloatArray
+from graspdb_geometry.mesh_reading.formats import FaceArray, FloatArray
 from graspdb_geometry.meshes import Mesh, Part
 
 #: Points on each surface that are compared, and points that find the nearest triangles of the other one.
@@ -82,9 +84,6 @@ def _distances(
 ) -> FloatArray:
     """From points (n, 3) to the surface of triangles (F, 3, 3), through the triangles of the nearest samples
     of it, and those that could be nearer."""
-    from scipy.spatial import cKDTree
-    from scipy.spatial.distance import cdist
-
     if not len(points):
         return np.empty(0)
     _, nearest = cKDTree(samples).query(points, k=min(_NEAREST, len(samples)))

@@ -16,8 +16,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
-from graspdb_geometry._formats import (
+from graspdb_geometry.mesh_reading.formats import (
     READERS,
     FaceArray,
     FloatArray,
@@ -26,7 +27,7 @@ from graspdb_geometry._formats import (
     read_glb,
     write_glb,
 )
-from graspdb_geometry._repair import repair
+from graspdb_geometry.mesh_reading.repair import repair
 
 #: Metres per unit.
 UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -326,7 +327,7 @@ def inspect_in_child(
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-m", "graspdb_geometry._mesh_child"],
+            [sys.executable, "-P", "-m", "graspdb_geometry.mesh_reading.child"],
             input=json.dumps(order).encode() + b"\n" + data,
             capture_output=True,
             timeout=seconds,
@@ -466,8 +467,6 @@ def _mass_properties(corners: FloatArray) -> tuple[float, FloatArray, FloatArray
 
 def _is_hull(vertices: FloatArray, faces: FaceArray, volume: float) -> bool:
     """Whether a closed surface of this volume fills its convex hull and has its area."""
-    from scipy.spatial import ConvexHull, QhullError
-
     try:
         hull = ConvexHull(vertices - vertices.mean(axis=0))
     except QhullError:

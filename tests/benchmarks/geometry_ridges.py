@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 
 from graspdb.examples import example
-from graspdb_geometry.jawpairs import pairs_of_mesh
-from graspdb_geometry.ridges import ridges_of_mesh
+from graspdb_geometry.features.jaw_pairs import pairs_of_mesh
+from graspdb_geometry.features.ridges import ridges_of_mesh
 
 POSES = 100_000
 

@@ -10,11 +10,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_geometry.antipodal import opposed_points
 from graspdb_geometry.collision import Scene, Surface
+from graspdb_geometry.features.antipodal import opposed_points
+from graspdb_geometry.features.jaw_pairs import JawPairs
+from graspdb_geometry.features.ridges import parts_solid
 from graspdb_geometry.grippers import PG70
-from graspdb_geometry.jawpairs import JawPairs
-from graspdb_geometry.ridges import parts_solid
 
 
 def of(mesh: trimesh.Trimesh, opening: float = 0.07) -> JawPairs:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_geometry.ridges import REACH_M, Ridges, ridges_of_mesh, ridges_of_parts
+from graspdb_geometry.features.ridges import REACH_M, Ridges, ridges_of_mesh, ridges_of_parts
 
 FloatArray = npt.NDArray[np.float64]
 Part = tuple[FloatArray, npt.NDArray[np.int64]]

@@ -12,7 +12,8 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_geometry import _surface_kernels, collision, grids, grippers
+from graspdb_geometry import collision, grids, grippers
+from graspdb_geometry._compiled import surface as compiled
 
 PG70 = grippers.PG70
 
@@ -86,10 +87,10 @@ def test_rays_and_winding_numbers_agree_on_what_is_inside(name: str) -> None:
     points = np.random.default_rng(8).uniform(low - 0.01, high + 0.01, size=(3000, 3))
     # Straight below vertices along the ray, where a careless crossing count goes wrong.
     distances = np.random.default_rng(9).uniform(0.0005, 0.05, size=(len(vertices), 1))
-    points = np.concatenate([points, vertices - distances * _surface_kernels._RAY[2]])
+    points = np.concatenate([points, vertices - distances * compiled._RAY[2]])
     stack = np.empty(128, dtype=np.int64)
-    winding = np.array([_surface_kernels.winding_number(x, vertices[faces]) for x in points])
-    inside = np.array([_surface_kernels.inside(x, tree, stack) for x in points])
+    winding = np.array([compiled.winding_number(x, vertices[faces]) for x in points])
+    inside = np.array([compiled.inside(x, tree, stack) for x in points])
     clear = np.abs(winding - np.round(winding)) < 1e-6
     assert clear.mean() > 0.99
     assert np.array_equal(inside[clear], winding[clear] > 0.5)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from graspdb_density import AnisotropicKernel, MixtureDensity, se3
 from graspdb_density.success.axis_bandwidth import ShapedSuccessModel
-from graspdb_geometry.jawpairs import pairs_of_mesh
-from graspdb_geometry.ridges import ridges_of_mesh
+from graspdb_geometry.features.jaw_pairs import pairs_of_mesh
+from graspdb_geometry.features.ridges import ridges_of_mesh
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]

@@ -1,7 +1,7 @@
 """Where an object can be grasped as far as its shape tells: a density before any success.
 
-Its rows are grasps that close on pairs of surfaces and edges (:mod:`graspdb_geometry.jawpairs`) and on
-opposed points of the surface (:mod:`graspdb_geometry.antipodal`), half of either, at every angle about the
+Its rows are grasps that close on pairs of surfaces and edges and on opposed points of the surface (both in
+:mod:`graspdb_geometry.features`), half of either, at every angle about the
 closing axis; those at which the open gripper collides, or closes on nothing, are left out. A kernel about
 every row makes it a density over R^3 x SO(3) like any other: it integrates to 1, both twins of a symmetric
 jaw, and what is drawn from it may be weighted by it.
@@ -17,7 +17,7 @@ import numpy as np
 
 from graspdb.wire import KernelInfo
 from graspdb_density import GraspDensity, IsotropicKernel
-from graspdb_geometry.jawpairs import JawPairs
+from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.densities.build import KernelChoice

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_geometry import meshes
-from graspdb_geometry.antipodal import opposed_points
 from graspdb_geometry.collision import Surface
-from graspdb_geometry.jawpairs import JawPairs, pairs_of_mesh, pairs_of_parts
-from graspdb_geometry.ridges import Ridges, parts_solid, ridges_of_mesh, ridges_of_parts
+from graspdb_geometry.features.antipodal import opposed_points
+from graspdb_geometry.features.jaw_pairs import JawPairs, pairs_of_mesh, pairs_of_parts
+from graspdb_geometry.features.ridges import Ridges, parts_solid, ridges_of_mesh, ridges_of_parts
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database

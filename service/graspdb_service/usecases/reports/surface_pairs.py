@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire.reports import AnisotropyRelation
 from graspdb_density.success.block_bootstrap import shares
-from graspdb_geometry.jawpairs import KINDS, JawPairs
+from graspdb_geometry.features.jaw_pairs import KINDS, JawPairs
 from graspdb_service.usecases.reports.common import LEVEL, finite
 from graspdb_service.usecases.trials.attempts import AllTrials
 

@@ -10,8 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.spatial import cKDTree
 
-from graspdb_geometry._formats import FaceArray, FloatArray
+from graspdb_geometry.mesh_reading.formats import FaceArray, FloatArray
 
 IntArray = npt.NDArray[np.int64]
 
@@ -77,10 +80,6 @@ def _areas(vertices: FloatArray, faces: FaceArray) -> FloatArray:
 
 def _sew(mesh: Repaired) -> None:
     """Merge vertices along seams, drop triangles that collapse or stand twice."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     # Only along open edges: elsewhere fine detail may be as small.
     edges = _edges(mesh.faces)
     _, first, count = np.unique(_undirected(edges), return_index=True, return_counts=True)
@@ -109,9 +108,6 @@ def _sew(mesh: Repaired) -> None:
 
 def _wind(mesh: Repaired) -> None:
     """Wind neighbours alike, and each closed piece that was not outwards."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import breadth_first_order, connected_components
-
     edges = _edges(mesh.faces)
     triangle = np.tile(np.arange(len(mesh.faces)), 3)
     _, which, count = np.unique(_undirected(edges), return_inverse=True, return_counts=True)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_geometry.jawpairs import KINDS, MARGIN_M, JawPairs, pairs_of_mesh, pairs_of_parts
-from graspdb_geometry.ridges import ridges_of_mesh, ridges_of_parts
+from graspdb_geometry.features.jaw_pairs import KINDS, MARGIN_M, JawPairs, pairs_of_mesh, pairs_of_parts
+from graspdb_geometry.features.ridges import ridges_of_mesh, ridges_of_parts
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 
-from graspdb_geometry import _ridge_kernels
+from graspdb_geometry._compiled import ridges
 from graspdb_geometry.collision import Surface
 
 __all__ = ["LEAST_BEND", "REACH_M", "Ridges", "Solid", "parts_solid", "ridges_of_mesh", "ridges_of_parts"]
@@ -105,7 +105,7 @@ class Ridges:
         distances = np.full(len(p), np.inf)
         if len(self) and len(p):
             order, boxes = self._blocks()
-            _ridge_kernels.nearest(
+            ridges.nearest(
                 p, np.ascontiguousarray(self.ends[order]), boxes, _BLOCK, float(reach_m),
                 np.ascontiguousarray(self.tangents[order]), np.ascontiguousarray(self.normals[order]),
                 _TIE_COSINE, _TIE_M, which, distances,
@@ -211,7 +211,7 @@ def parts_solid(parts: Sequence[FloatArray]) -> Solid:
 
     def within(points: FloatArray) -> npt.NDArray[np.bool_]:
         found = np.empty(len(points), dtype=np.bool_)
-        _ridge_kernels.inside_parts(np.ascontiguousarray(points), table, starts, boxes, found)
+        ridges.inside_parts(np.ascontiguousarray(points), table, starts, boxes, found)
         return found
 
     return within

@@ -7,10 +7,13 @@ import json
 import resource
 import sys
 
+from graspdb_geometry import meshes
+
 
 def main() -> int:
     """Limit this process, read one mesh, write the result; 0 also for a mesh that was refused."""
     order = json.loads(sys.stdin.buffer.readline())
+    # Both limits count what the libraries have used already.
     seconds = max(1, round(order["seconds"]))
     for kind, limit in (
         (resource.RLIMIT_AS, order["memory_bytes"]),
@@ -19,9 +22,6 @@ def main() -> int:
     ):
         with contextlib.suppress(ValueError, OSError):  # an inherited limit may be tighter already
             resource.setrlimit(kind, (limit, limit))
-    # Imported under the limits, so that the libraries count as well.
-    from graspdb_geometry import meshes
-
     try:
         inspection = meshes.inspect(
             sys.stdin.buffer.read(), order["media_type"], order["unit"], max_triangles=order["max_triangles"]

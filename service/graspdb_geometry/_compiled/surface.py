@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from graspdb_geometry._convex_kernels import _rotation, _segment_in_box, _to_tool
+from graspdb_geometry._compiled.convex import _rotation, _segment_in_box, _to_tool
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

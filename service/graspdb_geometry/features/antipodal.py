@@ -1,6 +1,6 @@
 """Opposed points of a surface: where a parallel jaw can close on curved or finely meshed objects.
 
-Plane faces and ridges (`jawpairs`) tell all of an object of few faces, and nothing of a smooth one, whose
+Plane faces and ridges (`jaw_pairs`) tell all of an object of few faces, and nothing of a smooth one, whose
 facets are too small to be faces. Here points are spread over the surface, and each is paired with the point
 opposite: their normals look away from each other, and the way from one to the other runs along them.
 
@@ -14,8 +14,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from graspdb_geometry.jawpairs import JawPairs
-from graspdb_geometry.ridges import Solid
+from graspdb_geometry.features.jaw_pairs import JawPairs
+from graspdb_geometry.features.ridges import Solid
 
 __all__ = ["opposed_points"]
 

@@ -6,8 +6,8 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from graspdb_geometry._convex_kernels import _rotation, _to_tool
-from graspdb_geometry._surface_kernels import _STACK, Tree, _boxes_apart
+from graspdb_geometry._compiled.convex import _rotation, _to_tool
+from graspdb_geometry._compiled.surface import _STACK, Tree, _boxes_apart
 
 FloatArray = npt.NDArray[np.float64]
 

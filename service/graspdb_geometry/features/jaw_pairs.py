@@ -26,9 +26,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from graspdb_geometry import _ridge_kernels
+from graspdb_geometry._compiled.ridges import regions
 from graspdb_geometry.collision import Surface
-from graspdb_geometry.ridges import Ridges, Solid, parts_solid
+from graspdb_geometry.features.ridges import Ridges, Solid, parts_solid
 
 __all__ = ["KINDS", "MARGIN_M", "JawPairs", "Kind", "pairs_of_mesh", "pairs_of_parts"]
 
@@ -106,7 +106,7 @@ class JawPairs:
         which = np.full(len(p), -1, dtype=np.int64)
         cosine = np.full(len(p), np.nan)
         if len(self) and len(p):
-            _ridge_kernels.regions(
+            regions(
                 p, np.ascontiguousarray(axes[:, :, 1]), self.centres, self.axes,
                 self.half + np.array([MARGIN_M, 0.0, MARGIN_M]), which, cosine,
             )  # fmt: skip

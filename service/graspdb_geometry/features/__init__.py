@@ -1,0 +1,1 @@
+"""What a parallel jaw can hold on an object: ridges, pairs of faces and edges, opposed points."""

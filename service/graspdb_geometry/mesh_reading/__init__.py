@@ -1,0 +1,1 @@
+"""Foreign mesh files: readers that trust nothing, repair, and the process that bounds them."""
