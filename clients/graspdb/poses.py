@@ -7,20 +7,44 @@ named before anything is sent.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 
-__all__ = ["as_poses", "as_vector7", "as_vectors7", "matrices", "quaternions_of"]
+__all__ = ["Poses", "as_poses", "as_vector7", "matrices", "quaternions_of", "vector"]
 
 Floats = NDArray[np.float64]
 
 
-def as_poses(poses: ArrayLike | Any) -> tuple[Floats, Floats]:
-    """Positions (N, 3) and unit quaternions xyzw (N, 4) of one or many poses.
+class Poses(NamedTuple):
+    """N poses: ``position`` (N, 3) in metres, and unit ``quaternion_xyzw`` (N, 4)."""
+
+    position: Floats
+    quaternion_xyzw: Floats
+
+    @property
+    def matrices(self) -> Floats:
+        """(N, 4, 4) homogeneous matrices."""
+        return matrices(self.position, self.quaternion_xyzw)
+
+    @property
+    def rows(self) -> Floats:
+        """(N, 7) rows x y z qx qy qz qw."""
+        return np.concatenate([self.position, self.quaternion_xyzw], axis=1)
+
+    def columns(self, part: slice = slice(None)) -> dict[str, Any]:
+        """As requests take them, all or a part."""
+        return {
+            "position": self.position[part].tolist(),
+            "quaternion_xyzw": self.quaternion_xyzw[part].tolist(),
+        }
+
+
+def as_poses(poses: ArrayLike | Any) -> Poses:
+    """One or many poses, checked, their quaternions normalised.
 
     Parameters
     ----------
@@ -35,11 +59,10 @@ def as_poses(poses: ArrayLike | Any) -> tuple[Floats, Floats]:
         is farther than 1e-3 from exact; the message names the first bad pose.
     """
     if hasattr(poses, "position") and hasattr(poses, "quaternion_xyzw"):
-        position, quaternion = np.asarray(poses.position, float), np.asarray(poses.quaternion_xyzw, float)
-        return as_poses(np.concatenate([np.atleast_2d(position), np.atleast_2d(quaternion)], axis=1))
+        given = Poses(*(np.atleast_2d(np.asarray(x, float)) for x in (poses.position, poses.quaternion_xyzw)))
+        return as_poses(given.rows)
     if isinstance(poses, (list, tuple)) and len(poses) and all(hasattr(p, "quaternion_xyzw") for p in poses):
-        parts = [as_poses(p) for p in poses]
-        return np.concatenate([p for p, _ in parts]), np.concatenate([q for _, q in parts])
+        return Poses(*(np.concatenate(columns) for columns in zip(*map(as_poses, poses), strict=True)))
     try:
         array = np.asarray(poses, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -72,7 +95,7 @@ def as_poses(poses: ArrayLike | Any) -> tuple[Floats, Floats]:
         np.abs(position).max(axis=1) > MAX_COORDINATE_M,
         "lies more than 1 km from the origin: coordinates are metres",
     )
-    return position, quaternion
+    return Poses(position, quaternion)
 
 
 def _refuse(bad: ArrayLike, what: str) -> None:
@@ -88,17 +111,25 @@ def as_vector7(pose: ArrayLike | Any) -> tuple[float, ...]:
     ValueError
         If it is no single valid pose.
     """
-    position, quaternion = as_poses(pose)
-    if len(position) != 1:
-        raise ValueError(f"expected one pose, got {len(position)}")
-    return (*position[0].tolist(), *quaternion[0].tolist())
+    rows = as_poses(pose).rows
+    if len(rows) != 1:
+        raise ValueError(f"expected one pose, got {len(rows)}")
+    return tuple(rows[0].tolist())
 
 
-def as_vectors7(position: ArrayLike, quaternion_xyzw: ArrayLike) -> Floats:
-    """Rows ``x y z qx qy qz qw`` (N, 7)."""
-    return np.concatenate(
-        [np.reshape(np.asarray(position, float), (-1, 3)), np.reshape(quaternion_xyzw, (-1, 4))], axis=1
-    )
+def vector(name: str, values: ArrayLike, of: str) -> list[float]:
+    """A vector as JSON, its numbers named by ``of``.
+
+    Raises
+    ------
+    ValueError
+        For another shape.
+    """
+    array, count = np.asarray(values, dtype=np.float64), of.count(",") + 1
+    if array.shape != (count,):
+        raise ValueError(f"{name} has shape {array.shape}; expected {count} numbers: {of}")
+    listed: list[float] = array.tolist()
+    return listed
 
 
 def quaternions_of(rotations: Floats) -> Floats:
@@ -135,21 +166,12 @@ def matrices(position: ArrayLike, quaternion_xyzw: ArrayLike) -> Floats:
     p, q = np.asarray(position, dtype=np.float64), np.asarray(quaternion_xyzw, dtype=np.float64)
     x, y, z, w = np.moveaxis(q, -1, 0)
     out = np.zeros((*p.shape[:-1], 4, 4))
-    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - z * w),
-        2 * (x * z + y * w),
-    )
-    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = (
-        2 * (x * y + z * w),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - x * w),
-    )
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = (
-        2 * (x * z - y * w),
-        2 * (y * z + x * w),
-        1 - 2 * (x * x + y * y),
-    )
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    out[..., :3, :3] = np.moveaxis(np.array(rotation), (0, 1), (-2, -1))
     out[..., :3, 3] = p
     out[..., 3, 3] = 1.0
     return out

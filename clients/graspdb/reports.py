@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
+from graspdb.options import known_keywords
 from graspdb.resources.runs import RunProgress, finished
-from graspdb.resources.selection import Selection, TrialSelection, query, taken
+from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.transport import Transport
 from graspdb.wire.reports import (
@@ -382,7 +383,7 @@ class Reports:
 
         Those are simulated by sweeps of purpose ``check``; ``calls`` says which are missing.
         """
-        params = taken(TrialSelection, selection, "bandwidth")
+        params = known_keywords(TrialSelection, selection, "bandwidth")
         return Bandwidth(self._get("bandwidth", BandwidthReport, params, progress, timeout_s))
 
     def kernel_similarity(
@@ -410,7 +411,7 @@ class Reports:
             "window_rotation_deg": window_rotation_deg,
             "component_position_m": component_position_m,
             "component_rotation_deg": component_rotation_deg,
-            **taken(TrialSelection, selection, "kernel_similarity"),
+            **known_keywords(TrialSelection, selection, "kernel_similarity"),
         }
         return KernelSimilarity(
             self._get("kernel-similarity", KernelSimilarityReport, params, progress, timeout_s)
@@ -507,4 +508,4 @@ def _axis(value: str | ArrayLike | None) -> str | None:
 
 
 def _asked(selection: Mapping[str, Any], method: str) -> dict[str, Any]:
-    return query(taken(Selection, selection, method))
+    return query(known_keywords(Selection, selection, method))

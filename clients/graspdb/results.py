@@ -13,15 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb import wire
-from graspdb.poses import as_vectors7, matrices
+from graspdb.poses import Poses, matrices
 
 __all__ = [
     "Grasp",
     "Grasps",
     "IntervalArrays",
     "LikelihoodArrays",
+    "PoseArrays",
     "SampledPoses",
     "TrialArrays",
+    "TriedPoses",
     "table_html",
 ]
 
@@ -43,9 +45,9 @@ def to_pandas(columns: Mapping[str, Any]) -> Any:
     return pandas.DataFrame(dict(columns))
 
 
-def pose_columns(position: Floats, quaternion_xyzw: Floats) -> dict[str, Floats]:
-    """Seven columns x, y, z, qx, qy, qz, qw."""
-    rows = as_vectors7(position, quaternion_xyzw)
+def pose_columns(poses: Any) -> dict[str, Floats]:
+    """Seven columns x, y, z, qx, qy, qz, qw of anything with ``position`` and ``quaternion_xyzw``."""
+    rows = Poses(poses.position, poses.quaternion_xyzw).rows
     return {name: rows[:, i] for i, name in enumerate(("x", "y", "z", "qx", "qy", "qz", "qw"))}
 
 
@@ -121,26 +123,16 @@ class Grasp:
     @classmethod
     def from_wire(cls, grasp: wire.Grasp) -> Grasp:
         """From the service's answer."""
+        fields = {name: getattr(grasp, name) for name in wire.Grasp.model_fields}
         world = grasp.world
-        return cls(
-            position=np.array(grasp.position),
-            quaternion_xyzw=np.array(grasp.quaternion_xyzw),
-            world=None if world is None else matrices(world.position, world.quaternion_xyzw),
-            density=grasp.density,
-            log_density=grasp.log_density,
-            relative=grasp.relative,
-            success_probability=grasp.success_probability,
-            interval=grasp.interval,
-            effective_trials=grasp.effective_trials,
-            collision_free=grasp.collision_free,
-            width_m=grasp.width_m,
-            nearest_trials=tuple(grasp.nearest_trials),
-            active_constraints=tuple(grasp.active_constraints),
-            score=grasp.score,
-            candidate=grasp.candidate,
-            prior=grasp.prior,
-            raw=grasp,
-        )
+        fields |= {
+            "position": np.array(grasp.position),
+            "quaternion_xyzw": np.array(grasp.quaternion_xyzw),
+            "world": None if world is None else matrices(world.position, world.quaternion_xyzw),
+            "nearest_trials": tuple(grasp.nearest_trials),
+            "active_constraints": tuple(grasp.active_constraints),
+        }
+        return cls(**fields, raw=grasp)
 
     @property
     def matrix(self) -> Floats:
@@ -238,12 +230,14 @@ class Grasps(Sequence[Grasp]):
 
     def to_pandas(self) -> Any:
         """A DataFrame with a row a grasp (extra ``pandas``)."""
-        position = np.array([g.position for g in self]).reshape(-1, 3)
-        quaternion = np.array([g.quaternion_xyzw for g in self]).reshape(-1, 4)
+        poses = Poses(
+            np.array([g.position for g in self]).reshape(-1, 3),
+            np.array([g.quaternion_xyzw for g in self]).reshape(-1, 4),
+        )
         names = ["score", "density", "log_density", "relative", "success_probability", "effective_trials"]
         names += ["collision_free", "width_m", "candidate", "simulated"]
         columns = {name: [getattr(g, name) for g in self] for name in names}
-        return to_pandas(pose_columns(position, quaternion) | columns)
+        return to_pandas(pose_columns(poses) | columns)
 
     def __repr__(self) -> str:
         lines = "".join(f"\n  {grasp!r}," for grasp in self._grasps)
@@ -345,14 +339,52 @@ def _of(values: Sequence[float | None], null: float) -> Floats:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SampledPoses:
+class PoseArrays:
+    """N tool frames in the object frame: ``position`` (N, 3) metres, ``quaternion_xyzw`` (N, 4)."""
+
+    position: Floats
+    quaternion_xyzw: Floats
+
+    @property
+    def matrices(self) -> Floats:
+        """(N, 4, 4) tool frames in the object frame."""
+        return matrices(self.position, self.quaternion_xyzw)
+
+    @property
+    def poses(self) -> Floats:
+        """(N, 7) rows x y z qx qy qz qw."""
+        return Poses(self.position, self.quaternion_xyzw).rows
+
+    def _columns(self) -> dict[str, Any]:
+        return dict(pose_columns(self))
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a pose (extra ``pandas``)."""
+        return to_pandas(self._columns())
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TriedPoses(PoseArrays):
+    """Poses with the ``outcome`` (N,) of each, by name."""
+
+    outcome: NDArray[np.str_]
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """(N,) True where the grasp held."""
+        return np.asarray(self.outcome == "success")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SampledPoses(PoseArrays):
     """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials.
 
     ``criterion`` says how proposals were drawn; None for plain samples.
     """
 
-    position: Floats
-    quaternion_xyzw: Floats
     proposal_density: Floats
     seed: int
     revision: int
@@ -372,36 +404,18 @@ class SampledPoses:
             criterion=answer.criterion if isinstance(answer, wire.Proposals) else None,
         )
 
-    @property
-    def matrices(self) -> Floats:
-        """(N, 4, 4) tool frames in the object frame."""
-        return matrices(self.position, self.quaternion_xyzw)
-
-    @property
-    def poses(self) -> Floats:
-        """(N, 7) rows x y z qx qy qz qw."""
-        return as_vectors7(self.position, self.quaternion_xyzw)
-
-    def __len__(self) -> int:
-        return len(self.position)
-
-    def to_pandas(self) -> Any:
-        """A DataFrame with a row a pose (extra ``pandas``)."""
-        columns = pose_columns(self.position, self.quaternion_xyzw)
-        return to_pandas(columns | {"proposal_density": self.proposal_density})
+    def _columns(self) -> dict[str, Any]:
+        return {**pose_columns(self), "proposal_density": self.proposal_density}
 
     def __repr__(self) -> str:
         return f"SampledPoses({len(self)} poses, seed={self.seed}, revision={self.revision})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TrialArrays:
-    """Stored trials as columns. ``outcome`` (N,) holds names; ``success`` (N,) is True for successes."""
+class TrialArrays(TriedPoses):
+    """Stored trials as columns, ``seq`` (N,) their numbers in commit order."""
 
     seq: NDArray[np.int64]
-    position: Floats
-    quaternion_xyzw: Floats
-    outcome: NDArray[np.str_]
     trials: tuple[wire.TrialOut, ...]
 
     @classmethod
@@ -415,27 +429,11 @@ class TrialArrays:
             trials=tuple(trials),
         )
 
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """(N,) True where the grasp held."""
-        return np.asarray(self.outcome == "success")
-
-    @property
-    def matrices(self) -> Floats:
-        """(N, 4, 4) tool frames in the object frame."""
-        return matrices(self.position, self.quaternion_xyzw)
-
-    def to_pandas(self) -> Any:
-        """A DataFrame with a row a trial (extra ``pandas``)."""
+    def _columns(self) -> dict[str, Any]:
         names = ["gripper", "source", "protocol", "batch", "sweep", "pose_index", "quality", "width_m"]
         names += ["proposal_density", "measured_at", "revision"]
-        columns: dict[str, Any] = {"seq": self.seq, **pose_columns(self.position, self.quaternion_xyzw)}
-        columns["outcome"] = self.outcome
-        columns |= {name: [getattr(t, name) for t in self.trials] for name in names}
-        return to_pandas(columns)
-
-    def __len__(self) -> int:
-        return len(self.seq)
+        columns = {"seq": self.seq, **pose_columns(self), "outcome": self.outcome}
+        return columns | {name: [getattr(t, name) for t in self.trials] for name in names}
 
     def __repr__(self) -> str:
         return f"TrialArrays({len(self)} trials, {int(self.success.sum())} successes)"

@@ -1,16 +1,14 @@
-"""What the commands share: the connection, vectors on the command line, tables and JSON."""
+"""What the commands share: the connection, tables and JSON."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import inspect
 import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -22,9 +20,10 @@ from rich.table import Table
 from graspdb.client import Client
 from graspdb.wire.reports import ReportRun
 
-__all__ = ["State", "out", "selecting", "show_rows", "show_table", "state_of", "vector"]
-
 ERRORS = Console(stderr=True)
+ObjectId = Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.", show_default=False)]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+T = TypeVar("T")
 
 
 @dataclasses.dataclass
@@ -39,6 +38,24 @@ class State:
         """Connect; a person waits in front of it, so fewer retries than a program's."""
         return Client(self.url, api_key=self.api_key, retries=2)
 
+    def show(self, value: Any, words: Mapping[str, Any] | str) -> None:
+        """The value with --json, else these names and values, or this line."""
+        if self.json:
+            out(value)
+        elif isinstance(words, str):
+            typer.echo(words)
+        else:
+            show_rows(words)
+
+    def show_list(self, items: Sequence[T], columns: Mapping[str, Callable[[T], Any]], *, empty: str) -> None:
+        """The items with --json, else a table of them."""
+        if self.json:
+            out(items)
+        else:
+            show_table(
+                tuple(columns), [[cell(item) for cell in columns.values()] for item in items], empty=empty
+            )
+
 
 def state_of(context: typer.Context) -> State:
     """The global options of this run."""
@@ -51,76 +68,6 @@ def state_of(context: typer.Context) -> State:
 def console() -> Console:
     """Standard output; wide where nobody looks, so that pipes get whole lines."""
     return Console() if sys.stdout.isatty() or "COLUMNS" in os.environ else Console(width=160)
-
-
-class Vector(tuple[float, ...]):
-    """Numbers from the command line; a class, because typer takes a tuple type for several arguments."""
-
-
-def vector(count: int, names: str) -> Any:
-    """A parser for ``count`` comma-separated numbers."""
-
-    def parse(text: str) -> Vector:
-        try:
-            numbers = Vector(float(part) for part in text.split(","))
-        except ValueError:
-            numbers = Vector()
-        if len(numbers) != count or not all(np.isfinite(numbers)):
-            raise typer.BadParameter(f"{text!r} is not {count} finite numbers {names}")
-        return numbers
-
-    parse.__name__ = names
-    return parse
-
-
-def vector_option(help: str, *names: str, count: int = 3, metavar: str = "x,y,z") -> Any:
-    """An option that takes a vector."""
-    return typer.Option(*names, help=help, parser=vector(count, metavar), metavar=metavar)
-
-
-Gripper = Annotated[str | None, typer.Option(help="Only trials with this gripper.")]
-Protocol = Annotated[str | None, typer.Option(help="Only trials with this protocol.")]
-Source = Annotated[str | None, typer.Option(help="Only trials from: simulation, robot, human, import.")]
-Kernel = Annotated[str | None, typer.Option(help="isotropic, anisotropic, or a stored kernel's id.")]
-SigmaPosition = Annotated[
-    float | None, typer.Option("--sigma-position-m", help="Kernel width in position, metres.")
-]
-SigmaRotation = Annotated[
-    float | None, typer.Option("--sigma-rotation-deg", help="Kernel width in rotation, degrees.")
-]
-
-
-def selecting(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with the options of a selection; it gets them as ``selection``, if it has that parameter."""
-    signature = inspect.signature(command, eval_str=True)
-    own = [parameter for parameter in signature.parameters.values() if parameter.name != "selection"]
-    options = {
-        "gripper": Gripper,
-        "protocol": Protocol,
-        "source": Source,
-        "kernel": Kernel,
-        "sigma_position_m": SigmaPosition,
-        "sigma_rotation_deg": SigmaRotation,
-    }
-    more = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-        for name, annotation in options.items()
-    ]
-
-    @functools.wraps(command)
-    def call(**given: Any) -> None:
-        chosen = {name: given.pop(name) for name in options}
-        if "selection" in signature.parameters:
-            given["selection"] = chosen
-        command(**given)
-
-    parameters = [*own, *more]
-    vars(call)["__signature__"] = signature.replace(parameters=parameters)
-    call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return call
-
-
-ObjectId = Annotated[str, typer.Argument(metavar="OBJECT", help="The object's id.", show_default=False)]
 
 
 def plain(value: Any) -> Any:
@@ -144,6 +91,15 @@ def plain(value: Any) -> Any:
 def out(value: Any) -> None:
     """JSON on standard output."""
     sys.stdout.write(json.dumps(plain(value), allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def flat(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Names and values, those of a mapping in it as ``name.key``."""
+    return {
+        f"{name}.{key}".rstrip("."): item
+        for name, value in fields.items()
+        for key, item in (value.items() if isinstance(value, dict) else [("", value)])
+    }
 
 
 def show_rows(rows: Mapping[str, Any]) -> None:

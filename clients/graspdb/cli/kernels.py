@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import (
-    Gripper,
-    ObjectId,
-    Protocol,
-    Source,
-    number,
-    out,
-    run_bar,
-    show_rows,
-    show_table,
-    state_of,
-)
+from graspdb.cli.common import ObjectId, number, run_bar, state_of
+from graspdb.cli.options import takes_options
+from graspdb.resources.kernels import KernelOptions
 from graspdb.wire.kernels import KernelProvenance
 
 kernels = typer.Typer(help="Stored kernels.", no_args_is_help=True)
@@ -41,48 +32,14 @@ def _fitted_on(source: KernelProvenance) -> dict[str, str]:
 
 
 @kernels.command("fit")
-def fit_kernel(
-    context: typer.Context,
-    id: ObjectId,
-    alignment: Annotated[
-        str, typer.Option(help="gripper; anisotropic: or object, edge, surface-pair; probability: or object.")
-    ] = "gripper",
-    components: Annotated[
-        str | None, typer.Option(help="anisotropic: 1 to 16 Gaussians, or auto; sampled: displacements.")
-    ] = None,
-    kind: Annotated[str, typer.Option(help="anisotropic, sampled or probability.")] = "anisotropic",
-    gripper: Gripper = None,
-    protocol: Protocol = None,
-    source: Source = None,
-) -> None:
+@takes_options
+def fit_kernel(context: typer.Context, id: ObjectId, options: KernelOptions) -> None:
     """Fit a kernel on an object's successes, or widths that predict success on all its attempts."""
     state = state_of(context)
-    count = int(components) if components is not None and components.isdigit() else components
-    given: dict[str, Any] = {
-        "gripper": gripper,
-        "protocol": protocol,
-        "source": source,
-        "components": count,
-    }
     with state.client() as db, run_bar(f"kernel of {id}") as show:
-        made = db.kernels.fit(
-            id,
-            kind=kind,
-            alignment=alignment,
-            progress=show,
-            **{name: value for name, value in given.items() if value is not None},
-        )
-    if state.json:
-        out(made)
-        return
-    source_of = made.provenance
-    show_rows(
-        {
-            "id": made.id,
-            "widths": _widths(made.widths_m, 1e3, "mm") + "; " + _widths(made.widths_deg, 1.0, "°"),
-            **_fitted_on(source_of),
-        }
-    )
+        made = db.kernels.fit(id, progress=show, **options)
+    widths = f"{_widths(made.widths_m, 1e3)} mm; {_widths(made.widths_deg)} °"
+    state.show(made, {"id": made.id, "widths": widths, **_fitted_on(made.provenance)})
 
 
 @kernels.command("list")
@@ -91,22 +48,16 @@ def list_kernels(context: typer.Context) -> None:
     state = state_of(context)
     with state.client() as db:
         found = list(db.kernels)
-    if state.json:
-        out(found)
-        return
-    show_table(
-        ("id", "object", "gripper", "alignment", "widths [mm]", "widths [°]"),
-        [
-            (
-                k.id,
-                k.provenance.object,
-                k.gripper,
-                k.alignment,
-                _widths(k.widths_m, 1e3, ""),
-                _widths(k.widths_deg, 1.0, ""),
-            )
-            for k in found
-        ],
+    state.show_list(
+        found,
+        {
+            "id": lambda k: k.id,
+            "object": lambda k: k.provenance.object,
+            "gripper": lambda k: k.gripper,
+            "alignment": lambda k: k.alignment,
+            "widths [mm]": lambda k: _widths(k.widths_m, 1e3),
+            "widths [°]": lambda k: _widths(k.widths_deg),
+        },
         empty="No kernels: fit one with graspdb kernels fit OBJECT.",
     )
 
@@ -120,5 +71,5 @@ def delete_kernel(
         db.kernels.delete(kernel)
 
 
-def _widths(values: tuple[float, ...], factor: float, unit: str) -> str:
-    return ", ".join(f"{factor * value:.1f}" for value in values) + (f" {unit}" if unit else "")
+def _widths(values: tuple[float, ...], factor: float = 1.0) -> str:
+    return ", ".join(f"{factor * value:.1f}" for value in values)

@@ -15,11 +15,11 @@ from graspdb.cli.common import (
     number,
     out,
     run_bar,
-    selecting,
     show_rows,
     show_table,
     state_of,
 )
+from graspdb.cli.options import takes_options
 from graspdb.errors import ChecksNeeded
 from graspdb.reports import (
     Bandwidth,
@@ -30,6 +30,7 @@ from graspdb.reports import (
     Sources,
     Summary,
 )
+from graspdb.resources.selection import Selection
 from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import REPORTS, ReportRange
 
@@ -62,10 +63,11 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
-@selecting
+@takes_options
 def report(
     context: typer.Context,
     id: ObjectId,
+    selection: Selection,
     name: Annotated[
         str | None,
         typer.Argument(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.poses import as_poses, as_vectors7
+from graspdb.poses import as_poses
 
 __all__ = ["read_poses", "read_trials"]
 
@@ -72,7 +72,7 @@ def read_poses(path: str) -> NDArray[np.float64]:
         If a pose is wrong.
     """
     if path.lower().endswith(".npy"):
-        return as_vectors7(*as_poses(np.load(path, allow_pickle=False)))
+        return as_poses(np.load(path, allow_pickle=False)).rows
     if path.lower().endswith(".csv"):
         records = _csv(path, trials=False)
     else:
@@ -99,7 +99,7 @@ def read_poses(path: str) -> NDArray[np.float64]:
                 )
             else:
                 pose = record
-            rows.append(np.concatenate([part[0] for part in as_poses(pose)]))
+            rows.append(as_poses(pose).rows[0])
         except (KeyError, TypeError, ValueError) as error:
             reason = f"has no {error}" if isinstance(error, KeyError) else str(error)
             raise FileProblem(f"{path}, pose {number}: {reason}") from error

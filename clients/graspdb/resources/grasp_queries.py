@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from graspdb import wire
 from graspdb.errors import Infeasible
+from graspdb.options import known_keywords
 from graspdb.poses import as_poses
 from graspdb.resources.pages import checked, segment
 from graspdb.resources.selection import (
@@ -17,11 +18,10 @@ from graspdb.resources.selection import (
     Selection,
     TrialSelection,
     best_grasp_request,
-    named,
+    names,
     query,
-    taken,
 )
-from graspdb.resources.sweeps import create_sweep
+from graspdb.resources.sweeps import SweepOptions, create_sweep
 from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.transport import Transport
 
@@ -49,7 +49,7 @@ class GraspQueries:
 
         Takes the :class:`Selection`.
         """
-        params = query(taken(Selection, selection, "density"))
+        params = query(known_keywords(Selection, selection, "density"))
         return wire.DensityInfo.model_validate(
             self._transport.json("GET", f"{self._path}/density", params=params)
         )
@@ -76,23 +76,18 @@ class GraspQueries:
         **selection
             :class:`Selection`.
         """
-        options = taken(Selection, selection, "likelihood")
-        position, quaternion = as_poses(poses)
-        options["include"] = None if include is None else named(include)
+        options = known_keywords(Selection, selection, "likelihood")
+        given = as_poses(poses)
+        options["include"] = None if include is None else names(include)
         # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
-        probe = {"position": position[:1].tolist(), "quaternion_xyzw": quaternion[:1].tolist()}
-        request = checked(wire.LikelihoodRequest, {**options, "poses": probe}).model_dump(
-            mode="json", exclude_unset=True
-        )
+        probe = checked(wire.LikelihoodRequest, {**options, "poses": given.columns(slice(1))})
+        request = probe.model_dump(mode="json", exclude_unset=True)
         answers: list[wire.Likelihoods] = []
         for attempt in range(3):
             answers = []
-            for start in range(0, len(position), chunk):
-                part = slice(start, start + chunk)
-                columns = {"position": position[part].tolist(), "quaternion_xyzw": quaternion[part].tolist()}
-                answer = self._transport.json(
-                    "POST", f"{self._path}/likelihood", body={**request, "poses": columns}
-                )
+            for start in range(0, len(given.position), chunk):
+                body = {**request, "poses": given.columns(slice(start, start + chunk))}
+                answer = self._transport.json("POST", f"{self._path}/likelihood", body=body)
                 answers.append(wire.Likelihoods.model_validate(answer))
                 if answers[-1].revision != answers[0].revision and attempt < 2:
                     break  # new trials came in between: one answer must rest on one revision
@@ -116,7 +111,7 @@ class GraspQueries:
         """
         if "count" in constraints:
             raise TypeError("best_grasp() gives one grasp; use best_grasps(count=...)")
-        given = taken(Constraints, constraints, "best_grasp")
+        given = known_keywords(Constraints, constraints, "best_grasp")
         return self._best_grasps(1, given, verify, verify_timeout_s)[0]
 
     def best_grasps(
@@ -148,7 +143,7 @@ class GraspQueries:
         TimeoutError
             If the simulation has not finished in time; it says so where no worker has come.
         """
-        given = taken(Constraints, constraints, "best_grasps")
+        given = known_keywords(Constraints, constraints, "best_grasps")
         return self._best_grasps(count, given, verify, verify_timeout_s)
 
     def _best_grasps(self, count: int, given: dict[str, Any], verify: bool, timeout_s: float) -> Grasps:
@@ -178,15 +173,10 @@ class GraspQueries:
             "source": given.get("source"),
         }
         chosen = self.density(**trials)
-        sweep = create_sweep(
-            self._transport,
-            self._object,
-            poses=grasps.matrices,
-            gripper=chosen.gripper,
-            protocol=chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None,
-            fidelity="fine",
-            purpose="check",
-        )
+        protocol = chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None
+        plan: SweepOptions = {"poses": grasps.matrices, "gripper": chosen.gripper, "protocol": protocol}
+        plan |= {"fidelity": "fine", "purpose": "check"}
+        sweep = create_sweep(self._transport, self._object, plan)
         try:
             sweep.wait(timeout=timeout_s)
         except TimeoutError as error:
@@ -202,7 +192,7 @@ class GraspQueries:
 
         Takes the :class:`Selection`.
         """
-        fields = {**taken(Selection, selection, "samples"), "count": count, "seed": seed}
+        fields = {**known_keywords(Selection, selection, "samples"), "count": count, "seed": seed}
         request = checked(wire.SamplesRequest, fields)
         answer = self._transport.json("POST", f"{self._path}/samples", body=request)
         return SampledPoses.from_wire(wire.Samples.model_validate(answer))
@@ -227,7 +217,7 @@ class GraspQueries:
             :class:`Selection`.
         """
         fields = {
-            **taken(Selection, selection, "proposals"),
+            **known_keywords(Selection, selection, "proposals"),
             "count": count,
             "seed": seed,
             "strategy": strategy,

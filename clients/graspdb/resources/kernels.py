@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Unpack
 
 from graspdb import wire
+from graspdb.options import Option
 from graspdb.resources.pages import Listing, checked, segment
 from graspdb.resources.runs import RunProgress, finished
+from graspdb.resources.selection import TrialSelection
 from graspdb.transport import Transport
 
-__all__ = ["Kernels"]
+__all__ = ["KernelOptions", "Kernels"]
+
+
+class KernelOptions(TrialSelection, total=False):
+    """The trials a kernel is fitted on, and the fields of :class:`graspdb.wire.KernelCreate` that say how."""
+
+    alignment: Annotated[
+        str,
+        Option(
+            "gripper; anisotropic: or object, edge, surface-pair; probability: or object.", default="gripper"
+        ),
+    ]
+    components: Annotated[
+        int | str | None,
+        Option("anisotropic: 1 to 16 Gaussians, or auto; sampled: displacements."),
+    ]
+    kind: Annotated[str, Option("anisotropic, sampled or probability.", default="anisotropic")]
+    window: wire.KernelWindow | Mapping[str, float] | None
+    component_widths: wire.KernelWidths | Mapping[str, float] | None
 
 
 class Kernels:
@@ -26,16 +46,12 @@ class Kernels:
         *,
         progress: RunProgress | None = None,
         timeout_s: float | None = None,
-        **options: Any,
+        **options: Unpack[KernelOptions],
     ) -> wire.StoredKernel:
         """Fit a kernel on an object's successes, or with ``kind="probability"`` on all its attempts.
 
         Waits until it is fitted. ``components="auto"`` may take a while: ``progress`` is called with its run
         meanwhile, and ``timeout_s`` ends the wait, not the fit: the kernel is in the list once it is done.
-
-        Options are those of :class:`graspdb.wire.KernelCreate`: ``kind``, ``gripper``, ``alignment``,
-        ``components`` (how many Gaussians, or ``auto``), ``window``, ``component_widths``, ``protocol``,
-        ``source``.
 
         Raises
         ------

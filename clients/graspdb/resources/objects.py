@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.files.meshes import GLB, MeshLike, read_mesh, scene_of
+from graspdb.options import Option, known_keywords
 from graspdb.reports import Reports
 from graspdb.resources.grasp_queries import GraspQueries
 from graspdb.resources.pages import Listing, checked, segment
-from graspdb.resources.selection import numbers
-from graspdb.resources.sweeps import Sweep, Sweeps, create_sweep
+from graspdb.resources.sweeps import Sweep, SweepOptions, Sweeps, create_sweep
 from graspdb.resources.trials import Batches, Trials
 from graspdb.results import table_html
 from graspdb.transport import Transport
 
-__all__ = ["GraspObject", "Objects"]
+__all__ = ["GraspObject", "ObjectProperties", "Objects"]
+
+
+class ObjectProperties(TypedDict, total=False):
+    """``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` and ``metadata`` of an object."""
+
+    name: Annotated[str | None, Option("A name for people.")]
+    mass_kg: Annotated[float | None, Option("Mass in kg.")]
+    density_kg_m3: Annotated[float | None, Option("Mass density, where the mass is not known.")]
+    friction: Annotated[float | None, Option("Coefficient of friction.")]
+    metadata: Mapping[str, Any] | None
 
 
 class GraspObject(GraspQueries):
@@ -50,10 +59,11 @@ class GraspObject(GraspQueries):
         """Ask the service for its present state."""
         return self._update(self._transport.json("GET", self._path))
 
-    def patch(self, /, **changes: Any) -> GraspObject:
+    def patch(self, /, **changes: Unpack[ObjectProperties]) -> GraspObject:
         """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
-        answer = self._transport.json("PATCH", self._path, body=_patch(changes))
-        return self._update(answer)
+        checked(wire.ObjectPatch, changes)
+        # Nulls are meant in a patch.
+        return self._update(self._transport.json("PATCH", self._path, body=changes))
 
     def delete(self) -> None:
         """Delete the object with everything that belongs to it."""
@@ -117,79 +127,10 @@ class GraspObject(GraspQueries):
         """The convex parts as GLB."""
         return self._transport.request("GET", f"{self._path}/convex-parts").content
 
-    def sweep(
-        self,
-        *,
-        max_poses: int | None = None,
-        position_step_m: float | None = None,
-        rotation_step_deg: float | None = None,
-        margin_m: float | None = None,
-        region: tuple[ArrayLike, ArrayLike] | None = None,
-        seed: int | None = None,
-        poses: ArrayLike | Any | None = None,
-        sample: int | None = None,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        fidelity: str | None = None,
-        purpose: str | None = None,
-        chunk_poses: int | None = None,
-    ) -> Sweep:
-        """Have workers simulate grasps: over a grid (the default), given ``poses``, or ``sample`` draws.
-
-        Parameters
-        ----------
-        max_poses
-            A random part of the grid, by ``seed``; without it the whole grid.
-        position_step_m, rotation_step_deg, margin_m, region
-            The grid: its steps, its margin about the bounding box, and the box (lower, upper) it is cut to.
-        poses
-            Exactly these.
-        sample
-            So many draws from the density.
-        gripper
-            Its profile's id, by default ``pg70``.
-        protocol
-            ``wrench`` (the contact forces can counter gravity in every direction) or ``lift``.
-        fidelity
-            ``standard`` or ``fine`` (smaller time step).
-        purpose
-            ``collect``, or ``check``: outcomes are stored but enter no density.
-        """
-        grid = {
-            "max_poses": max_poses,
-            "position_step_m": position_step_m,
-            "rotation_step_deg": rotation_step_deg,
-            "margin_m": margin_m,
-        }
-        if region is not None:
-            grid["region"] = {  # type: ignore[assignment]
-                "lower": numbers("region's lower corner", region[0], 3, "x, y, z"),
-                "upper": numbers("region's upper corner", region[1], 3, "x, y, z"),
-            }
-        grid = {key: value for key, value in grid.items() if value is not None}
-        if (poses is not None) + (sample is not None) + bool(grid) > 1:
-            raise ValueError(
-                f"give grid options ({', '.join(grid) or 'none'}), poses or sample, one of the three"
-            )
-        if poses is not None and seed is not None:
-            raise ValueError("seed is for a grid or for sample: given poses are simulated as they are")
-        drawn = None
-        if sample is not None:
-            drawn = {"count": sample} | ({} if seed is None else {"seed": seed})
-        elif poses is None:
-            grid |= {} if seed is None else {"seed": seed}
-        return create_sweep(
-            self._transport,
-            self.id,
-            grid=grid if poses is None and sample is None else None,
-            poses=poses,
-            sample=drawn,
-            gripper=gripper,
-            protocol=protocol,
-            fidelity=fidelity,
-            purpose=purpose,
-            chunk_poses=chunk_poses,
-        )
+    def sweep(self, **options: Unpack[SweepOptions]) -> Sweep:
+        """Have workers simulate grasps: over a grid, given poses, or draws, as :class:`SweepOptions` say."""
+        known_keywords(SweepOptions, options, "sweep")
+        return create_sweep(self._transport, self.id, options)
 
     def sweeps(self) -> Iterator[Sweep]:
         """The sweeps of this object."""
@@ -249,16 +190,12 @@ class Objects:
         unit: str = "m",
         media_type: str | None = None,
         convex_parts: MeshLike | Sequence[Any] | None = None,
-        name: str | None = None,
-        mass_kg: float | None = None,
-        density_kg_m3: float | None = None,
-        friction: float | None = None,
-        metadata: Mapping[str, Any] | None = None,
+        **properties: Unpack[ObjectProperties],
     ) -> GraspObject:
         """Create an object, with its mesh and convex parts if given: all of it or nothing.
 
         ``id`` is a slug; ``mesh``, ``unit`` and ``media_type`` as in :meth:`GraspObject.upload_mesh`,
-        ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`.
+        ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`, the rest :class:`ObjectProperties`.
 
         Raises
         ------
@@ -267,15 +204,8 @@ class Objects:
         InvalidInput
             If a property or the mesh is refused.
         """
-        fields = {
-            "id": id,
-            "name": name,
-            "mass_kg": mass_kg,
-            "density_kg_m3": density_kg_m3,
-            "friction": friction,
-            "metadata": metadata,
-        }
-        request = checked(wire.ObjectCreate, fields)
+        fields = known_keywords(ObjectProperties, properties, "create")
+        request = checked(wire.ObjectCreate, {"id": id, **fields})
         loaded = None if mesh is None else read_mesh(mesh, media_type)
         answer = self._transport.json("POST", "/objects", body=request, idempotent=True)
         created = GraspObject(self._transport, wire.ObjectInfo.model_validate(answer))
@@ -305,9 +235,3 @@ class Objects:
     def delete(self, id: str) -> None:
         """Delete an object with everything that belongs to it."""
         self._transport.request("DELETE", f"/objects/{segment(id)}")
-
-
-def _patch(changes: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Nulls are meant in a patch, so it is checked without dropping them."""
-    checked(wire.ObjectPatch, changes)
-    return dict(changes)

@@ -1,23 +1,19 @@
-"""What questions have in common: which trials they are about, and what a best grasp has to fulfil.
-
-Methods take these as keywords, ``**selection: Unpack[Selection]``: editors complete them, type checkers check
-them, and a name that is none of them is a TypeError.
-"""
+"""What questions have in common: which trials they are about, and what a best grasp has to fulfil."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from graspdb import wire
-from graspdb.poses import as_poses, as_vector7
+from graspdb.options import Corners, Option, PoseFile, Vector
+from graspdb.poses import as_poses, as_vector7, vector
 from graspdb.resources.pages import checked
 
-__all__ = ["Constraints", "Kernel", "Selection", "TrialSelection", "best_grasp_request", "query", "taken"]
+__all__ = ["Constraints", "Kernel", "Selection", "TrialSelection", "best_grasp_request", "query"]
 
 Kernel = wire.KernelSpec | Mapping[str, Any] | str
 
@@ -32,9 +28,9 @@ class TrialSelection(TypedDict, total=False):
         names no gripper or protocol fits every selection.
     """
 
-    gripper: str | None
-    protocol: str | None
-    source: str | None
+    gripper: Annotated[str | None, Option("Only trials with this gripper.")]
+    protocol: Annotated[str | None, Option("Only trials with this protocol.")]
+    source: Annotated[str | None, Option("Only trials from: simulation, robot, human, import.")]
 
 
 class Selection(TrialSelection, total=False):
@@ -49,9 +45,9 @@ class Selection(TrialSelection, total=False):
         Widths of the isotropic kernel, standard deviations per axis; by default chosen from the trials.
     """
 
-    kernel: Kernel | None
-    sigma_position_m: float | None
-    sigma_rotation_deg: float | None
+    kernel: Annotated[Kernel | None, Option("isotropic, anisotropic, or a stored kernel's id.")]
+    sigma_position_m: Annotated[float | None, Option("Kernel width in position, metres.")]
+    sigma_rotation_deg: Annotated[float | None, Option("Kernel width in rotation, degrees.")]
 
 
 class Constraints(Selection, total=False):
@@ -105,49 +101,41 @@ class Constraints(Selection, total=False):
         can't.
     """
 
-    objective: str | None
-    robust_of: str | None
-    pose_noise_m: float | None
-    pose_noise_deg: float | None
-    tool_noise_m: float | None
-    tool_noise_deg: float | None
-    box: tuple[ArrayLike, ArrayLike] | None
-    sphere: ArrayLike | None
-    above_plane: ArrayLike | None
+    objective: Annotated[
+        str | None, Option("density, success_probability (its interval's lower end) or robust.")
+    ]
+    robust_of: Annotated[str | None, Option("What robust averages: success_probability or density.")]
+    pose_noise_m: Annotated[float | None, Option("Noise of the object's place, per axis.")]
+    pose_noise_deg: Annotated[float | None, Option("... of its turn, about its centre.")]
+    tool_noise_m: Annotated[float | None, Option("Noise of the tool's place, per axis.")]
+    tool_noise_deg: Annotated[float | None, Option("... of its turn.")]
+    box: Annotated[
+        tuple[ArrayLike, ArrayLike] | None,
+        Corners("Lower corner of the workspace.", upper_help="Upper corner of the workspace."),
+    ]
+    sphere: Annotated[ArrayLike | None, Vector("Centre and radius.", of="x,y,z,r")]
+    above_plane: Annotated[ArrayLike | None, Vector("Keep n.x >= d.", of="nx,ny,nz,d")]
     half_spaces: ArrayLike | None
-    approach: ArrayLike | None
-    approach_cone_deg: float | None
-    closing: ArrayLike | None
-    closing_cone_deg: float | None
-    collision_free: bool | None
+    approach: Annotated[ArrayLike | None, Vector("Approach direction (tool z).")]
+    approach_cone_deg: Annotated[float | None, Option("Half angle about --approach.")]
+    closing: Annotated[ArrayLike | None, Vector("Closing direction (tool y).")]
+    closing_cone_deg: Annotated[float | None, Option("Half angle about --closing.")]
+    collision_free: Annotated[
+        bool | None, Option("Whether the gripper must clear the object.", "--collision-free/--any")
+    ]
     obstacles: wire.Obstacles | Mapping[str, Any] | None
-    pregrasp_distance_m: float | None
-    max_width_m: float | None
-    candidates: ArrayLike | Any | None
-    exclude: ArrayLike | Any | None
-    object_pose: ArrayLike | Any | None
-    frame: str | None
+    pregrasp_distance_m: Annotated[float | None, Option("The straight approach is free from this far back.")]
+    max_width_m: Annotated[float | None, Option("Fingers at most this far apart.")]
+    candidates: Annotated[
+        ArrayLike | Any | None, PoseFile("Rank these poses: a file as `likelihood` reads it.")
+    ]
+    exclude: Annotated[ArrayLike | Any | None, PoseFile("Stay away from these poses: a file.")]
+    object_pose: Annotated[ArrayLike | Any | None, Vector("The object in the world.", of="x,y,z,qx,qy,qz,qw")]
+    frame: Annotated[str | None, Option("Frame of the constraints: world or object.")]
     include: Sequence[str] | None
-    min_separation_m: float | None
-    min_separation_deg: float | None
-    prior: bool | None
-
-
-def taken(kind: type[Any], given: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """Keywords that a method was given, all of which ``kind``, a TypedDict, must name.
-
-    Raises
-    ------
-    TypeError
-        Naming the first that it does not.
-    """
-    known: frozenset[str] = kind.__optional_keys__
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            meant = f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(sorted(known))}"
-            raise TypeError(f"{method}() got an unexpected keyword argument {name!r}{meant}")
-    return dict(given)
+    min_separation_m: Annotated[float | None, Option("Distinct from this distance on.")]
+    min_separation_deg: Annotated[float | None, Option("Distinct from this angle on.")]
+    prior: Annotated[bool | None, Option("Before any success: whether to choose by the edges.")]
 
 
 def query(selection: Mapping[str, Any]) -> dict[str, Any]:
@@ -183,74 +171,45 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
     InvalidInput, ValueError
         Naming every wrong field.
     """
-    fields = {**given, "count": count}
+    fields = {name: value for name, value in given.items() if value is not None} | {"count": count}
     box = fields.pop("box", None)
     if box is not None:
         if len(box) != 2:
             raise ValueError("box is a pair: its lower and its upper corner, each x, y, z")
-        fields["box_min"] = numbers("box's lower corner", box[0], 3, "x, y, z")
-        fields["box_max"] = numbers("box's upper corner", box[1], 3, "x, y, z")
-    for name, what in (
+        fields["box_min"] = vector("box's lower corner", box[0], "x, y, z")
+        fields["box_max"] = vector("box's upper corner", box[1], "x, y, z")
+    for name, of in (
         ("sphere", "x, y, z, r"),
         ("above_plane", "nx, ny, nz, d"),
         ("approach", "x, y, z"),
         ("closing", "x, y, z"),
     ):
-        fields[name] = numbers(name, fields.get(name), what.count(",") + 1, what)
-    fields["half_spaces"] = _rows("half_spaces", fields.get("half_spaces"), 4, "nx, ny, nz, d")
-    fields["obstacles"] = _obstacles(fields.get("obstacles"))
+        if name in fields:
+            fields[name] = vector(name, fields[name], of)
+    if "half_spaces" in fields:
+        fields["half_spaces"] = _rows("half_spaces", fields["half_spaces"], "nx, ny, nz, d")
+    obstacles = fields.get("obstacles")
+    if isinstance(obstacles, Mapping) and "points" in obstacles:
+        fields["obstacles"] = {**obstacles, "points": _rows("points", obstacles["points"], "x, y, z")}
     for name in ("candidates", "exclude"):
-        fields[name] = _pose_columns(fields.get(name))
-    if fields.get("object_pose") is not None:
+        if name in fields:
+            fields[name] = as_poses(fields[name]).columns()
+    if "object_pose" in fields:
         fields["object_pose"] = as_vector7(fields["object_pose"])
-    if fields.get("include") is not None:
-        fields["include"] = named(fields["include"])
+    if "include" in fields:
+        fields["include"] = names(fields["include"])
     return checked(wire.BestGraspRequest, fields)
 
 
-def named(names: Sequence[str] | str) -> list[str]:
+def names(given: Sequence[str] | str) -> list[str]:
     """Names as a list; one may stand alone."""
-    return [names] if isinstance(names, str) else list(names)
+    return [given] if isinstance(given, str) else list(given)
 
 
-def numbers(name: str, values: ArrayLike | None, count: int, what: str) -> list[float] | None:
-    """A vector as JSON.
-
-    Raises
-    ------
-    ValueError
-        For another shape.
-    """
-    if values is None:
-        return None
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != (count,):
-        raise ValueError(f"{name} has shape {array.shape}; expected {count} numbers: {what}")
-    listed: list[float] = array.tolist()
-    return listed
-
-
-def _rows(name: str, values: ArrayLike | None, count: int, what: str) -> list[list[float]] | None:
-    if values is None:
-        return None
-    array = np.asarray(values, dtype=np.float64)
+def _rows(name: str, values: ArrayLike, of: str) -> list[list[float]]:
+    array, count = np.asarray(values, dtype=np.float64), of.count(",") + 1
     array = array[None] if array.ndim == 1 and array.size else array
     if array.size and (array.ndim != 2 or array.shape[1] != count):
-        raise ValueError(f"{name} has shape {array.shape}; expected rows of {count} numbers: {what}")
+        raise ValueError(f"{name} has shape {array.shape}; expected rows of {count} numbers: {of}")
     rows: list[list[float]] = array.reshape(-1, count).tolist()
     return rows
-
-
-def _pose_columns(poses: ArrayLike | Any | None) -> dict[str, Any] | None:
-    if poses is None:
-        return None
-    position, quaternion = as_poses(poses)
-    return {"position": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
-
-
-def _obstacles(obstacles: wire.Obstacles | Mapping[str, Any] | None) -> Any:
-    """Points may be an array."""
-    if obstacles is None or isinstance(obstacles, wire.Obstacles):
-        return obstacles
-    points = {"points": _rows("points", obstacles["points"], 3, "x, y, z")} if "points" in obstacles else {}
-    return {**obstacles, **points}

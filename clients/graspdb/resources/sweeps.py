@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,14 +22,16 @@ from rich.progress import (
 
 from graspdb import wire
 from graspdb.errors import SweepFailed
-from graspdb.poses import as_poses, matrices
+from graspdb.options import Corners, Option, PoseFile
+from graspdb.poses import as_poses, vector
 from graspdb.resources.pages import Listing, checked, segment
-from graspdb.results import pose_columns, table_html, to_pandas
+from graspdb.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
 
-__all__ = ["OutcomeArrays", "Sweep", "SweepBar", "Sweeps", "create_sweep", "duration"]
+__all__ = ["OutcomeArrays", "Sweep", "SweepBar", "SweepOptions", "Sweeps", "create_sweep", "duration"]
 
 ProgressCallback = Callable[[wire.SweepInfo], None]
+GRID_OPTIONS = ("max_poses", "position_step_m", "rotation_step_deg", "margin_m", "region")
 FINISHED = frozenset({"done", "failed", "cancelled"})
 _WORKER_SILENT_S = 30.0
 _OUTCOMES_PAGE = 50_000
@@ -37,36 +39,60 @@ _FIRST_POLL_S, _LAST_POLL_S = 0.2, 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OutcomeArrays:
+class OutcomeArrays(TriedPoses):
     """Every simulated pose of a sweep, collisions included: ``pose_index`` (N,), poses, ``outcome`` (N,)."""
 
     sweep: str
     pose_index: NDArray[np.int64]
-    position: NDArray[np.float64]
-    quaternion_xyzw: NDArray[np.float64]
-    outcome: NDArray[np.str_]
 
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """(N,) True where the grasp held."""
-        return np.asarray(self.outcome == "success")
-
-    @property
-    def matrices(self) -> NDArray[np.float64]:
-        """(N, 4, 4) tool frames in the object frame."""
-        return matrices(self.position, self.quaternion_xyzw)
-
-    def to_pandas(self) -> Any:
-        """A DataFrame with a row a pose (extra ``pandas``)."""
-        columns: dict[str, Any] = {"pose_index": self.pose_index}
-        columns |= pose_columns(self.position, self.quaternion_xyzw)
-        return to_pandas(columns | {"outcome": self.outcome})
-
-    def __len__(self) -> int:
-        return len(self.pose_index)
+    def _columns(self) -> dict[str, Any]:
+        return {"pose_index": self.pose_index, **pose_columns(self), "outcome": self.outcome}
 
     def __repr__(self) -> str:
         return f"OutcomeArrays({len(self)} poses of {self.sweep}, {int(self.success.sum())} successes)"
+
+
+class SweepOptions(TypedDict, total=False):
+    """What a sweep simulates: a grid (the default), given ``poses``, or ``sample`` draws.
+
+    Parameters
+    ----------
+    max_poses
+        A random part of the grid, by ``seed``; without it the whole grid.
+    position_step_m, rotation_step_deg, margin_m, region
+        The grid: its steps, its margin about the bounding box, and the box (lower, upper) it is cut to.
+    poses
+        Exactly these.
+    sample
+        So many draws from the density.
+    gripper
+        Its profile's id, by default ``pg70``.
+    protocol
+        ``wrench`` (the contact forces can counter gravity in every direction) or ``lift``.
+    fidelity
+        ``standard`` or ``fine`` (smaller time step).
+    purpose
+        ``collect``, or ``check``: outcomes are stored but enter no density.
+    """
+
+    max_poses: Annotated[int | None, Option("A random part of the grid.", min=1)]
+    position_step_m: Annotated[float | None, Option("Grid step, metres [0.01].")]
+    rotation_step_deg: Annotated[float | None, Option("Grid step, degrees [15].")]
+    margin_m: Annotated[float | None, Option("Margin about the bounding box [0.02].")]
+    region: Annotated[
+        tuple[ArrayLike, ArrayLike] | None,
+        Corners("Cut the grid to a box.", lower="region_min", upper="region_max"),
+    ]
+    poses: Annotated[
+        ArrayLike | Any | None, PoseFile("Simulate exactly the poses of this file (.csv, .npy, .json).")
+    ]
+    sample: Annotated[int | None, Option("Simulate so many draws from the density.", min=1)]
+    seed: Annotated[int | None, Option("Of --max-poses or --sample.", min=0)]
+    gripper: Annotated[str | None, Option("Gripper profile [pg70].")]
+    protocol: Annotated[str | None, Option("wrench or lift [wrench].")]
+    fidelity: Annotated[str | None, Option("standard or fine [standard].")]
+    purpose: Annotated[str | None, Option("collect or check [collect].")]
+    chunk_poses: Annotated[int | None, Option("Poses a job.", min=1)]
 
 
 class Sweep:
@@ -248,21 +274,30 @@ class Sweeps:
             yield Sweep(self._transport, info)
 
 
-def create_sweep(
-    transport: Transport,
-    object_id: str,
-    *,
-    grid: Mapping[str, Any] | None = None,
-    poses: ArrayLike | Any | None = None,
-    sample: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> Sweep:
-    """Queue a sweep: POST /objects/{object_id}/sweeps; see `GraspObject.sweep`."""
-    columns = None
+def create_sweep(transport: Transport, object_id: str, options: SweepOptions) -> Sweep:
+    """Queue a sweep of an object."""
+    fields: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
+    seed = {name: fields.pop(name) for name in ("seed",) if name in fields}
+    poses, sample = fields.pop("poses", None), fields.pop("sample", None)
+    grid = {name: fields.pop(name) for name in GRID_OPTIONS if name in fields}
+    if (poses is not None) + (sample is not None) + bool(grid) > 1:
+        raise ValueError(
+            f"give grid options ({', '.join(grid) or 'none'}), poses or sample, one of the three"
+        )
     if poses is not None:
-        position, quaternion = as_poses(poses)
-        columns = {"position": position.tolist(), "quaternion_xyzw": quaternion.tolist()}
-    request = checked(wire.SweepCreate, {"grid": grid, "poses": columns, "sample": sample, **options})
+        if seed:
+            raise ValueError("seed is for a grid or for sample: given poses are simulated as they are")
+        fields["poses"] = as_poses(poses).columns()
+    elif sample is not None:
+        fields["sample"] = {"count": sample, **seed}
+    else:
+        if "region" in grid:
+            corners = zip(("lower", "upper"), grid["region"], strict=True)
+            grid["region"] = {
+                end: vector(f"region's {end} corner", corner, "x, y, z") for end, corner in corners
+            }
+        fields["grid"] = {**grid, **seed}
+    request = checked(wire.SweepCreate, fields)
     answer = transport.json("POST", f"/objects/{segment(object_id)}/sweeps", body=request, idempotent=True)
     return Sweep(transport, wire.SweepInfo.model_validate(answer))
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import builtins
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,12 +16,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
+from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses
 from graspdb.resources.pages import Listing, segment
+from graspdb.resources.selection import TrialSelection
 from graspdb.results import TrialArrays
 from graspdb.transport import Transport
 
-__all__ = ["CHUNK_TRIALS", "Batches", "Receipt", "TrialListing", "Trials"]
+__all__ = ["CHUNK_TRIALS", "Batches", "Receipt", "TrialFilters", "TrialListing", "Trials", "Upload"]
 
 CHUNK_TRIALS = 50_000
 """Trials a request: some 10 MB of JSON, well under the service's default body limit."""
@@ -45,6 +46,34 @@ class Receipt:
         if len(self.batches) != 1:
             raise ValueError(f"this upload went into {len(self.batches)} batches: see .batches")
         return self.batches[0]
+
+
+class Upload(TypedDict, total=False):
+    """How trials are sent.
+
+    Parameters
+    ----------
+    chunk
+        Trials a request. Each request is stored wholly or not at all and is its own batch.
+    idempotency_key
+        Repeat a failed upload with the same key, data and ``chunk``, and nothing is stored twice.
+    progress
+        True shows a bar; a function is called with trials stored and total.
+    """
+
+    idempotency_key: Annotated[
+        str | None, Option("Repeat a failed upload with the same key: nothing is stored twice.")
+    ]
+    chunk: Annotated[int, Option("Trials a request, each a batch.", min=1, default=CHUNK_TRIALS)]
+    progress: bool | ProgressCallback
+
+
+class TrialFilters(TrialSelection, total=False):
+    """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch`` and ``since_revision``."""
+
+    outcome: Annotated[str | None, Option("Only this outcome.")]
+    batch: Annotated[str | None, Option("Only this batch.")]
+    since_revision: Annotated[int | None, Option("Only what came after this revision.")]
 
 
 class TrialListing(Listing[wire.TrialOut]):
@@ -80,11 +109,9 @@ class Trials:
         pose_covariance: ArrayLike | None = None,
         measured_at: datetime | Sequence[datetime | None] | None = None,
         metadata: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
-        chunk: int = CHUNK_TRIALS,
-        idempotency_key: str | None = None,
-        progress: bool | ProgressCallback = False,
+        **upload: Unpack[Upload],
     ) -> Receipt:
-        """Store grasp trials.
+        """Store grasp trials; how they are sent: :class:`Upload`.
 
         Parameters
         ----------
@@ -103,12 +130,6 @@ class Trials:
             (6, 6) or (N, 6, 6), translation first, tool frame.
         measured_at, metadata
             One for all, or a sequence with one a trial.
-        chunk
-            Trials a request. Each request is stored wholly or not at all and is its own batch.
-        idempotency_key
-            Repeat a failed upload with the same key, data and ``chunk``, and nothing is stored twice.
-        progress
-            True shows a bar; a function is called with trials stored and total.
 
         Raises
         ------
@@ -117,43 +138,26 @@ class Trials:
         InvalidInput
             If the service refuses the trials; the message names the trial and field.
         """
-        position, quaternion = as_poses(poses)
-        count = len(position)
-        columns: dict[str, list[Any]] = {
-            "position": position.tolist(),
-            "quaternion_xyzw": quaternion.tolist(),
-            "outcome": _outcomes(outcomes, count),
-        }
-        for name, values in (
-            ("proposal_density", proposal_density),
-            ("quality", quality),
-            ("width_m", width_m),
-        ):
-            if values is not None:
-                columns[name] = _numbers(name, values, count)
+        given = as_poses(poses)
+        count = len(given.position)
+        columns = {**given.columns(), "outcome": _outcomes(outcomes, count)}
+        numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
+        columns |= {name: _numbers(name, x, count) for name, x in numbers.items() if x is not None}
         if pose_covariance is not None:
-            covariance = np.asarray(pose_covariance, dtype=np.float64)
-            if covariance.shape not in {(6, 6), (count, 6, 6)}:
-                raise ValueError(
-                    f"pose_covariance has shape {covariance.shape}; expected (6, 6) or ({count}, 6, 6)"
-                )
-            columns["pose_covariance"] = np.broadcast_to(covariance, (count, 6, 6)).tolist()
+            columns["pose_covariance"] = _covariances(pose_covariance, count)
         if measured_at is not None:
-            times = [measured_at] * count if isinstance(measured_at, datetime) else builtins.list(measured_at)
-            columns["measured_at"] = [
-                None if t is None else t.isoformat() for t in _exactly("measured_at", times, count)
-            ]
+            times = _each("measured_at", measured_at, datetime, count)
+            columns["measured_at"] = [None if time is None else time.isoformat() for time in times]
         shared: dict[str, Any] = {"gripper": gripper, "source": source, "protocol": protocol}
         if isinstance(metadata, Mapping):
             shared["metadata"] = dict(metadata)
         elif metadata is not None:
-            columns["metadata"] = _exactly("metadata", builtins.list(metadata), count)
-        shared = {name: value for name, value in shared.items() if value is not None}
+            columns["metadata"] = _each("metadata", metadata, Mapping, count)
 
-        def body(start: int, stop: int) -> dict[str, Any]:
-            return {**shared, "columns": {name: values[start:stop] for name, values in columns.items()}}
+        def part(start: int, stop: int) -> dict[str, Any]:
+            return {"columns": {name: values[start:stop] for name, values in columns.items()}}
 
-        return self._send(body, count, chunk, idempotency_key, progress)
+        return self._send(part, shared, count, upload)
 
     def add_records(
         self,
@@ -165,43 +169,39 @@ class Trials:
         progress: bool | ProgressCallback = False,
         **shared: Any,
     ) -> Receipt:
-        """Store trials given as mappings with the fields of the HTTP interface.
+        """Store trials given as mappings with the fields of the HTTP interface; sent as :meth:`add` does.
 
         ``shared`` stands once for all that do not say it themselves: ``gripper``, ``source``, ``protocol``,
-        ``proposal_density``, ``metadata``. The other parameters and errors are those of :meth:`add`.
+        ``proposal_density``, ``metadata``.
         """
         trials = [dict(record) for record in records]
         if not trials:
             raise ValueError("give at least one trial")
-        shared = {name: value for name, value in shared.items() if value is not None}
-        return self._send(
-            lambda start, stop: {**shared, "trials": trials[start:stop]},
-            len(trials),
-            chunk,
-            idempotency_key,
-            progress,
-        )
+        upload: Upload = {"chunk": chunk, "idempotency_key": idempotency_key, "progress": progress}
+        return self._send(lambda start, stop: {"trials": trials[start:stop]}, shared, len(trials), upload)
 
     def _send(
         self,
-        body: Callable[[int, int], dict[str, Any]],
+        part: Callable[[int, int], dict[str, Any]],
+        shared: Mapping[str, Any],
         count: int,
-        chunk: int,
-        idempotency_key: str | None,
-        progress: bool | ProgressCallback,
+        upload: Upload,
     ) -> Receipt:
+        known_keywords(Upload, upload, "add")
+        chunk = upload.get("chunk", CHUNK_TRIALS)
         if chunk < 1:
             raise ValueError("chunk must be at least 1")
-        key = idempotency_key or str(uuid.uuid4())
+        key = upload.get("idempotency_key") or str(uuid.uuid4())
+        shared = {name: value for name, value in shared.items() if value is not None}
         receipts: list[wire.BatchReceipt] = []
-        with _upload_bar(progress) as report:
+        with _upload_bar(upload.get("progress", False)) as report:
             for number, start in enumerate(range(0, count, chunk)):
                 stop = min(start + chunk, count)
                 try:
                     answer = self._transport.json(
                         "POST",
                         self._path,
-                        body=body(start, stop),
+                        body={**shared, **part(start, stop)},
                         idempotency_key=key if count <= chunk else f"{key}-{number}",
                     )
                 except GraspDBError as error:
@@ -220,31 +220,15 @@ class Trials:
             revision=receipts[-1].revision,
         )
 
-    def list(
-        self,
-        *,
-        outcome: str | None = None,
-        source: str | None = None,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        batch: str | None = None,
-        since_revision: int | None = None,
-    ) -> TrialListing:
+    def list(self, **filters: Unpack[TrialFilters]) -> TrialListing:
         """The stored trials that match, read page by page as they are iterated."""
-        params = {
-            "outcome": outcome,
-            "source": source,
-            "gripper": gripper,
-            "protocol": protocol,
-            "batch": batch,
-            "since_revision": since_revision,
-        }
+        params = known_keywords(TrialFilters, filters, "list")
         return TrialListing(self._transport, self._path, wire.TrialOut, params)
 
     def __iter__(self) -> Iterator[wire.TrialOut]:
         return iter(self.list())
 
-    def to_pandas(self, /, **filters: Any) -> Any:
+    def to_pandas(self, /, **filters: Unpack[TrialFilters]) -> Any:
         """The stored trials as a DataFrame (extra ``pandas``); filters as in :meth:`list`."""
         return self.list(**filters).to_pandas()
 
@@ -294,10 +278,20 @@ def _numbers(name: str, values: ArrayLike, count: int) -> list[float | None]:
     return [None if np.isnan(value) else value for value in np.broadcast_to(array, (count,)).tolist()]
 
 
-def _exactly(name: str, values: list[Any], count: int) -> list[Any]:
-    if len(values) != count:
-        raise ValueError(f"{name} has {len(values)} entries for {count} poses")
-    return values
+def _covariances(values: ArrayLike, count: int) -> list[Any]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape not in {(6, 6), (count, 6, 6)}:
+        raise ValueError(f"pose_covariance has shape {array.shape}; expected (6, 6) or ({count}, 6, 6)")
+    listed: list[Any] = np.broadcast_to(array, (count, 6, 6)).tolist()
+    return listed
+
+
+def _each(name: str, values: Any, kind: type[Any], count: int) -> list[Any]:
+    """A value a trial; one goes for all."""
+    listed = [values] * count if isinstance(values, kind) else list(values)
+    if len(listed) != count:
+        raise ValueError(f"{name} has {len(listed)} entries for {count} poses")
+    return listed
 
 
 def _upload_bar(progress: bool | ProgressCallback) -> AbstractContextManager[ProgressCallback]:
