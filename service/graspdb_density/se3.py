@@ -2,10 +2,13 @@
 
 A rotation is a unit quaternion ``(x, y, z, w)``; ``q`` and ``-q`` are the same rotation. Every function takes
 arrays of shape (..., 4), (..., 3) or (..., 3, 3), broadcasts over the leading axes and computes in float64.
-Angles are radians.
+Angles are radians. `Poses` holds many rigid motions as one value.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +17,7 @@ __all__ = [
     "IDENTITY",
     "JAW_TURN",
     "Floats",
+    "Poses",
     "angle_between",
     "as_poses",
     "canonical",
@@ -39,6 +43,58 @@ JAW_TURN: Floats = np.array([0.0, 0.0, 1.0, 0.0])
 
 #: Quaternions this close to unit length are taken as rounding and normalised; others are refused.
 UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses as one value: of the tool frame in the object frame where nothing else is said.
+
+    `Poses.of` checks and copies; the plain constructor trusts its arrays. Immutable by convention: nobody
+    writes into the arrays.
+
+    Attributes
+    ----------
+    positions : (N, 3) metres
+    quaternions_xyzw : (N, 4) unit
+    """
+
+    positions: Floats
+    quaternions_xyzw: Floats
+
+    @classmethod
+    def of(cls, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> Poses:
+        """Check poses and copy them, contiguous float64, quaternions normalised.
+
+        Raises
+        ------
+        ValueError
+            For shapes other than (N, 3) and (N, 4), values that are not finite, or quaternions further than
+            ``UNIT_TOLERANCE`` from unit length.
+        """
+        return cls(*as_poses(positions, quaternions_xyzw))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Poses]) -> Poses:
+        """All poses of some parts, in order."""
+        return cls(
+            np.concatenate([part.positions for part in parts]),
+            np.concatenate([part.quaternions_xyzw for part in parts]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, rows: slice | NDArray[np.integer] | NDArray[np.bool_]) -> Poses:
+        """Some of the poses."""
+        return Poses(self.positions[rows], self.quaternions_xyzw[rows])
+
+    def turned(self, where: NDArray[np.bool_] | bool = True) -> Poses:
+        """The jaw's twins: the same grasps with the fingers exchanged, where ``where`` says so."""
+        twins = jaw_twin(self.quaternions_xyzw)
+        return Poses(
+            self.positions,
+            np.where(np.broadcast_to(where, len(self))[:, None], twins, self.quaternions_xyzw),
+        )
 
 
 def multiply(a: ArrayLike, b: ArrayLike) -> Floats:
