@@ -11,8 +11,7 @@ from __future__ import annotations
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from itertools import islice
-from types import TracebackType
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
 import anyio
 import anyio.to_thread
@@ -44,10 +43,11 @@ __all__ = [
 ]
 
 S = TypeVar("S")
+Sync = TypeVar("Sync", covariant=True)
 R = TypeVar("R")
 M = TypeVar("M")
 P = ParamSpec("P")
-_END = object()
+A = TypeVar("A", bound="Mirror[Any]")
 
 
 async def _in_thread(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
@@ -62,26 +62,28 @@ async def _each(items: Iterable[R]) -> AsyncIterator[R]:
             yield item
 
 
-class Mirror(Generic[S]):
+def _same(item: R) -> R:
+    return item
+
+
+class Mirror(Generic[Sync]):
     """The asynchronous side of ``sync``, an object of the synchronous client."""
 
-    def __init__(self, sync: S) -> None:
+    def __init__(self, sync: Sync) -> None:
         self.sync = sync
 
     def __repr__(self) -> str:
         return f"Async{self.sync!r}"
 
 
-def _awaited(
-    method: Callable[Concatenate[S, P], R],
-) -> Callable[Concatenate[Mirror[S], P], Awaitable[R]]:
-    """The method in a thread."""
+class _Attribute(Generic[S, R]):
+    """An attribute of the synchronous object."""
 
-    async def call(self: Mirror[S], /, *args: P.args, **kwargs: P.kwargs) -> R:
-        return await _in_thread(method, self.sync, *args, **kwargs)
+    def __init__(self, read: Callable[[S], R]) -> None:
+        self._read = read
 
-    functools.update_wrapper(call, method)
-    return call
+    def __get__(self, mirror: Any, owner: type[Any]) -> R:
+        return self._read(mirror.sync) if mirror is not None else cast("R", self)
 
 
 def _mirrored(
@@ -91,6 +93,34 @@ def _mirrored(
 
     async def call(self: Mirror[S], /, *args: P.args, **kwargs: P.kwargs) -> M:
         return mirror(await _in_thread(method, self.sync, *args, **kwargs))
+
+    functools.update_wrapper(call, method)
+    return call
+
+
+def _awaited(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[Mirror[S], P], Awaitable[R]]:
+    """The method in a thread."""
+    return _mirrored(method, _same)
+
+
+def _chained(method: Callable[Concatenate[Any, P], Any]) -> Callable[Concatenate[A, P], Awaitable[A]]:
+    """A method that changes its object and gives it back, in a thread."""
+
+    async def call(self: A, /, *args: P.args, **kwargs: P.kwargs) -> A:
+        await _in_thread(method, self.sync, *args, **kwargs)
+        return self
+
+    functools.update_wrapper(call, method)
+    return call
+
+
+def _at_once(
+    method: Callable[Concatenate[S, P], R], mirror: Callable[[R], M]
+) -> Callable[Concatenate[Mirror[S], P], M]:
+    """A method that asks the service nothing, its answer mirrored."""
+
+    def call(self: Mirror[S], /, *args: P.args, **kwargs: P.kwargs) -> M:
+        return mirror(method(self.sync, *args, **kwargs))
 
     functools.update_wrapper(call, method)
     return call
@@ -109,47 +139,18 @@ def _iterated(
     return call
 
 
-def _same(item: R) -> R:
-    return item
-
-
 class AsyncSweep(Mirror[Sweep]):
     """:class:`graspdb.resources.sweeps.Sweep`."""
 
-    @property
-    def info(self) -> wire.SweepInfo:
-        """Its state when last heard of."""
-        return self.sync.info
-
-    @property
-    def id(self) -> str:
-        """The sweep's identifier."""
-        return self.sync.id
-
-    @property
-    def state(self) -> str:
-        """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``, when last heard of."""
-        return self.sync.state
-
-    @property
-    def finished(self) -> bool:
-        """True if nothing more will happen to it by itself."""
-        return self.sync.finished
-
-    async def refresh(self) -> AsyncSweep:
-        """Ask the service how far it is."""
-        await _in_thread(self.sync.refresh)
-        return self
-
-    async def cancel(self) -> AsyncSweep:
-        """Stop it; what is already stored stays."""
-        await _in_thread(self.sync.cancel)
-        return self
-
-    async def retry(self) -> AsyncSweep:
-        """Queue the failed and cancelled chunks again."""
-        await _in_thread(self.sync.retry)
-        return self
+    info = _Attribute[Sweep, wire.SweepInfo](lambda sweep: sweep.info)
+    id = _Attribute[Sweep, str](lambda sweep: sweep.id)
+    state = _Attribute[Sweep, str](lambda sweep: sweep.state)
+    finished = _Attribute[Sweep, bool](lambda sweep: sweep.finished)
+    refresh = _chained(Sweep.refresh)
+    cancel = _chained(Sweep.cancel)
+    retry = _chained(Sweep.retry)
+    hint = _awaited(Sweep.hint)
+    outcomes = _awaited(Sweep.outcomes)
 
     async def wait(
         self, *, progress: bool | ProgressCallback = False, timeout: float | None = None
@@ -159,9 +160,6 @@ class AsyncSweep(Mirror[Sweep]):
         while (pause := await _in_thread(next, pauses, None)) is not None:
             await anyio.sleep(pause)
         return self
-
-    hint = _awaited(Sweep.hint)
-    outcomes = _awaited(Sweep.outcomes)
 
 
 class AsyncSweeps(Mirror[Sweeps]):
@@ -197,13 +195,8 @@ class AsyncTrials(Mirror[Trials]):
     add = _awaited(Trials.add)
     add_records = _awaited(Trials.add_records)
     to_pandas = _awaited(Trials.to_pandas)
-
-    def list(self, **filters: Any) -> AsyncTrialListing:
-        """The stored trials that match; filters as in :meth:`graspdb.resources.trials.Trials.list`."""
-        return AsyncTrialListing(self.sync.list(**filters))
-
-    def __aiter__(self) -> AsyncIterator[wire.TrialOut]:
-        return aiter(self.list())
+    list = _at_once(Trials.list, AsyncTrialListing)
+    __aiter__ = _iterated(Trials.list, _same)
 
 
 class AsyncBatches(Mirror[Batches]):
@@ -211,13 +204,8 @@ class AsyncBatches(Mirror[Batches]):
 
     get = _awaited(Batches.get)
     delete = _awaited(Batches.delete)
-
-    def list(self) -> AsyncListing[wire.BatchInfo]:
-        """All batches, read page by page."""
-        return AsyncListing(self.sync.list())
-
-    def __aiter__(self) -> AsyncIterator[wire.BatchInfo]:
-        return aiter(self.list())
+    list = _at_once(Batches.list, AsyncListing[wire.BatchInfo])
+    __aiter__ = _iterated(Batches.list, _same)
 
 
 class AsyncReports(Mirror[Reports]):
@@ -248,26 +236,11 @@ class AsyncGraspObject(Mirror[GraspObject]):
         self.batches = AsyncBatches(sync.batches)
         self.reports = AsyncReports(sync.reports)
 
-    @property
-    def info(self) -> wire.ObjectInfo:
-        """What the service said last."""
-        return self.sync.info
-
-    @property
-    def id(self) -> str:
-        """The object's identifier."""
-        return self.sync.id
-
-    async def refresh(self) -> AsyncGraspObject:
-        """Ask the service for its present state."""
-        await _in_thread(self.sync.refresh)
-        return self
-
-    async def patch(self, **changes: Any) -> AsyncGraspObject:
-        """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
-        await _in_thread(self.sync.patch, **changes)
-        return self
-
+    info = _Attribute[GraspObject, wire.ObjectInfo](lambda item: item.info)
+    id = _Attribute[GraspObject, str](lambda item: item.id)
+    summary = _at_once(GraspObject.summary, _same)
+    refresh = _chained(GraspObject.refresh)
+    patch = _chained(GraspObject.patch)
     delete = _awaited(GraspObject.delete)
     upload_mesh = _awaited(GraspObject.upload_mesh)
     download_mesh = _awaited(GraspObject.download_mesh)
@@ -282,10 +255,6 @@ class AsyncGraspObject(Mirror[GraspObject]):
     sweep = _mirrored(GraspObject.sweep, AsyncSweep)
     sweeps = _iterated(GraspObject.sweeps, AsyncSweep)
 
-    def summary(self) -> dict[str, str]:
-        """What a person wants to know of it, in words."""
-        return self.sync.summary()
-
 
 class AsyncObjects(Mirror[Objects]):
     """:class:`graspdb.resources.objects.Objects`."""
@@ -294,9 +263,7 @@ class AsyncObjects(Mirror[Objects]):
     get = _mirrored(Objects.get, AsyncGraspObject)
     list = _iterated(Objects.list, AsyncGraspObject)
     delete = _awaited(Objects.delete)
-
-    def __aiter__(self) -> AsyncIterator[AsyncGraspObject]:
-        return self.list()
+    __aiter__ = list
 
 
 class AsyncGrippers(Mirror[Grippers]):
@@ -305,9 +272,7 @@ class AsyncGrippers(Mirror[Grippers]):
     create = _awaited(Grippers.create)
     get = _awaited(Grippers.get)
     list = _iterated(Grippers.list, _same)
-
-    def __aiter__(self) -> AsyncIterator[wire.GripperInfo]:
-        return self.list()
+    __aiter__ = list
 
 
 class AsyncKernels(Mirror[Kernels]):
@@ -318,9 +283,7 @@ class AsyncKernels(Mirror[Kernels]):
     get = _awaited(Kernels.get)
     list = _iterated(Kernels.list, _same)
     delete = _awaited(Kernels.delete)
-
-    def __aiter__(self) -> AsyncIterator[wire.StoredKernel]:
-        return self.list()
+    __aiter__ = list
 
 
 class AsyncClient(Mirror[Client]):
@@ -341,24 +304,15 @@ class AsyncClient(Mirror[Client]):
         self.sweeps = AsyncSweeps(self.sync.sweeps)
         self.reports = AsyncAllReports(self.sync.reports)
 
-    @property
-    def url(self) -> str:
-        """The service's base address."""
-        return self.sync.url
-
+    url = _Attribute[Client, str](lambda client: client.url)
     info = _awaited(Client.info)
     ready = _awaited(Client.ready)
     workers = _awaited(Client.workers)
     add_example = _mirrored(Client.add_example, AsyncGraspObject)
-
-    async def close(self) -> None:
-        """Close the connections."""
-        await _in_thread(self.sync.close)
+    close = _awaited(Client.close)
 
     async def __aenter__(self) -> AsyncClient:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self.sync.close()
