@@ -146,9 +146,26 @@ def _named(server: str, name: str) -> str:
 
 
 @pytest.fixture
-def sqlite_url(tmp_path: Path) -> str:
+def empty_sqlite_url(tmp_path: Path) -> str:
     """A SQLite database of this test's own, not yet created."""
     return f"sqlite:///{tmp_path / 'graspdb.sqlite'}"
+
+
+@pytest.fixture(scope="session")
+def _sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A migrated database that every test's own is copied from."""
+    path = tmp_path_factory.mktemp("template") / "graspdb.sqlite"
+    database = Database(f"sqlite:///{path}")
+    schema.upgrade(database)
+    database.dispose()
+    return path
+
+
+@pytest.fixture
+def sqlite_url(empty_sqlite_url: str, tmp_path: Path, _sqlite_template: Path) -> str:
+    """A SQLite database of this test's own, migrated."""
+    shutil.copyfile(_sqlite_template, tmp_path / "graspdb.sqlite")
+    return empty_sqlite_url
 
 
 @pytest.fixture

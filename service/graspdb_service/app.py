@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import time
@@ -53,6 +54,11 @@ LATENCY = Histogram(
     "graspdb_http_request_seconds", "Time to the last byte of the answer.", ["method", "route"]
 )
 
+ABOUT: dict[str, Any] = {
+    "title": "GraspDB",
+    "summary": "The grasp database that answers",
+    "version": __version__,
+}
 ROUTERS = [
     operations.router,
     objects.router,
@@ -98,9 +104,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         ctx.close()
 
     app = FastAPI(
-        title="GraspDB",
-        summary="The grasp database that answers",
-        version=__version__,
+        **ABOUT,
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
@@ -109,12 +113,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.context = ctx
     for router in ROUTERS:
         app.include_router(router)
-    app.openapi = lambda: document(app)  # type: ignore[method-assign]
-    app.state.parameters = declared_parameters(app)
+    app.openapi = openapi_document  # type: ignore[method-assign]
+    app.state.parameters = declared_parameters(openapi_document())
     _add_docs(app)
     _add_problems(app)
     app.add_middleware(RequestTrace, max_body_bytes=settings.max_body_bytes)
     return app
+
+
+@functools.cache
+def openapi_document() -> dict[str, Any]:
+    """The OpenAPI document; it takes a second to make, and every application of a process has the same."""
+    return document([route for router in ROUTERS for route in router.routes], **ABOUT)
 
 
 def problem_response(problem: ProblemError, request_id: str) -> Response:

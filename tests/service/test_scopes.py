@@ -46,7 +46,7 @@ def test_route_without_a_scope_is_refused() -> None:
     def open_to_all() -> None: ...
 
     with pytest.raises(RuntimeError, match="GET /open declares no scope"):
-        declared_parameters(app)
+        declared_parameters(app.openapi())
 
 
 def test_route_with_an_unknown_scope_is_refused() -> None:
@@ -56,4 +56,4 @@ def test_route_with_an_unknown_scope_is_refused() -> None:
     def odd() -> None: ...
 
     with pytest.raises(RuntimeError, match="GET /odd declares no scope"):
-        declared_parameters(app)
+        declared_parameters(app.openapi())

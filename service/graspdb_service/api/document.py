@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic.json_schema import models_json_schema
+from starlette.routing import BaseRoute
 
 from graspdb.wire import Problem
 from graspdb_service.api.routing import BODY_MODELS
@@ -17,16 +18,10 @@ PROBLEM = {
 }
 
 
-def document(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document of the application, made once."""
-    if app.openapi_schema:
-        return app.openapi_schema
+def document(routes: Sequence[BaseRoute], *, title: str, summary: str, version: str) -> dict[str, Any]:
+    """The OpenAPI document of these routes."""
     found = get_openapi(
-        title=app.title,
-        version=app.version,
-        summary=app.summary,
-        routes=app.routes,
-        separate_input_output_schemas=False,
+        title=title, version=version, summary=summary, routes=routes, separate_input_output_schemas=False
     )
     schemas: dict[str, Any] = found.setdefault("components", {}).setdefault("schemas", {})
     models = [(model, "validation") for model in (*BODY_MODELS.values(), Problem)]
@@ -42,5 +37,4 @@ def document(app: FastAPI) -> dict[str, Any]:
             responses.pop("422", None)
             responses["default"] = PROBLEM
     found["components"]["schemas"] = dict(sorted(schemas.items()))
-    app.openapi_schema = found
     return found

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import orjson
-from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from fastapi import Depends, Header, Query, Request, Response
 from pydantic import BaseModel
 
 from graspdb_service.problems import ProblemError, invalid
@@ -49,8 +49,8 @@ def _schema(given: Any) -> dict[str, Any]:
     return schema
 
 
-def declared_parameters(app: FastAPI) -> dict[tuple[str, str], frozenset[str]]:
-    """The query parameters of every operation, by method and path, as the OpenAPI document has them.
+def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
+    """The query parameters of every operation, by method and path, of an OpenAPI document.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def declared_parameters(app: FastAPI) -> dict[tuple[str, str], frozenset[str]]:
         If an operation declares no scope: none may be open by oversight.
     """
     found = {}
-    for path, operations in app.openapi()["paths"].items():
+    for path, operations in document["paths"].items():
         for method, operation in operations.items():
             if operation.get(SCOPE_FIELD) not in SCOPES:
                 raise RuntimeError(f"{method.upper()} {path} declares no scope")

@@ -37,7 +37,9 @@ def upgrade(database: Database, revision: str = "head") -> str:
     with database.write() as tx:
         if not database.is_sqlite:
             tx.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": ADVISORY_LOCK})
-        _refuse_newer(tx)
+        history = _refuse_newer(tx)
+        if revision == "head" and _current(tx) == history.get_current_head():
+            return str(_current(tx))
         command.upgrade(alembic_config(tx), revision)
         return _current(tx) or "base"
 
@@ -45,9 +47,8 @@ def upgrade(database: Database, revision: str = "head") -> str:
 def check(database: Database) -> None:
     """Raise :class:`StaleSchema` unless the schema is exactly the one this version was written for."""
     with database.read() as tx:
-        _refuse_newer(tx)
+        head = _refuse_newer(tx).get_current_head()
         current = _current(tx)
-    head = ScriptDirectory(str(migrations_directory())).get_current_head()
     if current != head:
         found = "has no schema yet" if current is None else f"is at schema {current}"
         raise StaleSchema(
@@ -68,7 +69,8 @@ def _current(tx: Tx) -> str | None:
     return MigrationContext.configure(tx).get_current_revision()
 
 
-def _refuse_newer(tx: Tx) -> None:
+def _refuse_newer(tx: Tx) -> ScriptDirectory:
+    """The history of migrations, unless the database is at one that it does not have."""
     current = _current(tx)
     script = ScriptDirectory(str(migrations_directory()))
     if current is not None and current not in {item.revision for item in script.walk_revisions()}:
@@ -76,3 +78,4 @@ def _refuse_newer(tx: Tx) -> None:
             f"The database is at schema {current}, which this version of graspdb does not know:"
             " it was written by a newer one. Install that version or newer."
         )
+    return script
