@@ -8,6 +8,7 @@ from .kde.importance_weights import effective_sample_size, importance_weights, m
 from .kde.isotropic import GraspDensity
 from .kde.mixture import MixtureDensity
 from .kde.sample_kernel import SampledKernel
+from .kernels.diagonal import DiagonalKernel
 from .kernels.gaussian_mixture import AnisotropicKernel
 from .kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from .search.evolution import PoseNoise, expected, search_scored
@@ -20,6 +21,7 @@ __all__ = [
     "HAAR_VOLUME",
     "AnalyticKernel",
     "AnisotropicKernel",
+    "DiagonalKernel",
     "GraspDensity",
     "IsotropicKernel",
     "Maximum",

@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graspdb_density import AnisotropicKernel, MixtureDensity, se3
-from graspdb_density.success.axis_bandwidth import ShapedSuccessModel
+from graspdb_density import AnisotropicKernel, DiagonalKernel, MixtureDensity, SuccessModel, se3
 from graspdb_geometry.features.jaw_pairs import pairs_of_mesh
 from graspdb_geometry.features.ridges import ridges_of_mesh
 
@@ -202,7 +201,7 @@ def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     # The density is the default one.
     np.testing.assert_allclose(by["density"], plain["density"], rtol=1e-6)
     widths = [*kernel["widths_m"], *np.radians(kernel["widths_deg"])]
-    model = ShapedSuccessModel.shaped(p, q, won, widths=widths)
+    model = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(widths))
     found = model.evaluate(*at)
     np.testing.assert_allclose(by["success_probability"], found.probability, atol=1e-4)
     np.testing.assert_allclose(by["interval"]["low"], found.low, atol=1e-3)
@@ -249,7 +248,7 @@ def test_success_predicted_along_the_object_s_own_axes(
     found = ok(http.post("/objects/thing/likelihood", json=asked))
     assert found["kernel"]["alignment"] == "object"
     widths = [*along["widths_m"], *np.radians(along["widths_deg"])]
-    model = ShapedSuccessModel.shaped(p, q, won, widths=widths, axes=np.eye(3)[::-1])
+    model = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(widths, np.eye(3)[::-1]))
     expected = model.evaluate(p[:50], q[50:100]).probability
     np.testing.assert_allclose(found["success_probability"], expected, atol=1e-4)
     judged = ok(http.get(f"/objects/thing/reports/calibration?kernel={along['id']}"))

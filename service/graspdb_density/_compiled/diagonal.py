@@ -9,7 +9,7 @@ import numpy as np
 from .isotropic import MAX_RUNS, TWIN, runs_within
 from .options import exact, inlined
 
-__all__ = ["held_out_sums", "near_pairs", "shaped_sums"]
+__all__ = ["held_out_sums", "near_pairs", "square_sums"]
 
 
 @inlined
@@ -43,7 +43,7 @@ def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped
 
 
 @exact
-def shaped_sums(data, start, table, centre, scale, positions, quaternions, half, turning, radius, out):  # type: ignore[no-untyped-def]
+def square_sums(data, start, table, centre, scale, positions, quaternions, half, turning, radius, out):  # type: ignore[no-untyped-def]
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over rows with an exponent of at most radius^2.
 
     ``half`` (6,): 1 / (2 sigma^2), translations in units of the cells' scale, along each row's gripper's axes

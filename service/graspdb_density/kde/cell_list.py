@@ -9,7 +9,7 @@ the tail, not the whole, and the total over many additions stays proportional to
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,24 +124,6 @@ class Cells:
                 )
             )
         return self._assemble(tuple(segments), self.centre, self.scale)
-
-    def rescaled(self, factor: float) -> Cells:
-        """The same rows in the same order for a kernel narrower by ``factor`` in position."""
-        data = self.data.copy()
-        data[:3] *= np.float32(factor)
-        table = self.table.copy()
-        table[:, [c.EDGE, c.EDGE_Z]] *= factor
-        table[:, c.OX : c.OZ + 1] *= factor
-        table[:, c.LOW : c.HIGH + 3] *= factor
-        # The segments would have to follow to be extended; who wants that builds anew.
-        return replace(
-            self,
-            data=data,
-            table=table,
-            boxes=self.boxes * np.float32(factor),
-            scale=self.scale * factor,
-            segments=(),
-        )
 
     @classmethod
     def _assemble(cls, segments: tuple[_Segment, ...], centre: Floats, scale: float) -> Cells:

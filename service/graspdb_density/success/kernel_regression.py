@@ -5,8 +5,8 @@ success), n the effective number of attempts ``(sum k)^2 / sum k^2``, m0 the sha
 attempts and a = 1. Kernels count once an attempt whatever its proposal density: a share of attempts needs no
 weighting. The interval is that of the Beta distribution with mean P and n + a trials.
 
-It covers the truth smoothed by the kernel, not the truth at a point: compare with half the widths
-(`smoothing_bias`) to see how much smoothing hides.
+The kernel is isotropic, or a Gaussian with a bandwidth for every axis. The interval covers the truth smoothed
+by it, not the truth at a point.
 """
 
 from __future__ import annotations
@@ -19,20 +19,24 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
 from .. import se3
-from .._compiled import isotropic
+from .._compiled import diagonal, isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
+from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats
 
-__all__ = ["PRIOR_TRIALS", "SUCCESS_CUTOFF", "SuccessEstimate", "SuccessModel"]
+__all__ = ["PRIOR_TRIALS", "SUCCESS_CUTOFF", "SuccessEstimate", "SuccessKernel", "SuccessModel"]
+
+SuccessKernel = IsotropicKernel | DiagonalKernel
 
 #: Trials the prior share is worth.
 PRIOR_TRIALS = 1.0
 #: An attempt is within reach when position and rotation together are within this many standard deviations.
 SUCCESS_CUTOFF = 5.0
-_QUERY_BLOCK = 256
+#: Poses a thread takes at once.
+_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK = 256, 128
 _SORTED_FROM = 256
 
 
@@ -58,15 +62,12 @@ class SuccessEstimate:
 
 
 class SuccessModel:
-    """Attempts, sorted for evaluation; immutable. Use `build` and `extend`."""
+    """Attempts under a kernel, sorted for evaluation; immutable. Use `build` and `extend`."""
 
-    def __init__(
-        self, kernel: IsotropicKernel, succeeded: Cells | None, failed: Cells | None, counts: tuple[int, int]
-    ) -> None:
-        self._kernel = kernel
+    def __init__(self, kernel: SuccessKernel, succeeded: Cells | None, failed: Cells | None) -> None:
+        self.kernel = kernel
         self._succeeded = succeeded
         self._failed = failed
-        self._counts = counts
 
     @classmethod
     def build(
@@ -75,7 +76,7 @@ class SuccessModel:
         quaternions_xyzw: ArrayLike,
         success: ArrayLike,
         *,
-        kernel: IsotropicKernel,
+        kernel: SuccessKernel,
         symmetric: ArrayLike | bool = True,
     ) -> SuccessModel:
         """Sort attempts.
@@ -94,15 +95,7 @@ class SuccessModel:
         ValueError
             For wrong shapes or values that are not finite.
         """
-        p, q, won, flags = _attempts(positions, quaternions_xyzw, success, symmetric)
-        parts: list[Cells | None] = []
-        for chosen in (won, ~won):
-            if chosen.any():
-                ones = np.ones(int(chosen.sum()))
-                parts.append(Cells.build(p[chosen], q[chosen], ones, flags[chosen], kernel.sigma_position_m))
-            else:
-                parts.append(None)
-        return cls(kernel, parts[0], parts[1], (int(won.sum()), int((~won).sum())))
+        return cls(kernel, None, None).extend(positions, quaternions_xyzw, success, symmetric)
 
     def extend(
         self,
@@ -112,38 +105,36 @@ class SuccessModel:
         symmetric: ArrayLike | bool = True,
     ) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
-        p, q, won, flags = _attempts(positions, quaternions_xyzw, success, symmetric)
+        p, q, won, flags = checked_attempts(positions, quaternions_xyzw, success, symmetric)
+        if isinstance(self.kernel, IsotropicKernel):
+            widest = self.kernel.sigma_position_m
+        else:
+            # No width is larger than the one the cells are made for, so their runs reach far enough.
+            p, widest = self.kernel.along(p), max(self.kernel.sigmas[:3])
         parts: list[Cells | None] = []
         for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
-            ones = np.ones(int(chosen.sum()))
-            if not len(ones):
+            columns = p[chosen], q[chosen], np.ones(int(chosen.sum())), flags[chosen]
+            if not len(columns[0]):
                 parts.append(present)
             elif present is None:
-                parts.append(
-                    Cells.build(p[chosen], q[chosen], ones, flags[chosen], self._kernel.sigma_position_m)
-                )
+                parts.append(Cells.build(*columns, widest))
             else:
-                parts.append(present.extend(p[chosen], q[chosen], ones, flags[chosen]))
-        counts = (self._counts[0] + int(won.sum()), self._counts[1] + int((~won).sum()))
-        return SuccessModel(self._kernel, parts[0], parts[1], counts)
-
-    @property
-    def kernel(self) -> IsotropicKernel:
-        return self._kernel
+                parts.append(present.extend(*columns))
+        return SuccessModel(self.kernel, parts[0], parts[1])
 
     @property
     def size(self) -> int:
         """Attempts."""
-        return sum(self._counts)
+        return self.successes + (0 if self._failed is None else len(self._failed.rows))
 
     @property
     def successes(self) -> int:
-        return self._counts[0]
+        return 0 if self._succeeded is None else len(self._succeeded.rows)
 
     @property
     def prior_share(self) -> float:
         """Share of successes among all attempts, nan without any."""
-        return self._counts[0] / self.size if self.size else math.nan
+        return self.successes / self.size if self.size else math.nan
 
     @property
     def nbytes(self) -> int:
@@ -207,35 +198,17 @@ class SuccessModel:
         p, q = se3.as_poses(positions, quaternions_xyzw)
         won = self._sums(self._succeeded, p, q, cutoff, threads)
         lost = self._sums(self._failed, p, q, cutoff, threads)
-        total = won[:, 0] + lost[:, 0]
-        squares = won[:, 1] + lost[:, 1]
-        reached = total > 0.0
-        safe = np.where(reached, total, 1.0)
-        share = np.where(reached, won[:, 0] / safe, 0.0)
-        trials = np.where(reached, safe * (safe / np.where(reached, squares, 1.0)), 0.0)
         prior = self.prior_share
+        total, squares = (won + lost).T
+        probability, trials, share = shrunk_share(won[:, 0], total, squares, prior)
         alpha = PRIOR_TRIALS * prior + trials * share
         beta = PRIOR_TRIALS * (1.0 - prior) + trials * (1.0 - share)
-        probability = alpha / (PRIOR_TRIALS + trials)
         # Without any success, or any failure, the matching Beta would be a point: the interval then starts
         # from the share that half a trial more of either would give.
         if prior in (0.0, 1.0):
-            softened = (self._counts[0] + 0.5) / (self.size + 1.0)
+            softened = (self.successes + 0.5) / (self.size + 1.0)
             alpha, beta = alpha + (softened - prior), beta - (softened - prior)
         return probability, trials, alpha, beta
-
-    def smoothing_bias(
-        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
-    ) -> Floats:
-        """Probability here less that of a kernel half as wide, (M,): what smoothing moved, noise included."""
-        half = IsotropicKernel(0.5 * self._kernel.sigma_position_m, 0.5 * self._kernel.sigma_rotation)
-        narrow = SuccessModel(
-            half, _rescaled(self._succeeded, 2.0), _rescaled(self._failed, 2.0), self._counts
-        )
-        own = self.evaluate(positions, quaternions_xyzw, threads=threads).probability
-        return np.asarray(
-            own - narrow.evaluate(positions, quaternions_xyzw, threads=threads).probability, dtype=np.float64
-        )
 
     def _sums(self, cells: Cells | None, p: Floats, q: Floats, cutoff: float, threads: int) -> Floats:
         """Sums of k and k^2 (M, 2)."""
@@ -243,20 +216,51 @@ class SuccessModel:
         radius = scaled_radius(cutoff)
         if cells is None or not len(p):
             return out
+        kernel = self.kernel
+        if isinstance(kernel, DiagonalKernel):
+            p = kernel.along(p)
         order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
         p, q = p[order], q[order]
-        wide = self._kernel.sigma_rotation > TWIN_ROTATION
+        if isinstance(kernel, DiagonalKernel):
+            half = 0.5 / np.array(kernel.sigmas) ** 2
+            half[:3] /= cells.scale**2
+            turning, block = kernel.axes is None, _DIAGONAL_BLOCK
 
-        def work(begin: int, end: int) -> None:
-            isotropic.square_sums(
-                cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                p[begin:end], q[begin:end], self._kernel.kappa, radius, wide, out[begin:end],
-            )  # fmt: skip
+            def work(begin: int, end: int) -> None:
+                diagonal.square_sums(
+                    cells.data, cells.start, cells.table, cells.centre, cells.scale,
+                    p[begin:end], q[begin:end], half, turning, radius, out[begin:end],
+                )  # fmt: skip
+        else:
+            kappa, wide, block = kernel.kappa, kernel.sigma_rotation > TWIN_ROTATION, _ISOTROPIC_BLOCK
 
-        for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
+            def work(begin: int, end: int) -> None:
+                isotropic.square_sums(
+                    cells.data, cells.start, cells.table, cells.centre, cells.scale,
+                    p[begin:end], q[begin:end], kappa, radius, wide, out[begin:end],
+                )  # fmt: skip
+
+        for_blocks(work, len(p), block=block, threads=threads)
         result = np.empty_like(out)
         result[order] = out
         return result
+
+
+def shrunk_share(won: Floats, total: Floats, squares: Floats, prior: float) -> tuple[Floats, Floats, Floats]:
+    """Success probability, effective trials and the share it is shrunk from, each (M,).
+
+    Parameters
+    ----------
+    won, total, squares : (M,)
+        Sums of k over successes, and of k and k^2 over all attempts.
+    prior : float
+        The share of successes among all attempts.
+    """
+    reached = total > 0.0
+    safe = np.where(reached, total, 1.0)
+    share = np.where(reached, won / safe, 0.0)
+    trials = np.where(reached, safe * (safe / np.where(reached, squares, 1.0)), 0.0)
+    return (PRIOR_TRIALS * prior + trials * share) / (PRIOR_TRIALS + trials), trials, share
 
 
 def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Floats:
@@ -270,9 +274,10 @@ def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Float
     return out
 
 
-def _attempts(
+def checked_attempts(
     positions: ArrayLike, quaternions_xyzw: ArrayLike, success: ArrayLike, symmetric: ArrayLike | bool
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Attempts as arrays of one length, or a `ValueError` that says what is wrong."""
     p, q = se3.as_poses(positions, quaternions_xyzw)
     won = np.asarray(success)
     if won.shape != (len(p),) or won.dtype != np.bool_:
@@ -281,8 +286,3 @@ def _attempts(
     if flags.ndim and flags.shape != (len(p),):
         raise ValueError(f"symmetric is one flag or has shape ({len(p)},), not {flags.shape}")
     return p, q, won, np.broadcast_to(flags, (len(p),))
-
-
-def _rescaled(cells: Cells | None, factor: float) -> Cells | None:
-    """The same rows for a kernel narrower by ``factor`` in position."""
-    return None if cells is None else cells.rescaled(factor)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from graspdb.wire import KernelInfo, WeightsInfo
 from graspdb_density import (
     DEFAULT_KERNEL,
+    DiagonalKernel,
     GraspDensity,
     IsotropicKernel,
     MixtureDensity,
@@ -28,7 +29,6 @@ from graspdb_density import (
 )
 from graspdb_density.bandwidth.selection import FIRST_CHOICE
 from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
-from graspdb_density.success.axis_bandwidth import Widths
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage import trials
 from graspdb_service.storage.kernels import KernelRow
@@ -86,8 +86,8 @@ class Built:
         (N,) whether a grid tried it.
     chosen_from
         How many of the first rows the widths were chosen from.
-    predicting
-        Widths (6) that success probabilities are estimated with, where a kernel for those was asked for.
+    success_kernel
+        What success probabilities are estimated with, where a kernel for those was asked for.
     """
 
     revision: int
@@ -104,7 +104,7 @@ class Built:
     chosen_from: int = 0
     shaped: MixtureDensity | None = None
     sampled: GraspDensity | None = None
-    predicting: Widths | None = None
+    success_kernel: DiagonalKernel | None = None
 
     @property
     def asked(self) -> GraspDensity | MixtureDensity | None:
@@ -178,7 +178,7 @@ def build(
         proposal = np.concatenate([before.proposal_density, proposal])
         swept = np.concatenate([before.swept, swept])
     # A kernel that predicts success shapes no density: that one is as if none was asked for.
-    predicting = stored is not None and stored.kind == "probability"
+    for_success = stored is not None and stored.kind == "probability"
     built = Built(
         revision=row.revision,
         epoch=row.epoch,
@@ -191,8 +191,8 @@ def build(
         seq=seq,
         proposal_density=proposal,
         swept=swept,
-        chosen_from=widths_prefix(len(seq)) if choice.by_default or predicting else 0,
-        predicting=load.widths_of(stored, axes) if stored is not None and predicting else None,
+        chosen_from=widths_prefix(len(seq)) if choice.by_default or for_success else 0,
+        success_kernel=load.load_success_kernel(stored, axes) if stored is not None and for_success else None,
     )
     if not len(seq):
         return built
@@ -206,7 +206,7 @@ def build(
 
     weights = _weights(built, everything)
     added = None if old is None else _in_units_of(old, weights, len(rows))
-    if stored is not None and not predicting:
+    if stored is not None and not for_success:
         return _shaped(stored, axes, built, before, everything, fresh, weights, added)
     if before is not None and before.chosen_from == built.chosen_from:
         built = replace(built, kernel=before.kernel)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb_density import IsotropicKernel, SuccessModel
-from graspdb_density.success.axis_bandwidth import ShapedSuccessModel, Widths
+from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
+from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases.densities.cache import Built, require_object
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
@@ -79,7 +79,7 @@ class _Key:
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool
-    widths: Widths | None
+    success_kernel: DiagonalKernel | None
 
 
 class Successes:
@@ -104,7 +104,7 @@ class Successes:
             built.kernel.sigma_position_m,
             built.kernel.sigma_rotation_deg,
             collisions_known,
-            built.predicting,
+            built.success_kernel,
         )
         found = self._cache.get(
             key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
@@ -170,18 +170,19 @@ class Successes:
                 # Two sweeps of one grid share poses, which count once: looked at together.
                 before = None
                 stored = _fetch(tx, row.id, selected, without, None)
-        kernel = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
+        isotropic = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
+        kernel = key.success_kernel or isotropic
         old, sample = (None, None) if before is None else (before.model, before.sample)
         new = self._compute.run(lambda: _Columns.of(attempts.joined(stored)))
         size = len(new.success) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
             return self._refresh(key, slug, None)
-        model = self._compute.run(lambda: _extended(old, new, kernel, key.widths))
+        model = self._compute.run(lambda: _extended(old, new, kernel))
         if size > _LARGE:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
             chosen = np.random.default_rng(row.revision).random(len(new.success)) < share
-            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel, key.widths))
+            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel))
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
@@ -198,16 +199,12 @@ def _fetch(
     )
 
 
-def _extended(
-    old: SuccessModel | None, new: _Columns, kernel: IsotropicKernel, widths: Widths | None
-) -> SuccessModel | None:
+def _extended(old: SuccessModel | None, new: _Columns, kernel: SuccessKernel) -> SuccessModel | None:
     if not len(new.success):
         return old
     columns = new.position, new.quaternion, new.success
     if old is not None:
         return old.extend(*columns, symmetric=new.symmetric)
-    if widths is not None:
-        return ShapedSuccessModel.under(widths, *columns, symmetric=new.symmetric)
     return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance, KernelWidths
 from graspdb_density import AnisotropicKernel
-from graspdb_density.success.axis_bandwidth import fit_widths
+from graspdb_density.success.axis_bandwidth import fit_axis_bandwidths
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases.kernels import load
 from graspdb_service.usecases.runtime.context import Context
@@ -42,7 +42,7 @@ def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
         kept = ~everything.collided if tested else np.ones(len(everything), dtype=bool)
         try:
             fit = ctx.compute.run(
-                lambda: fit_widths(
+                lambda: fit_axis_bandwidths(
                     everything.position[kept],
                     everything.quaternion[kept],
                     everything.success[kept],
@@ -70,7 +70,7 @@ def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
             sigma_rotation_deg=min(40.0, math.degrees(fit.isotropic.sigma_rotation)),
         ),
     )
-    component = KernelComponent(covariance=np.diag(fit.widths**2).tolist())
+    component = KernelComponent(covariance=np.diag(np.square(fit.kernel.sigmas)).tolist())
     return {
         "kind": request.kind,
         "alignment": request.alignment,

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, KernelWidths
-from graspdb_density import AnisotropicKernel, IsotropicKernel, SampledKernel, se3
+from graspdb_density import AnisotropicKernel, DiagonalKernel, IsotropicKernel, SampledKernel, se3
 from graspdb_density.kernels.gaussian_mixture import mirror
-from graspdb_density.success.axis_bandwidth import Widths
 from graspdb_service.problems import conflict
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
@@ -85,11 +84,10 @@ def covariance_of(row: KernelRow) -> Floats:
     return np.asarray(np.einsum("c,ci,cj->ij", share, off, off) + np.diag(own), dtype=np.float64)
 
 
-def widths_of(row: KernelRow, along: Axes) -> Widths:
-    """Those of a kernel that predicts success, along the object's axes (3, 3) or, without, the gripper's."""
-    sigmas = tuple(float(width) for width in np.sqrt(np.diag(covariance_of(row))))
+def load_success_kernel(row: KernelRow, along: Axes) -> DiagonalKernel:
+    """One that predicts success, along the object's axes (3, 3) or, without, the gripper's."""
     assert not callable(along)
-    return Widths(sigmas, None if along is None else tuple(along.ravel().tolist()))
+    return DiagonalKernel.of(np.sqrt(np.diag(covariance_of(row))), along)
 
 
 def info_of(row: KernelRow, plain: KernelInfo | None = None) -> KernelInfo:

@@ -12,9 +12,8 @@ from graspdb.wire.reports import (
     CalibrationReport,
     CheckedGrasps,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, importance_weights
+from graspdb_density import GraspDensity, SuccessModel, importance_weights
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.success.axis_bandwidth import ShapedSuccessModel, Widths
 from graspdb_density.success.calibration import (
     ReliabilityBin,
     area_under_curve,
@@ -22,6 +21,7 @@ from graspdb_density.success.calibration import (
     calibrate,
     reliability,
 )
+from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_density.vicinity.anisotropy import LEAST_SUCCESSES
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
@@ -53,14 +53,10 @@ _REACH = 5.0
 _CHECKED_BINS = 5
 
 
-def _model(
-    everything: AllTrials, rows: NDArray[np.int64], kernel: IsotropicKernel, widths: Widths | None
-) -> SuccessModel:
-    """Of some attempts, under the widths that predict success where a kernel of that kind was asked for."""
+def _model(everything: AllTrials, rows: NDArray[np.int64], kernel: SuccessKernel) -> SuccessModel:
+    """Of some attempts."""
     attempts = everything.position[rows], everything.quaternion[rows], everything.success[rows]
     symmetric = everything.symmetric[rows]
-    if widths is not None:
-        return ShapedSuccessModel.under(widths, *attempts, symmetric=symmetric)
     return SuccessModel.build(*attempts, kernel=kernel, symmetric=symmetric)
 
 
@@ -97,7 +93,7 @@ def calibration_report(
         progress(fold / blocks.folds)
         if not held.size or not train.size:
             continue
-        model = _model(everything, train, kernel, built.predicting)
+        model = _model(everything, train, built.success_kernel or kernel)
         progress((fold + 0.5) / blocks.folds)
         predicted[held] = model.evaluate(p[held], q[held], threads=sources.threads).probability
         kept = train[everything.success[train]]
@@ -193,8 +189,8 @@ def _checked(
     q = np.concatenate([item.quaternion for item in found])
     codes = np.concatenate([item.codes for item in found])
     assert built.density is not None
-    kernel, widths = built.density.kernel, built.predicting
-    reach = max([kernel.sigma_position_m, *(() if widths is None else widths.sigmas[:3])])
+    kernel, diagonal = built.density.kernel, built.success_kernel
+    reach = max([kernel.sigma_position_m, *(() if diagonal is None else diagonal.sigmas[:3])])
     distance, _ = cKDTree(p).query(everything.position, distance_upper_bound=_REACH * reach)
     near = np.isfinite(distance)
     if test is not None:
@@ -202,7 +198,7 @@ def _checked(
         near &= ~everything.collided
     predicted = np.zeros(len(p))
     if near.any():
-        model = _model(everything, np.flatnonzero(near), kernel, widths)
+        model = _model(everything, np.flatnonzero(near), diagonal or kernel)
         predicted = model.evaluate(p, q, threads=sources.threads).probability.copy()
     if test is not None:
         predicted[~test.free(p, q, threads=sources.threads)] = 0.0
