@@ -26,22 +26,6 @@ from graspdb.resources.pages import PAGE, Item, Listing
 from graspdb.resources.sweeps import ProgressCallback, Sweep, Sweeps
 from graspdb.resources.trials import Batches, TrialListing, Trials
 
-__all__ = [
-    "AsyncAllReports",
-    "AsyncBatches",
-    "AsyncClient",
-    "AsyncGraspObject",
-    "AsyncGrippers",
-    "AsyncKernels",
-    "AsyncListing",
-    "AsyncObjects",
-    "AsyncReports",
-    "AsyncSweep",
-    "AsyncSweeps",
-    "AsyncTrialListing",
-    "AsyncTrials",
-]
-
 S = TypeVar("S")
 Sync = TypeVar("Sync", covariant=True)
 R = TypeVar("R")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Any
 
 from graspdb import wire
@@ -15,8 +14,6 @@ from graspdb.resources.pages import Listing
 from graspdb.resources.sweeps import Sweeps
 from graspdb.results import table_html
 from graspdb.transport import Transport
-
-__all__ = ["Client"]
 
 
 class Client:
@@ -114,9 +111,7 @@ class Client:
     def __enter__(self) -> Client:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:

@@ -6,25 +6,6 @@ from graspdb.wire import FieldError, Problem
 from graspdb.wire.reports import CheckCall
 from graspdb.wire.sweeps import FailedChunk
 
-__all__ = [
-    "AmbiguousSelection",
-    "ChecksNeeded",
-    "Conflict",
-    "Forbidden",
-    "GraspDBError",
-    "Infeasible",
-    "InvalidInput",
-    "LeaseLost",
-    "NotFound",
-    "ServiceError",
-    "SweepFailed",
-    "TooLarge",
-    "TooManyRequests",
-    "Unauthorized",
-    "Unreachable",
-    "error_for",
-]
-
 
 class GraspDBError(Exception):
     """Base of every error of this package."""

@@ -15,18 +15,6 @@ from numpy.typing import NDArray
 from graspdb import wire
 from graspdb.poses import Poses, matrices
 
-__all__ = [
-    "Grasp",
-    "Grasps",
-    "IntervalArrays",
-    "LikelihoodArrays",
-    "PoseArrays",
-    "SampledPoses",
-    "TrialArrays",
-    "TriedPoses",
-    "table_html",
-]
-
 Floats = NDArray[np.float64]
 
 

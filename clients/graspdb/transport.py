@@ -13,7 +13,6 @@ import random
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import Any
 
 import httpx
@@ -29,19 +28,7 @@ _RETRIED = frozenset({429, 502, 503, 504})
 
 
 class Transport:
-    """One connection pool to one service; safe to share between threads.
-
-    Parameters
-    ----------
-    url
-        Base address; by default ``$GRASPDB_URL``, else ``http://127.0.0.1:8000``.
-    api_key
-        Sent as a bearer token; by default ``$GRASPDB_API_KEY``.
-    timeout_s
-        Per attempt; computing requests can take as long.
-    retries
-        Attempts after the first.
-    """
+    """One connection pool to one service; safe to share between threads. See :class:`graspdb.Client`."""
 
     def __init__(
         self,
@@ -70,9 +57,7 @@ class Transport:
     def __enter__(self) -> Transport:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def request(
@@ -88,32 +73,17 @@ class Transport:
         idempotency_key: str | None = None,
         retries: int | None = None,
     ) -> httpx.Response:
-        """Send and return a 2xx or 304 answer.
+        """Send and return a 2xx or 304 answer; other answers raise their typed error, none Unreachable.
 
-        Parameters
-        ----------
-        body
-            Sent as JSON (a model without its unset fields).
-        content
-            A raw body; name its type in ``headers``.
-        idempotent
-            Give a creating POST an Idempotency-Key of its own, the same in every attempt.
-
-        Raises
-        ------
-        Unreachable
-            If no attempt got an answer.
-        GraspDBError
-            The typed error of the problem answered (:func:`graspdb.errors.error_for`).
+        ``body`` is sent as JSON (a model without its unset fields), ``content`` as it is with its type in
+        ``headers``. ``idempotent`` gives a creating POST an Idempotency-Key, the same in every attempt.
         """
         send = dict(headers or {})
         if body is not None:
-            text = (
-                body.model_dump_json(exclude_unset=True)
-                if isinstance(body, BaseModel)
-                else json.dumps(body, allow_nan=False)
-            )
-            content = text.encode()
+            if isinstance(body, BaseModel):
+                content = body.model_dump_json(exclude_unset=True).encode()
+            else:
+                content = json.dumps(body, allow_nan=False).encode()
             send.setdefault("Content-Type", "application/json")
         if idempotency_key or idempotent:
             send["Idempotency-Key"] = idempotency_key or str(uuid.uuid4())

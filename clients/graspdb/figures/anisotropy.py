@@ -71,23 +71,12 @@ def draw_anisotropy(report: AnisotropyReport) -> Figure:
     below -= _ABOVE
     for i, histogram in enumerate(report.translations):
         axes = placed(_LEFT + i * (flat + 0.12), flat, flat)
-        image = _heat(axes, histogram, 1e3)
-        low, high = histogram.slice_m or (0.0, 0.0)
-        axes.set_title(f"z {1e3 * low:.0f} to {1e3 * high:.0f} mm\nn = {_total(histogram)}", fontsize=8)
-        axes.set_xlabel("x [mm]", fontsize=8)
-        if i == 0:
-            axes.set_ylabel("y [mm]", fontsize=8)
-        else:
-            axes.set_yticklabels([])
+        _translation(axes, histogram, first=i == 0)
     below -= flat + _BELOW + _ABOVE
     step = (_WIDTH - _LEFT - 0.95) / 3
     for i, histogram in enumerate(report.rotations):
         axes = placed(_LEFT + i * step, _SQUARE, _SQUARE)
-        image = _heat(axes, histogram, 180.0 / math.pi)
-        first, second = (name[1:] for name in histogram.axes)
-        axes.set_title(f"rotation about {first}, then {second}\nn = {_total(histogram)}", fontsize=8)
-        axes.set_xlabel(f"about {first} [deg]", fontsize=8)
-        axes.set_ylabel(f"about {second} [deg]", fontsize=8, labelpad=1)
+        image = _rotation(axes, histogram)
     bar = figure.colorbar(image, cax=placed(_WIDTH - 0.85, 0.14, _SQUARE))
     bar.set_label("share of displaced grasps that\nsucceed (hatched: none tried)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
@@ -123,6 +112,26 @@ def _span(count: int) -> float:
 
 def _rows(count: float) -> float:
     return max(0.8, _ROW * count)
+
+
+def _translation(axes: Axes, histogram: AnisotropyHistogram, *, first: bool) -> None:
+    _heat(axes, histogram, 1e3)
+    low, high = histogram.slice_m or (0.0, 0.0)
+    axes.set_title(f"z {1e3 * low:.0f} to {1e3 * high:.0f} mm\nn = {_total(histogram)}", fontsize=8)
+    axes.set_xlabel("x [mm]", fontsize=8)
+    if first:
+        axes.set_ylabel("y [mm]", fontsize=8)
+    else:
+        axes.set_yticklabels([])
+
+
+def _rotation(axes: Axes, histogram: AnisotropyHistogram) -> Any:
+    image = _heat(axes, histogram, 180.0 / math.pi)
+    first, second = (name[1:] for name in histogram.axes)
+    axes.set_title(f"rotation about {first}, then {second}\nn = {_total(histogram)}", fontsize=8)
+    axes.set_xlabel(f"about {first} [deg]", fontsize=8)
+    axes.set_ylabel(f"about {second} [deg]", fontsize=8, labelpad=1)
+    return image
 
 
 def _total(histogram: AnisotropyHistogram) -> str:

@@ -13,9 +13,9 @@ from graspdb.figures.style import (
     GREY,
     MARKERS,
     ORANGE,
-    error_bars,
     new_figure,
     show_grid,
+    show_ranges,
     show_ticks,
     title,
 )
@@ -35,16 +35,10 @@ def draw_bandwidth(report: BandwidthReport) -> Figure:
     for turn, colour, marker in zip(turns, COLOURS, MARKERS, strict=False):
         points = [p for p in report.grid if p.sigma_rotation_deg == turn and p.log_likelihood is not None]
         left.errorbar(
-            [1e3 * p.sigma_position_m for p in points],
-            [p.log_likelihood or 0.0 for p in points],
-            yerr=[p.below_best_error or 0.0 for p in points],
-            color=colour,
-            marker=marker,
-            markersize=4,
-            capsize=2,
-            linewidth=1.3,
-            label=f"{turn:.1f}°",
-        )
+            [1e3 * p.sigma_position_m for p in points], [p.log_likelihood or 0.0 for p in points],
+            yerr=[p.below_best_error or 0.0 for p in points], color=colour, marker=marker, markersize=4,
+            capsize=2, linewidth=1.3, label=f"{turn:.1f}°",
+        )  # fmt: skip
     best = report.recommended
     left.axvspan(1e3 * report.range_m[0], 1e3 * report.range_m[1], color=GREY, alpha=0.12, linewidth=0)
     left.axvline(1e3 * best.sigma_position_m, color=GREY, linestyle=":", linewidth=1.2)
@@ -76,17 +70,8 @@ def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
     ):
         known = [i for i, item in enumerate(ranges) if item.value is not None]
         shown = [ranges[i] for i in known]
-        axes.errorbar(
-            at[known] + shift,
-            [item.value or 0.0 for item in shown],
-            yerr=error_bars(shown),
-            color=colour,
-            marker=marker,
-            markersize=5,
-            capsize=3,
-            linestyle="none",
-            label=label,
-        )
+        show_ranges(axes, at[known] + shift, shown, color=colour, marker=marker, markersize=5, capsize=3,
+                    label=label)  # fmt: skip
     axes.set_xticks(at)
     axes.set_xticklabels(
         [

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, error_bars, new_figure, number, show_grid, title
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, new_figure, number, show_grid, show_ranges, title
 from graspdb.wire.reports import CalibrationBin, CalibrationReport
 
 if TYPE_CHECKING:
@@ -28,9 +28,8 @@ def draw_calibration(report: CalibrationReport) -> Figure:
     show_bins(top, report.bins, linewidth=1.5, label=label)
     again = report.checked
     if again is not None:
-        top.errorbar(
-            [again.predicted], [again.rate.value or 0.0], yerr=error_bars([again.rate]), color=ORANGE,
-            marker="D", markersize=6, capsize=4, linestyle="none",
+        show_ranges(
+            top, [again.predicted], [again.rate], color=ORANGE, marker="D", markersize=6, capsize=4,
             label=f"{again.grasps:,} given grasps simulated again ({again.successes:,} succeed)",
         )  # fmt: skip
     top.set_ylabel("share that succeeded")

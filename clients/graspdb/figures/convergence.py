@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, new_figure, show_grid, title
+from graspdb.figures.style import BLUE, CURVE, GREEN, GREY, ORANGE, new_figure, show_grid, title, widths
 from graspdb.wire.reports import ConvergenceReport
 
 if TYPE_CHECKING:
@@ -22,29 +22,15 @@ def draw_convergence(report: ConvergenceReport) -> Figure:
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for curve, colour, marker in zip(report.curves, _COLOURS, "osD", strict=False):
         grasps = [point.grasps for point in curve.points]
-        kernel = curve.kernel
-        widths = f"{1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°"
         top.errorbar(
-            grasps,
-            [point.similarity for point in curve.points],
-            yerr=[point.deviation for point in curve.points],
-            color=colour,
-            marker=marker,
-            markersize=4,
-            capsize=3,
-            linewidth=1.5,
-            label=f"{curve.label} ({widths})",
-        )
+            grasps, [point.similarity for point in curve.points],
+            yerr=[point.deviation for point in curve.points], color=colour, marker=marker, **CURVE,
+            label=f"{curve.label} ({widths(curve.kernel)})",
+        )  # fmt: skip
         bottom.errorbar(
-            grasps,
-            [point.log_likelihood for point in curve.points],
-            yerr=[point.log_likelihood_error for point in curve.points],
-            color=colour,
-            marker=marker,
-            markersize=4,
-            capsize=3,
-            linewidth=1.5,
-        )
+            grasps, [point.log_likelihood for point in curve.points],
+            yerr=[point.log_likelihood_error for point in curve.points], color=colour, marker=marker, **CURVE,
+        )  # fmt: skip
         needed = curve.verdict.needed
         if needed.low is not None and needed.high is not None and needed.high > needed.low:
             top.axvspan(needed.low, needed.high, color=colour, alpha=0.12, linewidth=0)

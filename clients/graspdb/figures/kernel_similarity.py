@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from graspdb.figures.style import BLUE, GREY, ORANGE, new_figure, show_grid, show_ticks, title
+from graspdb.figures.style import BLUE, CURVE, GREY, ORANGE, new_figure, show_grid, show_ticks, title
 from graspdb.wire.reports import KernelSimilarityReport
 
 if TYPE_CHECKING:
@@ -21,15 +21,9 @@ def draw_kernel_similarity(report: KernelSimilarityReport) -> Figure:
         (right, report.mixtures, ORANGE, "s"),
     ):
         axes.errorbar(
-            [point.count for point in points],
-            [point.similarity for point in points],
-            yerr=[1.64 * point.error for point in points],
-            color=colour,
-            marker=marker,
-            markersize=4,
-            capsize=3,
-            linewidth=1.5,
-        )
+            [point.count for point in points], [point.similarity for point in points],
+            yerr=[1.64 * point.error for point in points], color=colour, marker=marker, **CURVE,
+        )  # fmt: skip
         axes.set_ylim(0.0, 1.02)
         show_grid(axes)
     left.set_xscale("log")

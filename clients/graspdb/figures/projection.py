@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graspdb.figures.style import BLUE, GREY, new_figure, show_grid, title
+from graspdb.figures.style import BLUE, GREY, new_figure, show_grid, title, widths
 from graspdb.wire.reports import ProjectionProfile, ProjectionReport
 
 if TYPE_CHECKING:
@@ -110,8 +110,7 @@ def _key(report: ProjectionReport) -> str:
     ):
         if vector is not None:
             lines.append(f"{name} within {cone:g}\u00b0 of\n  ({', '.join(f'{x:.3g}' for x in vector)})")
-    kernel = report.kernel
-    lines.append(f"kernel {1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}\u00b0")
+    lines.append(f"kernel {widths(report.kernel)}")
     lines.append("grey: the object" if report.outline else "no mesh: no silhouette")
     lines.append(f"band: {report.level:.0%} interval, all depths")
     return "\n".join(lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from graspdb.figures.calibration import show_bins
 from graspdb.figures.style import (
@@ -10,17 +10,21 @@ from graspdb.figures.style import (
     GREEN,
     GREY,
     ORANGE,
-    error_bars,
     new_figure,
     number,
     show_grid,
+    show_ranges,
     title,
+    widths,
 )
 from graspdb.wire.reports import SourceComparison, SourcesReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+_MARK: dict[str, Any] = {"markersize": 6, "capsize": 4}
 
 
 def draw_sources(report: SourcesReport) -> Figure:
@@ -66,10 +70,7 @@ def _shares(axes: Axes, item: SourceComparison, report: SourcesReport) -> None:
     if item.agreement is not None:
         names.append("agreement with\nsimulation")
         ranges.append(item.agreement)
-    axes.errorbar(
-        range(len(names)), [r.value or 0.0 for r in ranges], yerr=error_bars(ranges), color=BLUE, marker="o",
-        markersize=6, capsize=4, linestyle="none", label="found",
-    )  # fmt: skip
+    show_ranges(axes, range(len(names)), ranges, color=BLUE, marker="o", **_MARK, label="found")
     if item.predicted is not None:
         axes.plot([0], [item.predicted], color=ORANGE, marker="D", markersize=6, linestyle="none",
                   label="simulation's mean prediction")  # fmt: skip
@@ -92,19 +93,10 @@ def _similar(axes: Axes, item: SourceComparison) -> None:
         axes.set_xticks([])
         return
     axes.errorbar(
-        [0], [found.value], yerr=[1.64 * found.error], color=BLUE, marker="o", markersize=6, capsize=4,
-        linestyle="none",
-    )  # fmt: skip
-    axes.errorbar(
-        [1], [found.expected.value or 0.0], yerr=error_bars([found.expected]), color=GREEN, marker="s",
-        markersize=6, capsize=4, linestyle="none",
-    )  # fmt: skip
+        [0], [found.value], yerr=[1.64 * found.error], color=BLUE, marker="o", linestyle="none", **_MARK
+    )
+    show_ranges(axes, [1], [found.expected], color=GREEN, marker="s", **_MARK)
     axes.set_xticks([0, 1])
     axes.set_xticklabels([f"{item.source}\nto simulation", "as many grasps\nof simulation"])
     axes.set_xlim(-0.6, 1.6)
-    kernel = found.kernel
-    axes.set_title(
-        f"kernel {1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°;\n"
-        "green: range of 10 draws of simulation",
-        fontsize=8,
-    )
+    axes.set_title(f"kernel {widths(found.kernel)};\ngreen: range of 10 draws of simulation", fontsize=8)

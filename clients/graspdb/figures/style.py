@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from graspdb.wire.reports import ReportRange
 
 if TYPE_CHECKING:
@@ -17,6 +19,8 @@ COLOURS = (BLUE, ORANGE, GREEN, YELLOW, "#CC79A7", "#56B4E9", GREY)
 
 
 MARKERS = "osD^v"
+#: Of a curve with error bars.
+CURVE: dict[str, Any] = {"markersize": 4, "capsize": 3, "linewidth": 1.5}
 
 
 def new_figure(width: float | None = None, height: float | None = None) -> Figure:
@@ -74,14 +78,21 @@ def number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.2f}"
 
 
-def error_bars(ranges: Sequence[ReportRange]) -> list[list[float]]:
-    """Lengths of error bars below and above, as matplotlib wants them."""
-    below, above = [], []
-    for item in ranges:
-        value = item.value or 0.0
-        below.append(max(value - (value if item.low is None else item.low), 0.0))
-        above.append(max((value if item.high is None else item.high) - value, 0.0))
-    return [below, above]
+def widths(kernel: Any) -> str:
+    """A kernel's widths in words."""
+    return f"{1e3 * kernel.sigma_position_m:.1f} mm, {kernel.sigma_rotation_deg:.1f}°"
+
+
+def show_ranges(
+    axes: Axes, at: Any, ranges: Sequence[ReportRange], *, upright: bool = True, **style: Any
+) -> None:
+    """Draw values with their intervals as marks at ``at``, upright or lying."""
+    values = [item.value or 0.0 for item in ranges]
+    low = [value if item.low is None else item.low for item, value in zip(ranges, values, strict=True)]
+    high = [value if item.high is None else item.high for item, value in zip(ranges, values, strict=True)]
+    ends = np.maximum([np.subtract(values, low), np.subtract(high, values)], 0.0)
+    places = {"x": at, "y": values, "yerr": ends} if upright else {"x": values, "y": at, "xerr": ends}
+    axes.errorbar(**places, linestyle="none", **style)
 
 
 def show_ticks(axes: Axes, values: list[float]) -> None:

@@ -15,10 +15,10 @@ from graspdb.figures.style import (
     GREY,
     MARKERS,
     ORANGE,
-    error_bars,
     heading,
     new_figure,
     show_grid,
+    show_ranges,
 )
 from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import SummaryReport, SummaryRow
@@ -83,10 +83,8 @@ def _rates(axes: Axes, report: SummaryReport, at: NDArray[np.float64]) -> None:
         known = [i for i, rate in enumerate(rates) if rate.value is not None]
         shown = [rates[i] for i in known]
         height = at[known] + 0.2 * (1 - number)
-        axes.errorbar(
-            [rate.value or 0.0 for rate in shown], height, xerr=error_bars(shown), color=colour,
-            marker=marker, markersize=5, capsize=2, linestyle="none", label=report.rules[rule],
-        )  # fmt: skip
+        style = {"color": colour, "marker": marker, "markersize": 5, "capsize": 2}
+        show_ranges(axes, height, shown, upright=False, **style, label=report.rules[rule])
         for y, rate in zip(height, shown, strict=True):
             axes.annotate(f"{100 * (rate.value or 0.0):.2f} %", (rate.high or 0.0, y), xytext=(6, 0),
                           textcoords="offset points", fontsize=8, va="center")  # fmt: skip

@@ -7,8 +7,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-__all__ = ["GLB", "MeshLike", "read_mesh", "scene_of"]
-
 MeshLike = str | PathLike[str] | bytes | Any
 """A file, its bytes, or a trimesh object (a mesh or a scene)."""
 

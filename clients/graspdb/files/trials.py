@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from graspdb.poses import as_poses
 
-__all__ = ["read_poses", "read_trials"]
-
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at"})
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})

@@ -25,8 +25,6 @@ from graspdb.resources.sweeps import SweepOptions, create_sweep
 from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.transport import Transport
 
-__all__ = ["GraspQueries"]
-
 QUERY_POSES = 100_000
 """Poses a likelihood request: some 15 MB of JSON, well under the service's default body limit."""
 

@@ -9,8 +9,6 @@ from graspdb import wire
 from graspdb.resources.pages import Listing, checked, segment
 from graspdb.transport import Transport
 
-__all__ = ["Grippers"]
-
 
 class Grippers:
     """``db.grippers``: ``pg70``, ``panda`` and your own."""

@@ -12,8 +12,6 @@ from graspdb.resources.runs import RunProgress, finished
 from graspdb.resources.selection import TrialSelection
 from graspdb.transport import Transport
 
-__all__ = ["KernelOptions", "Kernels"]
-
 
 class KernelOptions(TrialSelection, total=False):
     """The trials a kernel is fitted on, and the fields of :class:`graspdb.wire.KernelCreate` that say how."""

@@ -19,8 +19,6 @@ from graspdb.resources.trials import Batches, Trials
 from graspdb.results import table_html
 from graspdb.transport import Transport
 
-__all__ = ["GraspObject", "ObjectProperties", "Objects"]
-
 
 class ObjectProperties(TypedDict, total=False):
     """``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` and ``metadata`` of an object."""

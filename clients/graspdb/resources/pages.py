@@ -12,8 +12,6 @@ from graspdb.errors import InvalidInput
 from graspdb.transport import Transport
 from graspdb.wire import FieldError, Problem
 
-__all__ = ["PAGE", "Listing", "checked", "segment"]
-
 PAGE = 1_000
 """The most items the service puts on a page."""
 

@@ -11,8 +11,6 @@ from graspdb.errors import GraspDBError, error_for
 from graspdb.transport import Transport
 from graspdb.wire.reports import ReportRun
 
-__all__ = ["RunProgress", "finished"]
-
 RunProgress = Callable[[ReportRun], None]
 """Called with a run while it is waited for."""
 

@@ -13,8 +13,6 @@ from graspdb.options import Corners, Option, PoseFile, Vector
 from graspdb.poses import as_poses, as_vector7, vector
 from graspdb.resources.pages import checked
 
-__all__ = ["Constraints", "Kernel", "Selection", "TrialSelection", "best_grasp_request", "query"]
-
 Kernel = wire.KernelSpec | Mapping[str, Any] | str
 
 

@@ -28,8 +28,6 @@ from graspdb.resources.pages import Listing, checked, segment
 from graspdb.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
 
-__all__ = ["OutcomeArrays", "Sweep", "SweepBar", "SweepOptions", "Sweeps", "create_sweep", "duration"]
-
 ProgressCallback = Callable[[wire.SweepInfo], None]
 GRID_OPTIONS = ("max_poses", "position_step_m", "rotation_step_deg", "margin_m", "region")
 FINISHED = frozenset({"done", "failed", "cancelled"})

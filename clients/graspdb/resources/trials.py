@@ -23,8 +23,6 @@ from graspdb.resources.selection import TrialSelection
 from graspdb.results import TrialArrays
 from graspdb.transport import Transport
 
-__all__ = ["CHUNK_TRIALS", "Batches", "Receipt", "TrialFilters", "TrialListing", "Trials", "Upload"]
-
 CHUNK_TRIALS = 50_000
 """Trials a request: some 10 MB of JSON, well under the service's default body limit."""
 

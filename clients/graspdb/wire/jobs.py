@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Base64Bytes, Field
 
-from graspdb.wire.base import Position, Quadruple, Request, Response, Text, Triple
+from graspdb.wire.base import Quadruple, Request, Response, Text, Triple
 from graspdb.wire.grippers import GripperProfile
 
 WorkerName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
@@ -144,24 +144,3 @@ class WorkerInfo(Response):
     jobs_leased: int
     jobs_done: int
     poses_done: int
-
-
-__all__ = [
-    "ClaimRequest",
-    "ClaimResponse",
-    "ClaimedJob",
-    "DecomposePayload",
-    "FailureNoted",
-    "FailureReport",
-    "GridPlan",
-    "JobKind",
-    "LeaseRenewed",
-    "PosePlan",
-    "Position",
-    "ResultAccepted",
-    "ResultRows",
-    "SimulatePayload",
-    "SimulateResult",
-    "WorkerInfo",
-    "WorkerName",
-]

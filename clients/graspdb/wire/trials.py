@@ -17,7 +17,6 @@ from graspdb.wire.base import (
     Response,
     Slug,
     Source,
-    Text,
     Triple,
     expand_matrix,
 )
@@ -132,17 +131,3 @@ class BatchInfo(Response):
     metadata: Metadata | None = None
     outcomes: dict[str, int] = Field(default_factory=dict)
     created_at: datetime
-
-
-__all__ = [
-    "BatchInfo",
-    "BatchReceipt",
-    "OutcomeIn",
-    "Text",
-    "TrialColumns",
-    "TrialColumnsIn",
-    "TrialDefaults",
-    "TrialIn",
-    "TrialOut",
-    "TrialsIn",
-]
