@@ -234,6 +234,13 @@ class Grasps(Sequence[Grasp]):
         )
 
 
+#: Columns of a likelihood, and what stands for a null in each.
+_NULLS = dict.fromkeys(
+    ("density", "log_density", "relative", "success_probability", "effective_trials"), np.nan
+)
+_NULLS["log_density"] = -np.inf
+
+
 @dataclass(frozen=True, eq=False)
 class IntervalArrays:
     """Bounds (N,) that hold the success probability with the given level; NaN where unknown."""
@@ -265,35 +272,23 @@ class LikelihoodArrays:
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
         """From the answers to consecutive parts of the poses."""
         free = _joined(answers, "collision_free")
+        columns = {name: _joined(answers, name) for name in _NULLS}
         intervals = [a.interval for a in answers if a.interval is not None and a.interval.low]
+        interval = None
+        if intervals:
+            ends = ([x for i in intervals for x in getattr(i, end)] for end in ("low", "high"))
+            interval = IntervalArrays(intervals[0].level, *(_floats(end, np.nan) for end in ends))
         return cls(
             revision=answers[-1].revision,
             kernel=answers[-1].kernel,
-            density=_floats(_joined(answers, "density"), np.nan),
-            log_density=_floats(_joined(answers, "log_density"), -np.inf),
-            relative=_floats(_joined(answers, "relative"), np.nan),
-            success_probability=_floats(_joined(answers, "success_probability"), np.nan),
-            effective_trials=_floats(_joined(answers, "effective_trials"), np.nan),
-            interval=IntervalArrays(
-                intervals[0].level,
-                _of([x for i in intervals for x in i.low], np.nan),
-                _of([x for i in intervals for x in i.high], np.nan),
-            )
-            if intervals
-            else None,
+            interval=interval,
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
+            **{name: None if x is None else _floats(x, _NULLS[name]) for name, x in columns.items()},
         )
 
     def _columns(self) -> dict[str, Any]:
-        names = (
-            "density",
-            "log_density",
-            "relative",
-            "success_probability",
-            "effective_trials",
-            "collision_free",
-        )
-        columns = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        names = [name for name in (*_NULLS, "collision_free") if getattr(self, name) is not None]
+        columns = {name: getattr(self, name) for name in names}
         if self.interval is not None:
             columns |= {"low": self.interval.low, "high": self.interval.high}
         return columns
@@ -318,11 +313,7 @@ def _joined(answers: Sequence[wire.Likelihoods], name: str) -> list[Any] | None:
     return None if name != "log_density" and all(v is None for v in joined) else joined
 
 
-def _floats(values: list[Any] | None, null: float) -> Floats | None:
-    return None if values is None else _of(values, null)
-
-
-def _of(values: Sequence[float | None], null: float) -> Floats:
+def _floats(values: Sequence[float | None], null: float) -> Floats:
     return np.array([null if v is None else v for v in values], dtype=np.float64)
 
 

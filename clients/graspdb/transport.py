@@ -13,7 +13,7 @@ import random
 import time
 import uuid
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 from pydantic import BaseModel, ValidationError
@@ -23,6 +23,7 @@ from graspdb.wire import Problem
 
 __all__ = ["DEFAULT_URL", "Transport"]
 
+Model = TypeVar("Model", bound=BaseModel)
 DEFAULT_URL = "http://127.0.0.1:8000"
 _RETRIED = frozenset({429, 502, 503, 504})
 
@@ -112,6 +113,10 @@ class Transport:
     def json(self, method: str, path: str, **options: Any) -> Any:
         """:meth:`request`, and the answer's JSON."""
         return self.request(method, path, **options).json()
+
+    def model(self, model: type[Model], method: str, path: str, **options: Any) -> Model:
+        """:meth:`request`, and the answer as this model."""
+        return model.model_validate(self.json(method, path, **options))
 
 
 def _retry_after(response: httpx.Response) -> float:

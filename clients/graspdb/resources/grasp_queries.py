@@ -48,9 +48,7 @@ class GraspQueries:
         Takes the :class:`Selection`.
         """
         params = query(known_keywords(Selection, selection, "density"))
-        return wire.DensityInfo.model_validate(
-            self._transport.json("GET", f"{self._path}/density", params=params)
-        )
+        return self._transport.model(wire.DensityInfo, "GET", f"{self._path}/density", params=params)
 
     def likelihood(
         self,
@@ -80,13 +78,12 @@ class GraspQueries:
         # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
         probe = checked(wire.LikelihoodRequest, {**options, "poses": given.columns(slice(1))})
         request = probe.model_dump(mode="json", exclude_unset=True)
-        answers: list[wire.Likelihoods] = []
+        path, answers = f"{self._path}/likelihood", list[wire.Likelihoods]()
         for attempt in range(3):
             answers = []
             for start in range(0, len(given.position), chunk):
                 body = {**request, "poses": given.columns(slice(start, start + chunk))}
-                answer = self._transport.json("POST", f"{self._path}/likelihood", body=body)
-                answers.append(wire.Likelihoods.model_validate(answer))
+                answers.append(self._transport.model(wire.Likelihoods, "POST", path, body=body))
                 if answers[-1].revision != answers[0].revision and attempt < 2:
                     break  # new trials came in between: one answer must rest on one revision
             else:
@@ -146,8 +143,9 @@ class GraspQueries:
 
     def _best_grasps(self, count: int, given: dict[str, Any], verify: bool, timeout_s: float) -> Grasps:
         request = best_grasp_request(count, given)
-        answer = self._transport.json("POST", f"{self._path}/best-grasp", body=request)
-        grasps = Grasps(wire.BestGrasps.model_validate(answer))
+        grasps = Grasps(
+            self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
+        )
         if len(grasps):
             return self._simulated(grasps, given, timeout_s) if verify else grasps
         if grasps.status == "no_successes":
@@ -192,8 +190,8 @@ class GraspQueries:
         """
         fields = {**known_keywords(Selection, selection, "samples"), "count": count, "seed": seed}
         request = checked(wire.SamplesRequest, fields)
-        answer = self._transport.json("POST", f"{self._path}/samples", body=request)
-        return SampledPoses.from_wire(wire.Samples.model_validate(answer))
+        answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
+        return SampledPoses.from_wire(answer)
 
     def proposals(
         self,
@@ -214,12 +212,8 @@ class GraspQueries:
         **selection
             :class:`Selection`.
         """
-        fields = {
-            **known_keywords(Selection, selection, "proposals"),
-            "count": count,
-            "seed": seed,
-            "strategy": strategy,
-        }
+        fields = known_keywords(Selection, selection, "proposals")
+        fields |= {"count": count, "seed": seed, "strategy": strategy}
         request = checked(wire.ProposalsRequest, fields)
-        answer = self._transport.json("POST", f"{self._path}/proposals", body=request)
-        return SampledPoses.from_wire(wire.Proposals.model_validate(answer))
+        answer = self._transport.model(wire.Proposals, "POST", f"{self._path}/proposals", body=request)
+        return SampledPoses.from_wire(answer)

@@ -19,12 +19,11 @@ class Grippers:
     def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
         """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
         request = checked(wire.GripperCreate, {"id": id, "name": name, **profile})
-        answer = self._transport.json("POST", "/grippers", body=request, idempotent=True)
-        return wire.GripperInfo.model_validate(answer)
+        return self._transport.model(wire.GripperInfo, "POST", "/grippers", body=request, idempotent=True)
 
     def get(self, id: str) -> wire.GripperInfo:
         """The gripper with this id."""
-        return wire.GripperInfo.model_validate(self._transport.json("GET", f"/grippers/{segment(id)}"))
+        return self._transport.model(wire.GripperInfo, "GET", f"/grippers/{segment(id)}")
 
     def list(self) -> Iterator[wire.GripperInfo]:
         """All grippers."""

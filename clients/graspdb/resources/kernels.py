@@ -64,7 +64,7 @@ class Kernels:
 
     def get(self, id: str) -> wire.StoredKernel:
         """The kernel with this id."""
-        return wire.StoredKernel.model_validate(self._transport.json("GET", f"/kernels/{segment(id)}"))
+        return self._transport.model(wire.StoredKernel, "GET", f"/kernels/{segment(id)}")
 
     def list(self) -> Iterator[wire.StoredKernel]:
         """All kernels, oldest first."""

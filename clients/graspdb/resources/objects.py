@@ -17,7 +17,7 @@ from graspdb.resources.pages import Listing, checked, segment
 from graspdb.resources.sweeps import Sweep, SweepOptions, Sweeps, create_sweep
 from graspdb.resources.trials import Batches, Trials
 from graspdb.results import table_html
-from graspdb.transport import Transport
+from graspdb.transport import Model, Transport
 
 
 class ObjectProperties(TypedDict, total=False):
@@ -86,16 +86,7 @@ class GraspObject(GraspQueries):
             Needed for bytes whose format they do not tell themselves.
         """
         content, kind = read_mesh(mesh, media_type)
-        answer = self._transport.json(
-            "PUT",
-            f"{self._path}/mesh",
-            params={"unit": unit},
-            content=content,
-            headers={"Content-Type": kind},
-        )
-        info = wire.MeshInfo.model_validate(answer)
-        self.refresh()
-        return info
+        return self._upload(wire.MeshInfo, "mesh", content, kind, params={"unit": unit})
 
     def download_mesh(self) -> bytes:
         """The mesh as it was uploaded."""
@@ -114,10 +105,12 @@ class GraspObject(GraspQueries):
         content, kind = read_mesh(parts, None, prefer="glb")
         if kind != GLB:
             raise ValueError(f"convex parts come as GLB, one geometry a part; this is {kind}")
-        answer = self._transport.json(
-            "PUT", f"{self._path}/convex-parts", content=content, headers={"Content-Type": GLB}
-        )
-        info = wire.PartsInfo.model_validate(answer)
+        return self._upload(wire.PartsInfo, "convex-parts", content, GLB)
+
+    def _upload(self, model: type[Model], what: str, content: bytes, kind: str, **options: Any) -> Model:
+        headers = {"Content-Type": kind}
+        path = f"{self._path}/{what}"
+        info = self._transport.model(model, "PUT", path, content=content, headers=headers, **options)
         self.refresh()
         return info
 
@@ -205,8 +198,8 @@ class Objects:
         fields = known_keywords(ObjectProperties, properties, "create")
         request = checked(wire.ObjectCreate, {"id": id, **fields})
         loaded = None if mesh is None else read_mesh(mesh, media_type)
-        answer = self._transport.json("POST", "/objects", body=request, idempotent=True)
-        created = GraspObject(self._transport, wire.ObjectInfo.model_validate(answer))
+        info = self._transport.model(wire.ObjectInfo, "POST", "/objects", body=request, idempotent=True)
+        created = GraspObject(self._transport, info)
         try:
             if loaded is not None:
                 created.upload_mesh(loaded[0], unit=unit, media_type=loaded[1])
@@ -219,8 +212,8 @@ class Objects:
 
     def get(self, id: str) -> GraspObject:
         """The object with this id."""
-        answer = self._transport.json("GET", f"/objects/{segment(id)}")
-        return GraspObject(self._transport, wire.ObjectInfo.model_validate(answer))
+        info = self._transport.model(wire.ObjectInfo, "GET", f"/objects/{segment(id)}")
+        return GraspObject(self._transport, info)
 
     def list(self) -> Iterator[GraspObject]:
         """All objects."""

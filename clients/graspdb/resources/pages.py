@@ -9,14 +9,13 @@ from urllib.parse import quote
 from pydantic import BaseModel, ValidationError
 
 from graspdb.errors import InvalidInput
-from graspdb.transport import Transport
+from graspdb.transport import Model, Transport
 from graspdb.wire import FieldError, Problem
 
 PAGE = 1_000
 """The most items the service puts on a page."""
 
 Item = TypeVar("Item", bound=BaseModel)
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def segment(identifier: str) -> str:

@@ -262,8 +262,8 @@ class Sweeps:
 
     def get(self, sweep: str) -> Sweep:
         """The sweep with this identifier."""
-        answer = self._transport.json("GET", f"/sweeps/{segment(sweep)}")
-        return Sweep(self._transport, wire.SweepInfo.model_validate(answer))
+        info = self._transport.model(wire.SweepInfo, "GET", f"/sweeps/{segment(sweep)}")
+        return Sweep(self._transport, info)
 
     def list(self, *, object: str | None = None, state: str | None = None) -> Iterator[Sweep]:
         """The sweeps, the newest first; of one object and in one state if said."""
@@ -296,8 +296,8 @@ def create_sweep(transport: Transport, object_id: str, options: SweepOptions) ->
             }
         fields["grid"] = {**grid, **seed}
     request = checked(wire.SweepCreate, fields)
-    answer = transport.json("POST", f"/objects/{segment(object_id)}/sweeps", body=request, idempotent=True)
-    return Sweep(transport, wire.SweepInfo.model_validate(answer))
+    path = f"/objects/{segment(object_id)}/sweeps"
+    return Sweep(transport, transport.model(wire.SweepInfo, "POST", path, body=request, idempotent=True))
 
 
 def duration(seconds: float) -> str:

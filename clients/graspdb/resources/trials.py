@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, TypedDict, Unpack
@@ -93,6 +93,7 @@ class Trials:
         self._transport = transport
         self._path = f"/objects/{segment(object_id)}/trials"
 
+    # long: most of it says what its keywords are.
     def add(
         self,
         poses: ArrayLike | Any,
@@ -196,11 +197,12 @@ class Trials:
             for number, start in enumerate(range(0, count, chunk)):
                 stop = min(start + chunk, count)
                 try:
-                    answer = self._transport.json(
-                        "POST",
-                        self._path,
-                        body={**shared, **part(start, stop)},
-                        idempotency_key=key if count <= chunk else f"{key}-{number}",
+                    body = {**shared, **part(start, stop)}
+                    own = key if count <= chunk else f"{key}-{number}"
+                    receipts.append(
+                        self._transport.model(
+                            wire.BatchReceipt, "POST", self._path, body=body, idempotency_key=own
+                        )
                     )
                 except GraspDBError as error:
                     if start:
@@ -210,7 +212,6 @@ class Trials:
                             f" {', '.join(r.batch for r in receipts)}."
                         )
                     raise
-                receipts.append(wire.BatchReceipt.model_validate(answer))
                 report(stop, count)
         return Receipt(
             batches=tuple(receipt.batch for receipt in receipts),
@@ -247,7 +248,7 @@ class Batches:
 
     def get(self, batch: str) -> wire.BatchInfo:
         """One batch."""
-        return wire.BatchInfo.model_validate(self._transport.json("GET", f"{self._path}/{segment(batch)}"))
+        return self._transport.model(wire.BatchInfo, "GET", f"{self._path}/{segment(batch)}")
 
     def delete(self, batch: str) -> None:
         """Delete a batch with all its trials (and, a sweep's, its packed outcomes)."""
@@ -292,29 +293,16 @@ def _each(name: str, values: Any, kind: type[Any], count: int) -> list[Any]:
     return listed
 
 
-def _upload_bar(progress: bool | ProgressCallback) -> AbstractContextManager[ProgressCallback]:
-    if callable(progress):
-        return nullcontext(progress)
-    return _UploadBar() if progress else nullcontext(lambda _done, _total: None)
-
-
-class _UploadBar(AbstractContextManager[ProgressCallback]):
+@contextmanager
+def _upload_bar(progress: bool | ProgressCallback) -> Iterator[ProgressCallback]:
     """On stderr, so that stdout stays clean for data."""
-
-    def __init__(self) -> None:
-        self._bar = Progress(
-            TextColumn("upload"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("trials"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task("upload", total=None)
-
-    def __enter__(self) -> ProgressCallback:
-        self._bar.start()
-        return lambda done, total: self._bar.update(self._task, completed=done, total=total)
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+    if callable(progress):
+        yield progress
+        return
+    bar = Progress(
+        TextColumn("upload"), BarColumn(), MofNCompleteColumn(), TextColumn("trials"), TimeRemainingColumn(),
+        console=Console(stderr=True), disable=not progress,
+    )  # fmt: skip
+    task = bar.add_task("upload", total=None)
+    with bar:
+        yield lambda done, total: bar.update(task, completed=done, total=total)
