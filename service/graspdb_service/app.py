@@ -37,6 +37,7 @@ from graspdb_service.api import (
     sweeps,
     trials,
 )
+from graspdb_service.api.context import Context
 from graspdb_service.api.document import document
 from graspdb_service.api.routing import declared_parameters, media_type, refuse_unknown_parameters
 from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
@@ -45,7 +46,6 @@ from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.usecases.grippers import seed
-from graspdb_service.usecases.runtime.context import Context
 
 log = logging.getLogger("graspdb")
 

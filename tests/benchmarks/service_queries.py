@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 
 from graspdb.wire import BestGraspRequest
 from graspdb_density import shell as shells
+from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.grasps import question
-from graspdb_service.usecases.runtime.context import Context
 
 Floats = NDArray[np.float64]
 AXES = np.array([0.06, 0.03, 0.03])

@@ -13,7 +13,7 @@ from graspdb.wire import OUTCOME_CODES, GridPlan
 from graspdb_service.storage.attempts import PackedChunk
 from graspdb_service.storage.sweeps import SweepRow
 from graspdb_service.storage.trials import Columns
-from graspdb_service.usecases.simulation import plan as plans
+from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.attempts import NO_ATTEMPT, Stored, Swept, joined
 from graspdb_service.usecases.trials.selection import Selected
 
@@ -27,7 +27,7 @@ def sweep_of(name: str, **options: Any) -> SweepRow:
         margin_m=0.0, **options,
     )  # fmt: skip
     now = datetime(2026, 1, 1, tzinfo=UTC)
-    poses = plans.pose_grid(plan).total
+    poses = sweep_plan.pose_grid(plan).total
     return SweepRow(
         id=name, object_id=1, provenance_id=7, gripper="pg70", protocol="wrench", fidelity="standard",
         purpose="collect", plan="grid", request={},
@@ -47,7 +47,7 @@ def stored(*sweeps: tuple[SweepRow, int], rows: int = 0) -> Stored:
     """Sweeps in chunks of 100 poses, taking turns, as two that run at a time store them."""
     chunks: list[list[Swept]] = []
     for row, seed in sweeps:
-        grid = plans.grid_of(row)
+        grid = sweep_plan.grid_of(row)
         chunks.append([])
         for start in range(0, grid.total, 100):
             stop = min(start + 100, grid.total)
@@ -69,7 +69,7 @@ def test_poses_of_two_grids_of_one_lattice_count_once_the_first_that_was_stored(
     part = sweep_of("b", region=((0.02, 0.0, 0.0), (0.05, 0.04, 0.03)))
     alone = joined(stored((whole, 0)))
     both = joined(stored((whole, 0), (part, 5)))
-    grid = plans.grid_of(whole)
+    grid = sweep_plan.grid_of(whole)
     planned = np.isin(np.arange(grid.full_total), grid.pose_indices(0, grid.total))
     expected = np.where(planned, outcome_of(np.arange(grid.full_total), 0), NO_ATTEMPT)
     assert len(alone) == int((expected != NO_ATTEMPT).sum())
@@ -78,7 +78,7 @@ def test_poses_of_two_grids_of_one_lattice_count_once_the_first_that_was_stored(
     keys = both.keys[1] * grid.rotation_count + both.keys[0]
     assert len(np.unique(keys)) == len(keys)
     # A pose that broke off in one sweep is known from the other.
-    cut = plans.grid_of(part)
+    cut = sweep_plan.grid_of(part)
     inside = np.isin(np.arange(grid.full_total), cut.pose_indices(0, cut.total))
     other = np.where(inside, outcome_of(np.arange(grid.full_total), 5), NO_ATTEMPT)
     assert set(keys) == set(np.flatnonzero((expected != NO_ATTEMPT) | (other != NO_ATTEMPT)))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, IsotropicKernel
 from graspdb_density.kde import brute_force
+from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
@@ -22,7 +23,6 @@ from graspdb_service.usecases.densities import cache as densities_module
 from graspdb_service.usecases.densities.cache import Built, KernelChoice
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import MAX_QUERIES, Compute
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from graspdb_density import se3
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
+from graspdb_service.api.context import Context
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import KernelChoice
 from graspdb_service.usecases.reports import convergence, registry
 from graspdb_service.usecases.reports.registry import Asked
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]

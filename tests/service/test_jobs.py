@@ -30,13 +30,13 @@ from graspdb.wire import (
     SweepCreate,
 )
 from graspdb_geometry.grids import PoseGrid
+from graspdb_service.api.context import Context
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.storage import assets, objects, schema
 from graspdb_service.storage import jobs as job_rows
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases import grippers
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.simulation import jobs, sweeps
 
 BOX = {"lower": [-0.02, -0.02, -0.05], "upper": [0.02, 0.02, 0.05]}

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from graspdb.wire.kernels import KernelCreate
 from graspdb_density import se3
 from graspdb_density.bandwidth import mixture_fit
+from graspdb_service.api.context import Context
 from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]

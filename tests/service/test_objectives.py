@@ -17,12 +17,12 @@ from graspdb_density import GraspDensity, IsotropicKernel, PoseNoise, Region, Su
 from graspdb_density.search.mode_search import Pool, Search
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
+from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.densities import success_models
 from graspdb_service.usecases.grasps import question, search
-from graspdb_service.usecases.runtime.context import Context
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
 from graspdb_geometry.grids import PoseGrid
+from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.densities.cache import Built, KernelChoice
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]

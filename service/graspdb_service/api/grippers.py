@@ -26,7 +26,7 @@ def create_gripper(
     ctx: Ctx, request: GripperCreate, response: Response, body: RawBody, key: IdempotencyKey
 ) -> object:
     """Store a parallel-jaw gripper's profile."""
-    made = grippers.create(ctx, request, key=key, body=body)
+    made = grippers.create(ctx.database, request, key=key, body=body)
     response.headers["Location"] = made.location
     return made.body
 
@@ -34,11 +34,11 @@ def create_gripper(
 @router.get("/grippers", **scope("read"))
 def list_grippers(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[GripperInfo]:
     """The grippers, by id."""
-    items, after = grippers.page(ctx, after=name_cursor(cursor), limit=limit)
+    items, after = grippers.page(ctx.database, after=name_cursor(cursor), limit=limit)
     return Page(items=items, next=encode_cursor(after))
 
 
 @router.get("/grippers/{gripper}", response_model=GripperInfo, **scope("read"))
 def get_gripper(ctx: Ctx, gripper: str, request: Request) -> Response:
     """One gripper's profile."""
-    return tagged_json(request, grippers.get(ctx, gripper))
+    return tagged_json(request, grippers.get(ctx.database, gripper))

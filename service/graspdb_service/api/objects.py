@@ -27,7 +27,7 @@ def create_object(
     ctx: Ctx, request: ObjectCreate, response: Response, body: RawBody, key: IdempotencyKey
 ) -> object:
     """Register an object; its mesh and its trials follow."""
-    made = objects.create(ctx, request, key=key, body=body)
+    made = objects.create(ctx.database, request, key=key, body=body)
     response.headers["Location"] = made.location
     return made.body
 
@@ -35,24 +35,24 @@ def create_object(
 @router.get("/objects", **scope("read"))
 def list_objects(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[ObjectInfo]:
     """The objects, by id."""
-    items, after = objects.page(ctx, after=name_cursor(cursor), limit=limit)
+    items, after = objects.page(ctx.database, after=name_cursor(cursor), limit=limit)
     return Page(items=items, next=encode_cursor(after))
 
 
 @router.get("/objects/{id}", response_model=ObjectInfo, **scope("read"))
 def get_object(ctx: Ctx, id: str, request: Request) -> Response:
     """One object: properties, mesh, and how many trials it has by outcome."""
-    row, info = objects.get(ctx, id)
+    row, info = objects.get(ctx.database, id)
     return tagged_json(request, info, tag=etag(row.id, row.revision))
 
 
 @router.patch("/objects/{id}", **scope("admin"))
 def change_object(ctx: Ctx, id: str, request: ObjectPatch) -> ObjectInfo:
     """Change properties: a field left out stays, an explicit null clears it."""
-    return objects.change(ctx, id, request)
+    return objects.change(ctx.database, id, request)
 
 
 @router.delete("/objects/{id}", status_code=204, **scope("admin"))
 def delete_object(ctx: Ctx, id: str) -> None:
     """Delete an object, its trials, densities and sweeps; 409 while a sweep of it runs."""
-    objects.remove(ctx, id)
+    objects.remove(ctx.database, id)

@@ -27,6 +27,7 @@ from graspdb.wire import (
 from graspdb.wire.base import Position, Quaternion
 from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn
 from graspdb_service import __version__
+from graspdb_service.api.context import Context
 from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
 from graspdb_service.formats.arrow import ARROW
 from graspdb_service.formats.columns import (
@@ -44,7 +45,6 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.grasps import likelihood, proposals
 from graspdb_service.usecases.grasps import question as bestgrasp
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 router = APIRouter(tags=["queries"])

@@ -32,12 +32,12 @@ from graspdb.wire.reports import (
     SummaryReport,
 )
 from graspdb_service import __version__
+from graspdb_service.api.context import Context
 from graspdb_service.api.queries import SelectionQuery
 from graspdb_service.api.routing import Ctx, etag, not_modified, scope
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.report_runs import RunRow
 from graspdb_service.usecases.reports import runs, summary
-from graspdb_service.usecases.runtime.context import Context
 
 router = APIRouter(tags=["reports"])
 

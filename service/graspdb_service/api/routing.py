@@ -14,8 +14,8 @@ import orjson
 from fastapi import Depends, Header, Query, Request, Response
 from pydantic import BaseModel
 
+from graspdb_service.api.context import Context
 from graspdb_service.problems import ProblemError, invalid
-from graspdb_service.usecases.runtime.context import Context
 
 Scope = Literal["public", "read", "trials:write", "jobs:work", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)

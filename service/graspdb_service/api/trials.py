@@ -83,7 +83,7 @@ def list_trials(
     chosen = posting.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
     kind = accepted(request, JSON, NDJSON, ARROW)
     after = number_cursor(cursor)
-    row, _ = objects.get(ctx, id)
+    row, _ = objects.get(ctx.database, id)
     tag = etag(row.id, row.revision, kind.rpartition("/")[2], request.url.query)
     fresh = not_modified(request, tag)
     if fresh is not None:
@@ -108,17 +108,17 @@ def list_trials(
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))
 def list_batches(ctx: Ctx, id: str, request: Request, limit: Limit = 100, cursor: Cursor = None) -> Response:
     """An object's batches in the order of their making."""
-    items, after = batches.page(ctx, id, after=number_cursor(cursor), limit=limit)
+    items, after = batches.page(ctx.database, id, after=number_cursor(cursor), limit=limit)
     return tagged_json(request, Page[BatchInfo](items=items, next=encode_cursor(after)))
 
 
 @router.get("/objects/{id}/batches/{batch}", response_model=BatchInfo, **scope("read"))
 def get_batch(ctx: Ctx, id: str, batch: str, request: Request) -> Response:
     """One batch, with everything it holds by outcome."""
-    return tagged_json(request, batches.get(ctx, id, batch))
+    return tagged_json(request, batches.get(ctx.database, id, batch))
 
 
 @router.delete("/objects/{id}/batches/{batch}", status_code=204, **scope("trials:write"))
 def delete_batch(ctx: Ctx, id: str, batch: str) -> None:
     """Delete a batch and its trials; 409 while its sweep runs."""
-    batches.remove(ctx, id, batch)
+    batches.remove(ctx.database, id, batch)

@@ -10,7 +10,6 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.usecases.geometry.collision import shape_of
 from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or
 
 
@@ -24,7 +23,7 @@ def seed(database: Database) -> None:
             grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
 
 
-def create(ctx: Context, request: GripperCreate, *, key: str | None, body: bytes) -> Created:
+def create(database: Database, request: GripperCreate, *, key: str | None, body: bytes) -> Created:
     """Store the user's gripper."""
     profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
     _check_shape(profile)
@@ -36,18 +35,18 @@ def create(ctx: Context, request: GripperCreate, *, key: str | None, body: bytes
             _info(require(tx, request.id)).model_dump(mode="json"), location=f"/grippers/{request.id}"
         )
 
-    return replay_or(ctx, scope="POST /grippers", key=key, request=body, create=make)
+    return replay_or(database, scope="POST /grippers", key=key, request=body, create=make)
 
 
-def get(ctx: Context, gripper: str) -> GripperInfo:
+def get(database: Database, gripper: str) -> GripperInfo:
     """One gripper."""
-    with ctx.database.read() as tx:
+    with database.read() as tx:
         return _info(require(tx, gripper))
 
 
-def page(ctx: Context, *, after: str, limit: int) -> tuple[list[GripperInfo], str | None]:
+def page(database: Database, *, after: str, limit: int) -> tuple[list[GripperInfo], str | None]:
     """A page of grippers by id, and where the next one starts."""
-    with ctx.database.read() as tx:
+    with database.read() as tx:
         rows = grippers.page(tx, after=after, limit=limit + 1)
     return [_info(row) for row in rows[:limit]], rows[limit - 1].id if len(rows) > limit else None
 

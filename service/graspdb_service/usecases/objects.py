@@ -7,14 +7,13 @@ from typing import Any
 from graspdb.wire import OUTCOMES, MeshInfo, ObjectCreate, ObjectInfo, ObjectPatch, PartsInfo
 from graspdb_service.problems import conflict, not_found
 from graspdb_service.storage import assets, objects, trials
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or
 
 
-def create(ctx: Context, request: ObjectCreate, *, key: str | None, body: bytes) -> Created:
+def create(database: Database, request: ObjectCreate, *, key: str | None, body: bytes) -> Created:
     """Store a new object, without mesh and trials."""
 
     def make(tx: Tx) -> Created:
@@ -24,37 +23,46 @@ def create(ctx: Context, request: ObjectCreate, *, key: str | None, body: bytes)
             info(require(tx, request.id), {}).model_dump(mode="json"), location=f"/objects/{request.id}"
         )
 
-    return replay_or(ctx, scope="POST /objects", key=key, request=body, create=make)
+    return replay_or(database, scope="POST /objects", key=key, request=body, create=make)
 
 
-def require(tx: Tx, slug: str, *, lock: bool = False) -> ObjectRow:
-    """The object with this slug, or a 404; ``lock`` holds it until the transaction ends."""
+def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:
+    """The object with this slug, and with this internal id where one is given; ``lock`` holds it until the
+    transaction ends.
+
+    Raises
+    ------
+    ProblemError
+        404 without such an object, 409 where it is another one by now.
+    """
     row = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
     if row is None:
         raise not_found("object", slug[:80], "GET /objects lists them, POST /objects makes one")
+    if object_id is not None and row.id != object_id:
+        raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
     return row
 
 
-def get(ctx: Context, slug: str) -> tuple[ObjectRow, ObjectInfo]:
+def get(database: Database, slug: str) -> tuple[ObjectRow, ObjectInfo]:
     """One object: as stored, and as the wire has it."""
-    with ctx.database.read() as tx:
+    with database.read() as tx:
         row = require(tx, slug)
         return row, info(row, trials.outcome_counts(tx, [row.id])[row.id])
 
 
-def page(ctx: Context, *, after: str, limit: int) -> tuple[list[ObjectInfo], str | None]:
+def page(database: Database, *, after: str, limit: int) -> tuple[list[ObjectInfo], str | None]:
     """A page of objects by id, and where the next one starts."""
-    with ctx.database.read() as tx:
+    with database.read() as tx:
         rows = objects.page(tx, after=after, limit=limit + 1)
         counts = trials.outcome_counts(tx, [row.id for row in rows])
     items = [info(row, counts[row.id]) for row in rows[:limit]]
     return items, items[-1].id if len(rows) > limit else None
 
 
-def change(ctx: Context, slug: str, patch: ObjectPatch) -> ObjectInfo:
+def change(database: Database, slug: str, patch: ObjectPatch) -> ObjectInfo:
     """Set the properties that are given; an explicit null clears one."""
     given = patch.model_dump(exclude_unset=True)
-    with ctx.database.write() as tx:
+    with database.write() as tx:
         row = require(tx, slug, lock=True)
         different = {name: value for name, value in given.items() if getattr(row, name) != value}
         if different:
@@ -64,9 +72,9 @@ def change(ctx: Context, slug: str, patch: ObjectPatch) -> ObjectInfo:
         return info(row, trials.outcome_counts(tx, [row.id])[row.id])
 
 
-def remove(ctx: Context, slug: str) -> None:
+def remove(database: Database, slug: str) -> None:
     """Delete an object and everything of it; 409 while a sweep runs, which would write on."""
-    with ctx.database.write() as tx:
+    with database.write() as tx:
         row = require(tx, slug, lock=True)
         if objects.has_running_sweep(tx, row.id):
             raise conflict(
@@ -74,7 +82,7 @@ def remove(ctx: Context, slug: str) -> None:
                 f"A sweep of {slug!r} is running: cancel it (POST /sweeps/{{id}}/cancel) or wait for its end",
             )
         objects.remove(tx, row)
-    with ctx.database.write() as tx:
+    with database.write() as tx:
         assets.drop_unused(tx, {h for h in (row.mesh_sha256, row.parts_sha256) if h})
 
 

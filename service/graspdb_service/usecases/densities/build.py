@@ -33,9 +33,9 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.storage import trials
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.proposal_density import Exposure
 from graspdb_service.usecases.geometry.features import Axes
-from graspdb_service.usecases.kernels import load
 from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
@@ -186,13 +186,15 @@ def build(
         object_row=row,
         selected=selected,
         exposure=exposure,
-        kernel=_info(choice) if stored is None else load.info_of(stored, _info(KernelChoice())),
+        kernel=_info(choice) if stored is None else stored_kernel.info_of(stored, _info(KernelChoice())),
         density=None,
         seq=seq,
         proposal_density=proposal,
         swept=swept,
         chosen_from=widths_prefix(len(seq)) if choice.by_default or for_success else 0,
-        success_kernel=load.load_success_kernel(stored, axes) if stored is not None and for_success else None,
+        success_kernel=stored_kernel.load_success_kernel(stored, axes)
+        if stored is not None and for_success
+        else None,
     )
     if not len(seq):
         return built
@@ -214,7 +216,7 @@ def build(
             return replace(built, density=old.extend(*fresh[:2], weights=added, symmetric=symmetric))
     elif built.chosen_from:
         chosen = _choose(everything(), proposal, built.chosen_from, threads)
-        built = replace(built, kernel=chosen if stored is None else load.info_of(stored, chosen))
+        built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
     return replace(built, density=_isotropic(built.kernel, everything(), weights))
 
 
@@ -241,7 +243,7 @@ def _shaped(
 ) -> Built:
     """The density under a stored kernel."""
     if stored.kind == "sampled":
-        kernel = load.load_sampled(stored)
+        kernel = stored_kernel.load_sampled(stored)
         position, quaternion, symmetric = everything()
         _check_components(kernel, len(position), len(position) + int(symmetric.sum()))
         old = None if before is None else before.density
@@ -254,17 +256,17 @@ def _shaped(
             sampled=kernel.placed(position, quaternion, weights=weights, symmetric=symmetric),
         )
     if before is not None and before.shaped is not None and added is not None:
-        frames = load.axes_at(axes, *fresh[:2])
+        frames = stored_kernel.axes_at(axes, *fresh[:2])
         shaped = before.shaped.extend(*fresh[:2], weights=added, symmetric=fresh[2], frames=frames)
     else:
         position, quaternion, symmetric = everything()
         shaped = MixtureDensity(
             position,
             quaternion,
-            kernel=load.load(stored),
+            kernel=stored_kernel.load(stored),
             weights=weights,
             symmetric=symmetric,
-            frames=load.axes_at(axes, position, quaternion),
+            frames=stored_kernel.axes_at(axes, position, quaternion),
         )
     return replace(built, density=shaped.isotropic, shaped=shaped)
 

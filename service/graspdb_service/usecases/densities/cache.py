@@ -12,20 +12,19 @@ from graspdb.wire import KernelSpec, Selection
 from graspdb_density.kde.isotropic import CUTOFF
 from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
-from graspdb_service.storage import kernels, objects, trials
-from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage import kernels, trials
+from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.usecases.densities import build, proposal_density
+from graspdb_service.usecases.densities import build, proposal_density, stored_kernel
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.geometry.features import Features
-from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.kernels import load
+from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Filters, Selected, resolve
 
-__all__ = ["Built", "Densities", "KernelChoice", "kernel_of", "require_object"]
+__all__ = ["Built", "Densities", "KernelChoice", "kernel_of"]
 
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
@@ -120,7 +119,7 @@ class Densities:
             404 for the object or gripper, 409 for an ambiguous selection.
         """
         with self._database.read() as tx:
-            row = require_object(tx, slug)
+            row = require(tx, slug)
             with self._lock:
                 known = self._resolved.get((row.id, filters))
             if known is not None and known[0] == row.revision:
@@ -196,7 +195,7 @@ class Densities:
 
     def _refresh(self, key: _Key, slug: str, before: Built | None, stored: KernelRow | None) -> Built:
         with self._database.read() as tx:
-            row = require_object(tx, slug, key.object_id)
+            row = require(tx, slug, object_id=key.object_id)
             selected = resolve(tx, row.id, key.filters)
             if before is not None and before.epoch != row.epoch:
                 before = None
@@ -220,23 +219,7 @@ class Densities:
                 exposure=exposure,
             )
         threads = self._compute.threads
-        axes = None if stored is None else load.axes(stored.alignment, row, selected, self._features)
+        axes = None if stored is None else stored_kernel.axes(stored.alignment, row, selected, self._features)
         return self._compute.run(
             lambda: build.build(key.kernel, stored, axes, row, selected, exposure, rows, before, threads)
         )
-
-
-def require_object(tx: Tx, slug: str, object_id: int | None = None) -> ObjectRow:
-    """The object with this slug, and with this internal id where one is given.
-
-    Raises
-    ------
-    ProblemError
-        404 without such an object, 409 where it is another one by now.
-    """
-    row = objects.find(tx, slug) if is_slug(slug) else None
-    if row is None:
-        raise not_found("object", slug[:80], "GET /objects lists those there are")
-    if object_id is not None and row.id != object_id:
-        raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
-    return row

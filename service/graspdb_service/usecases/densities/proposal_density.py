@@ -21,7 +21,7 @@ from graspdb_density.kde.importance_weights import pooled_density
 from graspdb_service.storage import attempts, sweeps
 from graspdb_service.storage.attempts import TriedGrid
 from graspdb_service.storage.database import Tx
-from graspdb_service.usecases.simulation import plan as plans
+from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
@@ -155,7 +155,7 @@ def _box(plan: GridPlan) -> _Box:
 @lru_cache(maxsize=256)
 def _box_of(plan: str) -> _Box:
     """The cubes of one step about a grid's positions, and its poses without ``max_poses``."""
-    grid = plans.pose_grid(GridPlan.model_validate_json(plan))
+    grid = sweep_plan.pose_grid(GridPlan.model_validate_json(plan))
     ends = np.array([grid.pose_indices(0, 1)[0], grid.pose_indices(grid.total - 1, grid.total)[0]])
     corners, _ = grid.poses(ends)
     half = 0.5 * grid.position_step_m
@@ -163,7 +163,7 @@ def _box_of(plan: str) -> _Box:
         tuple((corners[0] - half).tolist()),
         tuple((corners[1] + half).tolist()),
         grid.total,
-        grid.total / (plans.ROTATION_VOLUME * grid.volume_m3),
+        grid.total / (sweep_plan.ROTATION_VOLUME * grid.volume_m3),
     )
 
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.usecases.densities.cache import Built, require_object
+from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
@@ -159,7 +160,7 @@ class Successes:
     def _refresh(self, key: _Key, slug: str, before: _Attempts | None) -> _Attempts:
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]
         with self._database.read() as tx:
-            row = require_object(tx, slug, key.object_id)
+            row = require(tx, slug, object_id=key.object_id)
             selected = resolve(tx, row.id, key.filters)
             # A source whose first failure has come counts from now on with all it has posted.
             if before is not None and (before.epoch != row.epoch or before.tried != selected.tried):

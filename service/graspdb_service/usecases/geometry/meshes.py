@@ -16,9 +16,9 @@ from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.storage import assets, objects, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.context import Context
-from graspdb_service.usecases.simulation import decompositions
+from graspdb_service.usecases.runtime.runtime import Runtime
 
 GLB = "model/gltf-binary"
 MEDIA_TYPES = meshes.MEDIA_TYPES
@@ -30,7 +30,7 @@ _FIT_SHARE = 0.02
 _NEAR_SHARE = 0.01
 
 
-def put_mesh(ctx: Context, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
+def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
     """Check and store an object's mesh; a convex one becomes its own convex part.
 
     Raises
@@ -68,7 +68,7 @@ def put_mesh(ctx: Context, slug: str, content: bytes, *, media: str, unit: str) 
     return info
 
 
-def put_parts(ctx: Context, slug: str, content: bytes, *, media: str) -> PartsInfo:
+def put_parts(ctx: Runtime, slug: str, content: bytes, *, media: str) -> PartsInfo:
     """Check and store an object's convex parts, a GLB in metres with one geometry a part.
 
     Raises
@@ -100,7 +100,7 @@ def put_parts(ctx: Context, slug: str, content: bytes, *, media: str) -> PartsIn
     return info
 
 
-def check_parts(ctx: Context, row: ObjectRow, content: bytes) -> PartsInfo:
+def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
     """Check convex parts, wherever they come from, and measure them against their object's mesh.
 
     Raises
@@ -146,7 +146,7 @@ def store_parts(tx: Tx, row: ObjectRow, content: bytes, info: PartsInfo) -> None
     decompositions.settle(tx, replace(row, **values))
 
 
-def get_mesh(ctx: Context, slug: str) -> tuple[bytes, str, str]:
+def get_mesh(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
     """The mesh as it came: bytes, media type, SHA-256."""
     with ctx.database.read() as tx:
         row = require(tx, slug)
@@ -157,7 +157,7 @@ def get_mesh(ctx: Context, slug: str) -> tuple[bytes, str, str]:
     return found[0], str(row.mesh_info["media_type"]), row.mesh_sha256
 
 
-def get_parts(ctx: Context, slug: str) -> tuple[bytes, str, str]:
+def get_parts(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
     """The convex parts: GLB bytes, media type, SHA-256."""
     with ctx.database.read() as tx:
         row = require(tx, slug)
@@ -167,7 +167,7 @@ def get_parts(ctx: Context, slug: str) -> tuple[bytes, str, str]:
     return found[0], GLB, row.parts_sha256
 
 
-def _inspect(ctx: Context, content: bytes, media: str, unit: str, *, field: str = "mesh") -> Inspection:
+def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str = "mesh") -> Inspection:
     if media not in MEDIA_TYPES:
         raise _unsupported(MEDIA_TYPES, media)
     limit = ctx.settings.max_mesh_bytes
@@ -283,7 +283,7 @@ def _parts_values(tx: Tx, content: bytes, info: PartsInfo) -> dict[str, Any]:
     return {"parts_sha256": info.sha256, "parts_info": info.model_dump(mode="json")}
 
 
-def _drop_unused(ctx: Context, before: ObjectRow) -> None:
+def _drop_unused(ctx: Runtime, before: ObjectRow) -> None:
     old = {sha256 for sha256 in (before.mesh_sha256, before.parts_sha256) if sha256}
     if old:
         with ctx.database.write() as tx:

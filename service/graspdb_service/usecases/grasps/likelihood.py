@@ -19,8 +19,8 @@ from graspdb_density import GraspDensity, MixtureDensity, se3
 from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.densities.cache import Built, kernel_of
+from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ _CANDIDATES = 1_024
 _PRECISE_CUTOFF = 5.0
 
 
-def built_for(ctx: Context, slug: str, request: Selection) -> Built:
+def built_for(ctx: Estimators, slug: str, request: Selection) -> Built:
     """The density that a request is about."""
     choice, _ = kernel_of(request)
     return ctx.densities.get(slug, Filters.of(request), choice)
@@ -45,7 +45,7 @@ def built_for(ctx: Context, slug: str, request: Selection) -> Built:
 # -- the density itself ------------------------------------------------------------------------------------
 
 
-def density_info(ctx: Context, slug: str, request: Selection) -> tuple[DensityInfo, int]:
+def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, int]:
     """What is known of a density, and the object's internal id."""
     with ctx.compute.admitted():
         built = built_for(ctx, slug, request)
@@ -99,7 +99,7 @@ class LikelihoodAnswer:
 
 
 def likelihood(
-    ctx: Context,
+    ctx: Estimators,
     slug: str,
     request: Selection,
     positions: Floats,
@@ -153,7 +153,7 @@ def likelihood(
 
 
 def _log_density(
-    ctx: Context,
+    ctx: Estimators,
     density: GraspDensity | MixtureDensity,
     positions: Floats,
     quaternions: Floats,
@@ -174,7 +174,7 @@ def _log_density(
     return logs
 
 
-def _free(ctx: Context, test: CollisionTest, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
+def _free(ctx: Estimators, test: CollisionTest, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
     free = np.empty(len(positions), dtype=bool)
 
     def work(part: slice) -> None:
@@ -184,7 +184,7 @@ def _free(ctx: Context, test: CollisionTest, positions: Floats, quaternions: Flo
     return free
 
 
-def _global_maximum(ctx: Context, density: GraspDensity | MixtureDensity) -> float:
+def _global_maximum(ctx: Estimators, density: GraspDensity | MixtureDensity) -> float:
     if isinstance(density, GraspDensity):
         return ctx.compute.run(lambda: density.global_maximum(ctx.compute.threads)).log_density
     # What a search found is ranked by the mixture; ``log_density`` is that of the isotropic kernel.
@@ -207,7 +207,7 @@ class Draw:
     proposal_density: Floats
 
 
-def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
+def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
     """Draw grasps; the same revision, selection, kernel, count and seed give the same ones.
 
     Parameters
@@ -240,7 +240,7 @@ def draw(ctx: Context, slug: str, selection: Selection, count: int, seed: int | 
     )
 
 
-def check_count(ctx: Context, count: int) -> None:
+def check_count(ctx: Estimators, count: int) -> None:
     """413 for more draws than the service allows."""
     limit = ctx.settings.max_samples
     if count > limit:
@@ -262,7 +262,7 @@ def no_successes(slug: str) -> ProblemError:
 
 
 def density_at(
-    ctx: Context, density: GraspDensity | MixtureDensity, positions: Floats, quaternions: Floats
+    ctx: Estimators, density: GraspDensity | MixtureDensity, positions: Floats, quaternions: Floats
 ) -> Floats:
     """The density (n,) at draws from it."""
     return np.exp(_log_density(ctx, density, positions, quaternions, _PRECISE_CUTOFF))

@@ -18,11 +18,11 @@ from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_density.success.kernel_regression import PRIOR_TRIALS
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases.densities.cache import kernel_of
+from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import likelihood
 from graspdb_service.usecases.grasps.likelihood import Draw
 from graspdb_service.usecases.grasps.search import near_successes
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
@@ -51,7 +51,7 @@ CRITERIA: dict[Strategy, str] = {
 }
 
 
-def propose(ctx: Context, slug: str, request: ProposalsRequest) -> tuple[Draw, str]:
+def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw, str]:
     """Poses to try next, and how they were chosen; the same revision, request and seed give the same ones.
 
     Raises
@@ -102,7 +102,7 @@ def propose(ctx: Context, slug: str, request: ProposalsRequest) -> tuple[Draw, s
     return draw, CRITERIA["uncertainty"]
 
 
-def _from_edges(ctx: Context, slug: str, request: ProposalsRequest) -> Draw:
+def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     """Draws from the prior: no trial is needed, nor does any change it."""
     likelihood.check_count(ctx, request.count)
     choice, _ = kernel_of(request)

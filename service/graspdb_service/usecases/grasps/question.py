@@ -24,13 +24,13 @@ from graspdb_density import (
 from graspdb_density.search.evolution import Score
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built, KernelChoice, kernel_of
+from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import search
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.search import Bools, Floats, Question
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.trials.selection import Filters
 
 _NEAREST_TRIALS = 5
@@ -41,7 +41,7 @@ _NOISE_DRAWS, _FEW_DRAWS = 256, 16
 _CHANCES = frozenset({"success_probability", "interval", "effective_trials"})
 
 
-def best_grasps(ctx: Context, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
+def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
     """The best distinct grasps under the request's constraints, and the object's internal id.
 
     Raises
@@ -70,7 +70,7 @@ def best_grasps(ctx: Context, slug: str, request: GraspConstraints) -> tuple[Bes
         return _answer(built, kernel, "infeasible", [], *nearest, ranking=ranking), built.object_row.id
 
 
-def _prior(ctx: Context, request: GraspConstraints, built: Built, choice: KernelChoice) -> Prior | None:
+def _prior(ctx: Estimators, request: GraspConstraints, built: Built, choice: KernelChoice) -> Prior | None:
     """What to choose from before any success, where it may be and can be known."""
     if request.prior is False or choice.stored is not None:
         return None
@@ -103,7 +103,7 @@ def _answer(
 
 
 def _question(
-    ctx: Context, slug: str, request: GraspConstraints, built: Built, density: GraspDensity | None
+    ctx: Estimators, slug: str, request: GraspConstraints, built: Built, density: GraspDensity | None
 ) -> Question | None:
     """A question about a density; None where there is nothing to choose from.
 
@@ -296,7 +296,7 @@ def _chances(question: Question, model: SuccessModel, column: Literal["low", "pr
 # -- what is said of a grasp -------------------------------------------------------------------------------
 
 
-def _described(ctx: Context, question: Question, found: list[Maximum]) -> list[Grasp]:
+def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> list[Grasp]:
     """What is known of grasps that a search found."""
     if not found:
         return []

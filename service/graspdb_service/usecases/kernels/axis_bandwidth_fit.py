@@ -11,8 +11,8 @@ from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance
 from graspdb_density import AnisotropicKernel
 from graspdb_density.success.axis_bandwidth import fit_axis_bandwidths
 from graspdb_service.problems import conflict, invalid
-from graspdb_service.usecases.kernels import load
-from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.densities import stored_kernel
+from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.selection import Filters
 
@@ -20,7 +20,7 @@ from graspdb_service.usecases.trials.selection import Filters
 _CORRELATED = 1e-9
 
 
-def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
+def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
     """Widths chosen by held-out log loss, as :func:`graspdb_service.storage.kernels.create` takes them.
 
     Attempts that collided are left out where collisions are tested, as they are when success is predicted.
@@ -35,7 +35,7 @@ def fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
     with ctx.compute.admitted():
         row, selected = ctx.densities.current(request.object, filters)
         # Said first: without axes no number of trials helps.
-        axes = load.axes(request.alignment, row, selected, ctx.scenes.features)
+        axes = stored_kernel.axes(request.alignment, row, selected, ctx.scenes.features)
         assert not callable(axes)
         everything = attempts.read(ctx.database, row, selected)
         tested = ctx.scenes.test(row, selected) is not None

@@ -25,9 +25,9 @@ from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya,
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice
 from graspdb_service.usecases.geometry.features import Axes, Features
-from graspdb_service.usecases.kernels import load
 from graspdb_service.usecases.trials.selection import Filters
 
 Fitted = tuple[list[dict[str, Any]], dict[str, Any]]
@@ -83,7 +83,7 @@ def fitted(
     window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
     built = densities.get(request.object, filters_of(request), KernelChoice())
     # Said first: without axes no number of trials helps.
-    axes = load.axes(request.alignment, built.object_row, built.selected, features)
+    axes = stored_kernel.axes(request.alignment, built.object_row, built.selected, features)
     if built.density is None:
         raise conflict(
             "too-few-trials",
@@ -142,7 +142,7 @@ def _fit(
         components=None if count == "auto" else count or 1,
         weights=density.weights,
         symmetric=density.symmetric,
-        frame=load.axes_at(axes, density.positions, density.quaternions_xyzw),
+        frame=stored_kernel.axes_at(axes, density.positions, density.quaternions_xyzw),
         threads=threads,
         progress=progress,
     )
@@ -214,7 +214,7 @@ def components_of(kernel: AnisotropicKernel) -> list[dict[str, Any]]:
 
 def info(row: KernelRow) -> StoredKernel:
     """As the wire has it."""
-    used = load.info_of(row)
+    used = stored_kernel.info_of(row)
     assert used.widths_m is not None
     assert used.widths_deg is not None
     return StoredKernel(

@@ -24,11 +24,11 @@ from graspdb_service.problems import invalid, not_found
 from graspdb_service.storage import grippers, kernels
 from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
-from graspdb_service.usecases.densities.cache import require_object
+from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
-from graspdb_service.usecases.reports import runs
-from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.reports.runs import ReportRuns, model
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,9 @@ _MOST_SHIFT_M = 1.0
 _SAME = 1e-9
 
 
-def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
+def create(
+    ctx: Estimators, runs: ReportRuns, request: KernelCreate, *, key: str | None, body: bytes
+) -> Created:
     """Store a kernel, or with ``components=auto`` start the run that fits it (status 202) unless it is done
     at once.
 
@@ -58,23 +60,23 @@ def create(ctx: Context, request: KernelCreate, *, key: str | None, body: bytes)
         )
     scope = "POST /kernels"
     # A fit takes a while, and the trials may have gone since.
-    earlier = replayed(ctx, scope=scope, key=key, request=body)
+    earlier = replayed(ctx.database, scope=scope, key=key, request=body)
     if earlier is not None and earlier.status == 201:
         return earlier
     if not isinstance(request.components, list) and request.kind != "probability":
         fit.check(request)
         if request.components == "auto":
-            return _started(ctx, request, scope=scope, key=key, body=body)
+            return _started(ctx, runs, request, scope=scope, key=key, body=body)
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
         row = kernels.create(tx, str(uuid.uuid4()), **made)
         return Created(fit.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
-    return replay_or(ctx, scope=scope, key=key, request=body, create=make)
+    return replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
 
 
-def get(ctx: Context, id: str) -> StoredKernel:
+def get(ctx: Estimators, id: str) -> StoredKernel:
     """One kernel."""
     with ctx.database.read() as tx:
         row = kernels.find(tx, id)
@@ -84,17 +86,17 @@ def get(ctx: Context, id: str) -> StoredKernel:
 
 
 def page(
-    ctx: Context, *, after: int, limit: int, object: str | None, gripper: str | None
+    ctx: Estimators, *, after: int, limit: int, object: str | None, gripper: str | None
 ) -> tuple[list[StoredKernel], int | None]:
     """A page of kernels, oldest first, and where the next one starts."""
     with ctx.database.read() as tx:
-        object_id = None if object is None else require_object(tx, object).id
+        object_id = None if object is None else require(tx, object).id
         rows = kernels.page(tx, after=after, limit=limit + 1, object_id=object_id, gripper=gripper)
     items = [fit.info(row) for row in rows[:limit]]
     return items, rows[limit - 1].number if len(rows) > limit else None
 
 
-def remove(ctx: Context, id: str) -> None:
+def remove(ctx: Estimators, id: str) -> None:
     """Delete a kernel; densities that were asked with it go on only for answers under way."""
     with ctx.database.write() as tx:
         if not kernels.remove(tx, id):
@@ -103,7 +105,7 @@ def remove(ctx: Context, id: str) -> None:
         report_run_rows.remove(tx, id)
 
 
-def _given(ctx: Context, request: KernelCreate) -> dict[str, Any]:
+def _given(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
     assert isinstance(request.components, list)
     if request.gripper is not None:
         with ctx.database.read() as tx:
@@ -202,7 +204,7 @@ def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
         return None
 
 
-def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
+def _fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
     if request.kind == "probability":
         return axis_bandwidth_fit.fitted(ctx, request)
     with ctx.compute.admitted():
@@ -216,21 +218,23 @@ def _fitted(ctx: Context, request: KernelCreate) -> dict[str, Any]:
         )
 
 
-def _started(ctx: Context, request: KernelCreate, *, scope: str, key: str | None, body: bytes) -> Created:
+def _started(
+    ctx: Estimators, runs: ReportRuns, request: KernelCreate, *, scope: str, key: str | None, body: bytes
+) -> Created:
     """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
     assert request.object is not None
     row, _ = ctx.densities.current(request.object, fit.filters_of(request))
-    lease = ctx.reports.place()
+    lease = runs.place()
     id = str(uuid.uuid4())
 
     def make(tx: Tx) -> Created:
-        ctx.reports.enter_fit(tx, id, lease, row, request)
+        runs.enter_fit(tx, id, lease, row, request)
         return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
-    made = replay_or(ctx, scope=scope, key=key, request=body, create=make)
+    made = replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
     # The same request may have come before, even while this one did.
-    run = ctx.reports.follow(made.body["id"], lease if made.body["id"] == id else None)
+    run = runs.follow(made.body["id"], lease if made.body["id"] == id else None)
     if run.state == "running":
-        return replace(made, body=runs.model(run).model_dump(mode="json"))
+        return replace(made, body=model(run).model_dump(mode="json"))
     assert run.result is not None
     return Created(json.loads(run.result), location=f"/kernels/{run.id}")

@@ -29,8 +29,8 @@ from graspdb_density.vicinity.anisotropy import (
 )
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_service.problems import conflict
+from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.kernels import load
 from graspdb_service.usecases.reports import surface_pairs
 from graspdb_service.usecases.reports.common import (
     LEVEL,
@@ -133,7 +133,7 @@ def anisotropy_report(
 
 
 def _frames(sources: Sources, built: Built, alignment: str) -> Frames | None:
-    return load.axes(alignment, built.object_row, built.selected, sources.scenes.features)
+    return stored_kernel.axes(alignment, built.object_row, built.selected, sources.scenes.features)
 
 
 def _measure(

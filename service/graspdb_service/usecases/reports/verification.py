@@ -17,7 +17,7 @@ from graspdb_service.storage import checks, sweeps
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import LEVEL
-from graspdb_service.usecases.simulation import plan as plans
+from graspdb_service.usecases.trials import sweep_plan
 
 Floats = NDArray[np.float64]
 
@@ -45,11 +45,11 @@ def read(database: Database, built: Built) -> list[Check]:
     with database.read() as tx:
         found = checks.chunks(tx, built.object_row.id, gripper=selected.gripper, protocol=selected.protocol)
         plan = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in found}))
-        poses = [plans.chunk_poses(tx, plan[chunk.sweep_id], chunk.start, chunk.stop) for chunk in found]
+        poses = [sweep_plan.chunk_poses(tx, plan[chunk.sweep_id], chunk.start, chunk.stop) for chunk in found]
     result = []
     for chunk, given in zip(found, poses, strict=True):
         sweep = plan[chunk.sweep_id]
-        at = given or plans.grid_poses(plans.grid_of(sweep), chunk.start, chunk.stop)
+        at = given or sweep_plan.grid_poses(sweep_plan.grid_of(sweep), chunk.start, chunk.stop)
         codes = np.frombuffer(chunk.outcomes, dtype=np.uint8)
         kept = codes != _NO_ATTEMPT
         kernel = sweep.snapshot.get("drawn_with")

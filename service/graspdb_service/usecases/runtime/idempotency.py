@@ -9,9 +9,8 @@ from typing import Any
 
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage import idempotency
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.idempotency import Remembered
-from graspdb_service.usecases.runtime.context import Context
 
 
 @dataclass(frozen=True)
@@ -28,7 +27,7 @@ class Created:
 
 
 def replay_or(
-    ctx: Context,
+    database: Database,
     *,
     scope: str,
     key: str | None,
@@ -53,7 +52,7 @@ def replay_or(
     ProblemError
         422 where the key was used with another body, 409 where what it made has since been deleted.
     """
-    with ctx.database.write() as tx:
+    with database.write() as tx:
         if key is None:
             return create(tx)
         digest = hashlib.sha256(request).hexdigest()
@@ -73,7 +72,7 @@ def replay_or(
     return _answer(earlier, digest)
 
 
-def replayed(ctx: Context, *, scope: str, key: str | None, request: bytes) -> Created | None:
+def replayed(database: Database, *, scope: str, key: str | None, request: bytes) -> Created | None:
     """What the same request was answered before, or None.
 
     For requests whose checks may turn out otherwise the second time, or whose work is long: looked up before
@@ -86,7 +85,7 @@ def replayed(ctx: Context, *, scope: str, key: str | None, request: bytes) -> Cr
     """
     if key is None:
         return None
-    with ctx.database.read() as tx:
+    with database.read() as tx:
         earlier = idempotency.find(tx, scope, key)
     return None if earlier is None else _answer(earlier, hashlib.sha256(request).hexdigest())
 

@@ -10,7 +10,7 @@ from graspdb_geometry.meshes import UNITS
 from graspdb_service.problems import ProblemError, invalid
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.geometry.collision import shape_of
-from graspdb_service.usecases.simulation import plan as plans
+from graspdb_service.usecases.trials import sweep_plan
 
 #: An object's longest side in openings of the gripper, beyond which its unit is wrong or its gripper.
 MAX_SIZE_IN_OPENINGS, MIN_SIZE_IN_OPENINGS = 40.0, 0.01
@@ -143,7 +143,7 @@ def _unit_hint(row: ObjectRow, longest_m: float, profile: GripperProfile) -> str
 
 def too_many_poses(row: ObjectRow, plan: GridPlan, profile: GripperProfile, limit: int) -> ProblemError:
     """The grid is beyond the limit: every way to shrink it that is enough by itself, with its number."""
-    count = plans.pose_grid(plan).total
+    count = sweep_plan.pose_grid(plan).total
     ways = [f"max_poses={limit} or fewer (a random part of this grid)", *_ways(plan, limit)]
     title = (
         f"The grid has {count:,} poses, and a sweep at most {limit:,} (max_sweep_poses in /info)."
@@ -172,7 +172,7 @@ def _ways(plan: GridPlan, limit: int) -> Iterator[str]:
     ):
         for value in values:
             try:
-                total = plans.pose_grid(plan.model_copy(update={field: value})).total
+                total = sweep_plan.pose_grid(plan.model_copy(update={field: value})).total
             except ValueError:
                 break
             if total <= limit:

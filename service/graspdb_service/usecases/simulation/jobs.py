@@ -31,11 +31,11 @@ from graspdb_service.storage import batches, jobs, objects, sweeps, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.jobs import JobRow
 from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.usecases.geometry import meshes
+from graspdb_service.usecases.geometry import decompositions, meshes
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.context import Context
-from graspdb_service.usecases.simulation import decompositions, plan
-from graspdb_service.usecases.simulation.plan import ChunkPoses
+from graspdb_service.usecases.runtime.runtime import Runtime
+from graspdb_service.usecases.trials import sweep_plan
+from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
 
 #: An idle worker that asks again and again is noted this often, so that asking takes no write lock.
 WORKER_NOTED_EVERY_S = 10.0
@@ -54,7 +54,7 @@ class _Overtaken(Exception):
     """Another sweep over the same grid has finished a chunk since its chunks were read."""
 
 
-def claim(ctx: Context, request: ClaimRequest) -> ClaimResponse:
+def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
     """Lease jobs to a worker and register it.
 
     Raises
@@ -89,7 +89,7 @@ def claim(ctx: Context, request: ClaimRequest) -> ClaimResponse:
         jobs.see_worker(tx, request.worker, capabilities)
         rows = sweeps.find_many(tx, ids)
         stored = {
-            job.id: plan.chunk_poses(tx, rows[job.sweep_id], job.start, job.stop)
+            job.id: sweep_plan.chunk_poses(tx, rows[job.sweep_id], job.start, job.stop)
             for job in claimed
             if job.sweep_id is not None
         }
@@ -139,7 +139,7 @@ def _time(seconds: float | None) -> datetime:
     return datetime.fromtimestamp(seconds or 0.0, UTC)
 
 
-def _end(ctx: Context, job: JobRow) -> None:
+def _end(ctx: Runtime, job: JobRow) -> None:
     """Fail a job whose last attempt has run out."""
     with ctx.database.write() as tx:
         sweeps.lock_object(tx, job.object_id)
@@ -155,7 +155,7 @@ def _failed(tx: Tx, job: JobRow) -> None:
         decompositions.fail_waiting(tx, job, job.error or "no reason given")
 
 
-def renew(ctx: Context, job_id: str, lease_id: str, progress: str | None = None) -> LeaseRenewed:
+def renew(ctx: Runtime, job_id: str, lease_id: str, progress: str | None = None) -> LeaseRenewed:
     """Extend a lease, or tell its holder that the job is no longer wanted."""
     with ctx.database.write() as tx:
         ends = jobs.renew(tx, job_id, lease_id, ctx.settings.lease_s, progress=progress)
@@ -168,7 +168,7 @@ def renew(ctx: Context, job_id: str, lease_id: str, progress: str | None = None)
     raise _lost(job)
 
 
-def release(ctx: Context, job_id: str, lease_id: str) -> None:
+def release(ctx: Runtime, job_id: str, lease_id: str) -> None:
     """Give a job back, unfinished."""
     with ctx.database.write() as tx:
         if jobs.release(tx, job_id, lease_id):
@@ -177,7 +177,7 @@ def release(ctx: Context, job_id: str, lease_id: str) -> None:
     raise _lost(_found(job, job_id))
 
 
-def fail(ctx: Context, job_id: str, lease_id: str, report: FailureReport) -> FailureNoted:
+def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> FailureNoted:
     """Record a failed attempt; after the last one the job is failed for good."""
     with ctx.database.read() as tx:
         job = _found(jobs.find(tx, job_id), job_id)
@@ -195,7 +195,7 @@ def fail(ctx: Context, job_id: str, lease_id: str, report: FailureReport) -> Fai
     return FailureNoted(job=job_id, state=job.state, attempts=job.attempts)
 
 
-def complete(ctx: Context, job_id: str, lease_id: str, body: bytes, result: SimulateResult) -> ResultAccepted:
+def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: SimulateResult) -> ResultAccepted:
     """Store a chunk's result in the transaction that completes its job.
 
     Parameters
@@ -221,16 +221,16 @@ def complete(ctx: Context, job_id: str, lease_id: str, body: bytes, result: Simu
             sweep = sweeps.find(tx, job.sweep_id or "")
             if sweep is None:
                 raise _lost(job)
-            stored = plan.chunk_poses(tx, sweep, job.start, job.stop)
+            stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
             twins = _twins(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
             ranges = sweeps.done_ranges(tx, list(twins))
             seen = sweeps.count_done(tx, list(twins))
         outcomes = _outcomes(result, job)
         if stored is None:
-            grid = plan.grid_of(sweep)
-            poses = plan.grid_poses(grid, job.start, job.stop)
-            others = [(plan.grid_of(twin), ranges[twin.id]) for twin in twins.values()]
-            fresh = plan.not_stored_yet(grid, job.start, job.stop, poses.pose_index, others)
+            grid = sweep_plan.grid_of(sweep)
+            poses = sweep_plan.grid_poses(grid, job.start, job.stop)
+            others = [(sweep_plan.grid_of(twin), ranges[twin.id]) for twin in twins.values()]
+            fresh = sweep_plan.not_stored_yet(grid, job.start, job.stop, poses.pose_index, others)
         else:
             poses = stored
             fresh = np.ones(len(outcomes), dtype=np.bool_)
@@ -254,7 +254,7 @@ def complete(ctx: Context, job_id: str, lease_id: str, body: bytes, result: Simu
     )
 
 
-def complete_parts(ctx: Context, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
+def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
     """Store the convex parts that a worker made, in the transaction that completes its job.
 
     Raises
@@ -387,7 +387,7 @@ def _count(codes: npt.NDArray[np.uint8]) -> dict[int, int]:
 
 
 def _store(
-    ctx: Context,
+    ctx: Runtime,
     job: JobRow,
     lease_id: str,
     sha256: str,
@@ -470,7 +470,7 @@ def _lost(job: JobRow) -> ProblemError:
     return conflict("lease-lost", f"This lease is no longer the job's: {reason}. Drop it and claim again")
 
 
-def workers(ctx: Context, *, skip: int, limit: int) -> tuple[list[WorkerInfo], int | None]:
+def workers(ctx: Runtime, *, skip: int, limit: int) -> tuple[list[WorkerInfo], int | None]:
     """Every worker that ever asked for jobs, by name, and where the next page starts."""
     with ctx.database.read() as tx:
         rows = jobs.list_workers(tx, skip=skip, limit=limit + 1)

@@ -31,12 +31,13 @@ from graspdb_service.storage import batches, grippers, jobs, sweeps, trials
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
+from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import likelihood
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
-from graspdb_service.usecases.simulation import decompositions, feasibility
-from graspdb_service.usecases.simulation import plan as plans
+from graspdb_service.usecases.simulation import feasibility
+from graspdb_service.usecases.trials import sweep_plan
 
 #: More chunks than this are bookkeeping without a use: no lab has so many workers.
 MAX_CHUNKS = 100_000
@@ -76,7 +77,7 @@ class _Plan:
     kernel: KernelInfo | None = None
 
 
-def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
+def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
     """Check and queue a sweep.
 
     Parameters
@@ -90,7 +91,7 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
         404 without the object, 409 while it lacks its mesh, 422 for what can't be simulated.
     """
     scope = f"POST /objects/{slug}/sweeps"
-    earlier = replayed(ctx, scope=scope, key=key, request=request)
+    earlier = replayed(ctx.database, scope=scope, key=key, request=request)
     if earlier is not None:
         return earlier
     with ctx.database.read() as tx:
@@ -109,7 +110,9 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
     snapshot: dict[str, Any] = {"world": world.snapshot, "full_count": plan.full_count}
     if plan.grid is not None:
         snapshot["grid"] = plan.grid.model_dump(mode="json")
-        snapshot["repeat_key"] = plans.repeat_key(world.snapshot, spec.protocol, spec.fidelity, plan.grid)
+        snapshot["repeat_key"] = sweep_plan.repeat_key(
+            world.snapshot, spec.protocol, spec.fidelity, plan.grid
+        )
     if plan.kernel is not None:
         # A sample may name no widths, and those of a density change as it grows.
         snapshot["drawn_with"] = plan.kernel.model_dump(mode="json")
@@ -153,7 +156,7 @@ def create(ctx: Context, slug: str, spec: SweepCreate, *, key: str | None, reque
         info = _info(tx, _require(tx, sweep_id))
         return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
 
-    return replay_or(ctx, scope=scope, key=key, request=request, create=store)
+    return replay_or(ctx.database, scope=scope, key=key, request=request, create=store)
 
 
 def _new_id(created_ms: int) -> str:
@@ -205,7 +208,7 @@ def _mass(row: ObjectRow) -> float | None:
     )
 
 
-def _plan(ctx: Context, slug: str, spec: SweepCreate, world: _World) -> _Plan:
+def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan:
     if spec.poses is not None:
         return _given(ctx, spec.poses)
     if spec.sample is not None:
@@ -220,7 +223,7 @@ def _plan(ctx: Context, slug: str, spec: SweepCreate, world: _World) -> _Plan:
         symmetric=world.profile.symmetric,
     )
     try:
-        grid = plans.pose_grid(plan)
+        grid = sweep_plan.pose_grid(plan)
         count, full = grid.total, grid.full_total
     except ValueError as error:
         text = str(error)
@@ -232,7 +235,7 @@ def _plan(ctx: Context, slug: str, spec: SweepCreate, world: _World) -> _Plan:
     return _Plan("grid", count, grid=plan, full_count=full)
 
 
-def _given(ctx: Context, poses: Any) -> _Plan:
+def _given(ctx: Estimators, poses: Any) -> _Plan:
     if isinstance(poses, PoseColumns):
         position, quaternion = poses.position, poses.quaternion_xyzw
     else:
@@ -247,7 +250,7 @@ def _given(ctx: Context, poses: Any) -> _Plan:
     return _Plan("poses", len(table), poses=table)
 
 
-def _drawn(ctx: Context, slug: str, spec: SweepCreate, sample: SampleSpec) -> _Plan:
+def _drawn(ctx: Estimators, slug: str, spec: SweepCreate, sample: SampleSpec) -> _Plan:
     limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
     if sample.count > limit:
         raise invalid("sample.count", f"at most {limit}")
@@ -257,7 +260,7 @@ def _drawn(ctx: Context, slug: str, spec: SweepCreate, sample: SampleSpec) -> _P
     return _Plan("sample", len(table), poses=table, kernel=drawn.kernel)
 
 
-def _chunk_size(ctx: Context, spec: SweepCreate, plan: _Plan) -> int:
+def _chunk_size(ctx: Estimators, spec: SweepCreate, plan: _Plan) -> int:
     if spec.chunk_poses is not None:
         size = spec.chunk_poses
     else:
@@ -284,14 +287,14 @@ def _require(tx: Tx, sweep_id: str) -> SweepRow:
     return row
 
 
-def get(ctx: Context, sweep_id: str) -> SweepInfo:
+def get(ctx: Estimators, sweep_id: str) -> SweepInfo:
     """A sweep and how far it has come."""
     with ctx.database.read() as tx:
         return _info(tx, _require(tx, sweep_id))
 
 
 def listing(
-    ctx: Context, *, slug: str | None, state: str | None, cursor: str | None, limit: int
+    ctx: Estimators, *, slug: str | None, state: str | None, cursor: str | None, limit: int
 ) -> tuple[list[SweepInfo], str | None]:
     """A page of sweeps, the newest first, and the cursor of the next one."""
     with ctx.database.read() as tx:
@@ -301,7 +304,7 @@ def listing(
     return page, page[-1].id if len(rows) > limit else None
 
 
-def cancel(ctx: Context, sweep_id: str) -> SweepInfo:
+def cancel(ctx: Estimators, sweep_id: str) -> SweepInfo:
     """Stop what is not finished; what is stored stays. A finished sweep is left as it is."""
     with ctx.database.read() as tx:
         row = _require(tx, sweep_id)
@@ -312,7 +315,7 @@ def cancel(ctx: Context, sweep_id: str) -> SweepInfo:
         return _info(tx, _require(tx, sweep_id))
 
 
-def retry(ctx: Context, sweep_id: str) -> SweepInfo:
+def retry(ctx: Estimators, sweep_id: str) -> SweepInfo:
     """Queue failed and cancelled chunks again; without any it changes nothing.
 
     Raises
@@ -394,7 +397,7 @@ class OutcomePage:
     next: str | None
 
 
-def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> OutcomePage:
+def outcomes(ctx: Estimators, sweep_id: str, *, limit: int, cursor: str | None) -> OutcomePage:
     """Every pose of finished chunks, in the plan's order.
 
     While a sweep runs, a page has the chunks that are finished by then: read it again at the end.
@@ -409,8 +412,8 @@ def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> 
         row = _require(tx, sweep_id)
         # One pose more than asked for tells whether there is another page.
         chunks = sweeps.outcome_chunks(tx, sweep_id, first_number=number, poses=limit + skip + 1)
-        stored = {chunk.number: plans.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
-    grid = plans.grid_of(row) if row.plan == "grid" else None
+        stored = {chunk.number: sweep_plan.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
+    grid = sweep_plan.grid_of(row) if row.plan == "grid" else None
     index, position = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
     quaternion, codes = [np.empty((0, 4))], [np.empty(0, dtype=np.uint8)]
     following = None
@@ -425,7 +428,7 @@ def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> 
         poses = stored[chunk.number]
         if poses is None:
             assert grid is not None
-            poses = plans.grid_poses(grid, chunk.start, chunk.stop)
+            poses = sweep_plan.grid_poses(grid, chunk.start, chunk.stop)
         part = slice(first, last)
         index.append(poses.pose_index[part])
         position.append(poses.position[part])
@@ -445,7 +448,7 @@ def outcomes(ctx: Context, sweep_id: str, *, limit: int, cursor: str | None) -> 
     )
 
 
-def stream_outcomes(ctx: Context, sweep_id: str, *, cursor: str | None) -> Iterator[bytes]:
+def stream_outcomes(ctx: Estimators, sweep_id: str, *, cursor: str | None) -> Iterator[bytes]:
     """All poses of finished chunks from a cursor on, as an Arrow IPC stream.
 
     Raises

@@ -16,9 +16,9 @@ from graspdb_service.storage.attempts import PackedChunk
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.usecases.simulation import plan as plans
-from graspdb_service.usecases.simulation.plan import ChunkPoses
+from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
+from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -133,7 +133,9 @@ def fetch(
     plan = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
     swept = [
         Swept(
-            plan[chunk.sweep_id], chunk, plans.chunk_poses(tx, plan[chunk.sweep_id], chunk.start, chunk.stop)
+            plan[chunk.sweep_id],
+            chunk,
+            sweep_plan.chunk_poses(tx, plan[chunk.sweep_id], chunk.start, chunk.stop),
         )
         for chunk in chunks
     ]
@@ -152,7 +154,7 @@ def fetch(
 def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
     """Attempts in arrays, each pose of a grid once; ``most_collided`` as :func:`read` takes it."""
     rows, provenances, swept = stored.rows, stored.selected.provenances, stored.swept
-    grids = {item.sweep.id: plans.grid_of(item.sweep) for item in swept if item.poses is None}
+    grids = {item.sweep.id: sweep_plan.grid_of(item.sweep) for item in swept if item.poses is None}
     codes = [rows.outcome, *(np.frombuffer(item.chunk.outcomes, dtype=np.uint8) for item in swept)]
     kept = [np.ones(len(rows.outcome), dtype=bool), *(~np.isin(c, stored.without) for c in codes[1:])]
     indices: list[Ints | None] = [None]

@@ -16,7 +16,7 @@ from graspdb_service.storage.attempts import DoneChunk
 from graspdb_service.storage.batches import BatchRow
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.usecases.simulation import plan
+from graspdb_service.usecases.trials import sweep_plan
 
 Ints = NDArray[np.int64]
 
@@ -74,7 +74,7 @@ def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
     heirs, chunks = _chunks(tx, sweep)
     if not heirs:
         return None
-    grid = plan.grid_of(sweep)
+    grid = sweep_plan.grid_of(sweep)
     own = [chunk for chunk in chunks if chunk.sweep_id == sweep.id]
     if not own:
         return None
@@ -97,7 +97,7 @@ def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
         if chunk.sweep_id == sweep.id:
             continue
         heir = heirs[chunk.sweep_id]
-        theirs = plan.grid_of(heir).pose_indices(chunk.start, chunk.stop)
+        theirs = sweep_plan.grid_of(heir).pose_indices(chunk.start, chunk.stop)
         at = np.minimum(np.searchsorted(index, theirs), len(index) - 1)
         both = index[at] == theirs
         stored_here = chunk.revision < revision[at]

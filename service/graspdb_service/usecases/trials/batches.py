@@ -6,42 +6,41 @@ from graspdb.wire import OUTCOMES, BatchInfo
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.storage import batches, objects
 from graspdb_service.storage.batches import BatchRow
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases.identifiers import is_uuid
-from graspdb_service.usecases.objects import require as require_object
-from graspdb_service.usecases.runtime.context import Context
+from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.trials import batch_removal
 
 #: Sweeps over one grid that finish chunks meanwhile make a deletion look again.
 _MAX_LOOKS = 20
 
 
-def get(ctx: Context, slug: str, key: str) -> BatchInfo:
+def get(database: Database, slug: str, key: str) -> BatchInfo:
     """One batch, with everything it holds by outcome."""
-    with ctx.database.read() as tx:
-        row = require_object(tx, slug)
+    with database.read() as tx:
+        row = require(tx, slug)
         return _info(tx, slug, _require(tx, row.id, key))
 
 
-def page(ctx: Context, slug: str, *, after: int, limit: int) -> tuple[list[BatchInfo], int | None]:
+def page(database: Database, slug: str, *, after: int, limit: int) -> tuple[list[BatchInfo], int | None]:
     """A page of batches in the order of their making, and where the next one starts."""
-    with ctx.database.read() as tx:
-        row = require_object(tx, slug)
+    with database.read() as tx:
+        row = require(tx, slug)
         rows = batches.page(tx, row.id, after=after, limit=limit + 1)
         items = [_info(tx, slug, batch) for batch in rows[:limit]]
     return items, rows[limit - 1].id if len(rows) > limit else None
 
 
-def remove(ctx: Context, slug: str, key: str) -> None:
+def remove(database: Database, slug: str, key: str) -> None:
     """Delete a batch with its trials and packed outcomes; 409 while its sweep runs, which would write on.
 
     Poses that another sweep over the same grid has simulated as well stay, as that sweep's.
     """
     for _ in range(_MAX_LOOKS):
-        with ctx.database.read() as tx:
-            left = batch_removal.of(tx, _require(tx, require_object(tx, slug).id, key))
-        with ctx.database.write() as tx:
-            row = require_object(tx, slug, lock=True)
+        with database.read() as tx:
+            left = batch_removal.of(tx, _require(tx, require(tx, slug).id, key))
+        with database.write() as tx:
+            row = require(tx, slug, lock=True)
             batch = _require(tx, row.id, key)
             if batch.sweep_id is not None and objects.has_running_sweep(tx, row.id, sweep_id=batch.sweep_id):
                 raise conflict(

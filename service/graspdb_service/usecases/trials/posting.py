@@ -20,13 +20,13 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import TrialColumns
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.context import Context
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or
+from graspdb_service.usecases.runtime.runtime import Runtime
 
 STREAM_ROWS = 5_000
 
 
-def add(ctx: Context, slug: str, *, body: bytes, media: str, key: str | None) -> Created:
+def add(ctx: Runtime, slug: str, *, body: bytes, media: str, key: str | None) -> Created:
     """Store the trials of one request as a batch."""
     with ctx.database.read() as tx:
         require(tx, slug)
@@ -61,7 +61,7 @@ def add(ctx: Context, slug: str, *, body: bytes, media: str, key: str | None) ->
         )
 
     scope = f"POST /objects/{slug}/trials"
-    return replay_or(ctx, scope=scope, key=key, request=media.encode() + b"\n" + body, create=make)
+    return replay_or(ctx.database, scope=scope, key=key, request=media.encode() + b"\n" + body, create=make)
 
 
 def _refuse_unknown_grippers(tx: Tx, batch: TrialBatch) -> None:
@@ -90,7 +90,7 @@ class TrialFilter:
 
 
 def page(
-    ctx: Context, slug: str, chosen: TrialFilter, *, after: int, limit: int
+    ctx: Runtime, slug: str, chosen: TrialFilter, *, after: int, limit: int
 ) -> tuple[list[dict[str, Any]], int | None]:
     """A page of trials in commit order, and the sequence number after which the next one starts."""
     with ctx.database.read() as tx:
@@ -98,7 +98,7 @@ def page(
     return found[:limit], found[limit - 1]["seq"] if len(found) > limit else None
 
 
-def stream(ctx: Context, slug: str, chosen: TrialFilter, *, after: int) -> Iterator[bytes]:
+def stream(ctx: Runtime, slug: str, chosen: TrialFilter, *, after: int) -> Iterator[bytes]:
     """Every trial there is now, as lines; no transaction outlasts a piece, however slow the reader."""
     pieces = _pieces(ctx, slug, chosen, after)
     return (
@@ -106,7 +106,7 @@ def stream(ctx: Context, slug: str, chosen: TrialFilter, *, after: int) -> Itera
     )
 
 
-def stream_arrow(ctx: Context, slug: str, chosen: TrialFilter, *, after: int) -> Iterator[bytes]:
+def stream_arrow(ctx: Runtime, slug: str, chosen: TrialFilter, *, after: int) -> Iterator[bytes]:
     """As :func:`stream`, as an Arrow IPC stream.
 
     Raises
@@ -125,7 +125,7 @@ def page_arrow(items: list[dict[str, Any]], following: str | None) -> bytes:
     return b"".join(arrow.stream(schema, [trial_arrow.batch_of(items)]))
 
 
-def _pieces(ctx: Context, slug: str, chosen: TrialFilter, after: int) -> Iterator[list[dict[str, Any]]]:
+def _pieces(ctx: Runtime, slug: str, chosen: TrialFilter, after: int) -> Iterator[list[dict[str, Any]]]:
     with ctx.database.read() as tx:
         row = require(tx, slug)
 

@@ -18,7 +18,7 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.jobs import JobRow, job_ids
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.usecases.simulation import plan
+from graspdb_service.usecases.trials import sweep_plan
 
 #: A bounding box thinner than this share of its longest side holds a sheet, and no solid.
 MIN_FLATNESS = 1e-3
@@ -89,7 +89,7 @@ def take_parts(tx: Tx, row: ObjectRow, sweep: SweepRow) -> None:
     snapshot = {**sweep.snapshot, "world": world}
     if sweep.plan == "grid":
         grid = GridPlan.model_validate(sweep.snapshot["grid"])
-        snapshot["repeat_key"] = plan.repeat_key(world, sweep.protocol, sweep.fidelity, grid)
+        snapshot["repeat_key"] = sweep_plan.repeat_key(world, sweep.protocol, sweep.fidelity, grid)
     sweeps.keep_snapshot(tx, sweep.id, snapshot)
 
 

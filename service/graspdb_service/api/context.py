@@ -1,13 +1,13 @@
-"""What every use case works with."""
+"""The composition of one service process: routes hand use cases what they need of it."""
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import Densities
+from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -16,19 +16,11 @@ from graspdb_service.usecases.reports.runs import ReportRuns
 from graspdb_service.usecases.runtime.compute import Compute
 
 
-@dataclass
-class Context:
+@dataclass(kw_only=True)
+class Context(Estimators):
     """The parts of one service process."""
 
-    settings: Settings
-    database: Database
-    compute: Compute
-    densities: Densities
-    scenes: Scenes
-    priors: Priors
-    successes: Successes
     reports: ReportRuns
-    mesh_children: threading.BoundedSemaphore = field(default_factory=lambda: threading.BoundedSemaphore(2))
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
