@@ -1,7 +1,6 @@
 """Grasp densities: kernel density estimation on R^3 x SO(3). Arrays in, arrays out; no IO."""
 
 from . import se3
-from .analytic import AnalyticKernel
 from .bandwidth.selection import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
 from .kde import brute_force
 from .kde.importance_weights import effective_sample_size, importance_weights, mixture_weights
@@ -19,7 +18,6 @@ from .success.kernel_regression import SuccessEstimate, SuccessModel
 __all__ = [
     "DEFAULT_KERNEL",
     "HAAR_VOLUME",
-    "AnalyticKernel",
     "AnisotropicKernel",
     "DiagonalKernel",
     "GraspDensity",

@@ -18,6 +18,7 @@ import argparse
 import importlib.util
 import math
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +45,9 @@ from graspdb_density.bandwidth import mixture_fit
 from graspdb_density.kde import brute_force as reference
 from graspdb_density.kde.bhattacharyya import bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.isotropic import CUTOFF, scaled_radius
-from graspdb_density.shell import SEMI_AXES_M, shell
+
+sys.path.append(str(Path(__file__).parents[1] / "density"))
+from ellipsoid_shell import SEMI_AXES_M, shell
 
 Poses = tuple[se3.Floats, se3.Floats]
 ROUNDS = 5

@@ -33,11 +33,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import BestGraspRequest
-from graspdb_density import shell as shells
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.grasps import question
+
+sys.path.append(str(Path(__file__).parents[1] / "density"))
+import ellipsoid_shell
 
 Floats = NDArray[np.float64]
 AXES = np.array([0.06, 0.03, 0.03])
@@ -48,7 +50,7 @@ DENSE = {"sigma_position_m": 0.015, "sigma_rotation_deg": 15.0, "collision_free"
 
 def shell(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Grasps on the shell of a graspable ellipsoid (60 x 30 x 30 mm semi-axes), tool z inwards."""
-    return shells.shell(count, rng, semi_axes_m=AXES, depth_m=0.02)
+    return ellipsoid_shell.shell(count, rng, semi_axes_m=AXES, depth_m=0.02)
 
 
 def sphere_stl(subdivisions: int = 3) -> bytes:

@@ -12,8 +12,10 @@ import math
 import multiprocessing
 import resource
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -22,9 +24,11 @@ from scipy.spatial import cKDTree
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density._compiled.threads import processors
 from graspdb_density.kde.weighted_sums import LEAST, Kernel, KernelRows
-from graspdb_density.shell import shell
 from graspdb_density.statistics.convergence import bootstrap_similarity
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve, convergence_curve
+
+sys.path.append(str(Path(__file__).parents[1] / "density"))
+from ellipsoid_shell import shell
 
 Poses = tuple[se3.Floats, se3.Floats]
 KERNEL = IsotropicKernel(0.015, math.radians(15.0))

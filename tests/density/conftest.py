@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+import ellipsoid_shell
 from graspdb_density import se3
-from graspdb_density import shell as shells
 from graspdb_density.se3 import Floats
 
 Poses = tuple[Floats, Floats]
@@ -17,7 +17,7 @@ Poses = tuple[Floats, Floats]
 @pytest.fixture(scope="session")
 def shell() -> Callable[[int, np.random.Generator], Poses]:
     """Grasps around an ellipsoid: within 10 mm of its surface, approaching along the normal, any roll."""
-    return shells.shell
+    return ellipsoid_shell.shell
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import se3
-from .se3 import Floats
+from graspdb_density import se3
+from graspdb_density.se3 import Floats
 
 __all__ = ["SEMI_AXES_M", "shell"]
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import quad
 
-from . import se3
-from .kernels.isotropic import HAAR_VOLUME
-from .se3 import Floats
+from graspdb_density import se3
+from graspdb_density.kernels.isotropic import HAAR_VOLUME
+from graspdb_density.se3 import Floats
 
 __all__ = ["AnalyticKernel"]
 

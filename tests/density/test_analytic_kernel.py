@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from graspdb_density import AnalyticKernel, IsotropicKernel, se3
+from analytic_kernel import AnalyticKernel
+from graspdb_density import IsotropicKernel, se3
 from graspdb_density.kde import brute_force
 
 COVARIANCE = np.array([[1.0, 0.2, 0.0], [0.2, 4.0, 0.0], [0.0, 0.0, 2.0]]) * 1e-4
