@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import pwd
+import shlex
 import shutil
 import socket
 import subprocess
@@ -17,8 +18,9 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import httpx
 import psycopg
@@ -75,26 +77,75 @@ class PostgresServer:
         options = (
             f"-h 127.0.0.1 -p {self.port} -c unix_socket_directories='' -c fsync=off -c max_connections=300"
         )
-        self._run("pg_ctl", "-w", "-l", str(self._data / "log"), "-o", options, "start")
+        # A shell that stops the server at the end of its input, so also when this process is killed.
+        control = shlex.join([str(self._bin / "pg_ctl"), "-w", "-D", str(self._data)])
+        start = f"{control} -l {shlex.quote(str(self._data / 'log'))} -o {shlex.quote(options)} start"
+        self._shell = subprocess.Popen(
+            ["sh", "-c", f"{start} && echo started && read -r _; {control} -m immediate stop >&2"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            **self._as_user(),
+        )
+        assert self._shell.stdout is not None
+        output = []
+        while not output or output[-1] != b"started\n":
+            output.append(self._shell.stdout.readline())
+            if not output[-1]:
+                raise RuntimeError(f"PostgreSQL did not start: {output}")
         self.url = f"postgresql://graspdb@127.0.0.1:{self.port}/postgres"
 
     def stop(self) -> None:
-        self._run("pg_ctl", "-w", "-m", "immediate", "stop")
+        self._shell.communicate(timeout=60)
+
+    def _as_user(self) -> dict[str, Any]:
+        environment = {"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self._folder)}
+        return {"user": self._user, "cwd": self._folder, "env": environment}
 
     def _run(self, program: str, *arguments: str) -> None:
         with tempfile.TemporaryFile("w+") as output:
             done = subprocess.run(
                 [str(self._bin / program), "-D", str(self._data), *arguments],
-                user=self._user,
-                cwd=self._folder,
-                env={"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self._folder)},
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 check=False,
+                **self._as_user(),
             )
             if done.returncode:
                 output.seek(0)
                 raise RuntimeError(f"{program} failed:\n{output.read()}")
+
+
+@pytest.fixture
+def eventually() -> Callable[..., Any]:
+    """``eventually(condition, seconds=60)`` waits until a condition holds; what it came to."""
+
+    def wait(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+        deadline = time.monotonic() + seconds
+        while not (found := condition()):
+            assert time.monotonic() < deadline, "it never happened"
+            time.sleep(0.02)
+        return found
+
+    return wait
+
+
+@pytest.fixture
+def descendants(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
+    """``descendants()``: command lines of living processes that the test started, or these, and so on."""
+    mark = f"TEST_MARK={uuid.uuid4().hex}"
+    monkeypatch.setenv(*mark.split("="))
+
+    def living() -> list[str]:
+        found = []
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                if mark.encode() in (process / "environ").read_bytes().split(b"\0"):
+                    found.append((process / "cmdline").read_bytes().replace(b"\0", b" ").decode())
+        return found
+
+    return living
 
 
 @pytest.fixture(scope="session")

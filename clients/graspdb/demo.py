@@ -28,6 +28,7 @@ from rich.markup import escape
 
 from graspdb.client import Client
 from graspdb.errors import Conflict, GraspDBError, Infeasible
+from graspdb.processes import ChildProcess
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.sweeps import OutcomeArrays, Sweep, SweepBar, duration
 from graspdb.results import Grasp
@@ -57,15 +58,17 @@ class DemoFailed(GraspDBError):
 
 
 class Children:
-    """The processes of the demo: started in sessions of their own and stopped, whatever happens.
+    """The processes of the demo: in sessions of their own, stopped in order, and ended with it in any case.
 
     A context: within it Ctrl-C and SIGTERM raise, and are remembered, because an exception raised in the
-    midst of somebody's import may be swallowed there; :meth:`check` raises it again.
+    midst of somebody's import may be swallowed there; :meth:`check` raises it again. In the midst of a start
+    they wait until it is known what has been started.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._running: list[tuple[str, subprocess.Popen[bytes]]] = []
+        self._running: list[tuple[str, ChildProcess]] = []
+        self._starting = False
         self._before: dict[signal.Signals, Any] = {}
         self._signal: int | None = None
 
@@ -84,7 +87,8 @@ class Children:
 
     def _interrupt(self, number: int, _frame: FrameType | None) -> None:
         self._signal = number
-        self._raise_interrupt()
+        if not self._starting:
+            self._raise_interrupt()
 
     def _raise_interrupt(self) -> None:
         if self._signal == signal.SIGINT:
@@ -99,17 +103,22 @@ class Children:
         if path is None:
             raise DemoFailed(f"{program} is not installed: pip install 'graspdb[service,sim,examples]'")
         environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPDB_")}
-        with (self._folder / f"{program}.log").open("wb") as log:
-            process = subprocess.Popen(
-                [path, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                cwd=self._folder,
-                env=environment,
-                start_new_session=True,  # Ctrl-C comes to the demo alone, which stops them in order
-            )
-        self._running.append((program, process))
+        self._starting = True
+        try:
+            with (self._folder / f"{program}.log").open("wb") as log:
+                process = ChildProcess(
+                    [path, *arguments],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    cwd=self._folder,
+                    env=environment,
+                    start_new_session=True,  # Ctrl-C comes to the demo alone, which stops them in order
+                )
+            self._running.append((program, process))
+        finally:
+            self._starting = False
+        self._raise_interrupt()
 
     def check(self) -> None:
         """Raise :class:`DemoFailed` if one has ended, or the interruption there was."""

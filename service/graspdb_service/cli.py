@@ -17,6 +17,7 @@ try:
     import typer
     import uvicorn
 
+    from graspdb.processes import LIFELINE_HELP, end_with_parent
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
     from graspdb_service.storage.database import Database, UnsupportedDatabase
@@ -33,7 +34,7 @@ DatabaseUrl = Annotated[
 ]
 
 
-@cli.command()
+@cli.command(epilog=LIFELINE_HELP)
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on; 0 takes a free one.")] = None,
@@ -125,6 +126,7 @@ def _fail(message: str) -> NoReturn:
 
 def main() -> None:
     """Entry point."""
+    end_with_parent()
     cli()
 
 

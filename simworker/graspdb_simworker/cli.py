@@ -7,6 +7,7 @@ import importlib.util
 import logging
 import math
 import os
+import platform
 import signal
 import socket
 import sys
@@ -15,18 +16,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.progress import Progress
 
 from graspdb.errors import GraspDBError
+from graspdb.processes import LIFELINE_HELP, end_with_parent
 from graspdb.transport import Transport
 from graspdb.wire import Pose
-
-if TYPE_CHECKING:
-    from graspdb_simworker.supervisor import Child
+from graspdb_simworker.process.runner import ChunkRunner
 
 app = typer.Typer(
     add_completion=False,
@@ -35,6 +35,7 @@ app = typer.Typer(
     help="Simulates the grasps that a GraspDB service plans.",
 )
 
+log = logging.getLogger("graspdb.simworker")
 MISSING = (
     "graspdb-simworker: {what}: install the extra, `pip install 'graspdb[sim]'`"
     " (pybullet has wheels for CPython 3.10 and 3.11 on x86-64 Linux;"
@@ -50,11 +51,11 @@ def _root() -> None:
 def _require_pybullet() -> None:
     """Say in one line what is missing and leave with code 2."""
     missing = [
-        name for name in ("pybullet", "numba", "scipy", "trimesh") if importlib.util.find_spec(name) is None
+        name
+        for name in ("pybullet", "numba", "scipy", "trimesh", "PIL")
+        if importlib.util.find_spec(name) is None
     ]
     if missing:
-        import platform
-
         text = MISSING.format(
             what=f"{', '.join(missing)} is missing",
             version=platform.python_version(),
@@ -65,53 +66,62 @@ def _require_pybullet() -> None:
         raise typer.Exit(2)
 
 
-@app.command()
+ObjectName = Annotated[
+    str, typer.Argument(help="An object of the service, or without --url an example: cone, mug, ...")
+]
+ServiceUrl = Annotated[str | None, typer.Option(help="Take object and gripper from this service.")]
+GripperName = Annotated[str, typer.Option(help="A gripper of the service; without --url pg70 or panda.")]
+ApiKey = Annotated[
+    str | None, typer.Option(envvar="GRASPDB_API_KEY", help="With the scope jobs:work, to run; else read.")
+]
+Numbers = Annotated[str, typer.Option(help="Comma-separated, object frame.")]
+Protocol = Annotated[str, typer.Option(help="wrench or lift.")]
+DecomposeSeconds = Annotated[
+    float,
+    typer.Option(
+        min=0,
+        envvar="GRASPDB_DECOMPOSE_SECONDS",
+        help="Processor time that the decomposition of a mesh into convex parts may take;"
+        " 0 leaves them to other workers.",
+    ),
+]
+DecomposeMemory = Annotated[
+    int,
+    typer.Option(min=1024, envvar="GRASPDB_DECOMPOSE_MEMORY_MIB", help="Address space of a decomposition."),
+]
+Processes = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=1024,
+        help="Chunks simulated at once, one a core: 1 here, with --dask one a thread of the cluster.",
+    ),
+]
+DaskAddress = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Simulate on the Dask cluster of this scheduler, not here."),
+]
+
+
+@app.command(epilog=LIFELINE_HELP)
 def run(
-    url: Annotated[
-        str | None,
-        typer.Option(envvar="GRASPDB_URL", help="The service's address."),
-    ] = None,
-    processes: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=1024,
-            help="Chunks simulated at once, one a core: 1 here, with --dask one a thread of the cluster.",
-        ),
-    ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Simulate on the Dask cluster of this scheduler, not here."),
-    ] = None,
+    url: Annotated[str | None, typer.Option(envvar="GRASPDB_URL", help="The service's address.")] = None,
+    processes: Processes = None,
+    dask: DaskAddress = None,
     name: Annotated[str | None, typer.Option(help="As the service lists this worker.")] = None,
     exit_when_idle: Annotated[
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
     ] = False,
     once: Annotated[bool, typer.Option(help="Stop after one job for each process.")] = False,
-    decompose_seconds: Annotated[
-        float,
-        typer.Option(
-            min=0,
-            envvar="GRASPDB_DECOMPOSE_SECONDS",
-            help="Processor time that the decomposition of a mesh into convex parts may take;"
-            " 0 leaves them to other workers.",
-        ),
-    ] = 900.0,
-    decompose_memory_mib: Annotated[
-        int,
-        typer.Option(
-            min=1024, envvar="GRASPDB_DECOMPOSE_MEMORY_MIB", help="Address space of a decomposition."
-        ),
-    ] = 4096,
-    api_key: Annotated[
-        str | None, typer.Option(envvar="GRASPDB_API_KEY", help="With the scope jobs:work.")
-    ] = None,
+    decompose_seconds: DecomposeSeconds = 900.0,
+    decompose_memory_mib: DecomposeMemory = 4096,
+    api_key: ApiKey = None,
     verbose: Annotated[bool, typer.Option(help="Say what is going on.")] = False,
 ) -> None:
     """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked."""
     _require_pybullet()
-    from graspdb_simworker import decomposition
-    from graspdb_simworker.loop import Tally, Worker, WorkerFailed
+    from graspdb_simworker.decomposition import supervisor as decomposition
+    from graspdb_simworker.loop import Worker, WorkerFailed
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
@@ -119,11 +129,6 @@ def run(
         stream=sys.stderr,
     )
     logging.getLogger("httpx").setLevel(logging.WARNING)
-    log = logging.getLogger("graspdb.simworker")
-
-    def report(tally: Tally) -> None:
-        log.info("%d jobs, %d poses, %d grasps in physics", tally.jobs, tally.poses, tally.grasps)
-
     limits = None
     if decompose_seconds > 0:
         if decomposition.available():
@@ -143,8 +148,7 @@ def run(
             processes=processes or cluster.threads,
             exit_when_idle=exit_when_idle,
             once=once,
-            make_child=cluster.make_child,
-            report=report,
+            make_runner=cluster.make_runner,
             decompositions=limits,
         )
         _stop_on_signals(worker.stop)
@@ -153,29 +157,24 @@ def run(
         except WorkerFailed as error:
             typer.echo(f"graspdb-simworker: {error}", err=True)
             raise typer.Exit(2 if "pybullet" in str(error) else 1) from None
-    tally = worker.tally
-    typer.echo(
-        f"{tally.jobs} jobs, {tally.poses} poses, {tally.grasps} grasps in physics;"
-        f" {tally.failures} failed, {tally.lost} not wanted any more",
-        err=True,
-    )
+    typer.echo(str(worker.tally), err=True)
 
 
 @dataclass(frozen=True)
 class _Cluster:
-    """Where chunks are simulated: ``make_child`` for each of ``threads`` at once."""
+    """Where chunks are simulated: ``make_runner`` for each of ``threads`` at once."""
 
     threads: int
-    make_child: Callable[[], Child]
+    make_runner: Callable[[], ChunkRunner]
 
 
 @contextmanager
 def _cluster(address: str | None) -> Iterator[_Cluster]:
     """This machine, or the Dask cluster of a scheduler."""
-    from graspdb_simworker.supervisor import Child
+    from graspdb_simworker.process.local import LocalRunner
 
     if address is None:
-        yield _Cluster(1, Child)
+        yield _Cluster(1, LocalRunner)
         return
     try:
         distributed: Any = importlib.import_module("distributed")
@@ -186,7 +185,7 @@ def _cluster(address: str | None) -> Iterator[_Cluster]:
             err=True,
         )
         raise typer.Exit(2) from None
-    from graspdb_simworker.dispatch import Dispatched
+    from graspdb_simworker.process.executor import ExecutorRunner
 
     try:
         client = distributed.Client(address, timeout=10)
@@ -194,19 +193,7 @@ def _cluster(address: str | None) -> Iterator[_Cluster]:
         typer.echo(f"graspdb-simworker: no Dask scheduler at {address}: {error}", err=True)
         raise typer.Exit(1) from None
     with client, client.get_executor() as executor:
-        yield _Cluster(max(1, sum(client.nthreads().values())), lambda: Dispatched(executor))
-
-
-ObjectName = Annotated[
-    str, typer.Argument(help="An object of the service, or without --url an example: cone, mug, ...")
-]
-ServiceUrl = Annotated[str | None, typer.Option(help="Take object and gripper from this service.")]
-GripperName = Annotated[str, typer.Option(help="A gripper of the service; without --url pg70 or panda.")]
-ApiKey = Annotated[str | None, typer.Option(envvar="GRASPDB_API_KEY")]
-Numbers = Annotated[str, typer.Option(help="Comma-separated, object frame.")]
-
-
-Protocol = Annotated[str, typer.Option(help="wrench or lift.")]
+        yield _Cluster(max(1, sum(client.nthreads().values())), lambda: ExecutorRunner(executor))
 
 
 @app.command()
@@ -229,44 +216,34 @@ def verify(
     verified sooner.
     """
     _require_pybullet()
-    from graspdb_simworker import sources, verification
+    from graspdb_simworker.inspection import agreement, inputs, stored_outcomes
 
     with _explained():
         if sweep is not None:
             if url is None:
                 raise ValueError("--sweep needs --url, the service that has it")
             with _progress("poses read") as progress:
-                info, stored = sources.sweep_of(
+                info, stored = stored_outcomes.sample_of(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
             object_name = info.object
-            payload, parts = sources.load(
+            payload, parts = inputs.load(
                 info.object, info.gripper, protocol=info.protocol, url=url, api_key=api_key
             )
             with _progress("grasps") as progress:
-                found = verification.verify_stored(
+                found = agreement.verify_stored(
                     payload, parts, stored, count=count, seed=seed, progress=progress
                 )
         elif object_name:
-            payload, parts = sources.load(
+            payload, parts = inputs.load(
                 object_name, gripper, protocol=protocol, url=url, api_key=api_key, seed=seed
             )
-            payload = verification.enough_poses(payload, parts, count)
+            payload = agreement.enough_poses(payload, parts, count)
             with _progress("grasps") as progress:
-                found = verification.verify(payload, parts, count=count, seed=seed, progress=progress)
+                found = agreement.verify(payload, parts, count=count, seed=seed, progress=progress)
         else:
             raise ValueError("name an object, or a --sweep")
-    typer.echo(f"{'outcome':20} {'found':>7} {'checked':>8} {'agree':>7} {'same name':>10}")
-    for s in found.strata:
-        name = s.outcome.name.lower()
-        typer.echo(
-            f"{name:20} {s.available:7} {s.checked:8} {s.agree / s.checked:7.4f} {s.same / s.checked:10.4f}"
-        )
-    typer.echo(
-        f"{object_name}: success or failure agrees in {found.agreement:.4f} of the poses that met physics"
-        f" (at least {found.lower:.4f} at {verification.LEVEL:.0%}; {found.checked} checked);"
-        f" the same outcome in {found.same:.4f}"
-    )
+    typer.echo(found.summary(object_name))
 
 
 @app.command()
@@ -283,16 +260,17 @@ def show(
 ) -> None:
     """Simulate one grasp and draw it from two sides, seen from the jaw."""
     _require_pybullet()
-    from graspdb_simworker import pictures, sources
+    from graspdb_simworker.inspection import inputs, pictures
 
     with _explained():
         pose = Pose.model_validate({"position": position, "quaternion_xyzw": quaternion})
-        payload, parts = sources.load(object_name, gripper, protocol=protocol, url=url, api_key=api_key)
-        shown = sources.simulate_one(
+        payload, parts = inputs.load(
+            object_name, gripper, protocol=protocol, fine=fine, url=url, api_key=api_key
+        )
+        shown = pictures.simulate_one(
             payload,
             parts,
             pose,
-            "fine" if fine else "standard",
             film_every_s=pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf,
         )
         # The outcome's name and the object's: what a picture is worth that went astray.
@@ -338,6 +316,7 @@ def _stop_on_signals(stop: Callable[[], None]) -> None:
 
 def main() -> None:
     """Entry point."""
+    end_with_parent()
     app()
 
 

@@ -37,9 +37,9 @@ from graspdb.wire import (
     SimulatePayload,
     SimulateResult,
 )
-from graspdb_simworker import decomposition
-from graspdb_simworker.decomposition import DecompositionFailed, Limits
-from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
+from graspdb_simworker.decomposition.supervisor import DecompositionFailed, Limits, decompose
+from graspdb_simworker.process.local import LocalRunner
+from graspdb_simworker.process.runner import Cancelled, ChunkFailed, ChunkRunner, PybulletMissing
 
 log = logging.getLogger("graspdb.simworker")
 
@@ -83,9 +83,15 @@ class Tally:
     failures: int = 0
     lost: int = 0
 
+    def __str__(self) -> str:
+        return (
+            f"{self.jobs} jobs, {self.poses} poses, {self.grasps} grasps in physics;"
+            f" {self.failures} failed, {self.lost} not wanted any more"
+        )
+
 
 class Worker:
-    """Pulls simulate jobs from one service.
+    """Pulls jobs from one service.
 
     Parameters
     ----------
@@ -94,15 +100,11 @@ class Worker:
     name : str
         As the service lists it.
     processes : int
-        Children that simulate, a thread each.
-    exit_when_idle : bool
-        Return once there is nothing left to claim.
-    once : bool
-        Return after one job for each process.
-    make_child
-        Builds the supervised child of one thread.
-    report
-        Called from any thread after every finished job.
+        Chunks simulated at once, a thread and a runner each.
+    exit_when_idle, once : bool
+        Return when there is nothing left to claim, or after one job for each process.
+    make_runner
+        What simulates one thread's chunks.
     decompositions : Limits, optional
         What the decomposition of one mesh may take; None leaves them to other workers.
     """
@@ -115,8 +117,7 @@ class Worker:
         processes: int = 1,
         exit_when_idle: bool = False,
         once: bool = False,
-        make_child: Callable[[], Child] = Child,
-        report: Callable[[Tally], None] = lambda tally: None,
+        make_runner: Callable[[], ChunkRunner] = LocalRunner,
         decompositions: Limits | None = None,
     ) -> None:
         if processes < 1:
@@ -126,8 +127,7 @@ class Worker:
         self._processes = processes
         self._exit_when_idle = exit_when_idle
         self._once = once
-        self._make_child = make_child
-        self._report = report
+        self._make_runner = make_runner
         self._decompositions = decompositions
         self._stop = threading.Event()
         self._done = threading.Event()
@@ -235,7 +235,7 @@ class Worker:
 
     def _slot(self) -> None:
         failures = 0
-        with self._make_child() as child:
+        with self._make_runner() as runner:
             while not self._stop.is_set():
                 try:
                     job, wait = self._claim()
@@ -255,7 +255,7 @@ class Worker:
                         return
                     self._stop.wait(wait)
                     continue
-                self._work(child, job)
+                self._work(runner, job)
                 if self._once:
                     return
 
@@ -267,7 +267,7 @@ class Worker:
         )
         return (answer.jobs[0] if answer.jobs else None), max(0.1, answer.retry_after_s or IDLE_S)
 
-    def _work(self, child: Child, job: ClaimedJob) -> None:
+    def _work(self, runner: ChunkRunner, job: ClaimedJob) -> None:
         with self._holding(job) as lease:
             try:
                 payload = job.payload
@@ -275,7 +275,7 @@ class Worker:
                     self._decompose(payload, lease)
                     return
                 parts = self._parts_of(payload, lease)
-                result = child.run(payload, parts, wanted=lambda: self._wanted(lease))
+                result = runner.run(payload, parts, wanted=lambda: self._wanted(lease))
             except Cancelled:
                 self._abandon(lease)
             except ChunkFailed as error:
@@ -287,25 +287,23 @@ class Worker:
                 self._release(lease)
                 raise
             else:
-                self._submit(lease, payload, result)
+                if self._hand_in(lease, "result", result):
+                    self._count(payload.stop - payload.start, len(result.rows.pose_index))
 
     def _decompose(self, payload: DecomposePayload, lease: Lease) -> None:
         """Make an object's convex parts and hand them in."""
         if self._decompositions is None:
             raise ChunkFailed("this worker does not do 'decompose' jobs")
         mesh = self._fetched(payload.mesh, payload.mesh_sha256, lease)
-        parts = decomposition.decompose(
+        parts = decompose(
             payload,
             mesh,
             limits=self._decompositions,
             wanted=lambda: self._wanted(lease),
             progress=lease.note,
         )
-        if self._hand_in(lease, "result", parts) is not None:
-            with self._lock:
-                self.tally.jobs += 1
-                tally = self.tally
-            self._report(tally)
+        if self._hand_in(lease, "result", parts):
+            self._count()
 
     @contextlib.contextmanager
     def _holding(self, job: ClaimedJob) -> Iterator[Lease]:
@@ -377,21 +375,16 @@ class Worker:
             raise ChunkFailed(f"{path} has the SHA-256 {found}, the job was planned with {digest}")
         return data
 
-    def _submit(self, lease: Lease, payload: SimulatePayload, result: SimulateResult) -> None:
-        accepted = self._hand_in(lease, "result", result)
-        if accepted is None:
-            return
+    def _count(self, poses: int = 0, grasps: int = 0) -> None:
+        """One more job is done."""
         with self._lock:
             self.tally.jobs += 1
-            self.tally.poses += payload.stop - payload.start
-            self.tally.grasps += len(result.rows.pose_index)
-            tally = self.tally
-        self._report(tally)
+            self.tally.poses += poses
+            self.tally.grasps += grasps
+            log.info("%s", self.tally)
 
-    def _hand_in(
-        self, lease: Lease, what: str, body: SimulateResult | dict[str, str | bool] | bytes
-    ) -> bytes | None:
-        """Send until the service answers for good; None if it does not want it any more.
+    def _hand_in(self, lease: Lease, what: str, body: SimulateResult | dict[str, str | bool] | bytes) -> bool:
+        """Send until the service answers for good: whether it took it.
 
         The same body under the same lease is idempotent, so an answer lost on the way does no harm.
         Once the worker is asked to stop there is one more attempt, then the lease runs out by itself.
@@ -401,9 +394,9 @@ class Worker:
             last = self._stop.is_set()
             if lease.lost.is_set():
                 self.tally.lost += 1
-                return None
+                return False
             try:
-                answer = self._transport.request(
+                self._transport.request(
                     "PUT",
                     f"/jobs/{lease.job}/{what}",
                     params={"lease_id": lease.lease_id},
@@ -415,7 +408,7 @@ class Worker:
             except (Conflict, NotFound) as error:
                 log.warning("job %s: %s not wanted: %s", lease.job, what, error)
                 self.tally.lost += 1
-                return None
+                return False
             except (InvalidInput, TooLarge, Unauthorized, Forbidden) as error:
                 log.error("job %s: the service refuses the %s: %s", lease.job, what, error)
                 self.tally.failures += 1
@@ -423,17 +416,17 @@ class Worker:
                     message = f"the service refused the result: {error}"
                     permanent = isinstance(body, bytes)
                     self._hand_in(lease, "failure", {"error": message[:4000], "permanent": permanent})
-                return None
+                return False
             except GraspDBError as error:
                 if last:
                     log.error("job %s: %s not sent, stopping: %s", lease.job, what, error)
-                    return None
+                    return False
                 failures += 1
                 delay = _backoff(failures)
                 log.warning("job %s: %s not sent (again in %.1f s): %s", lease.job, what, delay, error)
                 self._stop.wait(delay)
             else:
-                return answer.content
+                return True
 
 
 def _backoff(failures: int) -> float:

@@ -18,7 +18,6 @@ import json
 import os
 import socket
 import struct
-import subprocess
 import sys
 import tempfile
 import threading
@@ -32,6 +31,7 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.processes import ChildProcess
 from graspdb.wire import BestGraspRequest
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
@@ -92,9 +92,7 @@ def server(folder: Path) -> Iterator[str]:
     ]
     environment = os.environ | {"GRASPDB_DATABASE_URL": database_in(folder)}
     with (folder / "log").open("w") as log:
-        process = subprocess.Popen(
-            [*command, "--log-level", "warning"], env=environment, stdout=log, stderr=log
-        )
+        process = ChildProcess([*command, "--log-level", "warning"], env=environment, stdout=log, stderr=log)
     url = f"http://127.0.0.1:{port}"
     try:
         for _ in range(600):

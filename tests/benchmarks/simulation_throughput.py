@@ -16,9 +16,9 @@ import numpy as np
 from graspdb.examples import EXAMPLES, example
 from graspdb.wire import Finger, GridPlan, GripperProfile, SimulatePayload
 from graspdb_geometry import collision
-from graspdb_simworker import chunks
-from graspdb_simworker.labels import weakest_force
-from graspdb_simworker.supervisor import Child
+from graspdb_simworker.process.local import LocalRunner
+from graspdb_simworker.simulation import chunks
+from graspdb_simworker.simulation.force_test import weakest_force
 
 CHUNK = 10_000
 ROUNDS = 5
@@ -108,11 +108,11 @@ def children(count: int) -> float:
     poses = 4 * CHUNK
 
     def work(number: int) -> None:
-        with Child() as child:
-            child.run(payload("mug", 0, 200), parts)
+        with LocalRunner() as runner:
+            runner.run(payload("mug", 0, 200), parts)
             ready.wait()
             for k in range(number, poses // CHUNK, count):
-                child.run(payload("mug", k * CHUNK, (k + 1) * CHUNK), parts)
+                runner.run(payload("mug", k * CHUNK, (k + 1) * CHUNK), parts)
 
     threads = [threading.Thread(target=work, args=(number,)) for number in range(count)]
     for thread in threads:

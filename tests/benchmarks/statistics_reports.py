@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 
+from graspdb.processes import ChildProcess
 from graspdb_density import se3
 
 TRIALS = 40_000
@@ -45,7 +45,7 @@ def server(folder: Path) -> Iterator[str]:
         "GRASPDB_REPORT_WAIT_S": "60",
     }
     with (folder / "log").open("w") as log:
-        process = subprocess.Popen(command, env=os.environ | settings, stdout=log, stderr=log)
+        process = ChildProcess(command, env=os.environ | settings, stdout=log, stderr=log)
     url = f"http://127.0.0.1:{port}"
     try:
         for _ in range(600):

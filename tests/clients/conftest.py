@@ -17,10 +17,20 @@ import numpy as np
 import pytest
 
 from graspdb import Client
+from graspdb.processes import ChildProcess
 
 
 def _command(name: str) -> str:
     return str(Path(sys.executable).with_name(name))
+
+
+def _stop(process: ChildProcess) -> None:
+    process.terminate()
+    try:
+        process.wait(30)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @contextmanager
@@ -32,7 +42,7 @@ def _served(folder: Path) -> Iterator[str]:
     url = f"http://127.0.0.1:{port}"
     log = folder / "log"
     with log.open("wb") as output:
-        process = subprocess.Popen(
+        process = ChildProcess(
             [_command("graspdb-server"), "serve", "--host", "127.0.0.1", "--port", str(port)],
             env={**os.environ, "GRASPDB_DATABASE_URL": f"sqlite:///{folder / 'graspdb.sqlite'}"},
             stdout=output,
@@ -51,19 +61,14 @@ def _served(folder: Path) -> Iterator[str]:
             time.sleep(0.05)
         yield url
     finally:
-        process.terminate()
-        try:
-            process.wait(15)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        _stop(process)
 
 
 @contextmanager
 def _worked(url: str, log: Path) -> Iterator[None]:
     """``graspdb-simworker run`` beside the service."""
     with log.open("wb") as output:
-        process = subprocess.Popen(
+        process = ChildProcess(
             [_command("graspdb-simworker"), "run", "--url", url, "--processes", "1"],
             stdout=output,
             stderr=subprocess.STDOUT,
@@ -72,12 +77,7 @@ def _worked(url: str, log: Path) -> Iterator[None]:
         yield
         assert process.poll() is None, log.read_text()
     finally:
-        process.terminate()
-        try:
-            process.wait(30)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        _stop(process)
 
 
 @pytest.fixture(scope="session")

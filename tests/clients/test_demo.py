@@ -11,7 +11,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from scipy import optimize, stats
 
@@ -40,13 +42,6 @@ def test_no_trials_have_no_interval() -> None:
             wilson_interval(successes, trials)
 
 
-def _until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 def _failure(children: Children) -> str | None:
     try:
         children.check()
@@ -55,20 +50,9 @@ def _failure(children: Children) -> str | None:
     return None
 
 
-def _alive(*texts: str) -> list[str]:
-    """Command lines of running processes that contain all the texts."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            line = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
-        except OSError:
-            continue
-        if all(text in line for text in texts) and str(os.getpid()) != path.parent.name:
-            found.append(line)
-    return found
-
-
-def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(tmp_path: Path) -> None:
+def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(
+    tmp_path: Path, descendants: Callable[[], list[str]], eventually: Callable[..., Any]
+) -> None:
     arguments = ["demo", "--keep", "--folder", str(tmp_path), "--max-poses", "20000"]
     process = subprocess.Popen(
         [GRASPDB, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -97,30 +81,60 @@ def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(tmp_path: Path) ->
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
     assert process.returncode == 0
-    assert not _alive(str(tmp_path))
+    eventually(lambda: not descendants(), 5)
 
 
-def test_stopped_in_the_middle_it_leaves_no_process(tmp_path: Path) -> None:
-    arguments = [GRASPDB, "demo", "--folder", str(tmp_path), "--max-poses", "2000000", "--processes", "1"]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    _until(lambda: bool(_alive("--port ", str(tmp_path))))
-    port = re.findall(r"--port (\d+)", _alive("--port ", str(tmp_path))[0])[0]
-    worker = f"--url http://127.0.0.1:{port} --processes"
-    _until(lambda: bool(_alive(worker)))
+Living = Callable[[], list[str]]
+
+
+def _started(*arguments: str) -> subprocess.Popen[str]:
+    arguments = (GRASPDB, "demo", "--max-poses", "2000000", "--processes", "1", *arguments)
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def _runs(descendants: Living, text: str) -> Callable[[], bool]:
+    return lambda: any(text in line for line in descendants())
+
+
+def test_stopped_in_the_middle_it_leaves_no_process(
+    tmp_path: Path, descendants: Living, eventually: Callable[..., Any]
+) -> None:
+    process = _started("--folder", str(tmp_path))
+    eventually(_runs(descendants, "graspdb-simworker run"))
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, out
     assert "Interrupted" in out
-    assert not _alive(str(tmp_path))
-    assert not _alive(worker)
+    eventually(lambda: not descendants(), 5)
 
 
-def test_a_child_that_fails_is_reported_with_its_last_lines(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("appeared", "number"),
+    [
+        ("demo", signal.SIGINT),
+        ("demo", signal.SIGKILL),
+        ("graspdb-server serve", signal.SIGKILL),
+        ("graspdb-simworker run", signal.SIGKILL),
+        ("graspdb_simworker.process.child", signal.SIGKILL),
+    ],
+)
+def test_however_early_and_hard_it_is_stopped_nothing_is_left(
+    tmp_path: Path, descendants: Living, eventually: Callable[..., Any], appeared: str, number: signal.Signals
+) -> None:
+    process = _started("--folder", str(tmp_path))
+    eventually(_runs(descendants, appeared))
+    time.sleep(np.random.default_rng().uniform(0.0, 3.0 if appeared == "demo" else 0.5))
+    process.send_signal(number)
+    process.communicate(timeout=60)
+    eventually(lambda: not descendants(), 10)
+
+
+def test_a_child_that_fails_is_reported_with_its_last_lines(
+    tmp_path: Path, eventually: Callable[..., Any]
+) -> None:
     with Children(tmp_path) as children:
         children.start("graspdb-server", "serve", "--database-url", "mysql://nowhere/x")
-        _until(lambda: _failure(children) is not None)
-        failure = _failure(children)
-        assert failure is not None
+        failure = eventually(lambda: _failure(children))
         assert "graspdb-server ended with exit code 1" in failure
         assert "mysql is not supported" in failure
 

@@ -27,6 +27,8 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.processes import ChildProcess
+
 STEP_M, ROTATION_STEP_DEG, MARGIN_M = 0.01, 60.0, 0.02
 BOX_M = (0.04, 0.04, 0.10)
 BATCH = 2_000
@@ -111,11 +113,11 @@ class Process:
         self._log = log
         self._command = command
         self._environment = {**os.environ, **environment}
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
 
     def start(self) -> None:
         with self._log.open("ab") as log:
-            self._process = subprocess.Popen(
+            self._process = ChildProcess(
                 [str(Path(sys.executable).with_name(self._command[0])), *self._command[1:]],
                 stdout=log,
                 stderr=subprocess.STDOUT,

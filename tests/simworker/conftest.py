@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graspdb.examples import ExampleObject, example
 from graspdb.wire import Finger, GridPlan, GripperProfile, PosePlan, SimulatePayload
-from graspdb_simworker import chunks
+from graspdb_simworker.simulation import chunks
 
 PG70 = GripperProfile(
     max_opening_m=0.070,

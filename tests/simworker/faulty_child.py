@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from graspdb_simworker import child, chunks
+from graspdb_simworker.process import child
+from graspdb_simworker.simulation import chunks
 
 
 def main() -> int:

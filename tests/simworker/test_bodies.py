@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_simworker.bodies import Part, mass_properties
+from graspdb_simworker.simulation.bodies import Part, mass_properties
 
 FACES = np.array(
     [

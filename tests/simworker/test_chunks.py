@@ -11,8 +11,8 @@ import pytest
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload, SimulateResult
 from graspdb_geometry import collision
-from graspdb_simworker import chunks
-from graspdb_simworker.labels import SIMULATION_ERROR, Label, Outcome
+from graspdb_simworker.simulation import chunks
+from graspdb_simworker.simulation.labels import SIMULATION_ERROR, Label, Outcome
 
 MakePayload = Callable[..., SimulatePayload]
 GetWorkpiece = Callable[..., chunks.Workpiece]

@@ -21,10 +21,10 @@ from graspdb.transport import Transport
 from graspdb.wire import DecomposePayload
 from graspdb_geometry import meshes
 from graspdb_geometry.deviation import deviation
-from graspdb_simworker import decomposition
-from graspdb_simworker.decomposition import DecompositionFailed, Limits
+from graspdb_simworker.decomposition import supervisor
+from graspdb_simworker.decomposition.supervisor import DecompositionFailed, Limits
 from graspdb_simworker.loop import Worker
-from graspdb_simworker.supervisor import Cancelled
+from graspdb_simworker.process.runner import Cancelled
 
 LIMITS = Limits(seconds=120.0)
 PAYLOAD = DecomposePayload(object="angle", mesh="/objects/angle/mesh", mesh_sha256="", unit="mm")
@@ -61,23 +61,23 @@ def check_parts(glb: bytes) -> None:
 
 def test_an_angle_is_split_the_same_every_time() -> None:
     notes: list[str] = []
-    first = decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notes.append)
+    first = supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notes.append)
     check_parts(first)
     assert "threshold 0.05" in notes[0]
     assert "mm off" in notes[-1]
-    assert decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS) == first
+    assert supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS) == first
 
 
 def test_too_little_time_is_said_with_the_way_out() -> None:
     with pytest.raises(DecompositionFailed, match=r"more than 0\.05 s .*--decompose-seconds.*convex parts"):
-        decomposition.decompose(PAYLOAD, angle_stl(), limits=Limits(seconds=0.05))
+        supervisor.decompose(PAYLOAD, angle_stl(), limits=Limits(seconds=0.05))
 
 
 def test_work_is_bounded_and_not_the_wait() -> None:
     # The kernel ends what has used up its processor time, long before three minutes are over by the clock.
     script = "import resource as r; r.setrlimit(r.RLIMIT_CPU, (1, 9))\nwhile True: pass"
     with pytest.raises(DecompositionFailed, match=r"more than 60 s .*--decompose-seconds"):
-        decomposition.decompose(
+        supervisor.decompose(
             PAYLOAD, angle_stl(), limits=Limits(seconds=60.0), command=(sys.executable, "-c", script)
         )
 
@@ -85,38 +85,38 @@ def test_work_is_bounded_and_not_the_wait() -> None:
 def test_a_signal_to_the_whole_group_is_left_to_the_worker() -> None:
     def notice(note: str) -> None:
         for child in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
-            if b"decompose_child" in Path(f"/proc/{child}/cmdline").read_bytes():
+            if b"decomposition.child" in Path(f"/proc/{child}/cmdline").read_bytes():
                 os.kill(int(child), signal.SIGTERM)
                 sent.append(note)
 
     sent: list[str] = []
 
-    check_parts(decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notice))
+    check_parts(supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notice))
     assert sent
 
 
 def test_too_little_memory_is_said_with_the_way_out() -> None:
     with pytest.raises(DecompositionFailed, match="memory"):
-        decomposition.decompose(PAYLOAD, angle_stl(), limits=Limits(120.0, 150 * 2**20))
+        supervisor.decompose(PAYLOAD, angle_stl(), limits=Limits(120.0, 150 * 2**20))
 
 
 def test_what_is_no_mesh_is_refused_with_the_reason() -> None:
     with pytest.raises(DecompositionFailed, match="not STL"):
-        decomposition.decompose(PAYLOAD, b"hello", limits=LIMITS)
+        supervisor.decompose(PAYLOAD, b"hello", limits=LIMITS)
 
 
 def test_a_child_that_dies_is_told_apart() -> None:
     command = (sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(DecompositionFailed, match="SIGSEGV"):
-        decomposition.decompose(PAYLOAD, angle_stl(), limits=LIMITS, command=command)
+        supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS, command=command)
 
 
 def test_the_best_so_far_is_taken_when_time_is_over() -> None:
     script = (
-        "import time; from graspdb_simworker import messages as m;"
+        "import time; from graspdb_simworker.process import channel as m;"
         "m.receive(0); m.send(1, m.RESULT, b'coarse'); m.send(1, m.RESULT, b'finer'); time.sleep(60)"
     )
-    found = decomposition.decompose(
+    found = supervisor.decompose(
         PAYLOAD, angle_stl(), limits=Limits(seconds=4.0), command=(sys.executable, "-c", script)
     )
     assert found == b"finer"
@@ -126,7 +126,7 @@ def test_it_stops_when_it_is_not_wanted_any_more() -> None:
     began = time.monotonic()
     command = (sys.executable, "-c", "import time; time.sleep(600)")
     with pytest.raises(Cancelled):
-        decomposition.decompose(
+        supervisor.decompose(
             PAYLOAD,
             angle_stl(),
             limits=LIMITS,

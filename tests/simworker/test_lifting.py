@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb.wire import Finger, GripperProfile, SimulatePayload
-from graspdb_simworker import chunks, lifting
-from graspdb_simworker.bodies import Part, mass_properties
-from graspdb_simworker.labels import GRAVITY_M_S2, Label, Outcome
 from graspdb_simworker.loop import CAPABILITIES
+from graspdb_simworker.simulation import chunks, lifting
+from graspdb_simworker.simulation.bodies import Part, mass_properties
+from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
+from graspdb_simworker.simulation.labels import Label, Outcome
 
 MakePayload = Callable[..., SimulatePayload]
 FindPoses = Callable[[str, int], list[tuple[Any, Any]]]

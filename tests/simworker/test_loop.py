@@ -19,9 +19,11 @@ from graspdb.errors import Unreachable
 from graspdb.examples import example
 from graspdb.transport import Transport
 from graspdb.wire import OUTCOMES, ClaimedJob, ClaimRequest, SimulatePayload
-from graspdb_simworker import chunks, loop
+from graspdb_simworker import loop
 from graspdb_simworker.loop import Lease, Worker, WorkerFailed
-from graspdb_simworker.supervisor import Child, ChunkFailed
+from graspdb_simworker.process.local import LocalRunner
+from graspdb_simworker.process.runner import ChunkFailed
+from graspdb_simworker.simulation import chunks
 
 Plan = Callable[..., dict[str, Any]]
 
@@ -114,17 +116,9 @@ def test_a_sweep_is_done_whole_with_the_outcomes_of_its_poses(
     workpiece_of: Callable[..., chunks.Workpiece],
 ) -> None:
     sweep = plan(2_000, 500)
-    reports: list[int] = []
-    worker = Worker(
-        transport,
-        name="two",
-        processes=2,
-        exit_when_idle=True,
-        report=lambda tally: reports.append(tally.jobs),
-    )
+    worker = Worker(transport, name="two", processes=2, exit_when_idle=True)
     worker.run()
     assert (worker.tally.jobs, worker.tally.poses, worker.tally.failures) == (4, 2_000, 0)
-    assert max(reports) == 4
     done = http.get(f"/sweeps/{sweep['id']}").json()
     assert (done["state"], done["chunks_done"], done["poses_done"]) == ("done", 4, 2_000)
 
@@ -177,7 +171,7 @@ def test_a_long_chunk_outlives_its_lease_by_the_heartbeat(
 ) -> None:
     sweep = plan(40, 40)
 
-    class Slow(Child):
+    class Slow(LocalRunner):
         """A child that takes longer than a lease lasts."""
 
         def run(self, payload: Any, parts_glb: bytes, **options: Any) -> Any:
@@ -188,7 +182,7 @@ def test_a_long_chunk_outlives_its_lease_by_the_heartbeat(
                 time.sleep(0.1)
             return super().run(payload, parts_glb, **options)
 
-    worker = Worker(transport, name="slow", exit_when_idle=True, make_child=Slow)
+    worker = Worker(transport, name="slow", exit_when_idle=True, make_runner=Slow)
     running = Running(worker)
     time.sleep(7.0)
     stolen = http.post("/jobs/claim", json={"worker": "thief", "capabilities": ["simulate"]}).json()
@@ -225,10 +219,10 @@ def test_a_job_that_fails_is_reported_with_its_reason(
 ) -> None:
     sweep = plan(40, 40)
 
-    def broken() -> Child:
-        return Child((sys.executable, "-c", "import sys; sys.exit(9)"))
+    def broken() -> LocalRunner:
+        return LocalRunner((sys.executable, "-c", "import sys; sys.exit(9)"))
 
-    worker = Worker(transport, name="broken", exit_when_idle=True, make_child=broken)
+    worker = Worker(transport, name="broken", exit_when_idle=True, make_runner=broken)
     worker.run()
     assert worker.tally.failures >= 1
     failed = http.get(f"/sweeps/{sweep['id']}").json()

@@ -17,9 +17,11 @@ import pytest
 
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload
-from graspdb_simworker import chunks, messages, supervisor
-from graspdb_simworker.labels import Label, Outcome
-from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
+from graspdb_simworker.process import channel, local, messages
+from graspdb_simworker.process.local import LocalRunner
+from graspdb_simworker.process.runner import Cancelled, ChunkFailed, PybulletMissing
+from graspdb_simworker.simulation import chunks
+from graspdb_simworker.simulation.labels import Label, Outcome
 
 MakePayload = Callable[..., SimulatePayload]
 GetWorkpiece = Callable[..., chunks.Workpiece]
@@ -51,12 +53,12 @@ def test_a_child_gives_the_bytes_of_this_process_and_so_does_the_next(
     payload = payload_of("mug", stop=2_000)
     here = chunks.simulate_chunk(payload, workpiece_of("mug"))
     seen: list[int] = []
-    with Child(recycle_chunks=2) as child:
+    with LocalRunner(recycle_chunks=2) as runner:
         results = []
         pids = []
         for _ in range(3):
-            results.append(child.run(payload, mug_glb, progress=seen.append))
-            pids.append(child.pid)
+            results.append(runner.run(payload, mug_glb, progress=seen.append))
+            pids.append(runner.pid)
     # The parts travelled as GLB, in float32: the same labels, and widths within its rounding of a micrometre.
     assert results[0] == results[1] == results[2]
     assert pids[0] is not None
@@ -74,11 +76,11 @@ def test_a_deadly_pose_is_a_simulation_error_and_the_rest_goes_on(
 ) -> None:
     poses = physical_poses("mug", 12)
     payload = payload_of("mug", poses=poses)
-    with Child() as child:
-        healthy = child.run(payload, mug_glb)
+    with LocalRunner() as runner:
+        healthy = runner.run(payload, mug_glb)
     deadly = poses[7][0]
-    with Child((*FAULTY, how, *map(repr, deadly)), pose_s=0.5) as child:
-        result = child.run(payload, mug_glb)
+    with LocalRunner((*FAULTY, how, *map(repr, deadly)), pose_s=0.5) as runner:
+        result = runner.run(payload, mug_glb)
     hit = np.array([np.allclose(p, deadly) for p, _ in poses])
     found, expected = (np.frombuffer(r.outcomes, np.uint8) for r in (result, healthy))
     assert hit[7]
@@ -95,56 +97,59 @@ def test_what_a_chunk_raises_is_its_failure_and_the_child_lives_on(
     payload_of: MakePayload, physical_poses: FindPoses, mug_glb: bytes
 ) -> None:
     poses = physical_poses("mug", 3)
-    with Child((*FAULTY, "raise", *map(repr, poses[1][0]))) as child:
+    with LocalRunner((*FAULTY, "raise", *map(repr, poses[1][0]))) as runner:
         with pytest.raises(ChunkFailed, match="RuntimeError: the parts make no sense"):
-            child.run(payload_of("mug", poses=poses), mug_glb)
-        assert len(child.run(payload_of("mug", poses=poses[:1]), mug_glb).outcomes) == 1
+            runner.run(payload_of("mug", poses=poses), mug_glb)
+        assert len(runner.run(payload_of("mug", poses=poses[:1]), mug_glb).outcomes) == 1
         with pytest.raises(ChunkFailed, match="GLB"):
-            child.run(payload_of("mug", poses=poses[:1], parts_sha256="other"), b"no GLB at all")
+            runner.run(payload_of("mug", poses=poses[:1], parts_sha256="other"), b"no GLB at all")
 
 
 def test_a_child_that_dies_at_once_fails_the_chunk(payload_of: MakePayload, mug_glb: bytes) -> None:
-    with Child((*FAULTY, "start")) as child, pytest.raises(ChunkFailed, match="exit code 3"):
-        child.run(payload_of("mug", stop=10), mug_glb)
+    with LocalRunner((*FAULTY, "start")) as runner, pytest.raises(ChunkFailed, match="exit code 3"):
+        runner.run(payload_of("mug", stop=10), mug_glb)
 
 
 def test_a_missing_pybullet_is_told_apart(payload_of: MakePayload, mug_glb: bytes) -> None:
     script = (
         "import sys; sys.modules['pybullet'] = None;"
-        " from graspdb_simworker import child; sys.exit(child.main())"
+        " from graspdb_simworker.process import child; sys.exit(child.main())"
     )
-    with Child((sys.executable, "-c", script)) as child, pytest.raises(PybulletMissing, match="pybullet"):
-        child.run(payload_of("mug", stop=10), mug_glb)
+    with (
+        LocalRunner((sys.executable, "-c", script)) as runner,
+        pytest.raises(PybulletMissing, match="pybullet"),
+    ):
+        runner.run(payload_of("mug", stop=10), mug_glb)
 
 
 def test_a_chunk_that_is_not_wanted_any_more_kills_its_child(payload_of: MakePayload, mug_glb: bytes) -> None:
     lost = threading.Event()
-    with Child() as child:
+    with LocalRunner() as runner:
         pids: list[int | None] = []
 
         def progress(done: int) -> None:
-            pids.append(child.pid)
+            pids.append(runner.pid)
             lost.set()
 
         with pytest.raises(Cancelled):
-            child.run(
+            runner.run(
                 payload_of("mug", stop=100_000), mug_glb, wanted=lambda: not lost.is_set(), progress=progress
             )
         assert pids[0] is not None
         assert not alive(pids[0])
-        assert child.pid is None
+        assert runner.pid is None
         # And the next chunk gets a new one.
-        assert len(child.run(payload_of("mug", stop=50), mug_glb).outcomes) == 50
+        assert len(runner.run(payload_of("mug", stop=50), mug_glb).outcomes) == 50
 
 
 def test_a_child_whose_worker_is_gone_ends_itself(payload_of: MakePayload, mug_glb: bytes) -> None:
-    process = subprocess.Popen(supervisor.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    process = subprocess.Popen(local.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stdin is not None
     assert process.stdout is not None
-    assert messages.receive(process.stdout.fileno(), silence_s=60.0)[0] == messages.READY
+    assert channel.receive(process.stdout.fileno(), silence_s=60.0)[0] == channel.READY
     chunk = messages.Chunk(payload_of("mug", stop=100_000).model_dump_json(), {}, 10.0, mug_glb)
-    messages.send(process.stdin.fileno(), messages.CHUNK, messages.pack_chunk(chunk))
-    assert messages.receive(process.stdout.fileno(), silence_s=60.0)[0] == messages.BEFORE
+    channel.send(process.stdin.fileno(), channel.CHUNK, messages.pack_chunk(chunk))
+    assert channel.receive(process.stdout.fileno(), silence_s=60.0)[0] == channel.BEFORE
     # In mid-chunk the pipes close, as they do when a worker is killed.
     process.stdin.close()
     process.stdout.close()
@@ -154,15 +159,15 @@ def test_a_child_whose_worker_is_gone_ends_itself(payload_of: MakePayload, mug_g
 def test_messages_survive_the_pipe_and_broken_pipes_are_noticed() -> None:
     reader, writer = os.pipe()
     big = os.urandom(3 << 20)
-    thread = threading.Thread(target=messages.send, args=(writer, messages.RESULT, big))
+    thread = threading.Thread(target=channel.send, args=(writer, channel.RESULT, big))
     thread.start()
-    assert messages.receive(reader, silence_s=10.0) == (messages.RESULT, big)
+    assert channel.receive(reader, silence_s=10.0) == (channel.RESULT, big)
     thread.join()
-    with pytest.raises(messages.Silent):
-        messages.receive(reader, silence_s=0.1, poll_s=0.02)
+    with pytest.raises(channel.Silent):
+        channel.receive(reader, silence_s=0.1, poll_s=0.02)
     os.close(writer)
-    with pytest.raises(messages.Closed):
-        messages.receive(reader)
+    with pytest.raises(channel.Closed):
+        channel.receive(reader)
     os.close(reader)
     label = Label(Outcome.SLIPPED, 0.0125, 0.0)
     assert messages.unpack_label(messages.pack_label(2**40, label)) == (2**40, label)

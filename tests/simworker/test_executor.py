@@ -13,8 +13,9 @@ from distributed import Client, LocalCluster
 
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload
-from graspdb_simworker.dispatch import Dispatched
-from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed
+from graspdb_simworker.process.executor import ExecutorRunner
+from graspdb_simworker.process.local import LocalRunner
+from graspdb_simworker.process.runner import Cancelled, ChunkFailed
 
 MakePayload = Callable[..., SimulatePayload]
 
@@ -30,12 +31,12 @@ def test_a_pool_of_processes_gives_the_same_bytes_and_outlives_a_bad_chunk(
 ) -> None:
     parts = example("mug").parts_glb()
     payload = payload_of("mug", start=0, stop=300)
-    with Dispatched(pool) as child:
-        first = child.run(payload, parts)
+    with ExecutorRunner(pool) as runner:
+        first = runner.run(payload, parts)
         with pytest.raises(ChunkFailed, match="GLB"):
-            child.run(payload.model_copy(update={"parts_sha256": "other"}), b"no parts")
-        again = child.run(payload, parts)
-    with Child() as here:
+            runner.run(payload.model_copy(update={"parts_sha256": "other"}), b"no parts")
+        again = runner.run(payload, parts)
+    with LocalRunner() as here:
         assert first == again == here.run(payload, parts)
     assert first.rows.pose_index
 
@@ -47,17 +48,17 @@ def test_a_dask_cluster_is_an_executor_like_any_other(payload_of: MakePayload) -
         LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
         client.get_executor() as executor,
-        Dispatched(executor) as child,
-        Child() as here,
+        ExecutorRunner(executor) as runner,
+        LocalRunner() as here,
     ):
-        assert child.run(payload, parts) == here.run(payload, parts)
+        assert runner.run(payload, parts) == here.run(payload, parts)
 
 
 def test_a_pool_whose_processes_die_fails_the_chunk_and_not_the_worker(payload_of: MakePayload) -> None:
-    with ProcessPoolExecutor(1) as pool, Dispatched(pool) as child:
+    with ProcessPoolExecutor(1) as pool, ExecutorRunner(pool) as runner:
         pool.submit(os._exit, 3)
         with pytest.raises(ChunkFailed, match=r"BrokenProcessPool|takes no chunks"):
-            child.run(payload_of("mug", start=0, stop=10), b"")
+            runner.run(payload_of("mug", start=0, stop=10), b"")
 
 
 def test_what_is_not_wanted_any_more_leaves_the_queue(payload_of: MakePayload) -> None:
@@ -68,8 +69,8 @@ def test_what_is_not_wanted_any_more_leaves_the_queue(payload_of: MakePayload) -
             taken.append(Future())  # queued behind others
             return taken[-1]
 
-    with Busy() as busy, Dispatched(busy) as child:
+    with Busy() as busy, ExecutorRunner(busy) as runner:
         asked = iter((True, True, False))
         with pytest.raises(Cancelled):
-            child.run(payload_of("mug", start=0, stop=10), b"", wanted=lambda: next(asked))
+            runner.run(payload_of("mug", start=0, stop=10), b"", wanted=lambda: next(asked))
     assert taken[0].cancelled()

@@ -3,19 +3,18 @@ its result."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from types import TracebackType
 
+from graspdb.processes import ChildProcess
 from graspdb.wire import SimulatePayload, SimulateResult
-from graspdb_simworker import messages
-from graspdb_simworker.labels import SIMULATION_ERROR, Label
+from graspdb_simworker.process import channel, messages
+from graspdb_simworker.process.runner import Cancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.simulation.labels import SIMULATION_ERROR, Label
 
-COMMAND = (sys.executable, "-m", "graspdb_simworker.child")
+COMMAND = (sys.executable, "-m", "graspdb_simworker.process.child")
 POSE_SECONDS = 10.0
 """A closing takes milliseconds; after so much of the processor's time it hangs."""
 SILENT = 6.0
@@ -27,34 +26,12 @@ RECYCLE_CHUNKS = 64
 MAX_DEATHS = 50
 """More dead children than this in one chunk are no bad luck with poses any more."""
 
-_ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
 
-
-class Cancelled(Exception):
-    """The chunk is not wanted any more."""
-
-
-class ChunkFailed(Exception):
-    """The chunk can't be simulated; the message says why."""
-
-
-class PybulletMissing(Exception):
-    """The child could not import pybullet."""
-
-
-class Child:
+class LocalRunner(ChunkRunner):
     """A simulating process and its replacements; used by one thread.
 
-    Parameters
-    ----------
-    command : sequence of str
-        Starts the process that speaks :mod:`graspdb_simworker.messages`.
-    pose_s : float
-        Longest closing, seconds of the processor.
-    recycle_chunks : int
-        Chunks before the process is replaced.
+    ``command`` starts what answers as :mod:`.child` does. A closing may take ``pose_s`` seconds of the
+    processor; after ``recycle_chunks`` chunks the process is replaced.
     """
 
     def __init__(
@@ -67,15 +44,10 @@ class Child:
         self._command = tuple(command)
         self._pose_s = pose_s
         self._recycle = recycle_chunks
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: ChildProcess | None = None
         self._chunks = 0
 
-    def __enter__(self) -> Child:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     @property
@@ -87,12 +59,7 @@ class Child:
         """End the child at once; harmless if there is none. May be called from any thread."""
         process, self._process = self._process, None
         if process is not None:
-            process.kill()
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    with contextlib.suppress(OSError):
-                        pipe.close()
+            channel.end(process)
 
     def run(
         self,
@@ -102,26 +69,8 @@ class Child:
         wanted: Callable[[], bool] = lambda: True,
         progress: Callable[[int], None] = lambda simulated: None,
     ) -> SimulateResult:
-        """Simulate a chunk, replacing the child as often as a pose kills it.
-
-        Parameters
-        ----------
-        payload : SimulatePayload
-        parts_glb : bytes
-            The object's convex parts.
-        wanted
-            Asked several times a second; the child is killed as soon as it says no.
-        progress
-            Told how many closings of the chunk are done.
-
-        Raises
-        ------
-        Cancelled
-            If it was not wanted any more.
-        ChunkFailed
-            With the reason, if the chunk as a whole can't be simulated.
-        PybulletMissing
-        """
+        """Simulate a chunk, replacing the process as often as a pose kills it; ``progress`` is told how many
+        closings of the chunk are done."""
         known: dict[int, Label] = {}
         deaths = 0
 
@@ -151,19 +100,16 @@ class Child:
             self.kill()
             raise
 
-    def _started(self, check: Callable[[], None]) -> subprocess.Popen[bytes]:
+    def _started(self, check: Callable[[], None]) -> ChildProcess:
         if self._process is not None:
             return self._process
         self._chunks = 0
-        process = subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **_ONE_THREAD}
-        )
-        self._process = process
+        process = self._process = channel.start(self._command)
         try:
-            kind, body = messages.receive(_fd(process.stdout), silence_s=START_SECONDS, check=check)
-        except (messages.Closed, messages.Silent) as error:
+            kind, body = channel.receive(_fd(process.stdout), silence_s=START_SECONDS, check=check)
+        except (channel.Closed, channel.Silent) as error:
             raise ChunkFailed(f"the simulating process did not start: {self._cause_of_death()}") from error
-        if kind == messages.MISSING:
+        if kind == channel.MISSING:
             raise PybulletMissing(body.decode(errors="replace"))
         return process
 
@@ -189,7 +135,7 @@ class _Attempt:
 
     def __init__(
         self,
-        process: subprocess.Popen[bytes],
+        process: ChildProcess,
         known: dict[int, Label],
         pose_s: float,
         check: Callable[[], None],
@@ -207,26 +153,26 @@ class _Attempt:
         """The result, or None if the process died or fell silent."""
         chunk = messages.Chunk(payload.model_dump_json(), self._known, self._pose_s, parts_glb)
         try:
-            messages.send(_fd(self._process.stdin), messages.CHUNK, messages.pack_chunk(chunk))
+            channel.send(_fd(self._process.stdin), channel.CHUNK, messages.pack_chunk(chunk))
             while True:
                 # Before the first closing the prefilter runs: minutes at worst, for the largest chunks.
                 silence = START_SECONDS if self.simulating is None else SILENT * self._pose_s + 5.0
-                kind, body = messages.receive(_fd(self._process.stdout), silence_s=silence, check=self._check)
+                kind, body = channel.receive(_fd(self._process.stdout), silence_s=silence, check=self._check)
                 self.heard += 1
                 # Here too: a busy child leaves no silence in which to ask.
                 self._check()
-                if kind == messages.BEFORE:
+                if kind == channel.BEFORE:
                     self.simulating = messages.unpack_row(body)
-                elif kind == messages.AFTER:
+                elif kind == channel.AFTER:
                     row, label = messages.unpack_label(body)
                     self._known[row] = label
                     self.simulating = None
                     self._progress(len(self._known))
-                elif kind == messages.RESULT:
+                elif kind == channel.RESULT:
                     return SimulateResult.model_validate_json(body)
-                elif kind == messages.ERROR:
+                elif kind == channel.ERROR:
                     raise ChunkFailed(body.decode(errors="replace"))
-        except (messages.Closed, messages.Silent):
+        except (channel.Closed, channel.Silent):
             return None
 
 

@@ -3,7 +3,7 @@
 The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at
 the origin, its tool frame is the world frame; for every grasp the *object* is moved instead. Nothing
 weighs: the object floats, so that the jaw centres it as it closes, and gravity enters afterwards
-through the force test in :mod:`graspdb_simworker.labels`.
+through the force test in :mod:`graspdb_simworker.simulation.labels`.
 
 What the solver does depends on what it did before: Bullet keeps contact caches and the order of
 overlapping pairs. Parking the object far away and stepping the world once after every grasp empties
@@ -22,8 +22,8 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from graspdb_simworker import lifting
-from graspdb_simworker.bodies import (
+from graspdb_simworker.simulation import lifting
+from graspdb_simworker.simulation.bodies import (
     HEAVY_KG,
     Carried,
     Closing,
@@ -36,8 +36,9 @@ from graspdb_simworker.bodies import (
     multiply,
     rotate,
 )
-from graspdb_simworker.bullet import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
-from graspdb_simworker.labels import MOVED_M, TURNED_RAD, rating
+from graspdb_simworker.simulation.bullet_world import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
+from graspdb_simworker.simulation.force_test import rating
+from graspdb_simworker.simulation.labels import MOVED_M, TURNED_RAD
 
 Fidelity = Literal["standard", "fine"]
 
@@ -51,7 +52,7 @@ NO_DOUBT = (1.8, 1.6, 1.5, 1.4, 1.2, 1.2, 1.2)
 """A reading from here on is the last one; 1 is the least that holds the weight. Lower ones are waited
 with: a heavy object often still creeps into a better hold, what moves between the fingers makes the forces
 ring, and a low reading may be an instant at which the fingers hardly touch. The median of the last
-:data:`graspdb_simworker.labels.RATED` counts."""
+:data:`graspdb_simworker.simulation.labels.RATED` counts."""
 DAMPING = 0.4
 """Rate at which the object's motion is damped while the jaw closes, over sqrt(closing force / mass / 1 m),
 which is the pace of its swing between the fingers: about 2 per second for 1.6 kg at 40 N, 5 for 75 g at
@@ -110,7 +111,7 @@ class GraspWorld(BulletWorld):
     gripper : Gripper
     fidelity : {'standard', 'fine'}
     lifts : bool
-        Lift and shake what is held after every closing, see :mod:`graspdb_simworker.lifting`.
+        Lift and shake what is held after every closing, see :mod:`graspdb_simworker.simulation.lifting`.
     visible : bool
         Build what can be seen, for :attr:`pictures`.
     film_every_s : float

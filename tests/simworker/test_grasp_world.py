@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb_geometry import collision
-from graspdb_simworker.bodies import Closing, End
-from graspdb_simworker.chunks import Workpiece
-from graspdb_simworker.labels import Outcome, label_of
-from graspdb_simworker.scene import GraspWorld
+from graspdb_simworker.simulation.bodies import Closing, End
+from graspdb_simworker.simulation.chunks import Workpiece
+from graspdb_simworker.simulation.grasp_world import GraspWorld
+from graspdb_simworker.simulation.labels import Outcome, label_of
 
 GetWorkpiece = Callable[..., Workpiece]
 FindPoses = Callable[[str, int], list[tuple[Any, Any]]]

@@ -26,8 +26,8 @@ from typing import Any
 
 from numba import njit
 
-from graspdb_simworker.bodies import MassProperties, Quaternion, Vector, multiply, rotate
-from graspdb_simworker.labels import GRAVITY_M_S2
+from graspdb_simworker.simulation.bodies import MassProperties, Quaternion, Vector, multiply, rotate
+from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
 
 LIFT_M = 0.10
 SHAKE_M = 0.020

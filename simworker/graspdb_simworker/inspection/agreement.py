@@ -10,6 +10,7 @@ that weighted sum when each stratum's agreement follows its posterior under Jeff
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +18,10 @@ from numpy.typing import NDArray
 
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import collision
-from graspdb_simworker import chunks
-from graspdb_simworker.bodies import Part
-from graspdb_simworker.labels import Outcome
+from graspdb_simworker.inspection.stored_outcomes import StoredOutcomes
+from graspdb_simworker.simulation import chunks
+from graspdb_simworker.simulation.bodies import Part
+from graspdb_simworker.simulation.labels import Outcome
 
 LEVEL = 0.95
 _DRAWS = 200_000
@@ -53,6 +55,21 @@ class Agreement:
     def checked(self) -> int:
         return sum(stratum.checked for stratum in self.strata)
 
+    def summary(self, name: str) -> str:
+        """A table of the strata, and what they come to for an object of this name."""
+        lines = [f"{'outcome':20} {'found':>7} {'checked':>8} {'agree':>7} {'same name':>10}"]
+        lines += [
+            f"{s.outcome.name.lower():20} {s.available:7} {s.checked:8}"
+            f" {s.agree / s.checked:7.4f} {s.same / s.checked:10.4f}"
+            for s in self.strata
+        ]
+        lines.append(
+            f"{name}: success or failure agrees in {self.agreement:.4f} of the poses that met physics"
+            f" (at least {self.lower:.4f} at {LEVEL:.0%}; {self.checked} checked);"
+            f" the same outcome in {self.same:.4f}"
+        )
+        return "\n".join(lines)
+
 
 def enough_poses(payload: SimulatePayload, parts: Sequence[Part], count: int) -> SimulatePayload:
     """The payload with so many random poses of its grid that about three times ``count`` meet physics."""
@@ -78,18 +95,9 @@ def verify(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Agreement:
-    """Simulate a chunk, then a stratified sample of its physics poses at fine fidelity.
+    """Simulate a chunk, then a stratified sample of ``count`` of its physics poses, or all, at fine fidelity.
 
-    Parameters
-    ----------
-    payload : SimulatePayload
-        The poses to sample from; its own fidelity is what is verified.
-    parts : sequence of (vertices, faces)
-    count : int
-        Poses to simulate again, as many as there are at most.
-    seed : int
-    progress
-        Told how many of how many closings are done.
+    ``progress`` is told how many of how many closings are done.
 
     Raises
     ------
@@ -97,86 +105,49 @@ def verify(
         If no pose of the chunk meets physics.
     """
     _, positions, quaternions = chunks.poses_of(payload)
-    coarse = chunks.prepare(payload, parts)
-    fine = chunks.prepare(payload.model_copy(update={"fidelity": "fine"}), parts)
-    try:
-        codes, first = coarse.scene.classify(positions, quaternions, coarse.shape)
+    rng = np.random.default_rng(seed)
+    with closing(chunks.prepare(payload, parts)) as coarse, closing(_fine(payload, parts)) as fine:
+        codes, travel = coarse.classify(positions, quaternions)
         rows = np.flatnonzero(codes == collision.CONTACT)
         if len(rows) == 0:
             raise ValueError("no pose of this sample needs physics: take more poses")
-        rng = np.random.default_rng(seed)
         rows = np.sort(rng.permutation(rows)[: 3 * count])
-        travel = np.minimum(first.min(axis=1), 0.5 * coarse.shape.max_opening_m)
         total = len(rows) + min(count, len(rows))
 
         def outcomes(workpiece: chunks.Workpiece, chosen: NDArray[np.int64], done: int) -> NDArray[np.uint8]:
-            found = np.empty(len(chosen), dtype=np.uint8)
-            for k, row in enumerate(chosen.tolist()):
-                label = workpiece.simulate(positions[row], quaternions[row], float(travel[row]))
-                found[k] = label.outcome
-                progress(done + k + 1, total)
-            return found
+            poses = positions[chosen], quaternions[chosen], travel[chosen]
+            return _outcomes(workpiece, *poses, lambda more: progress(done + more, total))
 
         labels = outcomes(coarse, rows, 0)
         picked = _stratified(labels, count, rng)
         again = outcomes(fine, rows[picked], len(rows))
-    finally:
-        coarse.close()
-        fine.close()
     found = {int(kind): float(n) for kind, n in zip(*np.unique(labels, return_counts=True), strict=True)}
     return _agreement(found, labels[picked], again, rng)
-
-
-@dataclass(frozen=True)
-class Stored:
-    """A sample of a sweep's stored outcomes, and how many of each outcome the sweep has.
-
-    ``positions`` (n, 3) and ``quaternions`` (n, 4) of the tool in the object frame, ``outcomes`` (n,)
-    codes; within each outcome every pose of the sweep is as likely to be here.
-    """
-
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-    outcomes: NDArray[np.uint8]
-    counts: Mapping[int, int]
 
 
 def verify_stored(
     payload: SimulatePayload,
     parts: Sequence[Part],
-    stored: Stored,
+    stored: StoredOutcomes,
     *,
     count: int,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Agreement:
-    """Simulate stored outcomes again at fine fidelity: a stratified sample of those that met physics.
-
-    Parameters
-    ----------
-    payload : SimulatePayload
-        Object, gripper and protocol.
-    parts : sequence of (vertices, faces)
-    stored : Stored
-    count : int
-        Poses to simulate again, as many as there are at most.
-    seed : int
-    progress
-        Told how many of how many closings are done.
+    """Simulate stored outcomes of the payload's object, gripper and protocol again at fine fidelity: a
+    stratified sample of ``count``, or all, of those that met physics.
 
     Raises
     ------
     ValueError
         If no pose of the sample meets physics.
     """
-    fine = chunks.prepare(payload.model_copy(update={"fidelity": "fine"}), parts)
     rng = np.random.default_rng(seed)
-    try:
-        codes, first = fine.scene.classify(stored.positions, stored.quaternions, fine.shape)
+    with closing(_fine(payload, parts)) as fine:
+        codes, travel = fine.classify(stored.positions, stored.quaternions)
         rows = np.flatnonzero(codes == collision.CONTACT)
         if len(rows) == 0:
             raise ValueError("no pose of this sweep needed physics")
-        travel = np.minimum(first.min(axis=1), 0.5 * fine.shape.max_opening_m)
         labels = stored.outcomes[rows]
         # A miss may be plain from the geometry: only the share that met physics counts.
         found = {
@@ -185,14 +156,29 @@ def verify_stored(
             for kind in np.unique(labels)
         }
         picked = _stratified(labels, count, rng)
-        again = np.empty(len(picked), dtype=np.uint8)
-        for k, row in enumerate(rows[picked].tolist()):
-            label = fine.simulate(stored.positions[row], stored.quaternions[row], float(travel[row]))
-            again[k] = label.outcome
-            progress(k + 1, len(picked))
-    finally:
-        fine.close()
+        chosen = rows[picked]
+        poses = stored.positions[chosen], stored.quaternions[chosen], travel[chosen]
+        again = _outcomes(fine, *poses, lambda done: progress(done, len(picked)))
     return _agreement(found, labels[picked], again, rng)
+
+
+def _fine(payload: SimulatePayload, parts: Sequence[Part]) -> chunks.Workpiece:
+    return chunks.prepare(payload.model_copy(update={"fidelity": "fine"}), parts)
+
+
+def _outcomes(
+    workpiece: chunks.Workpiece,
+    positions: NDArray[np.float64],
+    quaternions: NDArray[np.float64],
+    travel: NDArray[np.float64],
+    progress: Callable[[int], None],
+) -> NDArray[np.uint8]:
+    """Outcomes of tool poses (n, 3), (n, 4), whose fingers close freely by (n,) metres."""
+    found = np.empty(len(positions), dtype=np.uint8)
+    for row, way in enumerate(travel.tolist()):
+        found[row] = workpiece.simulate(positions[row], quaternions[row], way).outcome
+        progress(row + 1)
+    return found
 
 
 def _stratified(labels: NDArray[np.uint8], count: int, rng: np.random.Generator) -> NDArray[np.int64]:

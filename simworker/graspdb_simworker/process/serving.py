@@ -6,22 +6,23 @@ import signal
 
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import meshes
-from graspdb_simworker import chunks, messages
-from graspdb_simworker.labels import Label
+from graspdb_simworker.process import channel, messages
+from graspdb_simworker.simulation import chunks
+from graspdb_simworker.simulation.labels import Label
 
 WORKPIECE_FIELDS = {"parts_sha256", "mass_kg", "friction", "gripper", "protocol", "fidelity"}
 """Chunks that agree in these share a world."""
 
 
 def serve(source: int, sink: int) -> None:
-    """Answer chunks until the worker closes the pipe (which raises :class:`messages.Closed`)."""
-    messages.send(sink, messages.READY)
+    """Answer chunks until the worker closes the pipe (which raises :class:`channel.Closed`)."""
+    channel.send(sink, channel.READY)
     key: str | None = None
     workpiece: chunks.Workpiece | None = None
     while True:
-        kind, body = messages.receive(source, poll_s=3600.0)
-        if kind != messages.CHUNK:
-            raise messages.Closed(f"unexpected message {kind!r}")
+        kind, body = channel.receive(source, poll_s=3600.0)
+        if kind != channel.CHUNK:
+            raise channel.Closed(f"unexpected message {kind!r}")
         try:
             chunk = messages.unpack_chunk(body)
             payload = SimulatePayload.model_validate_json(chunk.payload_json)
@@ -34,18 +35,18 @@ def serve(source: int, sink: int) -> None:
 
             # By the processor's time: what else the machine does must not change a label.
             def before(row: int, limit: float = chunk.pose_s) -> None:
-                messages.send(sink, messages.BEFORE, messages.pack_row(row))
+                channel.send(sink, channel.BEFORE, messages.pack_row(row))
                 signal.setitimer(signal.ITIMER_PROF, limit)
 
             def after(row: int, label: Label) -> None:
                 signal.setitimer(signal.ITIMER_PROF, 0.0)
-                messages.send(sink, messages.AFTER, messages.pack_label(row, label))
+                channel.send(sink, channel.AFTER, messages.pack_label(row, label))
 
             result = chunks.simulate_chunk(payload, workpiece, known=chunk.known, before=before, after=after)
-        except messages.Closed:
+        except channel.Closed:
             raise
         except Exception as error:  # noqa: BLE001 - the chunk's failure, told to the worker
             signal.setitimer(signal.ITIMER_PROF, 0.0)
-            messages.send(sink, messages.ERROR, f"{type(error).__name__}: {error}".encode())
+            channel.send(sink, channel.ERROR, f"{type(error).__name__}: {error}".encode())
             continue
-        messages.send(sink, messages.RESULT, result.model_dump_json().encode())
+        channel.send(sink, channel.RESULT, result.model_dump_json().encode())

@@ -1,8 +1,7 @@
-"""From a closing to a label, by one of two protocols.
+"""Can contact forces hold an object against gravity, whichever way down is? The paper's test: forces only.
 
-**wrench**: can the contact forces hold the object against gravity, whichever way down is? The test is
-the paper's: forces only. Two contacts may be enough although the object could turn about the line
-through them; with torques no grasp by two contacts would pass at all.
+Two contacts may be enough although the object could turn about the line through them; with torques no grasp
+by two contacts would pass at all.
 
 A contact i with normal n_i (into the object) and measured normal force f_i can exert any force of its
 capped friction cone
@@ -15,36 +14,19 @@ must contain the ball of radius m g. W is convex and contains 0, hence the large
 minimum of its support function over unit directions d
 
     h(d) = sum_i f_i max(0, n_i . d + mu sqrt(1 - (n_i . d)^2)).
-
-Where the forces ring because the object still moves, several instants of the stalled jaw are rated and
-the median of the last five counts. ``f_i`` is scaled by the gripper's force over the force the jaw was
-simulated with, see :func:`graspdb_simworker.bodies.closing_force`.
-
-**lift**: is the object still held, and where it was, after the jaw lifted and shook it
-(:mod:`graspdb_simworker.lifting`)? A grasp on two points may well hold the object and let it swing; so the
-object may move by :data:`MOVED_M` at the tool's origin and turn by :data:`TURNED_RAD` at most, the steps of
-the default grid: further off it is another grasp.
 """
 
 from __future__ import annotations
 
 import math
-import statistics
-from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from graspdb_simworker.bodies import Carried, Closing, Contacts, End, Gripper
+from graspdb_simworker.simulation.bodies import Contacts, Gripper
 
 GRAVITY_M_S2 = 9.80665
-MOVED_M = 0.010
-TURNED_RAD = math.radians(15.0)
-WORST_QUALITY = -1000.0
-RATED = 5
-"""So many of the last instants of a stalled jaw are rated at most."""
 MERGE_COSINE = 1.0 - 1e-8
 """Contacts whose normals differ less than this (0.008 degrees) act as one: their cones add up to one cone."""
 _COARSE = 96
@@ -52,44 +34,6 @@ _STARTS = 3
 _ON_CIRCLE = 24
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _COMPASS = np.array([[math.cos(k * math.pi / 4.0), math.sin(k * math.pi / 4.0)] for k in range(8)])
-
-
-class Outcome(IntEnum):
-    """Codes of outcomes, as packed in results. The same numbers as on the wire; a test compares the two."""
-
-    FAILURE = 0
-    SUCCESS = 1
-    COLLISION = 2
-    MISSED = 3
-    SLIPPED = 4
-    DROPPED = 5
-    WRENCH_INSUFFICIENT = 6
-    TIMEOUT = 7
-    SIMULATION_ERROR = 8
-
-
-@dataclass(frozen=True)
-class Label:
-    """What a grasp came to.
-
-    Attributes
-    ----------
-    outcome : Outcome
-    width_m : float
-        Distance between the fingers at the end.
-    quality : float
-        ``wrench``: largest weight the contacts hold in the worst direction, over the object's weight;
-        success from 1 on. ``lift``: 1 minus the farthest displacement in the jaw, in units of what is
-        allowed (the larger of translation / 10 mm and rotation / 15 degrees); 1 did not move at all,
-        success down to 0. NaN where nothing was measured.
-    """
-
-    outcome: Outcome
-    width_m: float
-    quality: float
-
-
-SIMULATION_ERROR = Label(Outcome.SIMULATION_ERROR, math.nan, math.nan)
 
 
 def _fibonacci_directions(count: int) -> NDArray[np.float64]:
@@ -336,41 +280,11 @@ def compile_force_test() -> None:
 
 
 def rating(contacts: Contacts, gripper: Gripper, mass_kg: float, friction: float) -> float:
-    """Largest weight that the contacts hold in the worst direction, over the object's weight."""
+    """Largest weight that the contacts hold in the worst direction, over the object's weight.
+
+    Measured forces are scaled by the gripper's force over the one the jaw was simulated with, see
+    :func:`graspdb_simworker.simulation.bodies.closing_force`.
+    """
     scale = gripper.force_n / gripper.closing_force_n
     force, _ = weakest_force(contacts.normals, contacts.forces * scale, friction)
     return force / (mass_kg * GRAVITY_M_S2)
-
-
-def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float) -> Label:
-    """Name a closing's outcome and rate it.
-
-    ``missed``: nothing was between the fingers, or the object was pushed out before both touched it;
-    ``slipped``: both had touched it and it was squeezed out; ``timeout``: the jaw neither stalled nor
-    closed; ``simulation_error``: a pose that is not finite any more; ``wrench_insufficient``: the force
-    test failed. After a lift: ``dropped``: not held at the end; ``slipped``: held, but moved too far.
-    """
-    width = max(0.0, closing.opening_m)
-    if closing.end is End.EMPTY:
-        return Label(Outcome.SLIPPED if closing.touched else Outcome.MISSED, width, 0.0)
-    if closing.end is End.TIMEOUT:
-        return Label(Outcome.TIMEOUT, width, math.nan)
-    if closing.end is End.UNSTABLE:
-        return SIMULATION_ERROR
-    if closing.carried is not None:
-        return _carried_label(closing.carried, width)
-    ratings = closing.ratings[-RATED:] or [
-        rating(now, gripper, mass_kg, friction) for now in closing.contacts[-RATED:]
-    ]
-    quality = statistics.median(ratings)
-    return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
-
-
-def _carried_label(carried: Carried, width_m: float) -> Label:
-    quality = 1.0 - max(carried.translation_m / MOVED_M, carried.rotation_rad / TURNED_RAD)
-    if not math.isfinite(quality):
-        return SIMULATION_ERROR
-    quality = max(WORST_QUALITY, quality)
-    if not carried.held:
-        return Label(Outcome.DROPPED, width_m, quality)
-    return Label(Outcome.SUCCESS if quality >= 0.0 else Outcome.SLIPPED, width_m, quality)

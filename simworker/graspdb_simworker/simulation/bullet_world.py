@@ -1,5 +1,5 @@
 """Gripper and object in a headless Bullet world, built once, to be posed and driven by
-:mod:`graspdb_simworker.scene`. Only these two modules import pybullet."""
+:mod:`graspdb_simworker.simulation.grasp_world`. Only these two modules import pybullet."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from graspdb_simworker import camera, urdf
-from graspdb_simworker.bodies import (
+from graspdb_simworker.simulation import camera, urdf
+from graspdb_simworker.simulation.bodies import (
     Gripper,
     MassProperties,
     Part,
@@ -47,7 +47,7 @@ class BulletWorld:
     gripper : Gripper
     solver_iterations : int
     by_faces : bool
-        Faces can touch in whole polygons, see :mod:`graspdb_simworker.urdf`, once they are told to.
+        Faces can touch in whole polygons, see :mod:`.urdf`, once they are told to.
     visible : bool
         Build what can be seen.
     """

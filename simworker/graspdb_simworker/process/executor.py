@@ -11,10 +11,10 @@ import threading
 import weakref
 from collections.abc import Callable
 from concurrent import futures
-from types import TracebackType
 
 from graspdb.wire import SimulatePayload, SimulateResult
-from graspdb_simworker.supervisor import Cancelled, Child, ChunkFailed, PybulletMissing
+from graspdb_simworker.process.local import LocalRunner
+from graspdb_simworker.process.runner import Cancelled, ChunkFailed, ChunkRunner, PybulletMissing
 
 POLL_S = 0.2
 
@@ -24,63 +24,31 @@ _local = threading.local()
 def simulate(payload_json: str, parts_glb: bytes) -> str:
     """Simulate a chunk in this thread's child; runs in a member of the pool.
 
-    The child stays for the next chunk and ends with the thread; should the process be killed, its child
-    notices.
-
-    Parameters
-    ----------
-    payload_json : str
-        A :class:`~graspdb.wire.SimulatePayload`.
-    parts_glb : bytes
-
-    Returns
-    -------
-    str
-        A :class:`~graspdb.wire.SimulateResult` as JSON.
+    The child stays for the next chunk and ends with the thread or the process. Takes and gives the JSON of
+    :class:`~graspdb.wire.SimulatePayload` and :class:`~graspdb.wire.SimulateResult`.
 
     Raises
     ------
     ChunkFailed, PybulletMissing
     """
-    child: Child | None = getattr(_local, "child", None)
-    if child is None:
-        child = _local.child = Child()
-        weakref.finalize(threading.current_thread(), child.kill)
-    return child.run(SimulatePayload.model_validate_json(payload_json), parts_glb).model_dump_json()
+    runner: LocalRunner | None = getattr(_local, "runner", None)
+    if runner is None:
+        runner = _local.runner = LocalRunner()
+        weakref.finalize(threading.current_thread(), runner.kill)
+    return runner.run(SimulatePayload.model_validate_json(payload_json), parts_glb).model_dump_json()
 
 
-class Dispatched(Child):
-    """A child that is somewhere else: hands every chunk to an executor and waits for its result.
-
-    Parameters
-    ----------
-    executor : concurrent.futures.Executor
-        Shared by all; shut down by its owner.
-    """
+class ExecutorRunner(ChunkRunner):
+    """Hands every chunk to an executor, which its owner shuts down, and waits for the result."""
 
     def __init__(self, executor: futures.Executor) -> None:
-        super().__init__()
         self._executor = executor
 
     def run(
-        self,
-        payload: SimulatePayload,
-        parts_glb: bytes,
-        *,
-        wanted: Callable[[], bool] = lambda: True,
-        progress: Callable[[int], None] = lambda simulated: None,
+        self, payload: SimulatePayload, parts_glb: bytes, *, wanted: Callable[[], bool] = lambda: True
     ) -> SimulateResult:
         """Have a chunk simulated. One that is no longer wanted is taken from the queue; if it runs already
-        it runs to its end, and nobody asks for its result.
-
-        Raises
-        ------
-        Cancelled
-            If it was not wanted any more.
-        ChunkFailed
-            With the reason, also if the executor lost it.
-        PybulletMissing
-        """
+        it runs to its end, and nobody asks for its result. ``ChunkFailed`` also if the executor lost it."""
         try:
             future = self._executor.submit(simulate, payload.model_dump_json(), parts_glb)
         except RuntimeError as error:
@@ -96,7 +64,5 @@ class Dispatched(Child):
         except Exception as error:
             raise ChunkFailed(f"the executor lost the chunk: {type(error).__name__}: {error}") from error
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Nothing to end: the children belong to the executor's members."""

@@ -1,7 +1,7 @@
 """The process that decomposes a mesh into convex parts: an order and a mesh in, candidates out, best last.
 
-Run as ``python -m graspdb_simworker.decompose_child`` by :mod:`graspdb_simworker.decomposition`. CoACD lives
-here, because it takes memory and time that only a process of its own can bound, and can't be interrupted.
+Run as ``python -m graspdb_simworker.decomposition.child`` by :mod:`.supervisor`. CoACD lives here, because it
+takes memory and time that only a process of its own can bound, and can't be interrupted.
 
 Reads one ``CHUNK`` (a line of JSON, then the mesh as it was uploaded); writes ``NOTE`` (how far it is, for a
 person), ``RESULT`` (a candidate as GLB, each finer than the one before) and ``ERROR``.
@@ -13,42 +13,34 @@ import json
 import math
 import os
 import resource
-import signal
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-from graspdb_simworker import messages
+from graspdb_simworker.process import channel
 
 
 def main() -> int:
     """Decompose one mesh."""
-    source, sink = os.dup(0), os.dup(1)
-    # CoACD prints its log on the standard output: out of the way of the messages.
-    null = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(null, stream)
-    # An interrupt at the terminal, or a manager that stops the whole group, is for the worker, who ends its
-    # children itself: one that died before it would look like the work's fault.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    source, sink = channel.take_streams()
+    os.dup2(0, 2)  # CoACD's log
     try:
-        _, body = messages.receive(source, poll_s=60.0)
+        _, body = channel.receive(source, poll_s=60.0)
         head, _, content = body.partition(b"\n")
         order = json.loads(head)
         memory, seconds = int(order["memory_bytes"]), max(1, math.ceil(order["seconds"]))
         for kind, soft, hard in (
             (resource.RLIMIT_AS, memory, memory),
-            # The kernel ends it by SIGXCPU at the first, also if the worker is long dead.
+            # The kernel ends it by SIGXCPU at the first.
             (resource.RLIMIT_CPU, seconds, seconds + 5),
             (resource.RLIMIT_CORE, 0, 0),
         ):
             with suppress(ValueError, OSError):  # an inherited limit may be tighter already
                 resource.setrlimit(kind, (soft, hard))
         _serve(order, content, sink)
-    except messages.Closed:
+    except channel.Closed:
         pass
     return 0
 
@@ -56,17 +48,22 @@ def main() -> int:
 def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
     try:
         # Imported under the limits, so that the libraries count as well.
-        from graspdb_simworker import convexity
+        from graspdb_simworker.decomposition import convexity
+    except ModuleNotFoundError as error:
+        channel.send(sink, channel.MISSING, str(error).encode())
+        return
     except ImportError as error:
-        messages.send(sink, messages.MISSING, str(error).encode())
+        channel.send(
+            sink, channel.ERROR, f"its libraries do not fit into the memory allowed: {error}".encode()
+        )
         return
     try:
         for kind, body in _steps(convexity, order, content):
-            messages.send(sink, kind, body)
+            channel.send(sink, kind, body)
     except convexity.Undecomposable as error:
-        messages.send(sink, messages.ERROR, str(error).encode())
+        channel.send(sink, channel.ERROR, str(error).encode())
     except MemoryError:
-        messages.send(sink, messages.ERROR, b"it needs more memory than allowed")
+        channel.send(sink, channel.ERROR, b"it needs more memory than allowed")
 
 
 def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -75,13 +72,13 @@ def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tu
     target = convexity.target_m(mesh)
     best = float("inf")
     for threshold in convexity.THRESHOLDS:
-        yield messages.NOTE, f"CoACD at threshold {threshold:g}".encode()
+        yield channel.NOTE, f"CoACD at threshold {threshold:g}".encode()
         found = convexity.decompose(mesh, threshold, max_parts=order["max_parts"], seed=order["seed"])
         if found.deviation_m < best:
             best = found.deviation_m
-            yield messages.RESULT, found.glb
+            yield channel.RESULT, found.glb
         note = f"{found.parts} parts at threshold {threshold:g}, {1000 * found.deviation_m:.2g} mm off"
-        yield messages.NOTE, note.encode()
+        yield channel.NOTE, note.encode()
         # A finer one takes longer; what there is by now is worth more than nothing at the end.
         if found.deviation_m <= target or time.process_time() - began > order["seconds"] / 6:
             return

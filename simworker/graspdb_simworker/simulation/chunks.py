@@ -22,9 +22,10 @@ from graspdb.wire import GridPlan, GripperProfile, ResultRows, SimulatePayload, 
 from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import GripperShape
-from graspdb_simworker.bodies import MIN_FINGER_SHARE, Gripper, Part, closing_force
-from graspdb_simworker.labels import Label, Outcome, compile_force_test, label_of
-from graspdb_simworker.scene import GraspWorld
+from graspdb_simworker.simulation.bodies import MIN_FINGER_SHARE, Gripper, Part, closing_force
+from graspdb_simworker.simulation.force_test import compile_force_test
+from graspdb_simworker.simulation.grasp_world import GraspWorld
+from graspdb_simworker.simulation.labels import Label, Outcome, label_of
 
 PROTOCOLS = ("wrench", "lift")
 """Protocols this worker can simulate."""
@@ -32,14 +33,6 @@ PROTOCOLS = ("wrench", "lift")
 
 class UnsupportedProtocol(ValueError):
     """The chunk asks for a protocol that this worker does not have."""
-
-
-def ignore_start(row: int) -> None:
-    """Take no note of a grasp about to be simulated."""
-
-
-def ignore_end(row: int, label: Label) -> None:
-    """Take no note of a grasp's label."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +47,14 @@ class Workpiece:
     mass_kg: float
     friction: float
 
+    def classify(
+        self, positions: NDArray[np.float64], quaternions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """What geometry says of tool poses (n, 3), (n, 4): its code (n,), and how far each finger can close
+        before the first touches (n,), metres."""
+        codes, first_contact = self.scene.classify(positions, quaternions, self.shape)
+        return codes, np.minimum(first_contact.min(axis=1), 0.5 * self.shape.max_opening_m)
+
     def simulate(
         self, position: NDArray[np.float64], quaternion: NDArray[np.float64], travel_m: float
     ) -> Label:
@@ -67,8 +68,14 @@ class Workpiece:
         self.world.close_world()
 
 
-def prepare(payload: SimulatePayload, parts: Sequence[Part]) -> Workpiece:
-    """Build what the payload's chunks are simulated with.
+def prepare(
+    payload: SimulatePayload,
+    parts: Sequence[Part],
+    *,
+    visible: bool = False,
+    film_every_s: float = math.inf,
+) -> Workpiece:
+    """Build what the payload's chunks are simulated with; visible for pictures of the end, or at intervals.
 
     Raises
     ------
@@ -92,6 +99,8 @@ def prepare(payload: SimulatePayload, parts: Sequence[Part]) -> Workpiece:
             gripper,
             payload.fidelity,
             lifts=payload.protocol == "lift",
+            visible=visible,
+            film_every_s=film_every_s,
         ),
         gripper=gripper,
         shape=shape_of(payload.gripper),
@@ -179,10 +188,10 @@ def simulate_chunk(
     workpiece: Workpiece,
     *,
     known: Mapping[int, Label] | None = None,
-    before: Callable[[int], None] = ignore_start,
-    after: Callable[[int, Label], None] = ignore_end,
+    before: Callable[[int], None] = lambda row: None,
+    after: Callable[[int, Label], None] = lambda row, label: None,
 ) -> SimulateResult:
-    """Simulate a chunk.
+    """Simulate a chunk: an outcome for every pose, and rows for those that met physics.
 
     Parameters
     ----------
@@ -194,15 +203,10 @@ def simulate_chunk(
         died of them.
     before, after
         Called around each closing with the row within the chunk.
-
-    Returns
-    -------
-    SimulateResult
-        An outcome for every pose, and rows for those that met physics.
     """
     known = known or {}
     indices, positions, quaternions = poses_of(payload)
-    codes, first_contact = workpiece.scene.classify(positions, quaternions, workpiece.shape)
+    codes, travel = workpiece.classify(positions, quaternions)
     outcomes = np.full(len(indices), Outcome.MISSED, dtype=np.uint8)
     outcomes[codes == collision.COLLIDES] = Outcome.COLLISION
     physical = np.flatnonzero(codes == collision.CONTACT)
@@ -211,9 +215,8 @@ def simulate_chunk(
         for row in physical.tolist():
             label = known.get(row)
             if label is None:
-                travel = min(float(first_contact[row].min()), 0.5 * workpiece.shape.max_opening_m)
                 before(row)
-                label = workpiece.simulate(positions[row], quaternions[row], travel)
+                label = workpiece.simulate(positions[row], quaternions[row], float(travel[row]))
                 after(row, label)
             outcomes[row] = label.outcome
             rows.pose_index.append(int(indices[row]))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from graspdb_simworker.bodies import Gripper, MassProperties, Part, Vector, obj_of_parts
+from graspdb_simworker.simulation.bodies import Gripper, MassProperties, Part, Vector, obj_of_parts
 
 _NO_INERTIA = (
     '<inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>'

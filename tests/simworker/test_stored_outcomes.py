@@ -1,22 +1,18 @@
-"""What a service has stored of a sweep, simulated again; and films."""
+"""What a service has stored of a sweep, simulated again."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from PIL import Image
 
 from graspdb.examples import example
 from graspdb.transport import Transport
-from graspdb_simworker import pictures, sources, verification
-from graspdb_simworker.labels import Outcome
+from graspdb_simworker.inspection import agreement, inputs, stored_outcomes
 from graspdb_simworker.loop import Worker
+from graspdb_simworker.simulation.labels import Outcome
 
 
 @pytest.fixture
@@ -43,7 +39,7 @@ def swept(serve: Callable[..., str], sqlite_url: str) -> Iterator[tuple[str, str
 
 def test_stored_outcomes_are_verified(swept: tuple[str, str]) -> None:
     url, sweep = swept
-    info, stored = sources.sweep_of(sweep, per_outcome=40, url=url)
+    info, stored = stored_outcomes.sample_of(sweep, per_outcome=40, url=url)
     assert (info.protocol, info.state) == ("wrench", "done")
     assert sum(stored.counts.values()) == 1500
     assert {name for name, n in info.outcomes.items() if n} == {
@@ -51,21 +47,21 @@ def test_stored_outcomes_are_verified(swept: tuple[str, str]) -> None:
     }
     for kind in np.unique(stored.outcomes):
         assert (stored.outcomes == kind).sum() == min(40, stored.counts[int(kind)])
-    payload, parts = sources.load("mug", "pg70", protocol=info.protocol, url=url)
-    found = verification.verify_stored(payload, parts, stored, count=24)
+    payload, parts = inputs.load("mug", "pg70", protocol=info.protocol, url=url)
+    found = agreement.verify_stored(payload, parts, stored, count=24)
     assert 0 < found.checked <= 30
     assert found.agreement > 0.8
     # Geometry alone decided most misses: they are not among what is compared.
     missed = [s for s in found.strata if s.outcome is Outcome.MISSED]
     assert all(s.available < stored.counts[Outcome.MISSED] for s in missed)
     # A wrong label does not go unnoticed.
-    lie = verification.Stored(
+    lie = stored_outcomes.StoredOutcomes(
         stored.positions,
         stored.quaternions,
         np.full_like(stored.outcomes, Outcome.SUCCESS),
         {Outcome.SUCCESS: len(stored.outcomes)},
     )
-    assert verification.verify_stored(payload, parts, lie, count=24).agreement < 0.7
+    assert agreement.verify_stored(payload, parts, lie, count=24).agreement < 0.7
 
     # The same worker does the other protocol.
     rim = {"position": [0.0, 0.028, 0.035], "quaternion_xyzw": [1.0, 0.0, 0.0, 0.0]}
@@ -76,32 +72,3 @@ def test_stored_outcomes_are_verified(swept: tuple[str, str]) -> None:
         (trial,) = http.get("/objects/mug/trials", params={"batch": lift["batch"]}).json()["items"]
     assert (trial["outcome"], trial["protocol"]) == ("success", "lift")
     assert 0.8 < trial["quality"] <= 1.0
-
-
-def test_a_film_shows_the_object_swing(tmp_path: Path) -> None:
-    arguments = ["--quaternion", "0,0.70710678,0,0.70710678", "--protocol", "lift", "--out", "cone.gif"]
-    done = subprocess.run(
-        [sys.executable, "-m", "graspdb_simworker.cli", "show", "cone", *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    # Held 7 cm beside its centre of mass, it turns in the jaw.
-    assert done.stdout.splitlines()[-1].startswith(("slipped", "dropped"))
-    with Image.open(tmp_path / "cone.gif") as film:
-        assert film.n_frames > 5  # type: ignore[attr-defined]
-        first = np.asarray(film.convert("RGB"), dtype=int)
-        film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
-        last = np.asarray(film.convert("RGB"), dtype=int)
-    assert (np.abs(first - last).max(axis=2) > 60).mean() > 0.05
-
-
-def test_without_pillow_a_film_is_numbered_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    frames = [np.full((4, 6, 3), shade, dtype=np.uint8) for shade in (0, 90, 180)]
-    assert "graspdb[plot]" in pictures.write(tmp_path / "film.gif", frames)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"film-{k:03d}.png" for k in range(3)]
-    assert pictures.write(tmp_path / "none.gif", []) == ""

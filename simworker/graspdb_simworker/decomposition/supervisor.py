@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,17 +13,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from graspdb.wire import DecomposePayload
-from graspdb_simworker import messages
-from graspdb_simworker.supervisor import Cancelled, ChunkFailed
+from graspdb_simworker.process import channel
+from graspdb_simworker.process.runner import Cancelled, ChunkFailed
 
-COMMAND = (sys.executable, "-m", "graspdb_simworker.decompose_child")
+COMMAND = (sys.executable, "-m", "graspdb_simworker.decomposition.child")
 SEED = 0
 """CoACD searches at random; with one seed the same mesh gets the same parts."""
 
 PATIENCE = 3.0
 """A decomposition may wait so many times as long as it works."""
 _WAY_OUT = "Simplify the mesh, or give its convex parts"
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def decompose(
     progress
         Told in words how far it is.
     command
-        Starts the process that speaks as :mod:`graspdb_simworker.decompose_child` does.
+        Starts the process that speaks as :mod:`graspdb_simworker.decomposition.child` does.
 
     Raises
     ------
@@ -105,29 +103,27 @@ def decompose(
         "seconds": limits.seconds,
         "memory_bytes": limits.memory_bytes,
     }
-    process = subprocess.Popen(
-        tuple(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **_ONE_THREAD}
-    )
+    process = channel.start(command)
     assert process.stdin is not None
     assert process.stdout is not None
     best: bytes | None = None
     try:
-        with contextlib.suppress(messages.Closed):
-            messages.send(process.stdin.fileno(), messages.CHUNK, json.dumps(order).encode() + b"\n" + mesh)
+        with contextlib.suppress(channel.Closed):
+            channel.send(process.stdin.fileno(), channel.CHUNK, json.dumps(order).encode() + b"\n" + mesh)
         while True:
-            kind, body = messages.receive(process.stdout.fileno(), check=check)
-            if kind == messages.NOTE:
+            kind, body = channel.receive(process.stdout.fileno(), check=check)
+            if kind == channel.NOTE:
                 progress(body.decode(errors="replace"))
-            elif kind == messages.RESULT:
+            elif kind == channel.RESULT:
                 best = body
-            elif kind == messages.MISSING:
+            elif kind == channel.MISSING:
                 raise ChunkFailed(f"CoACD can't be imported: {body.decode(errors='replace')}")
-            elif kind == messages.ERROR and best is None:
+            elif kind == channel.ERROR and best is None:
                 raise DecompositionFailed(f"{body.decode(errors='replace')}. {_WAY_OUT}")
     except _Late:
         if best is None:
             raise _too_long(limits) from None
-    except messages.Closed:
+    except channel.Closed:
         if best is None and process.wait() == -signal.SIGXCPU:
             raise _too_long(limits) from None
         if best is None:
@@ -136,10 +132,7 @@ def decompose(
                 f" (the worker's --decompose-memory-mib). {_WAY_OUT}"
             ) from None
     finally:
-        process.kill()
-        process.wait()
-        process.stdin.close()
-        process.stdout.close()
+        channel.end(process)
     return best
 
 

@@ -1,0 +1,102 @@
+"""Where `show` and `verify` take their object and gripper from: a service, or the examples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, cast, get_args
+
+import numpy as np
+
+from graspdb.examples import example
+from graspdb.transport import Transport
+from graspdb.wire import Finger, GridPlan, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
+from graspdb_geometry import meshes
+from graspdb_geometry.grippers import GRIPPER_SHAPES
+from graspdb_simworker.simulation.bodies import Part
+
+Protocol = Literal["wrench", "lift"]
+
+_DRIVES: dict[str, dict[str, float]] = {
+    "pg70": {"finger_mass_kg": 0.1, "max_speed_m_s": 0.06, "force_n": 40.0, "friction": 0.4},
+    "panda": {"finger_mass_kg": 0.015, "max_speed_m_s": 0.05, "force_n": 70.0, "friction": 0.4},
+}
+"""What closes the grippers that can be had without a service: as every service has them built in."""
+
+
+def load(
+    name: str,
+    gripper: str,
+    *,
+    protocol: str = "wrench",
+    fine: bool = False,
+    url: str | None = None,
+    api_key: str | None = None,
+    seed: int = 0,
+) -> tuple[SimulatePayload, Sequence[Part]]:
+    """Payload of an object's default grid (10 mm, 15 degrees, 20 mm margin), and its convex parts.
+
+    Raises
+    ------
+    ValueError
+        For an unknown example, gripper or protocol, or an object that can't be simulated yet.
+    GraspDBError
+        As the service answers.
+    """
+    if protocol not in get_args(Protocol):
+        raise ValueError(f"no protocol {protocol!r}; there are {', '.join(get_args(Protocol))}")
+    parts: Sequence[Part]
+    if url is None:
+        thing = example(name)
+        shape = GRIPPER_SHAPES.get(gripper)
+        if shape is None:
+            raise ValueError(
+                f"no gripper {gripper!r} without a service; there are {', '.join(GRIPPER_SHAPES)}"
+            )
+        profile = GripperProfile(
+            max_opening_m=shape.max_opening_m,
+            finger=Finger(
+                width_m=shape.finger_width_m,
+                thickness_m=shape.finger_thickness_m,
+                length_m=shape.finger_length_m,
+            ),
+            tip_offset_m=shape.tip_offset_m,
+            palm_size_m=shape.palm_size_m,
+            **_DRIVES[gripper],
+        )
+        parts, mass, friction = thing.parts, thing.mass_kg, thing.friction
+    else:
+        with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
+            info = ObjectInfo.model_validate_json(transport.request("GET", f"/objects/{name}").content)
+            if info.mass_kg is None or info.convex_parts is None:
+                raise ValueError(f"{name} needs mass_kg and convex parts before it can be simulated")
+            answer = transport.request("GET", f"/grippers/{gripper}")
+            profile = GripperInfo.model_validate_json(answer.content).profile
+            parts = meshes.parts_from_glb(transport.request("GET", f"/objects/{name}/convex-parts").content)
+        mass = info.mass_kg
+        friction = profile.friction if info.friction is None else info.friction
+    points = np.concatenate([vertices for vertices, _ in parts])
+    low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    grid = GridPlan(
+        lower=(low[0], low[1], low[2]),
+        upper=(high[0], high[1], high[2]),
+        position_step_m=0.01,
+        rotation_step_deg=15.0,
+        margin_m=0.02,
+        seed=seed,
+        symmetric=profile.symmetric,
+    )
+    payload = SimulatePayload(
+        sweep="",
+        object=name,
+        convex_parts="",
+        parts_sha256="",
+        mass_kg=mass,
+        friction=friction,
+        gripper=profile,
+        protocol=cast(Protocol, protocol),
+        fidelity="fine" if fine else "standard",
+        grid=grid,
+        start=0,
+        stop=0,
+    )
+    return payload, parts

@@ -1,0 +1,80 @@
+"""A sample of what a service has stored of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.transport import Transport
+from graspdb.wire import OUTCOME_CODES, SweepInfo, SweepOutcomes
+
+
+@dataclass(frozen=True)
+class StoredOutcomes:
+    """A sample of a sweep's stored outcomes, and how many of each outcome the sweep has.
+
+    ``positions`` (n, 3) and ``quaternions`` (n, 4) of the tool in the object frame, ``outcomes`` (n,)
+    codes; within each outcome every pose of the sweep is as likely to be here.
+    """
+
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+    outcomes: NDArray[np.uint8]
+    counts: Mapping[int, int]
+
+
+def sample_of(
+    sweep: str,
+    *,
+    per_outcome: int,
+    url: str,
+    api_key: str | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[SweepInfo, StoredOutcomes]:
+    """A sweep, and of each of its outcomes but collisions a random sample of ``per_outcome``, or all.
+
+    ``progress`` is told how many of how many poses have been read.
+
+    Raises
+    ------
+    ValueError
+        If nothing of the sweep is simulated yet.
+    GraspDBError
+        As the service answers.
+    """
+    rng = np.random.default_rng(seed)
+    # For each outcome the poses with the smallest of random keys, one drawn for each pose.
+    kept = {name: np.empty((0, 8)) for name in OUTCOME_CODES if name != "collision"}
+    counts = dict.fromkeys(OUTCOME_CODES, 0)
+    with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
+        info = SweepInfo.model_validate_json(transport.request("GET", f"/sweeps/{sweep}").content)
+        cursor: str | None = None
+        while True:
+            params = {"limit": "100000", **({} if cursor is None else {"cursor": cursor})}
+            answer = transport.request("GET", f"/sweeps/{sweep}/outcomes", params=params)
+            page = SweepOutcomes.model_validate_json(answer.content)
+            outcomes = np.array(page.outcome, dtype=object)
+            keys = rng.random(len(outcomes))
+            for name, before in kept.items():
+                rows = np.flatnonzero(outcomes == name)
+                counts[name] += len(rows)
+                new: NDArray[np.float64] = np.array(
+                    [[keys[row], *page.position[row], *page.quaternion_xyzw[row]] for row in rows]
+                ).reshape(-1, 8)
+                both = np.concatenate([before, new])
+                kept[name] = both[np.argsort(both[:, 0])[:per_outcome]]
+            counts["collision"] += int((outcomes == "collision").sum())
+            progress(sum(counts.values()), info.poses)
+            cursor = page.next
+            if cursor is None:
+                break
+    if not any(map(len, kept.values())):
+        raise ValueError(f"sweep {sweep} has no outcome to verify yet")
+    sample: NDArray[np.float64] = np.concatenate(list(kept.values()))
+    codes = np.repeat([OUTCOME_CODES[name] for name in kept], [len(k) for k in kept.values()])
+    by_code = {OUTCOME_CODES[name]: n for name, n in counts.items()}
+    return info, StoredOutcomes(sample[:, 1:4], sample[:, 4:8], codes.astype(np.uint8), by_code)

@@ -1,0 +1,39 @@
+"""What simulates chunks, wherever it does: here in a process of its own, or on a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
+
+from graspdb.wire import SimulatePayload, SimulateResult
+
+
+class Cancelled(Exception):
+    """The chunk is not wanted any more."""
+
+
+class ChunkFailed(Exception):
+    """The chunk can't be simulated; the message says why."""
+
+
+class PybulletMissing(Exception):
+    """The simulating process could not import pybullet."""
+
+
+class ChunkRunner(AbstractContextManager[Any], Protocol):
+    """Simulates one chunk after the other for one thread; what it holds for that ends with its context."""
+
+    def run(
+        self, payload: SimulatePayload, parts_glb: bytes, *, wanted: Callable[[], bool]
+    ) -> SimulateResult:
+        """Simulate a chunk of an object with these convex parts; ``wanted`` is asked several times a second.
+
+        Raises
+        ------
+        Cancelled
+            If it was not wanted any more.
+        ChunkFailed
+            With the reason, if the chunk as a whole can't be simulated.
+        PybulletMissing
+        """

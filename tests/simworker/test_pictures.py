@@ -1,0 +1,90 @@
+"""Drawing grasps: what `show` writes and says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from graspdb_service.usecases.grippers import BUILTIN
+from graspdb_simworker.inspection import inputs, pictures
+
+
+def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "graspdb_simworker.cli", *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_show_draws_the_grasp_it_simulates(tmp_path: Path) -> None:
+    done = run("show", "mug", "--position", "0,0.028,0.035", "--quaternion", "1,0,0,0", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].startswith("success: fingers 0.005")
+    with Image.open(tmp_path / "grasp.png") as picture:
+        assert picture.format == "PNG"
+        image = np.asarray(picture)
+    assert image.shape == (480, 1280, 3)
+    # Both views show the orange mug, the dark fingers and the grey palm, before white.
+    red, green, blue = (image[..., k].astype(int) for k in range(3))
+    orange, dark = (red > green + 40) & (green > blue + 20), (red < 70) & (blue < 100)
+    for half in (slice(0, 640), slice(640, 1280)):
+        assert orange[:, half].mean() > 0.02
+        assert dark[:, half].mean() > 0.005
+
+    collision = run("show", "mug", "--position", "0,0,0.02", folder=tmp_path)
+    assert collision.returncode == 0
+    assert collision.stdout.splitlines()[-1].startswith("collision")
+
+
+def test_show_names_what_is_wrong(tmp_path: Path) -> None:
+    for arguments, word in (
+        (("show", "teapot"), "teapot"),
+        (("show", "mug", "--quaternion", "1,0,0,1"), "norm"),
+        (("verify", "mug", "--gripper", "claw"), "claw"),
+        (("verify", "mug", "--protocol", "shake"), "shake"),
+        (("verify", "--sweep", "abc"), "--url"),
+        (("verify",), "name an object"),
+    ):
+        done = run(*arguments, folder=tmp_path)
+        assert done.returncode == 1
+        assert word in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_film_shows_the_object_swing(tmp_path: Path) -> None:
+    arguments = ["--quaternion", "0,0.70710678,0,0.70710678", "--protocol", "lift", "--out", "cone.gif"]
+    done = run("show", "cone", *arguments, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    # Held 7 cm beside its centre of mass, it turns in the jaw.
+    assert done.stdout.splitlines()[-1].startswith(("slipped", "dropped"))
+    with Image.open(tmp_path / "cone.gif") as film:
+        assert film.n_frames > 5  # type: ignore[attr-defined]
+        first = np.asarray(film.convert("RGB"), dtype=int)
+        film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
+        last = np.asarray(film.convert("RGB"), dtype=int)
+    assert (np.abs(first - last).max(axis=2) > 60).mean() > 0.05
+
+
+def test_pictures_are_written_as_they_are(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    assert pictures.write(tmp_path / "end.png", [image // 2, image]) == str(tmp_path / "end.png")
+    with Image.open(tmp_path / "end.png") as written:
+        np.testing.assert_array_equal(np.asarray(written), image)
+    assert pictures.write(tmp_path / "none.gif", []) == ""
+
+
+@pytest.mark.parametrize("gripper", ["pg70", "panda"])
+def test_a_gripper_without_a_service_is_the_one_that_services_have(gripper: str) -> None:
+    payload, _ = inputs.load("cone", gripper)
+    _, profile = BUILTIN[gripper]
+    not_simulated = {"base_to_tool", "max_acceleration_m_s2"}
+    assert payload.gripper.model_dump(exclude=not_simulated) == profile.model_dump(exclude=not_simulated)
