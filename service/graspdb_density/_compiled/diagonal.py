@@ -43,7 +43,7 @@ def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped
 
 
 @exact
-def square_sums(data, start, table, centre, scale, positions, quaternions, half, turning, radius, out):  # type: ignore[no-untyped-def]
+def square_sums(cells, positions, quaternions, half, turning, radius, out):  # type: ignore[no-untyped-def]
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over rows with an exponent of at most radius^2.
 
     ``half`` (6,): 1 / (2 sigma^2), translations in units of the cells' scale, along each row's gripper's axes
@@ -52,17 +52,16 @@ def square_sums(data, start, table, centre, scale, positions, quaternions, half,
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     cut = radius * radius
+    data, table = cells.data, cells.table
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
+        p = (positions[j] - cells.centre) * cells.scale
         bx, by, bz, bw = quaternions[j, 0], quaternions[j, 1], quaternions[j, 2], quaternions[j, 3]
         total, squares = 0.0, 0.0
         for s in range(table.shape[0]):
             twin = table[s, TWIN] > 0.0
-            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+            for r in range(runs_within(cells.start, table, s, p[0], p[1], p[2], radius, runs)):
                 for i in range(runs[r, 0], runs[r, 1]):
-                    dx, dy, dz = px - data[0, i], py - data[1, i], pz - data[2, i]
+                    dx, dy, dz = p[0] - data[0, i], p[1] - data[1, i], p[2] - data[2, i]
                     ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
                     x, y, z = dx, dy, dz
                     if turning:

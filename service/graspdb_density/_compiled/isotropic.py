@@ -17,11 +17,14 @@ Accumulation is float32 within a block of at most ``BLOCK`` kernels and float64 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import isotropic_runs
-from .options import fast
+from .isotropic_runs import At, single
+from .options import fast, inlined
 
 F32 = np.float32
 BLOCK = 2048
@@ -39,6 +42,45 @@ _ZERO = F32(0.0)
 _TILE = 1024
 #: No sum is as large.
 _NEVER = 1e300
+
+
+class CellArrays(NamedTuple):
+    """Sorted kernels as every loop takes them; `kde.cell_list` makes them.
+
+    Attributes
+    ----------
+    data : (8, N) float32, start : (cells,) int32, table : (S, COLUMNS)
+    blocks : (B, 3) int64
+        First and last + 1 row of a block, 1 for rows with a twin.
+    boxes : (B, 6) float32
+        Lowest and highest corner of a block's positions, scaled units.
+    centre : (3,) metres
+    scale : float
+        1 / (sigma sqrt 2), 1/m.
+    """
+
+    data: NDArray[np.float32]
+    start: NDArray[np.int32]
+    table: NDArray[np.float64]
+    blocks: NDArray[np.int64]
+    boxes: NDArray[np.float32]
+    centre: NDArray[np.float64]
+    scale: float
+
+
+@inlined
+def place(cells, position, quaternion, kappa):
+    """Where a pose stands among sorted kernels."""
+    return At(
+        (position[0] - cells.centre[0]) * cells.scale,
+        (position[1] - cells.centre[1]) * cells.scale,
+        (position[2] - cells.centre[2]) * cells.scale,
+        quaternion[0] * kappa,
+        quaternion[1] * kappa,
+        quaternion[2] * kappa,
+        quaternion[3] * kappa,
+        kappa,
+    )
 
 
 @fast
@@ -91,19 +133,18 @@ def runs_within(start, table, s, px, py, pz, radius, runs):
 
 
 @fast
-def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
+def _sum_at(cells, at, radius, wide, runs):
     """Sum of weights times kernels (1 at a centre) within ``radius``, their k r^2, and how many were visited.
 
     ``wide`` is 0 where the nearest of twins and antipodes stands for all, 1 where both twins count, 2 where
     antipodes do too.
     """
-    fx, fy, fz = F32(px), F32(py), F32(pz)
-    k = F32(kappa)
-    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    data, table = cells.data, cells.table
+    near = single(at)
     total, spread, visited = 0.0, 0.0, 0
     for s in range(table.shape[0]):
         twin = F32(table[s, TWIN])
-        for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+        for r in range(runs_within(cells.start, table, s, at.x, at.y, at.z, radius, runs)):
             begin, end = runs[r, 0], runs[r, 1]
             visited += end - begin
             while begin < end:
@@ -111,15 +152,15 @@ def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
                 full = stop - (stop - begin) % isotropic_runs.LANES
                 if wide == 0 and twin > _ZERO and full + isotropic_runs.LANES <= data.shape[1]:
                     if full > begin:
-                        part = isotropic_runs.run_narrow(data, begin, full, fx, fy, fz, q0, q1, q2, q3, k)
+                        part = isotropic_runs.run_narrow(data, begin, full, near)
                         total += part[0]
                         spread += part[1]
                     if stop > full:
-                        part = isotropic_runs.rest_narrow(data, full, stop, fx, fy, fz, q0, q1, q2, q3, k)
+                        part = isotropic_runs.rest_narrow(data, full, stop, near)
                         total += part[0]
                         spread += part[1]
                 else:
-                    part = isotropic_runs.run(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, wide)
+                    part = isotropic_runs.run(data, begin, stop, near, twin, wide)
                     total += part[0]
                     spread += part[1]
                 begin = stop
@@ -127,252 +168,189 @@ def _sum_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs):
 
 
 @fast
-def moments_at(data, start, table, px, py, pz, q, kappa, radius, wide, runs, sums):
-    """Fill ``sums`` (9,) with the moments of `moments_wide` over the kernels within ``radius``."""
-    fx, fy, fz = F32(px), F32(py), F32(pz)
-    k = F32(kappa)
-    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
-    sums[:] = 0.0
-    for s in range(table.shape[0]):
-        twin = F32(table[s, TWIN])
-        for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
-            begin, end = runs[r, 0], runs[r, 1]
-            while begin < end:
-                stop = min(begin + BLOCK, end)
-                if wide > 0:
-                    isotropic_runs.moments_wide(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, sums)
-                else:
-                    isotropic_runs.moments_narrow(
-                        data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, sums
-                    )
-                begin = stop
-
-
-@fast
-def exact_log_sum(data, blocks, boxes, px, py, pz, q, kappa, margin):
+def exact_log_sum(data, blocks, boxes, at, margin):
     """Log of the sum over all kernels, without a cut-off; right however far the pose is from data.
 
     Blocks of kernels whose bounding box proves every exponent to lie ``margin`` nats below the largest one
     found are left out: with ``margin = 16 + log(total weight / least weight)`` the sum is short of less than
     1.2e-7 of itself.
-
-    Parameters
-    ----------
-    blocks : (B, 3) int64, first and last + 1 of a block, 1 for rows with a twin
-    boxes : (B, 6) float32, lowest and highest corner of the positions, scaled units
     """
-    q0, q1, q2, q3 = q[0] * kappa, q[1] * kappa, q[2] * kappa, q[3] * kappa
     count = blocks.shape[0]
     bound = np.empty(count)
     first = 0
     for j in range(count):
-        gx = max(max(boxes[j, 0] - px, px - boxes[j, 3]), 0.0)
-        gy = max(max(boxes[j, 1] - py, py - boxes[j, 4]), 0.0)
-        gz = max(max(boxes[j, 2] - pz, pz - boxes[j, 5]), 0.0)
+        gx = max(max(boxes[j, 0] - at.x, at.x - boxes[j, 3]), 0.0)
+        gy = max(max(boxes[j, 1] - at.y, at.y - boxes[j, 4]), 0.0)
+        gz = max(max(boxes[j, 2] - at.z, at.z - boxes[j, 5]), 0.0)
         bound[j] = -(gx * gx + gy * gy + gz * gz)
         if bound[j] > bound[first]:
             first = j
-    twin = float(blocks[first, 2])
-    top = isotropic_runs.top_of_run(
-        data, blocks[first, 0], blocks[first, 1], px, py, pz, q0, q1, q2, q3, kappa, twin
-    )
+    top = isotropic_runs.top_of_run(data, blocks[first, 0], blocks[first, 1], at, float(blocks[first, 2]))
     total = 0.0
     for j in range(count):
         if bound[j] < top - margin:
             continue
         twin = float(blocks[j, 2])
-        here = isotropic_runs.top_of_run(
-            data, blocks[j, 0], blocks[j, 1], px, py, pz, q0, q1, q2, q3, kappa, twin
-        )
+        here = isotropic_runs.top_of_run(data, blocks[j, 0], blocks[j, 1], at, twin)
         if here > top:
             total *= math.exp(top - here)
             top = here
         elif here < top - margin:
             continue
-        total += isotropic_runs.sum_of_run(
-            data, blocks[j, 0], blocks[j, 1], px, py, pz, q0, q1, q2, q3, kappa, twin, top
-        )
+        total += isotropic_runs.sum_of_run(data, blocks[j, 0], blocks[j, 1], at, twin, top)
     return top + math.log(total)
 
 
 @fast
-def log_sums(
-    data, start, table, blocks, boxes, centre, scale, positions, quaternions, kappa, stages, wide, margin, out
-):
+def log_sums(cells, positions, quaternions, kappa, stages, wide, margin, out):
     """Log of the weighted kernel sum at every pose into ``out`` (M,).
 
     Parameters
     ----------
     stages : (T, 3)
         Radii to try in turn, each with the largest mean exponent of position and the least mean kernel at
-        which what lies outside is too little to matter (see `density.stages`). A pose that passes none is
-        summed without a cut-off.
+        which what lies outside is too little to matter (see `kde.isotropic.stages`). A pose that passes none
+        is summed without a cut-off.
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
+        at = place(cells, positions[j], quaternions[j], kappa)
         done = False
         for t in range(stages.shape[0]):
-            total, spread, visited = _sum_at(
-                data, start, table, px, py, pz, quaternions[j], kappa, stages[t, 0], wide, runs
-            )
+            total, spread, visited = _sum_at(cells, at, stages[t, 0], wide, runs)
             if total > 0.0 and spread <= stages[t, 1] * total and total >= stages[t, 2] * visited:
                 out[j] = math.log(total)
                 done = True
                 break
         if not done:
-            out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
+            out[j] = exact_log_sum(cells.data, cells.blocks, cells.boxes, at, margin)
 
 
 @fast
-def all_sums(data, table, centre, scale, positions, quaternions, kappa, wide, out):
+def all_sums(cells, positions, quaternions, kappa, wide, out):
     """The weighted sum over all kernels at every pose into ``out`` (M,), as brute force has it."""
-    k = F32(kappa)
     out[:] = 0.0
-    for s in range(table.shape[0]):
-        twin = F32(table[s, TWIN])
-        begin = int(table[s, OFFSET])
-        end = begin + int(table[s, COUNT])
+    for s in range(cells.table.shape[0]):
+        twin = F32(cells.table[s, TWIN])
+        begin = int(cells.table[s, OFFSET])
+        end = begin + int(cells.table[s, COUNT])
         while begin < end:
             stop = min(begin + _TILE, end)
             for j in range(positions.shape[0]):
-                px = F32((positions[j, 0] - centre[0]) * scale)
-                py = F32((positions[j, 1] - centre[1]) * scale)
-                pz = F32((positions[j, 2] - centre[2]) * scale)
-                q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
-                q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
-                out[j] += isotropic_runs.total(data, begin, stop, px, py, pz, q0, q1, q2, q3, k, twin, wide)
+                near = single(place(cells, positions[j], quaternions[j], kappa))
+                out[j] += isotropic_runs.total(cells.data, begin, stop, near, twin, wide)
             begin = stop
 
 
 @fast
-def all_log_sums(
-    data, table, blocks, boxes, centre, scale, positions, quaternions, kappa, wide, least, margin, out
-):
+def all_log_sums(cells, positions, quaternions, kappa, wide, least, margin, out):
     """Log of the weighted sum over all kernels at every pose into ``out`` (M,), without a cut-off.
 
     By brute force, and where that gives less than ``least`` by `exact_log_sum`.
     """
     if least < _NEVER:
-        all_sums(data, table, centre, scale, positions, quaternions, kappa, wide, out)
+        all_sums(cells, positions, quaternions, kappa, wide, out)
     else:
         out[:] = 0.0
     for j in range(positions.shape[0]):
         if out[j] >= least:
             out[j] = math.log(out[j])
         else:
-            px = (positions[j, 0] - centre[0]) * scale
-            py = (positions[j, 1] - centre[1]) * scale
-            pz = (positions[j, 2] - centre[2]) * scale
-            out[j] = exact_log_sum(data, blocks, boxes, px, py, pz, quaternions[j], kappa, margin)
+            at = place(cells, positions[j], quaternions[j], kappa)
+            out[j] = exact_log_sum(cells.data, cells.blocks, cells.boxes, at, margin)
 
 
 @fast
-def sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
+def sums(cells, positions, quaternions, kappa, radius, wide, out):
     """The weighted kernel sum within ``radius`` at every pose, zero where nothing is in reach."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    k = F32(kappa)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
-        fx, fy, fz = F32(px), F32(py), F32(pz)
-        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
-        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        at = place(cells, positions[j], quaternions[j], kappa)
+        near = single(at)
         total = 0.0
-        for s in range(table.shape[0]):
-            twin = F32(table[s, TWIN])
-            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+        for s in range(cells.table.shape[0]):
+            twin = F32(cells.table[s, TWIN])
+            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
                 begin, end = runs[r, 0], runs[r, 1]
                 while begin < end:
                     stop = min(begin + BLOCK, end)
-                    total += isotropic_runs.total(
-                        data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, wide
-                    )
+                    total += isotropic_runs.total(cells.data, begin, stop, near, twin, wide)
                     begin = stop
         out[j] = total
 
 
 @fast
-def reached(start, table, centre, scale, positions, radius, out):
-    """How many kernels a sum at each pose visits, into ``out`` (M,) int64."""
+def reached(cells, positions, radius, out):
+    """How many kernels a sum at each position visits, into ``out`` (M,) int64."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
+        p = (positions[j] - cells.centre) * cells.scale
         out[j] = 0
-        for s in range(table.shape[0]):
-            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+        for s in range(cells.table.shape[0]):
+            for r in range(runs_within(cells.start, cells.table, s, p[0], p[1], p[2], radius, runs)):
                 out[j] += runs[r, 1] - runs[r, 0]
 
 
 @fast
-def moments(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
-    """The moments at every pose into ``out`` (M, 9)."""
+def moments(cells, positions, quaternions, kappa, radius, wide, out):
+    """The moments of `isotropic_runs.moments_wide` at every pose into ``out`` (M, 9)."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    out[:] = 0.0
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
-        moments_at(data, start, table, px, py, pz, quaternions[j], kappa, radius, wide, runs, out[j])
+        at = place(cells, positions[j], quaternions[j], kappa)
+        near = single(at)
+        for s in range(cells.table.shape[0]):
+            twin = F32(cells.table[s, TWIN])
+            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
+                begin, end = runs[r, 0], runs[r, 1]
+                while begin < end:
+                    stop = min(begin + BLOCK, end)
+                    if wide > 0:
+                        isotropic_runs.moments_wide(cells.data, begin, stop, near, twin, out[j])
+                    else:
+                        isotropic_runs.moments_narrow(cells.data, begin, stop, near, twin, out[j])
+                    begin = stop
 
 
 @fast
-def scatter_sums(
-    data, start, table, centre, scale, positions, quaternions, weights, twins, kappa, radius, wide, out
-):
+def scatter_sums(cells, positions, quaternions, weights, twins, kappa, radius, wide, out):
     """Add the kernels of the given rows to the sums ``out`` (N,) at every sorted kernel's centre."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     every = F32(1.0) if wide > 0 else F32(0.0)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
-        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
-        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        at = place(cells, positions[j], quaternions[j], kappa)
+        near = single(at)
         twin = F32(1.0) if twins[j] else F32(0.0)
         weight = F32(weights[j] * (0.5 if twins[j] else 1.0))
-        for s in range(table.shape[0]):
-            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
-                isotropic_runs.scatter_run(
-                    data, runs[r, 0], runs[r, 1], F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin,
-                    every, weight, out,
-                )  # fmt: skip
+        for s in range(cells.table.shape[0]):
+            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
+                isotropic_runs.scatter_run(cells.data, runs[r, 0], runs[r, 1], near, twin, every, weight, out)
 
 
 @fast
-def square_sums(data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, out):
+def square_sums(cells, positions, quaternions, kappa, radius, wide, out):
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over kernels with an exponent of at most radius^2.
 
     ``radius`` is the cut-off over sqrt 2: position and rotation share the allowance. The cut is exact,
     because far from data it decides between an attempt and none.
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    k, cut = F32(kappa), F32(radius * radius)
+    cut = F32(radius * radius)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
-        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
-        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        at = place(cells, positions[j], quaternions[j], kappa)
+        near = single(at)
         total, squares = 0.0, 0.0
-        for s in range(table.shape[0]):
-            twin = F32(table[s, TWIN])
-            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+        for s in range(cells.table.shape[0]):
+            twin = F32(cells.table[s, TWIN])
+            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
                 begin, end = runs[r, 0], runs[r, 1]
                 while begin < end:
                     stop = min(begin + BLOCK, end)
+                    # The constant lets LLVM make a loop of its own of either.
                     if wide:
-                        part = isotropic_runs.squares_run(
-                            data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, k, twin, True, cut
-                        )
+                        part = isotropic_runs.squares_run(cells.data, begin, stop, near, twin, True, cut)
                     else:
-                        part = isotropic_runs.squares_run(
-                            data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, k, twin, False, cut
-                        )
+                        part = isotropic_runs.squares_run(cells.data, begin, stop, near, twin, False, cut)
                     total += part[0]
                     squares += part[1]
                     begin = stop
@@ -381,38 +359,19 @@ def square_sums(data, start, table, centre, scale, positions, quaternions, kappa
 
 
 @fast
-def other_blocks_sums(
-    data, block, start, table, centre, scale, positions, quaternions, own, kappa, radius, out
-):
+def other_blocks_sums(cells, block, positions, quaternions, own, kappa, radius, out):
     """Kernel sums at poses (M,) over the sorted kernels whose ``block`` (N,) int32 differs from ``own``
     (M,).
     """
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    k = F32(kappa)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
-        q0, q1 = F32(quaternions[j, 0] * kappa), F32(quaternions[j, 1] * kappa)
-        q2, q3 = F32(quaternions[j, 2] * kappa), F32(quaternions[j, 3] * kappa)
+        at = place(cells, positions[j], quaternions[j], kappa)
+        near = single(at)
         total = 0.0
-        for s in range(table.shape[0]):
-            twin = F32(table[s, TWIN])
-            for r in range(runs_within(start, table, s, px, py, pz, radius, runs)):
+        for s in range(cells.table.shape[0]):
+            twin = F32(cells.table[s, TWIN])
+            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
                 total += isotropic_runs.other_blocks_run(
-                    data,
-                    block,
-                    own[j],
-                    runs[r, 0],
-                    runs[r, 1],
-                    F32(px),
-                    F32(py),
-                    F32(pz),
-                    q0,
-                    q1,
-                    q2,
-                    q3,
-                    k,
-                    twin,
+                    cells.data, block, own[j], runs[r, 0], runs[r, 1], near, twin
                 )
         out[j] = total

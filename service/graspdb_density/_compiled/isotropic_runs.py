@@ -1,12 +1,11 @@
 """Compiled loops over one run of rows: contiguous, and all with the jaw's twin or all without.
 
-``data`` and the scaling are those of `compiled`; a query's quaternion comes times ``kappa``, so that a dot
-product is an exponent. ``wide`` is 0 where the nearest of twins and antipodes stands for all, 1 where both
-twins count, 2 where antipodes do too.
+``data`` and the scaling are those of `isotropic`; `At` is where a pose stands among the rows. ``wide`` is 0
+where the nearest of twins and antipodes stands for all, 1 where both twins count, 2 where antipodes do too.
 
 LLVM turns the whole loop into vector code only with unsigned indices (signed ones wrap around in Python) and
 without slices, whose reference counts would cost more than a short run; ``tests/benchmarks`` notice a loss.
-Accumulation is float32: callers keep runs to `compiled.BLOCK` rows.
+Accumulation is float32: callers keep runs to `isotropic.BLOCK` rows.
 """
 
 # Numba infers the types of compiled functions.
@@ -14,10 +13,12 @@ Accumulation is float32: callers keep runs to `compiled.BLOCK` rows.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from .exp import LOG2E, exp, exp2
-from .options import fast
+from .options import fast, inlined
 
 F32 = np.float32
 #: Rows in the vectors that a loop takes at once, with AVX-512; a multiple of what it takes elsewhere.
@@ -25,46 +26,92 @@ LANES = 32
 _ZERO = F32(0.0)
 
 
+class At(NamedTuple):
+    """A pose among sorted rows: its position in their scaled units, ``kappa`` times its quaternion, so that a
+    dot product is an exponent, and ``kappa``.
+    """
+
+    x: Any
+    y: Any
+    z: Any
+    qx: Any
+    qy: Any
+    qz: Any
+    qw: Any
+    kappa: Any
+
+
+@inlined
+def single(at):
+    """The same in float32."""
+    return At(
+        F32(at.x), F32(at.y), F32(at.z), F32(at.qx), F32(at.qy), F32(at.qz), F32(at.qw), F32(at.kappa)
+    )  # fmt: skip
+
+
+@inlined
+def _base2(at):
+    """Rotation's exponents to base 2, once, so that no kernel has to."""
+    return At(
+        at.x, at.y, at.z, at.qx * LOG2E, at.qy * LOG2E, at.qz * LOG2E, at.qw * LOG2E, at.kappa * LOG2E
+    )  # fmt: skip
+
+
+@inlined
+def offset(data, i, at):
+    """From a pose to row ``i``, in scaled units."""
+    return data[0, i] - at.x, data[1, i] - at.y, data[2, i] - at.z
+
+
+@inlined
+def squared(data, i, at):
+    """The squared distance, which is the exponent of position."""
+    dx, dy, dz = offset(data, i, at)
+    return dx * dx + dy * dy + dz * dz
+
+
+@inlined
+def cosines(data, i, at):
+    """``kappa`` times the cosine of half the angle to row ``i``, and to its twin."""
+    own = data[3, i] * at.qx + data[4, i] * at.qy + data[5, i] * at.qz + data[6, i] * at.qw
+    twin = data[3, i] * at.qy - data[4, i] * at.qx + data[5, i] * at.qw - data[6, i] * at.qz
+    return own, twin
+
+
+@inlined
+def nearest(data, i, at):
+    """The largest of a row's four cosines: of the twins and their antipodes."""
+    a, b = cosines(data, i, at)
+    return max(abs(a), abs(b))
+
+
 @fast
-def run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
+def run_narrow(data, begin, end, at):
     """Sums of k and k r^2 over rows with a twin, where the antipode's and the farther twin's share is
     negligible.
-
-    (qx..qw) is kappa times the quaternion. Here and below both are taken to base 2 once, so that no kernel
-    has to.
     """
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
-        r2 = dx * dx + dy * dy + dz * dz
-        k = data[7, i] * exp2((max(abs(a), abs(b)) - kappa) - r2 * LOG2E)
+        r2 = squared(data, i, at)
+        k = data[7, i] * exp2((nearest(data, i, at) - at.kappa) - r2 * LOG2E)
         total += k
         spread += k * r2
     return total, spread
 
 
 @fast
-def rest_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
+def rest_narrow(data, begin, end, at):
     """`run_narrow` over fewer than ``LANES`` rows, of which there are that many from ``begin`` on: whole
     vectors of which the end is thrown away, where LLVM would take the rest of a loop one by one.
     """
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     total, spread = _ZERO, _ZERO
     first, count = np.uint64(begin), np.int32(end - begin)
     for j in range(np.uint64(LANES)):
         i = first + j
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
-        r2 = dx * dx + dy * dy + dz * dz
-        k = data[7, i] * exp2((max(abs(a), abs(b)) - kappa) - r2 * LOG2E)
+        r2 = squared(data, i, at)
+        k = data[7, i] * exp2((nearest(data, i, at) - at.kappa) - r2 * LOG2E)
         k = k if np.int32(j) < count else _ZERO
         total += k
         spread += k * r2
@@ -72,51 +119,37 @@ def rest_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
 
 
 @fast
-def total_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
+def total_narrow(data, begin, end, at):
     """As `run_narrow` without k r^2, which only a cut-off needs to know: a sixth less work."""
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     total = _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
-        r2 = dx * dx + dy * dy + dz * dz
-        total += data[7, i] * exp2((max(abs(a), abs(b)) - kappa) - r2 * LOG2E)
+        total += data[7, i] * exp2((nearest(data, i, at) - at.kappa) - squared(data, i, at) * LOG2E)
     return total
 
 
 @fast
-def run_single(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa):
+def run_single(data, begin, end, at):
     """As `run_narrow` over rows without a twin."""
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        r2 = dx * dx + dy * dy + dz * dz
-        k = data[7, i] * exp2((abs(a) - kappa) - r2 * LOG2E)
+        r2 = squared(data, i, at)
+        k = data[7, i] * exp2((abs(cosines(data, i, at)[0]) - at.kappa) - r2 * LOG2E)
         total += k
         spread += k * r2
     return total, spread
 
 
 @fast
-def run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+def run_twins(data, begin, end, at, twin):
     """Sums of k and k r^2 over both twins, each by its nearer end."""
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        r2 = dx * dx + dy * dy + dz * dz
-        base = -kappa - r2 * LOG2E
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        r2 = squared(data, i, at)
+        base = -at.kappa - r2 * LOG2E
+        a, b = cosines(data, i, at)
         k = data[7, i] * (exp2(base + abs(a)) + twin * exp2(base + abs(b)))
         total += k
         spread += k * r2
@@ -124,18 +157,14 @@ def run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
 
 
 @fast
-def run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+def run_wide(data, begin, end, at, twin):
     """Sums of k and k r^2 with every term: both twins, each with its antipode."""
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        r2 = dx * dx + dy * dy + dz * dz
-        base = -kappa - r2 * LOG2E
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz
+        r2 = squared(data, i, at)
+        base = -at.kappa - r2 * LOG2E
+        a, b = cosines(data, i, at)
         own = exp2(base + a) + exp2(base - a)
         other = exp2(base + b) + exp2(base - b)
         k = data[7, i] * (own + twin * other)
@@ -144,36 +173,44 @@ def run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
     return total, spread
 
 
-@fast
-def moments_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sums):
-    """As `moments_wide` with the nearest of twins and antipodes standing for all."""
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+@inlined
+def _moments(data, begin, end, at, twin, wide, sums):
+    at = _base2(at)
     s = _ZERO
     sx, sy, sz = _ZERO, _ZERO, _ZERO
     m0, m1, m2, m3 = _ZERO, _ZERO, _ZERO, _ZERO
     rr = _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
+        dx, dy, dz = offset(data, i, at)
         r2 = dx * dx + dy * dy + dz * dz
-        u0, u1, u2, u3 = data[3, i], data[4, i], data[5, i], data[6, i]
-        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
-        b = (u0 * qy - u1 * qx + u2 * qw - u3 * qz) * twin
+        a, b = cosines(data, i, at)
+        b = b * twin
         own = abs(a) >= abs(b)
-        near = a if own else b
-        k = data[7, i] * exp2((abs(near) - kappa) - r2 * LOG2E)
-        g = k if near >= _ZERO else -k
-        ga = g if own else _ZERO
-        gb = _ZERO if own else g
+        base = -at.kappa - r2 * LOG2E
+        if wide:
+            large, small = max(abs(a), abs(b)), min(abs(a), abs(b))
+            k1 = data[7, i] * exp2(base + large)
+            k2 = data[7, i] * twin * exp2(base + small)
+            k3 = data[7, i] * exp2(base - large)
+            k4 = data[7, i] * twin * exp2(base - small)
+            k = k1 + k2 + k3 + k4
+            ga = (k1 - k3) if own else (k2 - k4)
+            gb = (k2 - k4) if own else (k1 - k3)
+        else:
+            k = data[7, i] * exp2(base + max(abs(a), abs(b)))
+            ga = k if own else _ZERO
+            gb = _ZERO if own else k
+        ga = ga if a >= _ZERO else -ga
+        gb = gb if b >= _ZERO else -gb
         s += k
         sx += k * dx
         sy += k * dy
         sz += k * dz
-        m0 += ga * u0 - gb * u1
-        m1 += ga * u1 + gb * u0
-        m2 += ga * u2 - gb * u3
-        m3 += ga * u3 + gb * u2
+        # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z), as `cosines` pairs it with q.
+        m0 += ga * data[3, i] - gb * data[4, i]
+        m1 += ga * data[4, i] + gb * data[3, i]
+        m2 += ga * data[5, i] - gb * data[6, i]
+        m3 += ga * data[6, i] + gb * data[5, i]
         rr += k * r2
     sums[0] += s
     sums[1] += sx
@@ -187,103 +224,65 @@ def moments_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, su
 
 
 @fast
-def moments_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, sums):
+def moments_wide(data, begin, end, at, twin, sums):
     """Add to ``sums`` (9,): k, k (p_i - p), the signed pull k mu_i of the quaternion, and k r^2, scaled
     units.
     """
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
-    s = _ZERO
-    sx, sy, sz = _ZERO, _ZERO, _ZERO
-    m0, m1, m2, m3 = _ZERO, _ZERO, _ZERO, _ZERO
-    rr = _ZERO
-    for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        r2 = dx * dx + dy * dy + dz * dz
-        u0, u1, u2, u3 = data[3, i], data[4, i], data[5, i], data[6, i]
-        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
-        b = (u0 * qy - u1 * qx + u2 * qw - u3 * qz) * twin
-        base = -kappa - r2 * LOG2E
-        w = data[7, i]
-        large, small = max(abs(a), abs(b)), min(abs(a), abs(b))
-        k1 = w * exp2(base + large)
-        k2 = w * twin * exp2(base + small)
-        k3 = w * exp2(base - large)
-        k4 = w * twin * exp2(base - small)
-        own_near = abs(a) >= abs(b)
-        ga = (k1 - k3) if own_near else (k2 - k4)
-        gb = (k2 - k4) if own_near else (k1 - k3)
-        ga = ga if a >= _ZERO else -ga
-        gb = gb if b >= _ZERO else -gb
-        k = k1 + k2 + k3 + k4
-        s += k
-        sx += k * dx
-        sy += k * dy
-        sz += k * dz
-        # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z), as b pairs it with q.
-        m0 += ga * u0 - gb * u1
-        m1 += ga * u1 + gb * u0
-        m2 += ga * u2 - gb * u3
-        m3 += ga * u3 + gb * u2
-        rr += k * r2
-    sums[0] += s
-    sums[1] += sx
-    sums[2] += sy
-    sums[3] += sz
-    sums[4] += m0
-    sums[5] += m1
-    sums[6] += m2
-    sums[7] += m3
-    sums[8] += rr
+    _moments(data, begin, end, at, twin, True, sums)
 
 
 @fast
-def run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide):
+def moments_narrow(data, begin, end, at, twin, sums):
+    """As `moments_wide` with the nearest of twins and antipodes standing for all."""
+    _moments(data, begin, end, at, twin, False, sums)
+
+
+@fast
+def run(data, begin, end, at, twin, wide):
     """Sums of k and k r^2 over rows that all have a twin or have none."""
     if wide == 2:
-        return run_wide(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin)
+        return run_wide(data, begin, end, at, twin)
     if wide == 1:
-        return run_twins(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin)
+        return run_twins(data, begin, end, at, twin)
     if twin > _ZERO:
-        return run_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa)
-    return run_single(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa)
+        return run_narrow(data, begin, end, at)
+    return run_single(data, begin, end, at)
 
 
 @fast
-def total(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide):
+def total(data, begin, end, at, twin, wide):
     """The first of what `run` gives."""
     if wide == 0 and twin > _ZERO:
-        return total_narrow(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa)
-    return run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide)[0]
+        return total_narrow(data, begin, end, at)
+    return run(data, begin, end, at, twin, wide)[0]
+
+
+@inlined
+def _squared_double(data, i, at):
+    dx, dy, dz = np.float64(data[0, i]) - at.x, np.float64(data[1, i]) - at.y, np.float64(data[2, i]) - at.z
+    return dx * dx + dy * dy + dz * dz
 
 
 @fast
-def top_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+def top_of_run(data, begin, end, at, twin):
     """Largest exponent of a run, float64."""
     top = -1e300
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = np.float64(data[0, i]) - px
-        dy = np.float64(data[1, i]) - py
-        dz = np.float64(data[2, i]) - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        top = max(top, max(abs(a), abs(b)) - kappa - (dx * dx + dy * dy + dz * dz))
+        a, b = cosines(data, i, at)
+        b = b * twin
+        top = max(top, max(abs(a), abs(b)) - at.kappa - _squared_double(data, i, at))
     return top
 
 
 @fast
-def sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):
+def sum_of_run(data, begin, end, at, twin, top):
     """Sum of every term of a run relative to e^top, exponents in float64."""
     total = _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = np.float64(data[0, i]) - px
-        dy = np.float64(data[1, i]) - py
-        dz = np.float64(data[2, i]) - pz
-        base = -kappa - (dx * dx + dy * dy + dz * dz) - top
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
+        base = -at.kappa - _squared_double(data, i, at) - top
         # Without a twin b may be far above the top: e^(base + b) would be beyond float32, and 0 times it NaN.
-        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
+        a, b = cosines(data, i, at)
+        b = b * twin
         own = exp(F32(base + a)) + exp(F32(base - a))
         other = exp(F32(base + b)) + exp(F32(base - b))
         total += data[7, i] * (own + F32(twin) * other)
@@ -291,37 +290,31 @@ def sum_of_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, top):
 
 
 @fast
-def scatter_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, weight, out):
+def scatter_run(data, begin, end, at, twin, wide, weight, out):
     """Add one kernel's value at every kernel centre of a run."""
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        base = -kappa - (dx * dx + dy * dy + dz * dz)
-        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
-        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        large, small = max(a, b), min(a, b)
+        base = -at.kappa - squared(data, i, at)
+        a, b = cosines(data, i, at)
+        b = abs(b) * twin
+        large, small = max(abs(a), b), min(abs(a), b)
         rest = exp(base - large) + twin * (exp(base + small) + exp(base - small))
         out[i] += weight * (exp(base + large) + wide * rest)
 
 
 @fast
-def squares_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, cut):
+def squares_run(data, begin, end, at, twin, wide, cut):
     """Sums of k and k^2 over kernels whose exponent is above ``-cut``.
 
     ``wide`` asks for twins and antipodes; without it, the nearest stands for all.
     """
-    qx, qy, qz, qw, kappa = qx * LOG2E, qy * LOG2E, qz * LOG2E, qw * LOG2E, kappa * LOG2E
+    at = _base2(at)
     cut = cut * LOG2E
     total, squares = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        base = -kappa - (dx * dx + dy * dy + dz * dz) * LOG2E
-        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
-        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        large, small = max(a, b), min(a, b)
+        base = -at.kappa - squared(data, i, at) * LOG2E
+        a, b = cosines(data, i, at)
+        b = abs(b) * twin
+        large, small = max(abs(a), b), min(abs(a), b)
         k = exp2(base + large)
         if wide:
             k += exp2(base - large) + twin * (exp2(base + small) + exp2(base - small))
@@ -332,16 +325,12 @@ def squares_run(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, wide,
 
 
 @fast
-def other_blocks_run(data, block, own, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin):
+def other_blocks_run(data, block, own, begin, end, at, twin):
     """Sum of both twins' kernels over a run, those of block ``own`` left out."""
     total = _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        base = -kappa - (dx * dx + dy * dy + dz * dz)
-        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
-        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz)
-        k = exp(base + a) + twin * exp(base + b)
+        base = -at.kappa - squared(data, i, at)
+        a, b = cosines(data, i, at)
+        k = exp(base + abs(a)) + twin * exp(base + abs(b))
         total += data[7, i] * k if block[i] != own else _ZERO
     return total

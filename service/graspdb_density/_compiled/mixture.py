@@ -126,18 +126,17 @@ def _component(data, begin, n, all_n, xi, lower, log_weight):
 
 
 @fast
-def mixture_sums_at(
-    data, start, table, frames, turning, px, py, pz, q, metres, lowers, log_weights, radius, runs, xi
-):
+def mixture_sums_at(cells, frames, turning, p, q, metres, mixture, radius, runs, xi):
     """Weighted mixture sum at one pose (scaled units), that weighted by the position's exponent, rows
     visited.
     """
-    fx, fy, fz = F32(px), F32(py), F32(pz)
+    data, table = cells.data, cells.table
+    fx, fy, fz = F32(p[0]), F32(p[1]), F32(p[2])
     q0, q1, q2, q3 = F32(q[0]), F32(q[1]), F32(q[2]), F32(q[3])
     total, spread, visited = 0.0, 0.0, 0
     for s in range(table.shape[0]):
         twin = F32(table[s, c.TWIN])
-        for r in range(c.runs_within(start, table, s, px, py, pz, radius, runs)):
+        for r in range(c.runs_within(cells.start, table, s, p[0], p[1], p[2], radius, runs)):
             begin, end = runs[r, 0], runs[r, 1]
             visited += end - begin
             while begin < end:
@@ -146,14 +145,14 @@ def mixture_sums_at(
                 all_n = n + -n % LANES
                 if begin + all_n > data.shape[1]:
                     all_n = n
-                if turning > 0.0:
+                if turning:
                     _nearest_in_gripper(data, begin, all_n, fx, fy, fz, q0, q1, q2, q3, F32(metres), twin, xi)
                 else:
                     _nearest_displacements(
                         data, frames, begin, all_n, fx, fy, fz, q0, q1, q2, q3, F32(metres), twin, xi
                     )
-                for j in range(lowers.shape[0]):
-                    part = _component(data, begin, n, all_n, xi, lowers[j], log_weights[j])
+                for j in range(mixture.lowers.shape[0]):
+                    part = _component(data, begin, n, all_n, xi, mixture.lowers[j], mixture.log_weights[j])
                     total += part[0]
                     spread += part[1]
                 begin += n
@@ -162,30 +161,27 @@ def mixture_sums_at(
 
 @fast
 def mixture_log_sums(
-    data, start, table, frames, turning, centre, scale, positions, quaternions, lowers, log_weights, stages,
-    unit, rows, row_quaternions, row_frames, symmetric, log_rows, lowers64, log_weights64, wraps, out,
-):  # fmt: skip
-    """Log of the mixture sum at every pose into ``out`` (M,), in units of ``unit`` (log); `compiled.log_sums`
-    tells what stages are. What passes none is summed over all rows in float64.
+    cells, frames, positions, quaternions, mixture, stages, unit, exact_rows, exact_mixture, out
+):
+    """Log of the mixture sum at every pose into ``out`` (M,), in units of ``unit`` (log); stages are those of
+    `isotropic.log_sums`. What passes none is summed over all rows in float64.
+
+    ``frames`` (9, N) float32 are those of the sorted rows, ``exact_rows`` and ``exact_mixture`` the same rows
+    and components in float64.
     """
     runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
     xi = np.empty((6, BLOCK), dtype=np.float32)
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
+        p = (positions[j] - cells.centre) * cells.scale
         done = False
         for t in range(stages.shape[0]):
             total, spread, visited = mixture_sums_at(
-                data, start, table, frames, turning, px, py, pz, quaternions[j], 1.0 / scale, lowers,
-                log_weights, stages[t, 0], runs, xi,
+                cells, frames, exact_rows.turning, p, quaternions[j], 1.0 / cells.scale, mixture, stages[t, 0],
+                runs, xi,
             )  # fmt: skip
             if total > 0.0 and spread <= stages[t, 1] * total and total >= stages[t, 2] * visited:
                 out[j] = math.log(total) - unit
                 done = True
                 break
         if not done:
-            out[j] = mixture_log_sum(
-                rows, row_quaternions, row_frames, symmetric, turning > 0, log_rows, lowers64, log_weights64,
-                wraps, positions[j], quaternions[j],
-            )  # fmt: skip
+            out[j] = mixture_log_sum(exact_rows, exact_mixture, positions[j], quaternions[j])

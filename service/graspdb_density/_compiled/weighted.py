@@ -6,14 +6,20 @@ The values of a run of rows are written to a short buffer by a loop that turns i
 a threshold are then added to one accumulator a weighting.
 """
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import exp
 from . import isotropic as c
+from .isotropic_runs import cosines, single, squared
 from .options import exact, fast, inlined
 
 F32 = np.float32
@@ -22,6 +28,48 @@ BLOCK = 256
 #: Columns of weightings come in multiples of this.
 LANES = 32
 _ONE, _ZERO = F32(1.0), F32(0.0)
+
+
+class Mixture(NamedTuple):
+    """Components of a Gaussian mixture over displacements, in float32 or float64.
+
+    Attributes
+    ----------
+    lowers : (C, 27)
+        The whitening matrix over sqrt 2, rows of its lower triangle, then the whitened mean.
+    log_weights : (C,)
+        Log peaks, the largest 0.
+    wraps : bool
+        Whether a rotation's other vector, by angle - 2 pi about the same axis, counts.
+    """
+
+    lowers: NDArray[np.floating]
+    log_weights: NDArray[np.floating]
+    wraps: bool
+
+    def single(self) -> Mixture:
+        """The same in float32."""
+        return Mixture(self.lowers.astype(np.float32), self.log_weights.astype(np.float32), self.wraps)
+
+
+class MixtureRows(NamedTuple):
+    """Rows in float64 for the sum without a cut-off.
+
+    Attributes
+    ----------
+    positions : (N, 3), quaternions : (N, 4), symmetric : (N,) bool, log_rows : (N,) log weight of a twin
+    frames : (N, 9)
+        Axes that translations are measured along, rows of the matrix.
+    turning : bool
+        Whether they turn with the jaw.
+    """
+
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+    frames: NDArray[np.float64]
+    symmetric: NDArray[np.bool_]
+    log_rows: NDArray[np.float64]
+    turning: bool
 
 
 def _angle_coefficients() -> tuple[np.float32, ...]:
@@ -43,7 +91,7 @@ _TINY = F32(1e-6)
 
 
 @inlined
-def _angle_factor(w):  # type: ignore[no-untyped-def]
+def _angle_factor(w):
     """Rotation angle over the sine of its half, for w = cos(angle / 2) in [0, 1]."""
     t = w + w - _ONE
     y = _A10 * t + _A9
@@ -59,34 +107,25 @@ def _angle_factor(w):  # type: ignore[no-untyped-def]
 
 
 @fast
-def _isotropic_values(data, begin, n, px, py, pz, qx, qy, qz, qw, kappa, twin, wide, out):  # type: ignore[no-untyped-def]
-    """Kernels of rows ``begin .. begin + n``, 1 at a centre, both twins summed; (qx..qw) is kappa times the
-    quaternion.
-    """
+def _isotropic_values(data, begin, n, at, twin, wide, out):
+    """Kernels of rows ``begin .. begin + n``, 1 at a centre, both twins summed."""
     for k in range(np.uint64(n)):
         i = np.uint64(begin) + k
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
-        b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        out[k] = exp.exp(max(a, b) - kappa - (dx * dx + dy * dy + dz * dz))
+        a, b = cosines(data, i, at)
+        out[k] = exp.exp(max(abs(a), abs(b) * twin) - at.kappa - squared(data, i, at))
     if wide:
         for k in range(np.uint64(n)):
             i = np.uint64(begin) + k
-            dx = data[0, i] - px
-            dy = data[1, i] - py
-            dz = data[2, i] - pz
-            base = -kappa - (dx * dx + dy * dy + dz * dz)
-            a = abs(data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw)
-            b = abs(data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz)
+            base = -at.kappa - squared(data, i, at)
+            a, b = cosines(data, i, at)
+            a, b = abs(a), abs(b)
             low = min(a, b)
             # The nearest of the four is there already; the others are both antipodes and the farther twin.
             out[k] += exp.exp(base - a) + twin * (exp.exp(base + low) + exp.exp(base - b))
 
 
 @fast
-def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi):  # type: ignore[no-untyped-def]
+def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi):
     """Displacements (6, n) from rows (``turned``: from their twins) to a pose: translation in the row's frame
     (metres), shortest rotation vector in its gripper's frame (radians).
     """
@@ -119,7 +158,7 @@ def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi
 
 
 @fast
-def _add_component(xi, n, lower, log_weight, far, out):  # type: ignore[no-untyped-def]
+def _add_component(xi, n, lower, log_weight, far, out):
     """Add one Gaussian component at ``xi`` (6, n) to ``out``.
 
     ``lower`` (27,): the whitening matrix over sqrt 2, rows of its lower triangle, then the whitened mean.
@@ -149,9 +188,7 @@ def _add_component(xi, n, lower, log_weight, far, out):  # type: ignore[no-untyp
 
 
 @fast
-def _mixture_values(  # type: ignore[no-untyped-def]
-    data, frames, begin, n, p, q, metres, twin, frame_turns, lowers, log_weights, wraps, xi, out
-):
+def _mixture_values(data, frames, begin, n, p, q, metres, twin, frame_turns, mixture, xi, out):
     """Mixture kernels of rows ``begin .. begin + n``, their largest component 1 at its mean, both twins
     summed.
     """
@@ -159,14 +196,14 @@ def _mixture_values(  # type: ignore[no-untyped-def]
         out[k] = _ZERO
     for t in range(2 if twin else 1):
         _displacements(data, frames, begin, n, p, q, metres, t == 1, frame_turns, xi)
-        for j in range(lowers.shape[0]):
-            _add_component(xi, n, lowers[j], log_weights[j], False, out)
-            if wraps:
-                _add_component(xi, n, lowers[j], log_weights[j], True, out)
+        for j in range(mixture.lowers.shape[0]):
+            _add_component(xi, n, mixture.lowers[j], mixture.log_weights[j], False, out)
+            if mixture.wraps:
+                _add_component(xi, n, mixture.lowers[j], mixture.log_weights[j], True, out)
 
 
 @fast
-def _accumulate(values, n, begin, least, weights, index, kept_values, out):  # type: ignore[no-untyped-def]
+def _accumulate(values, n, begin, least, weights, index, kept_values, out):
     """Add ``value * weights[row]`` for every value above ``least``; how many there were.
 
     First a branch-free compaction, since which values count is hardly predictable, then four rows at a time
@@ -200,9 +237,7 @@ def _accumulate(values, n, begin, least, weights, index, kept_values, out):  # t
 
 
 @fast
-def isotropic_sums(  # type: ignore[no-untyped-def]
-    data, start, table, centre, scale, positions, quaternions, kappa, radius, wide, least, weights, out
-):
+def isotropic_sums(cells, positions, quaternions, kappa, radius, wide, least, weights, out):
     """Kernel sums of poses (M,) under every weighting: ``out`` (M, B) = K weights (N, B); entries used.
 
     Entries of K beyond ``radius`` (scaled) or not above ``least`` are zero.
@@ -213,54 +248,43 @@ def isotropic_sums(  # type: ignore[no-untyped-def]
     index = np.empty(BLOCK + 1, dtype=np.int64)
     kept = 0
     for j in range(positions.shape[0]):
-        px = (positions[j, 0] - centre[0]) * scale
-        py = (positions[j, 1] - centre[1]) * scale
-        pz = (positions[j, 2] - centre[2]) * scale
-        q = quaternions[j]
-        q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+        at = c.place(cells, positions[j], quaternions[j], kappa)
+        near = single(at)
         out[j, :] = _ZERO
-        for s in range(table.shape[0]):
-            twin = F32(table[s, c.TWIN])
-            for r in range(c.runs_within(start, table, s, px, py, pz, radius, runs)):
+        for s in range(cells.table.shape[0]):
+            twin = F32(cells.table[s, c.TWIN])
+            for r in range(c.runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
                 begin, end = runs[r, 0], runs[r, 1]
                 while begin < end:
                     n = min(BLOCK, end - begin)
-                    _isotropic_values(
-                        data, begin, n, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, wide,
-                        values,
-                    )  # fmt: skip
+                    _isotropic_values(cells.data, begin, n, near, twin, wide, values)
                     kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
                     begin += n
     return kept
 
 
 @fast
-def mixture_sums(  # type: ignore[no-untyped-def]
-    data, start, table, centre, scale, frames, frame_turns, positions, quaternions, lowers, log_weights,
-    wraps, radius, least, weights, out,
-):  # fmt: skip
+def mixture_sums(cells, frames, frame_turns, positions, quaternions, mixture, radius, least, weights, out):
     """As `isotropic_sums`, for a mixture of Gaussians over the displacement from each row."""
     runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
     values = np.empty(BLOCK, dtype=np.float32)
     kept_values = np.empty(BLOCK + 1, dtype=np.float32)
     index = np.empty(BLOCK + 1, dtype=np.int64)
     xi = np.empty((6, BLOCK), dtype=np.float32)
-    p = np.empty(3)
-    metres = 1.0 / scale
+    metres = 1.0 / cells.scale
     kept = 0
     for j in range(positions.shape[0]):
-        for axis in range(3):
-            p[axis] = (positions[j, axis] - centre[axis]) * scale
+        p = (positions[j] - cells.centre) * cells.scale
         out[j, :] = _ZERO
-        for s in range(table.shape[0]):
-            twin = table[s, c.TWIN] > 0.5
-            for r in range(c.runs_within(start, table, s, p[0], p[1], p[2], radius, runs)):
+        for s in range(cells.table.shape[0]):
+            twin = cells.table[s, c.TWIN] > 0.5
+            for r in range(c.runs_within(cells.start, cells.table, s, p[0], p[1], p[2], radius, runs)):
                 begin, end = runs[r, 0], runs[r, 1]
                 while begin < end:
                     n = min(BLOCK, end - begin)
                     _mixture_values(
-                        data, frames, begin, n, p, quaternions[j], metres, twin, frame_turns, lowers,
-                        log_weights, wraps, xi, values,
+                        cells.data, frames, begin, n, p, quaternions[j], metres, twin, frame_turns, mixture,
+                        xi, values,
                     )  # fmt: skip
                     kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
                     begin += n
@@ -268,7 +292,7 @@ def mixture_sums(  # type: ignore[no-untyped-def]
 
 
 @exact
-def _component_exponent(x, lower):  # type: ignore[no-untyped-def]
+def _component_exponent(x, lower):
     """Half the squared Mahalanobis distance of one displacement (6,), in float64."""
     square = 0.0
     at = 0
@@ -282,24 +306,27 @@ def _component_exponent(x, lower):  # type: ignore[no-untyped-def]
 
 
 @exact
-def mixture_log_sum(  # type: ignore[no-untyped-def]
-    positions, quaternions, frames, symmetric, frame_turns, log_rows, lowers, log_weights, wraps, p, q
-):
+def mixture_log_sum(rows, mixture, p, q):
     """Log of the weighted mixture sum at one pose over all rows, in float64 and without a cut-off: for poses
     so far from every row that the fast sums vanish.
     """
     top, total = -math.inf, 0.0
     x = np.empty(6)
-    for i in range(positions.shape[0]):
-        dx, dy, dz = p[0] - positions[i, 0], p[1] - positions[i, 1], p[2] - positions[i, 2]
-        f = frames[i]
-        ax, ay, az, aw = -quaternions[i, 0], -quaternions[i, 1], -quaternions[i, 2], quaternions[i, 3]
+    for i in range(rows.positions.shape[0]):
+        dx, dy, dz = p[0] - rows.positions[i, 0], p[1] - rows.positions[i, 1], p[2] - rows.positions[i, 2]
+        f = rows.frames[i]
+        ax, ay, az, aw = (
+            -rows.quaternions[i, 0],
+            -rows.quaternions[i, 1],
+            -rows.quaternions[i, 2],
+            rows.quaternions[i, 3],
+        )
         vx = aw * q[0] + ax * q[3] + ay * q[2] - az * q[1]
         vy = aw * q[1] - ax * q[2] + ay * q[3] + az * q[0]
         vz = aw * q[2] + ax * q[1] - ay * q[0] + az * q[3]
         w = aw * q[3] - ax * q[0] - ay * q[1] - az * q[2]
-        for t in range(2 if symmetric[i] else 1):
-            flip = -1.0 if (t == 1 and frame_turns) else 1.0
+        for t in range(2 if rows.symmetric[i] else 1):
+            flip = -1.0 if (t == 1 and rows.turning) else 1.0
             if t == 1:
                 ux, uy, uz, uw = vy, -vx, -w, vz
             else:
@@ -311,12 +338,14 @@ def mixture_log_sum(  # type: ignore[no-untyped-def]
             x[0] = flip * (f[0] * dx + f[3] * dy + f[6] * dz)
             x[1] = flip * (f[1] * dx + f[4] * dy + f[7] * dz)
             x[2] = f[2] * dx + f[5] * dy + f[8] * dz
-            for wrap in range(2 if wraps else 1):
+            for wrap in range(2 if mixture.wraps else 1):
                 turn = angle - 2.0 * math.pi * wrap
                 scale = turn / sine if sine > 1e-12 else 2.0
                 x[3], x[4], x[5] = scale * ux, scale * uy, scale * uz
-                for j in range(lowers.shape[0]):
-                    value = log_rows[i] + log_weights[j] - _component_exponent(x, lowers[j])
+                for j in range(mixture.lowers.shape[0]):
+                    value = (
+                        rows.log_rows[i] + mixture.log_weights[j] - _component_exponent(x, mixture.lowers[j])
+                    )
                     if value > top:
                         total = total * math.exp(top - value) + 1.0 if total > 0.0 else 1.0
                         top = value

@@ -218,7 +218,7 @@ def _held_out(
     def work(begin: int, end: int) -> None:
         part = held[begin:end]
         isotropic.other_blocks_sums(
-            cells.data, sorted_block, cells.start, cells.table, cells.centre, cells.scale,
+            cells.arrays, sorted_block,
             p[part], q[part], block[part], kernel.kappa, scaled_radius(5.0), out[begin:end],
         )  # fmt: skip
 

@@ -169,6 +169,13 @@ class Cells:
             segments=tuple(kept),
         )
 
+    @property
+    def arrays(self) -> c.CellArrays:
+        """What the compiled loops take."""
+        return c.CellArrays(
+            self.data, self.start, self.table, self.blocks, self.boxes, self.centre, self.scale
+        )
+
     def visiting_order(self, positions: Floats) -> NDArray[np.intp]:
         """An order in which neighbours follow each other, so that kernels stay in the processor's cache."""
         edge = self.table[0, c.EDGE] / self.scale

@@ -255,13 +255,13 @@ class GraspDensity:
         def work(begin: int, end: int) -> None:
             if not len(steps):
                 isotropic.all_log_sums(
-                    cells.data, cells.table, cells.blocks, cells.boxes, cells.centre, cells.scale,
-                    p[begin:end], q[begin:end], self._kernel.kappa, terms, least, margin, out[begin:end],
+                    cells.arrays, p[begin:end], q[begin:end], self._kernel.kappa, terms, least, margin,
+                    out[begin:end],
                 )  # fmt: skip
                 return
             isotropic.log_sums(
-                cells.data, cells.start, cells.table, cells.blocks, cells.boxes, cells.centre, cells.scale,
-                p[begin:end], q[begin:end], self._kernel.kappa, steps, self.wide, margin, out[begin:end],
+                cells.arrays, p[begin:end], q[begin:end], self._kernel.kappa, steps, self.wide, margin,
+                out[begin:end],
             )  # fmt: skip
 
         for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
@@ -318,8 +318,7 @@ class GraspDensity:
         cells = self._cells
         out = np.empty((len(positions), 9))
         isotropic.moments(
-            cells.data, cells.start, cells.table, cells.centre, cells.scale,
-            positions, quaternions, self._kernel.kappa, scaled_radius(cutoff), self.wide, out,
+            cells.arrays, positions, quaternions, self._kernel.kappa, scaled_radius(cutoff), self.wide, out,
         )  # fmt: skip
         return out
 
@@ -332,8 +331,8 @@ class GraspDensity:
 
         def work(begin: int, end: int) -> None:
             isotropic.sums(
-                cells.data, cells.start, cells.table, cells.centre, cells.scale, positions[begin:end],
-                quaternions[begin:end], self._kernel.kappa, scaled_radius(cutoff), self.wide, out[begin:end],
+                cells.arrays, positions[begin:end], quaternions[begin:end], self._kernel.kappa,
+                scaled_radius(cutoff), self.wide, out[begin:end],
             )  # fmt: skip
 
         for_blocks(work, len(positions), block=16, threads=threads)

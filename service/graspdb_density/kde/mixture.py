@@ -80,25 +80,21 @@ class MixtureDensity:
         self._spread = spread
         raw = rows.weights * rows.size
         self._hold(rows, Cells.build(rows.positions, rows.quaternions_xyzw, raw, rows.symmetric, spread))
-        peaks = kernel.log_peaks
-        self._log_unit = float(peaks.max())
-        self._log_weights = peaks - self._log_unit
-        whitening = np.linalg.inv(np.linalg.cholesky(kernel.covariances)) / math.sqrt(2.0)
-        row, column = np.tril_indices(6)
-        offset = np.einsum("cij,cj->ci", whitening, kernel.means)
-        self._lowers = np.concatenate([whitening[:, row, column], offset], axis=1)
+        self._log_unit = rows.log_unit
+        self._mixture = rows.mixture._replace(wraps=True)
         turn = max(float(np.linalg.eigvalsh(s[3:, 3:])[-1]) for s in kernel.covariances) ** 0.5
         mean_turn = float(np.linalg.norm(kernel.means[:, 3:], axis=1).max())
         self._narrow = turn <= NARROW and mean_turn + 2.5 * turn <= math.radians(75.0)
 
     def _hold(self, rows: KernelRows, cells: Cells) -> None:
         self._rows, self._cells = rows, cells
-        self._frames = rows.frames.reshape(-1, 9)
         if self._kernel.frame == "gripper":
             # Turned by the rows' own quaternions in the loops.
             self._sorted_frames = np.zeros((9, 1), dtype=np.float32)
         else:
-            self._sorted_frames = np.ascontiguousarray(self._frames[cells.rows].T, dtype=np.float32)
+            self._sorted_frames = np.ascontiguousarray(
+                rows.frames.reshape(-1, 9)[cells.rows].T, dtype=np.float32
+            )
 
     def extend(
         self,
@@ -184,18 +180,14 @@ class MixtureDensity:
         order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
         p, q = p[order], q[order]
         stages = self._stages()
-        rows, turning = self._rows, float(self._kernel.frame == "gripper")
-        log_rows = np.log(rows.weights * np.where(rows.symmetric, 0.5, 1.0))
-        lowers, log_weights = self._lowers.astype(np.float32), self._log_weights.astype(np.float32)
+        rows, components = self._rows.exact, self._mixture.single()
         unit = math.log(self._total / self._unit)
         out = np.empty(len(p))
 
         def work(begin: int, end: int) -> None:
             mixture.mixture_log_sums(
-                cells.data, cells.start, cells.table, self._sorted_frames, turning,
-                cells.centre, cells.scale, p[begin:end], q[begin:end], lowers, log_weights, stages, unit,
-                rows.positions, rows.quaternions_xyzw, self._frames, rows.symmetric, log_rows,
-                self._lowers, self._log_weights, True, out[begin:end],
+                cells.arrays, self._sorted_frames, p[begin:end], q[begin:end], components, stages, unit,
+                rows, self._mixture, out[begin:end],
             )  # fmt: skip
 
         for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
@@ -240,15 +232,9 @@ class MixtureDensity:
     def reference(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> Floats:
         """Log density at poses (M,) in float64 over all rows, twins and wraps; M times N evaluations."""
         p, q = se3.as_poses(positions, quaternions_xyzw)
-        rows = self._rows
-        log_rows = np.log(rows.weights * np.where(rows.symmetric, 0.5, 1.0))
         values = [
-            mixture_log_sum(
-                rows.positions, rows.quaternions_xyzw, self._frames, rows.symmetric,
-                self._kernel.frame == "gripper", log_rows, self._lowers, self._log_weights, True, at, to,
-            )
-            for at, to in zip(p, q, strict=True)
-        ]  # fmt: skip
+            mixture_log_sum(self._rows.exact, self._mixture, at, to) for at, to in zip(p, q, strict=True)
+        ]
         return self._log_unit + np.array(values)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:

@@ -166,6 +166,18 @@ class KernelRows:
     def _sorted_frames(self) -> NDArray[np.float32]:
         return np.ascontiguousarray(self.frames.reshape(-1, 9)[self._cells.rows].T, dtype=np.float32)
 
+    @cached_property
+    def exact(self) -> weighted.MixtureRows:
+        """The rows in float64, as the sum without a cut-off takes them."""
+        return weighted.MixtureRows(
+            self.positions,
+            self.quaternions_xyzw,
+            np.ascontiguousarray(self.frames.reshape(-1, 9)),
+            self.symmetric,
+            np.log(self.weights * np.where(self.symmetric, 0.5, 1.0)),
+            self._own_frames,
+        )
+
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held, those made on demand included."""
@@ -193,15 +205,17 @@ class KernelRows:
         whitening = np.linalg.inv(root) / math.sqrt(2.0)
         offset = np.einsum("cij,cj->ci", whitening, mean)
         rows, columns = np.tril_indices(6)
-        self._lowers = np.concatenate([whitening[:, rows, columns], offset], axis=1)
         self._draw_roots = root
         self.log_unit = float(peaks.max())
-        self._log_weights = peaks - self.log_unit
         spread = np.sqrt(np.linalg.eigvalsh(cov[:, :3, :3])[:, -1])
         self._reach = float(np.max(np.linalg.norm(mean[:, :3], axis=1) + CUTOFF * spread))
         turn = np.sqrt(np.linalg.eigvalsh(cov[:, 3:, 3:])[:, -1])
         # Beyond pi the same rotation has another vector; it counts where a component reaches that far.
-        self._wraps = bool(np.any(np.linalg.norm(mean[:, 3:], axis=1) + 5.3 * turn > math.pi))
+        self.mixture = weighted.Mixture(
+            np.concatenate([whitening[:, rows, columns], offset], axis=1),
+            peaks - self.log_unit,
+            bool(np.any(np.linalg.norm(mean[:, 3:], axis=1) + 5.3 * turn > math.pi)),
+        )
         return self._reach / CUTOFF
 
     @property
@@ -270,15 +284,13 @@ class KernelRows:
             nonlocal done
             if isinstance(self.kernel, IsotropicKernel):
                 weighted.isotropic_sums(
-                    cells.data, cells.start, cells.table, cells.centre, cells.scale, p[begin:end],
-                    q[begin:end], self.kernel.kappa, radius, self.kernel.sigma_rotation > _WIDE_ROTATION,
-                    least, padded, out[begin:end],
+                    cells.arrays, p[begin:end], q[begin:end], self.kernel.kappa, radius,
+                    self.kernel.sigma_rotation > _WIDE_ROTATION, least, padded, out[begin:end],
                 )  # fmt: skip
             else:
                 weighted.mixture_sums(
-                    cells.data, cells.start, cells.table, cells.centre, cells.scale, self._sorted_frames,
-                    self._own_frames, p[begin:end], q[begin:end], self._lowers.astype(np.float32),
-                    self._log_weights.astype(np.float32), self._wraps, radius, least, padded, out[begin:end],
+                    cells.arrays, self._sorted_frames, self._own_frames, p[begin:end], q[begin:end],
+                    self.mixture.single(), radius, least, padded, out[begin:end],
                 )  # fmt: skip
             if progress is not None:
                 with guard:
@@ -322,15 +334,10 @@ class KernelRows:
         p, q = se3.as_poses(positions, quaternions_xyzw)
         if isinstance(self.kernel, IsotropicKernel):
             return self._isotropic(self.kernel).log_density(p, q, cutoff=None, threads=threads)
-        log_rows = np.log(self.weights * np.where(self.symmetric, 0.5, 1.0))
-        frames = np.ascontiguousarray(self.frames.reshape(-1, 9))
-        out = np.empty(len(p))
-        for j in range(len(p)):
-            out[j] = weighted.mixture_log_sum(
-                self.positions, self.quaternions_xyzw, frames, self.symmetric, self._own_frames, log_rows,
-                self._lowers, self._log_weights, self._wraps, p[j], q[j],
-            )  # fmt: skip
-        return out + self.log_unit
+        values = [
+            weighted.mixture_log_sum(self.exact, self.mixture, at, to) for at, to in zip(p, q, strict=True)
+        ]
+        return self.log_unit + np.array(values)
 
     # -- sampling
 

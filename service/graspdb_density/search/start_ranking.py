@@ -106,7 +106,7 @@ def _extended(density: GraspDensity, known: CentreSums, threads: int) -> CentreS
     ordered = values[cells.rows]
     if len(adding):
         isotropic.scatter_sums(
-            cells.data, cells.start, cells.table, cells.centre, cells.scale,
+            cells.arrays,
             density.positions[adding], density.quaternions_xyzw[adding], weights, density.symmetric[adding],
             density.kernel.kappa, _RADIUS, density.wide, ordered,
         )  # fmt: skip
@@ -128,7 +128,7 @@ def _sums(density: GraspDensity, cells: Cells, rows: NDArray[np.int64], threads:
 
     def work(begin: int, end: int) -> None:
         isotropic.sums(
-            cells.data, cells.start, cells.table, cells.centre, cells.scale, positions[begin:end],
+            cells.arrays, positions[begin:end],
             quaternions[begin:end], density.kernel.kappa, _RADIUS, density.wide, out[begin:end],
         )  # fmt: skip
 
@@ -165,7 +165,5 @@ def _reached(density: GraspDensity, rows: NDArray[np.int64]) -> NDArray[np.int64
     """How many kernels are visited for the sum at each of some centres."""
     out = np.empty(len(rows), dtype=np.int64)
     cells = density.cells
-    isotropic.reached(
-        cells.start, cells.table, cells.centre, cells.scale, density.positions[rows], _RADIUS, out
-    )
+    isotropic.reached(cells.arrays, density.positions[rows], _RADIUS, out)
     return out

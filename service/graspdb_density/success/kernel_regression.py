@@ -228,16 +228,14 @@ class SuccessModel:
 
             def work(begin: int, end: int) -> None:
                 diagonal.square_sums(
-                    cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                    p[begin:end], q[begin:end], half, turning, radius, out[begin:end],
+                    cells.arrays, p[begin:end], q[begin:end], half, turning, radius, out[begin:end],
                 )  # fmt: skip
         else:
             kappa, wide, block = kernel.kappa, kernel.sigma_rotation > TWIN_ROTATION, _ISOTROPIC_BLOCK
 
             def work(begin: int, end: int) -> None:
                 isotropic.square_sums(
-                    cells.data, cells.start, cells.table, cells.centre, cells.scale,
-                    p[begin:end], q[begin:end], kappa, radius, wide, out[begin:end],
+                    cells.arrays, p[begin:end], q[begin:end], kappa, radius, wide, out[begin:end],
                 )  # fmt: skip
 
         for_blocks(work, len(p), block=block, threads=threads)
