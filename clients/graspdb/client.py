@@ -6,13 +6,14 @@ from typing import Any
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
+from graspdb.examples import example
 from graspdb.reports import AllReports
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
 from graspdb.resources.objects import GraspObject, Objects
 from graspdb.resources.pages import Listing
+from graspdb.resources.results import table_html
 from graspdb.resources.sweeps import Sweeps
-from graspdb.results import table_html
 from graspdb.transport import Transport
 
 
@@ -86,8 +87,6 @@ class Client:
         Conflict
             If it exists already.
         """
-        from graspdb.examples import example
-
         model = example(name)
         try:
             parts = model.parts_glb()

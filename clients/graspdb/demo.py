@@ -30,8 +30,8 @@ from graspdb.client import Client
 from graspdb.errors import Conflict, GraspDBError, Infeasible
 from graspdb.processes import ChildProcess
 from graspdb.resources.objects import GraspObject
+from graspdb.resources.results import Grasp
 from graspdb.resources.sweeps import OutcomeArrays, Sweep, SweepBar, duration
-from graspdb.results import Grasp
 
 __all__ = ["Children", "DemoFailed", "demo", "wilson_interval"]
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.options import known_keywords
-from graspdb.resources.runs import RunProgress, finished
+from graspdb.resources.runs import RunProgress, wait_for_run
 from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.transport import Transport
@@ -475,7 +475,7 @@ class Reports:
         found = answer.json()
         if answer.status_code == 202:
             where = answer.headers["Location"]
-            found = finished(self._transport, where, f"the {name} report", progress, timeout_s)
+            found = wait_for_run(self._transport, where, f"the {name} report", progress, timeout_s)
         return model.model_validate(found)
 
     def __repr__(self) -> str:

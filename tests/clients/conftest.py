@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import socket
 import subprocess
@@ -15,8 +16,9 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from graspdb import Client
+from graspdb import Client, cli
 from graspdb.processes import ChildProcess
 
 
@@ -114,7 +116,42 @@ def fresh_id() -> str:
     return f"object-{uuid.uuid4().hex[:12]}"
 
 
-Cluster = tuple[np.ndarray, np.ndarray]
+@pytest.fixture
+def run(
+    service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str, str]]:
+    """Run ``graspdb`` with these arguments: exit code, standard output, standard error."""
+    monkeypatch.setenv("GRASPDB_URL", service_url)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def invoke(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["graspdb", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        code = ended.value.code
+        return (code if isinstance(code, int) else 0 if code is None else 1), captured.out, captured.err
+
+    return invoke
+
+
+@pytest.fixture
+def help_of() -> Callable[..., str]:
+    """The help of a command of ours after these arguments, all of which it must know; nothing runs."""
+    programs = {
+        "graspdb": ("graspdb.cli", "app"),
+        "graspdb-server": ("graspdb_service.cli", "cli"),
+        "graspdb-simworker": ("graspdb_simworker.cli", "app"),
+    }
+
+    def text(program: str, *arguments: str) -> str:
+        module, name = programs[program]
+        app = getattr(importlib.import_module(module), name)
+        shown = CliRunner().invoke(app, [*arguments, "--help"])
+        assert shown.exit_code == 0, (program, arguments, shown.output)
+        return shown.output
+
+    return text
 
 
 @pytest.fixture

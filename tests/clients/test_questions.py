@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -12,12 +11,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspdb import Client, Infeasible, cli, wire
+from graspdb import Client, Infeasible, wire
 from graspdb.errors import Conflict, InvalidInput
 from graspdb.reports import Reports
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.selection import Constraints, Selection, TrialSelection
 
+Run = Callable[..., tuple[int, str, str]]
 DOWN = [1.0, 0.0, 0.0, 0.0]
 
 
@@ -82,12 +82,7 @@ def test_selections_choose_trials_and_kernels_everywhere(grasped: GraspObject) -
     assert report.raw.kernel.sigma_position_m == 0.011
 
 
-def test_grasps_before_any_success_say_so(
-    untried: GraspObject,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    service_url: str,
-) -> None:
+def test_grasps_before_any_success_say_so(untried: GraspObject, run: Run) -> None:
     with pytest.raises(Infeasible, match="name a gripper"):
         untried.best_grasp()
     with pytest.raises(Infeasible, match="no successful trial"):
@@ -111,16 +106,7 @@ def test_grasps_before_any_success_say_so(
     assert not untried.best_grasp().prior
     untried.batches.delete(receipt.batch)
 
-    monkeypatch.setenv("GRASPDB_URL", service_url)
-    for arguments in (
-        ["best-grasp", untried.id, "--gripper", "pg70"],
-        ["best-grasp", untried.id, "--no-prior"],
-    ):
-        monkeypatch.setattr(sys, "argv", ["graspdb", "--json", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        answer = json.loads(capsys.readouterr().out)
-        if "--no-prior" in arguments:
-            assert (ended.value.code, answer["grasps"]) == (1, [])
-        else:
-            assert answer["grasps"][0]["prior"] is True
+    code, out, _ = run("--json", "best-grasp", untried.id, "--gripper", "pg70")
+    assert (code, json.loads(out)["grasps"][0]["prior"]) == (0, True)
+    code, out, _ = run("--json", "best-grasp", untried.id, "--no-prior")
+    assert (code, json.loads(out)["grasps"]) == (1, [])

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -132,17 +133,8 @@ def commands() -> list[str]:
     return sorted({" ".join(command.split()) for command in (*inline, *beside)})
 
 
-def test_the_commands_it_names_take_what_it_gives_them() -> None:
+def test_the_commands_it_names_take_what_it_gives_them(help_of: Callable[..., str]) -> None:
     named = commands()
     assert len(named) >= 10
     for command in named:
-        program, *arguments = command.split()
-        # Help is shown once all options before it are known to exist; nothing runs.
-        done = subprocess.run(
-            [str(Path(sys.executable).with_name(program)), *arguments, "--help"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, (command, done.stderr)
-        assert "usage" in done.stdout.lower(), command
+        assert "usage" in help_of(*command.split()).lower(), command

@@ -12,8 +12,8 @@ from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows,
 from graspdb.cli.options import Numbers, takes_options, vector_option
 from graspdb.errors import Infeasible
 from graspdb.files.trials import read_poses
+from graspdb.resources.results import Grasp, Grasps, SampledPoses
 from graspdb.resources.selection import Constraints, Selection
-from graspdb.results import Grasp, Grasps, SampledPoses
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")]

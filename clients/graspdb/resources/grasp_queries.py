@@ -12,7 +12,8 @@ from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
 from graspdb.poses import as_poses
-from graspdb.resources.pages import checked, segment
+from graspdb.resources.pages import segment, validate
+from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
     Constraints,
     Selection,
@@ -22,7 +23,6 @@ from graspdb.resources.selection import (
     query,
 )
 from graspdb.resources.sweeps import SweepOptions, create_sweep
-from graspdb.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.transport import Transport
 
 QUERY_POSES = 100_000
@@ -76,7 +76,7 @@ class GraspQueries:
         given = as_poses(poses)
         options["include"] = None if include is None else names(include)
         # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
-        probe = checked(wire.LikelihoodRequest, {**options, "poses": given.columns(slice(1))})
+        probe = validate(wire.LikelihoodRequest, {**options, "poses": given.columns(slice(1))})
         request = probe.model_dump(mode="json", exclude_unset=True)
         path, answers = f"{self._path}/likelihood", list[wire.Likelihoods]()
         for attempt in range(3):
@@ -189,7 +189,7 @@ class GraspQueries:
         Takes the :class:`Selection`.
         """
         fields = {**known_keywords(Selection, selection, "samples"), "count": count, "seed": seed}
-        request = checked(wire.SamplesRequest, fields)
+        request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
         return SampledPoses.from_wire(answer)
 
@@ -214,6 +214,6 @@ class GraspQueries:
         """
         fields = known_keywords(Selection, selection, "proposals")
         fields |= {"count": count, "seed": seed, "strategy": strategy}
-        request = checked(wire.ProposalsRequest, fields)
+        request = validate(wire.ProposalsRequest, fields)
         answer = self._transport.model(wire.Proposals, "POST", f"{self._path}/proposals", body=request)
         return SampledPoses.from_wire(answer)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from graspdb import wire
-from graspdb.resources.pages import Listing, checked, segment
+from graspdb.resources.pages import Listing, segment, validate
 from graspdb.transport import Transport
 
 
@@ -18,7 +18,7 @@ class Grippers:
 
     def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
         """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
-        request = checked(wire.GripperCreate, {"id": id, "name": name, **profile})
+        request = validate(wire.GripperCreate, {"id": id, "name": name, **profile})
         return self._transport.model(wire.GripperInfo, "POST", "/grippers", body=request, idempotent=True)
 
     def get(self, id: str) -> wire.GripperInfo:

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Unpack
 
 from graspdb import wire
 from graspdb.options import Option
-from graspdb.resources.pages import Listing, checked, segment
-from graspdb.resources.runs import RunProgress, finished
+from graspdb.resources.pages import Listing, segment, validate
+from graspdb.resources.runs import RunProgress, wait_for_run
 from graspdb.resources.selection import TrialSelection
 from graspdb.transport import Transport
 
@@ -80,10 +80,10 @@ class Kernels:
     def _create(
         self, fields: dict[str, Any], progress: RunProgress | None = None, timeout_s: float | None = None
     ) -> wire.StoredKernel:
-        request = checked(wire.KernelCreate, fields)
+        request = validate(wire.KernelCreate, fields)
         answer = self._transport.request("POST", "/kernels", body=request, idempotent=True)
         made = answer.json()
         if answer.status_code == 202:
             where = answer.headers["Location"]
-            made = finished(self._transport, where, "the kernel", progress, timeout_s)
+            made = wait_for_run(self._transport, where, "the kernel", progress, timeout_s)
         return wire.StoredKernel.model_validate(made)

@@ -13,10 +13,10 @@ from graspdb.files.meshes import GLB, MeshLike, read_mesh, scene_of
 from graspdb.options import Option, known_keywords
 from graspdb.reports import Reports
 from graspdb.resources.grasp_queries import GraspQueries
-from graspdb.resources.pages import Listing, checked, segment
+from graspdb.resources.pages import Listing, segment, validate
+from graspdb.resources.results import table_html
 from graspdb.resources.sweeps import Sweep, SweepOptions, Sweeps, create_sweep
 from graspdb.resources.trials import Batches, Trials
-from graspdb.results import table_html
 from graspdb.transport import Model, Transport
 
 
@@ -59,7 +59,7 @@ class GraspObject(GraspQueries):
 
     def patch(self, /, **changes: Unpack[ObjectProperties]) -> GraspObject:
         """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
-        checked(wire.ObjectPatch, changes)
+        validate(wire.ObjectPatch, changes)
         # Nulls are meant in a patch.
         return self._update(self._transport.json("PATCH", self._path, body=changes))
 
@@ -196,7 +196,7 @@ class Objects:
             If a property or the mesh is refused.
         """
         fields = known_keywords(ObjectProperties, properties, "create")
-        request = checked(wire.ObjectCreate, {"id": id, **fields})
+        request = validate(wire.ObjectCreate, {"id": id, **fields})
         loaded = None if mesh is None else read_mesh(mesh, media_type)
         info = self._transport.model(wire.ObjectInfo, "POST", "/objects", body=request, idempotent=True)
         created = GraspObject(self._transport, info)

@@ -25,7 +25,7 @@ def segment(identifier: str) -> str:
     return quote(identifier, safe="")
 
 
-def checked(model: type[Model], fields: Mapping[str, Any]) -> Model:
+def validate(model: type[Model], fields: Mapping[str, Any]) -> Model:
     """Build a request from what was given (None means not given).
 
     Raises

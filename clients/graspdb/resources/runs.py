@@ -17,7 +17,7 @@ RunProgress = Callable[[ReportRun], None]
 _POLL_S = 0.5
 
 
-def finished(
+def wait_for_run(
     transport: Transport, location: str, what: str, progress: RunProgress | None, timeout_s: float | None
 ) -> dict[str, Any]:
     """The result of the run at ``location``; ``what`` it is, for whoever reads an error.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from graspdb import wire
 from graspdb.options import Corners, Option, PoseFile, Vector
 from graspdb.poses import as_poses, as_vector7, vector
-from graspdb.resources.pages import checked
+from graspdb.resources.pages import validate
 
 Kernel = wire.KernelSpec | Mapping[str, Any] | str
 
@@ -150,7 +150,7 @@ def query(selection: Mapping[str, Any]) -> dict[str, Any]:
     if fields.get("kernel") is None or isinstance(fields["kernel"], str):
         return fields
     kernel = fields.pop("kernel")
-    spec = checked(wire.KernelSpec, kernel) if isinstance(kernel, Mapping) else kernel
+    spec = validate(wire.KernelSpec, kernel) if isinstance(kernel, Mapping) else kernel
     if spec.cutoff is not None:
         raise ValueError("a cutoff is for questions about poses: leave it out of the kernel here")
     for name in ("sigma_position_m", "sigma_rotation_deg"):
@@ -196,7 +196,7 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
         fields["object_pose"] = as_vector7(fields["object_pose"])
     if "include" in fields:
         fields["include"] = names(fields["include"])
-    return checked(wire.BestGraspRequest, fields)
+    return validate(wire.BestGraspRequest, fields)
 
 
 def names(given: Sequence[str] | str) -> list[str]:

@@ -24,8 +24,8 @@ from graspdb import wire
 from graspdb.errors import SweepFailed
 from graspdb.options import Corners, Option, PoseFile
 from graspdb.poses import as_poses, vector
-from graspdb.resources.pages import Listing, checked, segment
-from graspdb.results import TriedPoses, pose_columns, table_html
+from graspdb.resources.pages import Listing, segment, validate
+from graspdb.resources.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
 
 ProgressCallback = Callable[[wire.SweepInfo], None]
@@ -295,7 +295,7 @@ def create_sweep(transport: Transport, object_id: str, options: SweepOptions) ->
                 end: vector(f"region's {end} corner", corner, "x, y, z") for end, corner in corners
             }
         fields["grid"] = {**grid, **seed}
-    request = checked(wire.SweepCreate, fields)
+    request = validate(wire.SweepCreate, fields)
     path = f"/objects/{segment(object_id)}/sweeps"
     return Sweep(transport, transport.model(wire.SweepInfo, "POST", path, body=request, idempotent=True))
 

@@ -19,8 +19,8 @@ from graspdb.errors import GraspDBError
 from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses
 from graspdb.resources.pages import Listing, segment
+from graspdb.resources.results import TrialArrays
 from graspdb.resources.selection import TrialSelection
-from graspdb.results import TrialArrays
 from graspdb.transport import Transport
 
 CHUNK_TRIALS = 50_000
@@ -116,7 +116,7 @@ class Trials:
         ----------
         poses
             Tool frames in the object frame: (N, 4, 4) matrices or (N, 7) rows x y z qx qy qz qw, or one
-            pose; a :class:`~graspdb.results.Grasp` or samples are taken too.
+            pose; a :class:`~graspdb.resources.results.Grasp` or samples are taken too.
         outcomes
             (N,) booleans or outcome names; a single one goes for all poses.
         gripper, source, protocol

@@ -9,6 +9,7 @@ from pydantic import Base64Bytes, Field
 
 from graspdb.wire.base import Quadruple, Request, Response, Text, Triple
 from graspdb.wire.grippers import GripperProfile
+from graspdb.wire.sweeps import Fidelity, Protocol
 
 WorkerName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
 Capability = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f]+$")]
@@ -58,8 +59,8 @@ class SimulatePayload(Response):
     mass_kg: float
     friction: float
     gripper: GripperProfile
-    protocol: Literal["wrench", "lift"]
-    fidelity: Literal["standard", "fine"]
+    protocol: Protocol
+    fidelity: Fidelity
     grid: GridPlan | None = None
     poses: PosePlan | None = None
     start: int

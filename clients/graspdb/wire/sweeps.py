@@ -82,7 +82,7 @@ class WaitingFor(Response):
 
     kind: Literal["decompose"]
     job: str
-    state: Literal["queued", "running", "done", "failed", "cancelled"]
+    state: SweepState
     attempts: int
     worker: str | None = None
     progress: str | None = None
