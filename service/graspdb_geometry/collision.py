@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_geometry._compiled import convex, surface
 from graspdb_geometry._compiled.widths import surface_extents
 from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.poses import Poses, ToolPoses, checked
 
 FloatArray = npt.NDArray[np.float64]
 CodeArray = npt.NDArray[np.uint8]
@@ -70,17 +71,12 @@ class Scene:
             np.array([s.radius for s in solids]),
         )
 
-    def classify(
-        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
-    ) -> tuple[CodeArray, FloatArray]:
+    def classify(self, poses: Poses, shape: GripperShape, threads: int = 1) -> tuple[CodeArray, FloatArray]:
         """What the open gripper meets in each pose.
 
         Parameters
         ----------
-        positions : (n, 3) float
-            Tool origins in the object frame, metres.
-        quaternions : (n, 4) float
-            Unit quaternions xyzw of the tool in the object frame.
+        poses : (n)
         shape : GripperShape
             Tested at its full opening.
         threads : int
@@ -94,7 +90,7 @@ class Scene:
             For CONTACT the distance in metres that the finger at +y, and the one at -y, can close alone
             before it meets the object; beyond the stroke if the object lies on one side only.  Otherwise NaN.
         """
-        p, q = _poses(positions, quaternions)
+        p, q = checked(poses)
         boxes = _gripper_boxes(shape, None, 0.0)
         codes = np.empty(len(p), dtype=np.uint8)
         extents = np.empty((len(p), 2))
@@ -109,8 +105,7 @@ class Scene:
 
     def collides(
         self,
-        positions: npt.ArrayLike,
-        quaternions: npt.ArrayLike,
+        poses: Poses,
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
@@ -120,7 +115,7 @@ class Scene:
 
         Parameters
         ----------
-        positions, quaternions, shape, threads
+        poses, shape, threads
             As in :meth:`classify`.
         opening_m : float, optional
             Gap between the fingers, its widest by default.
@@ -132,7 +127,7 @@ class Scene:
         -------
         (n,) bool
         """
-        p, q = _poses(positions, quaternions)
+        p, q = checked(poses)
         boxes = _gripper_boxes(shape, opening_m, retreat_m)
         codes = np.empty(len(p), dtype=np.uint8)
         extents = np.empty((len(p), 2))
@@ -144,22 +139,18 @@ class Scene:
         hits: npt.NDArray[np.bool_] = codes == COLLIDES
         return hits
 
-    def holds(
-        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
-    ) -> npt.NDArray[np.bool_]:
+    def holds(self, poses: Poses, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
         """Whether the open gripper is free and something lies between its fingers, (n,)."""
-        codes, _ = self.classify(positions, quaternions, shape, threads)
+        codes, _ = self.classify(poses, shape, threads)
         return np.asarray(codes == CONTACT)
 
-    def widths(
-        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
-    ) -> FloatArray:
+    def widths(self, poses: Poses, shape: GripperShape, threads: int = 1) -> FloatArray:
         """How far apart the fingers are once both touch the object, metres, (n,).
 
         That is the object's extent along y between the fingers, for a free object is centred as they close.
         NaN where the open gripper collides or nothing is between the fingers.
         """
-        _, travel = self.classify(positions, quaternions, shape, threads)
+        _, travel = self.classify(poses, shape, threads)
         return np.asarray(shape.max_opening_m - travel.sum(axis=1), dtype=np.float64)
 
 
@@ -199,15 +190,14 @@ class Surface:
 
     def collides(
         self,
-        positions: npt.ArrayLike,
-        quaternions: npt.ArrayLike,
+        poses: Poses,
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
         retreat_m: float = 0.0,
     ) -> npt.NDArray[np.bool_]:
         """Whether the gripper overlaps the object in each pose; as :meth:`Scene.collides`."""
-        p, q = _poses(positions, quaternions)
+        p, q = checked(poses)
         boxes = np.ascontiguousarray(_gripper_boxes(shape, opening_m, retreat_m)[:3])
         hits = np.empty(len(p), dtype=np.bool_)
 
@@ -217,11 +207,9 @@ class Surface:
         _in_blocks(run, len(p), threads)
         return hits
 
-    def holds(
-        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
-    ) -> npt.NDArray[np.bool_]:
+    def holds(self, poses: Poses, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
         """As :meth:`Scene.holds`; much quicker than asking how wide."""
-        p, q = _poses(positions, quaternions)
+        p, q = checked(poses)
         column = np.ascontiguousarray(_gripper_boxes(shape, None, 0.0)[3:])
         met = np.empty(len(p), dtype=np.bool_)
 
@@ -229,13 +217,11 @@ class Surface:
             surface.collides(p[block], q[block], column, self._tree, False, met[block])
 
         _in_blocks(run, len(p), threads)
-        return met & ~self.collides(p, q, shape, threads=threads)
+        return met & ~self.collides(poses, shape, threads=threads)
 
-    def widths(
-        self, positions: npt.ArrayLike, quaternions: npt.ArrayLike, shape: GripperShape, threads: int = 1
-    ) -> FloatArray:
+    def widths(self, poses: Poses, shape: GripperShape, threads: int = 1) -> FloatArray:
         """As :meth:`Scene.widths`."""
-        p, q = _poses(positions, quaternions)
+        p, q = checked(poses)
         column = np.ascontiguousarray(_gripper_boxes(shape, None, 0.0)[3])
         extents = np.empty((len(p), 2))
 
@@ -244,7 +230,7 @@ class Surface:
 
         _in_blocks(run, len(p), threads)
         width: FloatArray = extents[:, 1] - extents[:, 0]
-        width[self.collides(p, q, shape, threads=threads)] = np.nan
+        width[self.collides(poses, shape, threads=threads)] = np.nan
         return width
 
     def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -306,15 +292,14 @@ class PointCloud:
 
     def collides(
         self,
-        positions: npt.ArrayLike,
-        quaternions: npt.ArrayLike,
+        poses: Poses,
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
         retreat_m: float = 0.0,
     ) -> npt.NDArray[np.bool_]:
         """Whether the gripper overlaps a ball in each pose; as :meth:`Scene.collides`."""
-        p, q = _poses(positions, quaternions)
+        p, q = checked(poses)
         boxes = np.ascontiguousarray(_gripper_boxes(shape, opening_m, retreat_m)[:3])
         hits = np.empty(len(p), dtype=np.bool_)
 
@@ -339,9 +324,7 @@ def box_part(half_extents: npt.ArrayLike, position: npt.ArrayLike, quaternion: n
     if half.shape != (3,) or not np.all(half > 0) or not np.all(np.isfinite(half)):
         raise ValueError("half_extents must be three positive numbers")
     signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    p, q = _poses(
-        np.reshape(np.asarray(position, dtype=np.float64), (1, -1)), np.reshape(quaternion, (1, -1))
-    )
+    p, q = checked(ToolPoses(np.reshape(position, (1, -1)), np.reshape(quaternion, (1, -1))))
     vertices: FloatArray = Rotation.from_quat(q[0]).apply(signs * half) + p[0]
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = np.array([(a, b, c) for quad in quads for a, b, c in (quad[:3], (quad[0], *quad[2:]))])
@@ -419,21 +402,6 @@ def _gripper_boxes(shape: GripperShape, opening_m: float | None, retreat_m: floa
         [np.concatenate([centres, [column_centre]]), np.concatenate([shrunk, [column_half]])], axis=1
     )
     return np.ascontiguousarray(boxes)
-
-
-def _poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    p = np.ascontiguousarray(positions, dtype=np.float64)
-    q = np.ascontiguousarray(quaternions, dtype=np.float64)
-    if p.ndim != 2 or p.shape[1] != 3:
-        raise ValueError("positions must have shape (n, 3)")
-    if q.shape != (len(p), 4):
-        raise ValueError("quaternions must have shape (n, 4), one for each position")
-    if not (np.all(np.isfinite(p)) and np.all(np.isfinite(q))):
-        raise ValueError("positions and quaternions must be finite")
-    norms = np.linalg.norm(q, axis=1)
-    if np.any(np.abs(norms - 1.0) > 1e-3):
-        raise ValueError("quaternions must have unit length")
-    return p, q / norms[:, None]
 
 
 def _in_blocks(run: Callable[[slice], Any], count: int, threads: int) -> None:

@@ -15,6 +15,7 @@ from graspdb_geometry.features.antipodal import opposed_points
 from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_geometry.features.ridges import parts_solid
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 
 
 def of(mesh: trimesh.Trimesh, opening: float = 0.07) -> JawPairs:
@@ -58,7 +59,7 @@ def test_grasps_on_them_hold_something(name: str) -> None:
     )
     assert len(found) > 200
     positions, quaternions, _ = found.grasps(4_000)
-    held = Scene(parts).holds(positions, quaternions, PG70)
+    held = Scene(parts).holds(ToolPoses(positions, quaternions), PG70)
     # The elongated D is a plate, into whose middle no finger reaches.
     assert held.mean() > 0.03
     again = opposed_points(

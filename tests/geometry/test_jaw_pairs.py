@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from graspdb.examples import EXAMPLES, example
 from graspdb_geometry.features.jaw_pairs import KINDS, MARGIN_M, JawPairs, pairs_of_mesh, pairs_of_parts
 from graspdb_geometry.features.ridges import ridges_of_mesh, ridges_of_parts
+from graspdb_geometry.poses import ToolPoses
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -115,18 +116,20 @@ def test_the_pair_a_grasp_is_at_and_its_frame() -> None:
     ]
     p = np.array([position for position, _ in poses])
     q = np.array([turn.as_quat() for _, turn in poses])
-    which, angle = both.at(p, q)
+    which, angle = both.at(ToolPoses(p, q))
     gaps = [round(float(both.gaps_m[w]), 6) if w >= 0 else None for w in which]
     assert gaps == [0.03, 0.05, None, 0.05, None]
     np.testing.assert_allclose(np.degrees(angle[[0, 1, 3]]), [12.0, 0.0, 40.0], atol=1e-6)
     assert np.isnan(angle[[2, 4]]).all()
-    frames = both.frames(p, q)
+    frames = both.frames(ToolPoses(p, q))
     np.testing.assert_allclose(frames[0], down.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(frames[1], poses[1][1].as_matrix(), atol=1e-9)
     assert np.isnan(frames[[2, 4]]).all()
     # The jaw turned about its approach sees x and y turned.
     twin = (Rotation.from_quat(q) * Rotation.from_rotvec([0, 0, math.pi])).as_quat()
-    np.testing.assert_allclose(both.frames(p, twin)[[0, 1, 3]], frames[[0, 1, 3]] * [-1, -1, 1], atol=1e-9)
+    np.testing.assert_allclose(
+        both.frames(ToolPoses(p, twin))[[0, 1, 3]], frames[[0, 1, 3]] * [-1, -1, 1], atol=1e-9
+    )
     assert len(found.within(0.04)) == (found.gaps_m <= 0.04).sum() < len(found)
 
 
@@ -138,7 +141,7 @@ def test_at_is_the_most_parallel_of_those_that_hold_it(seed: int) -> None:
     found = pairs_of_mesh(*thing.triangles, ridges_of_mesh(*thing.triangles), watertight=True, opening_m=0.07)
     p = rng.uniform(-0.045, 0.045, (40, 3))
     turns = Rotation.random(40, random_state=seed)
-    which, angle = found.at(p, turns.as_quat())
+    which, angle = found.at(ToolPoses(p, turns.as_quat()))
     closing = turns.as_matrix()[:, :, 1]
     room = found.half + np.array([MARGIN_M, 0, MARGIN_M])
     for x, c, w, a in zip(p, closing, which, angle, strict=True):
@@ -154,9 +157,9 @@ def test_at_is_the_most_parallel_of_those_that_hold_it(seed: int) -> None:
 def test_nothing_to_close_on() -> None:
     ball = of(trimesh.creation.icosphere(3, 0.05))
     assert not len(ball)
-    assert (ball.at([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)])[0] == -1).all()
-    assert np.isnan(ball.frames([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)])).all()
-    assert ball.frames(np.empty((0, 3)), np.empty((0, 4))).shape == (0, 3, 3)
+    assert (ball.at(ToolPoses([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)]))[0] == -1).all()
+    assert np.isnan(ball.frames(ToolPoses([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0, 1.0)]))).all()
+    assert ball.frames(ToolPoses(np.empty((0, 3)), np.empty((0, 4)))).shape == (0, 3, 3)
     with pytest.raises(ValueError, match="opening"):
         of(trimesh.creation.box(), opening=0.0)
 
@@ -168,7 +171,7 @@ def test_grasps_on_pairs_are_at_their_pairs(name: str) -> None:
     positions, quaternions, weights = found.grasps(4_000)
     assert len(positions) == pytest.approx(4_000, rel=0.1)
     assert weights.sum() == pytest.approx(1.0)
-    which, angle = found.at(positions, quaternions)
+    which, angle = found.at(ToolPoses(positions, quaternions))
     assert (which >= 0).all()
     np.testing.assert_allclose(angle, 0.0, atol=1e-6)
     # Every pair has its share, and every turn about its axis.

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from graspdb_geometry import collision, grippers
+from graspdb_geometry.poses import ToolPoses
 
 PG70 = grippers.PG70
 HERE = [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]
@@ -22,7 +23,7 @@ def test_points_against_distances_to_the_boxes(seed: int, radius: float, random_
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.2, 0.2, size=(40, 3))
     positions, quaternions = random_poses(rng, 60, 0.2)
-    hits = collision.PointCloud(points, radius).collides(positions, quaternions, PG70)
+    hits = collision.PointCloud(points, radius).collides(ToolPoses(positions, quaternions), PG70)
     half_extents, centres = PG70.boxes()
     seen = (points[None] - positions[:, None]) @ np.eye(3)
     seen = np.stack([Rotation.from_quat(q).inv().apply(x) for q, x in zip(quaternions, seen, strict=True)])
@@ -45,10 +46,10 @@ def test_the_approach_collides_where_a_stop_on_it_does(
     scene = collision.Scene([(points, [])])
     positions, quaternions = random_poses(rng, 40, 0.15)
     approach = Rotation.from_quat(quaternions).apply([0, 0, 1])
-    swept = scene.collides(positions, quaternions, PG70, retreat_m=0.1)
+    swept = scene.collides(ToolPoses(positions, quaternions), PG70, retreat_m=0.1)
     stops = np.zeros(len(positions), dtype=bool)
     for back in np.linspace(0, 0.1, 101):
-        stops |= scene.collides(positions - back * approach, quaternions, PG70)
+        stops |= scene.collides(ToolPoses(positions - back * approach, quaternions), PG70)
     assert np.all(swept[stops])
     # What only the sweep hits lies between two stops: linear programming must find it in the swept boxes.
     reference = oracle([points])
@@ -74,11 +75,11 @@ def test_approach_by_hand() -> None:
     # Beyond a bar across the way that ends at z = 5 mm; the palm's rear is at 200 - 139 = 61 mm.
     beyond = [[0.0, 0.0, 0.2]], HERE[1]
     wall = collision.Scene([collision.box_part([0.005, 0.2, 0.005], [0, 0, 0.0], [0, 0, 0, 1])])
-    assert not wall.collides(*beyond, PG70).any()
-    assert not wall.collides(*beyond, PG70, retreat_m=0.05).any()
-    assert wall.collides(*beyond, PG70, retreat_m=0.07).any()
+    assert not wall.collides(ToolPoses(*beyond), PG70).any()
+    assert not wall.collides(ToolPoses(*beyond), PG70, retreat_m=0.05).any()
+    assert wall.collides(ToolPoses(*beyond), PG70, retreat_m=0.07).any()
     with pytest.raises(ValueError, match="retreat_m"):
-        wall.collides(*HERE, PG70, retreat_m=-0.1)
+        wall.collides(ToolPoses(*HERE), PG70, retreat_m=-0.1)
 
 
 def test_surface_and_parts_agree_on_the_approach(random_poses: Any) -> None:
@@ -87,8 +88,10 @@ def test_surface_and_parts_agree_on_the_approach(random_poses: Any) -> None:
     surface = collision.Surface(vertices, faces, watertight=True)
     scene = collision.Scene([(vertices, faces)])
     for retreat in (0.0, 0.08):
-        hits = surface.collides(positions, quaternions, PG70, retreat_m=retreat)
-        assert np.array_equal(hits, scene.collides(positions, quaternions, PG70, retreat_m=retreat))
+        hits = surface.collides(ToolPoses(positions, quaternions), PG70, retreat_m=retreat)
+        assert np.array_equal(
+            hits, scene.collides(ToolPoses(positions, quaternions), PG70, retreat_m=retreat)
+        )
         assert 0 < hits.sum() < len(hits)
 
 
@@ -102,7 +105,7 @@ def test_bad_clouds_are_refused(points: Any, radius: float, message: str) -> Non
 
 
 def test_an_empty_cloud_is_no_obstacle() -> None:
-    assert not collision.PointCloud(np.zeros((0, 3))).collides(*HERE, PG70).any()
+    assert not collision.PointCloud(np.zeros((0, 3))).collides(ToolPoses(*HERE), PG70).any()
 
 
 def test_flat_boxes_are_refused() -> None:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from graspdb.examples import EXAMPLES, example
 from graspdb_geometry import collision, grids, grippers
 from graspdb_geometry._compiled import surface as compiled
+from graspdb_geometry.poses import ToolPoses
 
 PG70 = grippers.PG70
 
@@ -42,7 +43,7 @@ def test_loose_triangles_agree_with_linear_programming(seed: int, oracle: Any, r
     corners = rng.uniform(-0.1, 0.1, size=(count, 1, 3)) + rng.normal(size=(count, 3, 3)) * 0.03
     surface = collision.Surface(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), watertight=False)
     positions, quaternions = random_poses(rng, 4, 0.15)
-    hits = surface.collides(positions, quaternions, PG70)
+    hits = surface.collides(ToolPoses(positions, quaternions), PG70)
     half_extents, centres = PG70.boxes()
     for p, q, hit in zip(positions, quaternions, hits, strict=True):
         rotation = Rotation.from_quat(q).as_matrix()
@@ -64,8 +65,8 @@ def test_a_closed_surface_collides_like_its_convex_parts(name: str) -> None:
     grid = grids.PoseGrid(*(tuple(b) for b in thing.bounds), max_poses=20_000, seed=2)
     positions, quaternions = grid.poses(grid.pose_indices(0, grid.total))
     for opening in (None, 0.02):
-        by_surface = surface.collides(positions, quaternions, PG70, opening, threads=2)
-        assert np.array_equal(by_surface, scene.collides(positions, quaternions, PG70, opening))
+        by_surface = surface.collides(ToolPoses(positions, quaternions), PG70, opening, threads=2)
+        assert np.array_equal(by_surface, scene.collides(ToolPoses(positions, quaternions), PG70, opening))
         assert 0 < by_surface.sum() < len(positions)
 
 
@@ -74,8 +75,8 @@ def test_a_gripper_wholly_inside_collides_with_solids_only() -> None:
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     faces = [[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)]
     pose = [[0.1, 0.2, 0.3]], [[0.0, 0.0, 0.0, 1.0]]
-    assert collision.Surface(corners, faces, watertight=True).collides(*pose, PG70).all()
-    assert not collision.Surface(corners, faces, watertight=False).collides(*pose, PG70).any()
+    assert collision.Surface(corners, faces, watertight=True).collides(ToolPoses(*pose), PG70).all()
+    assert not collision.Surface(corners, faces, watertight=False).collides(ToolPoses(*pose), PG70).any()
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -9,6 +9,7 @@ import pytest
 
 from graspdb_geometry.collision import Scene, Surface, box_part
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 
 BOX = box_part([0.01, 0.02, 0.05], [0, 0, 0], [0, 0, 0, 1])
 
@@ -20,8 +21,8 @@ def test_a_box_by_hand() -> None:
     quaternions = [down, down, turned, down, down]
     expected = [0.04, 0.04, 0.02, np.nan, np.nan]  # beside it: as wide; beyond: nothing; into it: collides
     for solid in (Scene([BOX]), Surface(*BOX, watertight=True)):
-        np.testing.assert_allclose(solid.widths(poses, quaternions, PG70), expected, atol=2e-7)
-        np.testing.assert_array_equal(solid.holds(poses, quaternions, PG70), np.isfinite(expected))
+        np.testing.assert_allclose(solid.widths(ToolPoses(poses, quaternions), PG70), expected, atol=2e-7)
+        np.testing.assert_array_equal(solid.holds(ToolPoses(poses, quaternions), PG70), np.isfinite(expected))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -33,11 +34,14 @@ def test_parts_and_surface_agree(seed: int, random_hull: Any, random_poses: Any)
     hull = ConvexHull(points)
     scene, surface = Scene([(points, [])]), Surface(points, hull.simplices, watertight=True)
     positions, quaternions = random_poses(rng, 3_000, 0.08)
-    a, b = scene.widths(positions, quaternions, PG70), surface.widths(positions, quaternions, PG70)
+    a, b = (
+        scene.widths(ToolPoses(positions, quaternions), PG70),
+        surface.widths(ToolPoses(positions, quaternions), PG70),
+    )
     both = ~np.isnan(a) & ~np.isnan(b)
     assert both.sum() > 50
     np.testing.assert_allclose(a[both], b[both], atol=1e-6)
     # Poses that differ only touch: a corner within the tolerance.
     assert (np.isnan(a) != np.isnan(b)).sum() <= 3
     for solid, widths in ((scene, a), (surface, b)):
-        assert (solid.holds(positions, quaternions, PG70) != np.isfinite(widths)).sum() <= 3
+        assert (solid.holds(ToolPoses(positions, quaternions), PG70) != np.isfinite(widths)).sum() <= 3

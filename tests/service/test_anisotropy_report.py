@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_density import se3
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 
 Floats = NDArray[np.float64]
 Post = Callable[..., dict[str, Any]]
@@ -47,7 +48,7 @@ def attempts(scene: Scene, *, tilt_deg: float = 40.0) -> tuple[Floats, Floats, l
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     p = np.tile(grid, (len(turns), 1))
     q = np.repeat([turn.as_quat() for turn in turns], len(grid), axis=0)
-    codes, _ = scene.classify(p, q, PG70)
+    codes, _ = scene.classify(ToolPoses(p, q), PG70)
     closing = se3.rotate(q, np.array([0.0, 1.0, 0.0]))
     held = (codes == 2) & (np.abs(closing[:, 1]) > math.cos(math.radians(25.0)))
     told = ["success" if h else "collision" if c == 0 else "missed" for h, c in zip(held, codes, strict=True)]

@@ -14,6 +14,7 @@ from graspdb_density import GraspDensity, IsotropicKernel, Region, se3
 from graspdb_density.kde import brute_force
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -265,7 +266,7 @@ def test_collision_free(
     assert free["grasps"]
     for grasp in free["grasps"]:
         assert grasp["collision_free"] is True
-        assert not scene.collides([grasp["position"]], [grasp["quaternion_xyzw"]], PG70)[0]
+        assert not scene.collides(ToolPoses([grasp["position"]], [grasp["quaternion_xyzw"]]), PG70)[0]
         assert grasp["log_density"] < blind["log_density"]
     answer = http.post(
         "/objects/thing/likelihood",
@@ -274,7 +275,7 @@ def test_collision_free(
             "gripper": "pg70",
         },
     ).json()
-    assert answer["collision_free"] == (~scene.collides(*trials, PG70)).tolist()
+    assert answer["collision_free"] == (~scene.collides(ToolPoses(*trials), PG70)).tolist()
     assert len(set(answer["collision_free"])) == 2
     # Where everything in reach collides, that is infeasible.
     inside = best(http, gripper="pg70", box_min=[-0.01, -0.01, -0.03], box_max=[0.01, 0.01, 0.0])
@@ -519,7 +520,7 @@ def test_obstacles_width_and_approach(
 
     (grasp,) = posted(http, gripper="pg70")["grasps"]
     assert grasp["width_m"] == pytest.approx(0.06, abs=0.003)
-    assert grasp["width_m"] == pytest.approx(box.widths(*pose_of(grasp), PG70)[0], abs=1e-6)
+    assert grasp["width_m"] == pytest.approx(box.widths(ToolPoses(*pose_of(grasp)), PG70)[0], abs=1e-6)
     (grasp,) = posted(http, gripper="pg70", max_width_m=0.04)["grasps"]
     assert grasp["width_m"] == pytest.approx(0.02, abs=0.003)
     assert posted(http, gripper="pg70", max_width_m=0.01)["status"] == "infeasible"

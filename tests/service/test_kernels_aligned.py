@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_density import AnisotropicKernel, DiagonalKernel, MixtureDensity, SuccessModel, se3
 from graspdb_geometry.features.jaw_pairs import pairs_of_mesh
 from graspdb_geometry.features.ridges import ridges_of_mesh
+from graspdb_geometry.poses import ToolPoses
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -73,7 +74,7 @@ def expected(kernel: dict[str, Any], poses: Poses, size: tuple[float, float, flo
     if kernel["alignment"] == "edge":
         frames = ridges.frames(poses[0])
     else:
-        frames = pairs_of_mesh(*box(size), ridges, watertight=True, opening_m=0.07).frames(*poses)
+        frames = pairs_of_mesh(*box(size), ridges, watertight=True, opening_m=0.07).frames(ToolPoses(*poses))
     own = np.isfinite(frames).all(axis=(1, 2))
     assert 0 < own.sum() < len(own)
     frames = np.where(own[:, None, None], frames, se3.to_matrix(poses[1]))

@@ -17,6 +17,7 @@ from graspdb_density import GraspDensity, IsotropicKernel, PoseNoise, Region, Su
 from graspdb_density.search.mode_search import Pool, Search
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
@@ -178,7 +179,7 @@ def test_collisions_under_noise_count(
     rng = np.random.default_rng(0)
     p = np.array([0, 0, 0.045]) + rng.uniform(-1, 1, (600, 3)) * [0.004, 0.0049, 0.004]
     q = se3.multiply(np.array([1.0, 0, 0, 0]), se3.from_rotation_vector(rng.normal(size=(600, 3)) * 0.01))
-    free = ~scene.collides(p, q, PG70)
+    free = ~scene.collides(ToolPoses(p, q), PG70)
     p, q = p[free], q[free]
     won = rng.random(len(p)) < np.where(p[:, 1] > 0.002, 0.95, 0.8)
     post(http, "thing", (p, q), ["success" if w else "slipped" for w in won], gripper="pg70")
@@ -306,7 +307,7 @@ def exhaustive(
     inside = region.contains(p, q)
     p, q = p[inside], q[inside]
     if scene is not None and len(p):
-        free = ~scene.collides(p, q, PG70, threads=2)
+        free = ~scene.collides(ToolPoses(p, q), PG70, threads=2)
         p, q = p[free], q[free]
     return float(density.log_density(p, q, threads=2).max()) if len(p) else -math.inf
 
@@ -342,7 +343,7 @@ def compare(
             (grasp,) = answer.grasps
             pose = np.array([grasp.position]), np.array([grasp.quaternion_xyzw])
             assert region.contains(*pose).all(), seed
-            assert tested is None or not tested.collides(*pose, PG70).any(), seed
+            assert tested is None or not tested.collides(ToolPoses(*pose), PG70).any(), seed
             assert math.exp(grasp.log_density - best) >= 0.999, (seed, grasp.log_density - best, query)
 
 
@@ -365,7 +366,7 @@ class Field:
         p = centres[rows] + rng.normal(size=(len(rows), 3)) * 0.012
         q = se3.multiply(turns[rows], se3.from_rotation_vector(rng.normal(size=(len(rows), 3)) * 0.2))
         # Where the gripper collides nothing can be tried.
-        free = ~scene.collides(p, q, PG70, threads=2)
+        free = ~scene.collides(ToolPoses(p, q), PG70, threads=2)
         rows, self.positions, self.quaternions = rows[free], p[free], q[free]
         self.won = rng.random(len(rows)) < shares[rows]
         self.scene = scene
@@ -376,7 +377,7 @@ class Field:
     def chance(self, column: str) -> Callable[[Floats, Floats], Floats]:
         def score(p: Floats, q: Floats) -> Floats:
             values = np.zeros(len(p))
-            free = np.flatnonzero(~self.scene.collides(p, q, PG70, threads=2))
+            free = np.flatnonzero(~self.scene.collides(ToolPoses(p, q), PG70, threads=2))
             if len(free):
                 found = self.model.evaluate(p[free], q[free], level=0.9, threads=2)
                 values[free] = getattr(found, column)
@@ -406,7 +407,7 @@ class Field:
 
         def allowed(p: Floats, q: Floats) -> Bools:
             ok = self.near(p, q)
-            return ok & ~self.scene.collides(p, q, PG70, threads=2) if free else ok
+            return ok & ~self.scene.collides(ToolPoses(p, q), PG70, threads=2) if free else ok
 
         ok = allowed(p, q) if len(p) else np.zeros(0, dtype=bool)
         p, q = p[ok], q[ok]
@@ -472,7 +473,7 @@ def compare_scores(
             pose = np.array([grasp.position]), np.array([grasp.quaternion_xyzw])
             assert region.contains(*pose).all(), seed
             assert field.near(*pose).all(), seed
-            assert not query["collision_free"] or not field.scene.collides(*pose, PG70).any(), seed
+            assert not query["collision_free"] or not field.scene.collides(ToolPoses(*pose), PG70).any(), seed
             assert grasp.score == pytest.approx(float(score(*pose)[0]), rel=1e-3, abs=1e-6), seed
             assert grasp.score >= 0.999 * best, (seed, grasp.score / best, query)
 

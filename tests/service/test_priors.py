@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -82,10 +83,13 @@ def test_edges_close_on_opposed_faces_at_any_turn(sqlite_http: httpx.Client, box
         assert (approach @ np.array(direction) > 0.8).mean() > 0.02, direction
     assert (np.abs(p) < np.array(SIZE) / 2 + 0.05).all()
     # Far more of them are free of the object than of poses turned at random in the same places.
-    free = ~box.collides(p, q, PG70)
+    free = ~box.collides(ToolPoses(p, q), PG70)
     random = se3.random_quaternions(len(p), np.random.default_rng(0))
     assert free.mean() > 0.4
-    assert np.isfinite(box.widths(p, q, PG70)).mean() > 3 * np.isfinite(box.widths(p, random, PG70)).mean()
+    assert (
+        np.isfinite(box.widths(ToolPoses(p, q), PG70)).mean()
+        > 3 * np.isfinite(box.widths(ToolPoses(p, random), PG70)).mean()
+    )
     assert (g > 0).all()
     assert propose(sqlite_http, count=4_000, seed=3) == answer
     assert propose(sqlite_http, count=4_000, seed=4)["position"] != answer["position"]
@@ -155,7 +159,7 @@ def test_a_smooth_object_has_opposed_points(sqlite_http: httpx.Client, make_obje
     assert np.median(np.abs(closing[:, 2])) < 0.35
     turn = np.arctan2(closing[:, 1], closing[:, 0]) % np.pi
     assert np.histogram(turn, bins=6, range=(0, np.pi))[0].min() > 0.1 * len(turn)
-    held = Scene([(np.asarray(ball.vertices), np.asarray(ball.faces))]).holds(p, q, PG70)
+    held = Scene([(np.asarray(ball.vertices), np.asarray(ball.faces))]).holds(ToolPoses(p, q), PG70)
     assert held.mean() > 0.5
     (grasp,) = best(sqlite_http)["grasps"]
     assert grasp["prior"] is True
@@ -172,7 +176,7 @@ def test_a_grasp_before_any_success_is_marked_prior(
     assert (answer["status"], len(answer["grasps"])) == ("ok", 5)
     assert "edges" in answer["kernel"]["rule"]
     p, q = poses_of(answer["grasps"])
-    assert np.isfinite(box.widths(p, q, PG70)).all()
+    assert np.isfinite(box.widths(ToolPoses(p, q), PG70)).all()
     for grasp in answer["grasps"]:
         assert grasp["prior"] is True
         assert grasp["collision_free"] is True
@@ -212,7 +216,7 @@ def test_it_keeps_every_constraint(sqlite_http: httpx.Client, box: Scene) -> Non
     assert (axes[:, 2, 2] <= -math.cos(math.radians(20)) + 1e-6).all()
     # Only x, 30 mm, is narrow enough.
     assert (np.abs(axes[:, 0, 1]) > 0.8).all()
-    assert (box.widths(p, q, PG70) <= 0.045).all()
+    assert (box.widths(ToolPoses(p, q), PG70) <= 0.045).all()
     assert all(grasp["prior"] and grasp["world"] for grasp in answer["grasps"])
     far = best(sqlite_http, box_min=[1, 1, 1], box_max=[2, 2, 2])
     assert (far["status"], far["grasps"]) == ("infeasible", [])
@@ -220,7 +224,7 @@ def test_it_keeps_every_constraint(sqlite_http: httpx.Client, box: Scene) -> Non
     # Robust under noise, and ranked among candidates.
     robust = best(sqlite_http, objective="robust", tool_noise_m=0.005, tool_noise_deg=5)
     assert robust["status"] == "ok"
-    assert np.isfinite(box.widths(*poses_of(robust["grasps"]), PG70)).all()
+    assert np.isfinite(box.widths(ToolPoses(*poses_of(robust["grasps"])), PG70)).all()
     first = best(sqlite_http, count=5, candidates={"position": p.tolist(), "quaternion_xyzw": q.tolist()})
     assert {grasp["candidate"] for grasp in first["grasps"]} == set(range(len(p)))
 
@@ -244,7 +248,7 @@ def test_failures_alone_tell_how_unlikely_it_is(sqlite_http: httpx.Client, box: 
     (other,) = best(sqlite_http, objective="success_probability")["grasps"]
     assert other["prior"] is True
     assert other["effective_trials"] < 1
-    assert np.isfinite(box.widths(*poses_of([other]), PG70)).all()
+    assert np.isfinite(box.widths(ToolPoses(*poses_of([other])), PG70)).all()
 
 
 def test_when_it_does_not_answer(sqlite_http: httpx.Client, make_object: Make, box: Scene) -> None:

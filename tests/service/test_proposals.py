@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_geometry.collision import Scene, box_part
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.proposals import uncertain
 
@@ -148,7 +149,7 @@ def test_trials_of_proposals_are_weighted(
 def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Poses]) -> None:
     scene = Scene([box_part([0.01, 0.03, 0.05], [0, 0, 0], [0, 0, 0, 1])])
     p, q = clusters([((0, 0, 0.045), (1.0, 0, 0, 0))], 300, sigma_m=0.004, sigma_rad=0.05)
-    free = ~scene.collides(p, q, PG70)
+    free = ~scene.collides(ToolPoses(p, q), PG70)
     p, q = p[free], q[free]
     won = np.arange(len(p)) % 2 == 0
     density = GraspDensity.build(p[won], q[won], kernel=KERNEL)
@@ -156,8 +157,8 @@ def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Poses]) ->
     blind, seeing = uncertain(density, model, None), uncertain(density, model, CollisionTest(scene, PG70))
     assert blind is not None
     assert seeing is not None
-    assert scene.collides(blind.positions, blind.quaternions_xyzw, PG70).mean() > 0.2
-    assert not scene.collides(seeing.positions, seeing.quaternions_xyzw, PG70).any()
+    assert scene.collides(ToolPoses(blind.positions, blind.quaternions_xyzw), PG70).mean() > 0.2
+    assert not scene.collides(ToolPoses(seeing.positions, seeing.quaternions_xyzw), PG70).any()
     # Where everything near collides, nothing is left.
     huge = Scene([box_part([0.5, 0.5, 0.5], [0, 0, 0], [0, 0, 0, 1])])
     assert uncertain(density, model, CollisionTest(huge, PG70)) is None

@@ -19,6 +19,7 @@ from graspdb_density.statistics.convergence import verdict
 from graspdb_density.statistics.incremental_bootstrap import convergence_curve
 from graspdb_density.success.calibration import area_under_curve, assign_blocks, calibrate
 from graspdb_density.vicinity.anisotropy import empirical
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.storage import objects, report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import Question
@@ -220,7 +221,7 @@ def test_collisions_known_and_aligned_with_the_object(
     q = se3.random_quaternions(3_000, rng)
     from graspdb_geometry.grippers import PG70
 
-    hit = scene.collides(p, q, PG70)
+    hit = scene.collides(ToolPoses(p, q), PG70)
     won = ~hit & (np.abs(p[:, 1]) < 0.02)
     told = ["collision" if h else "success" if w else "missed" for h, w in zip(hit, won, strict=True)]
     assert 20 < won.sum() < hit.sum()

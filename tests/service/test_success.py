@@ -18,6 +18,7 @@ from graspdb_density.kde import brute_force
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -141,7 +142,7 @@ def run_sweep(
         index = plan.pose_indices(payload["start"], payload["stop"])
         p, q = plan.poses(index)
         codes = np.where(p[:, 0] > 0, OUTCOME_CODES["success"], OUTCOME_CODES["missed"]).astype(np.uint8)
-        codes[scene.collides(p, q, PG70)] = COLLISION
+        codes[scene.collides(ToolPoses(p, q), PG70)] = COLLISION
         rows = index[(codes == OUTCOME_CODES["success"]) | ((codes != COLLISION) & (index % 2 == 0))]
         result = {
             "outcomes": base64.b64encode(codes.tobytes()).decode(),
@@ -172,7 +173,7 @@ def test_sweeps_with_their_packed_outcomes(
     queries = poses[0][rows] + 0.005 * rng.normal(size=(150, 3)), poses[1][rows]
     tried = codes != COLLISION
     attempts, won = (poses[0][tried], poses[1][tried]), codes[tried] == OUTCOME_CODES["success"]
-    collides = scene.collides(*queries, PG70)
+    collides = scene.collides(ToolPoses(*queries), PG70)
     assert 10 < collides.sum() < 140
 
     def expected(attempts: Poses, won: Bools) -> tuple[Floats, ...]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from graspdb.examples import ExampleObject, example
 from graspdb.wire import Finger, GridPlan, GripperProfile, PosePlan, SimulatePayload
+from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.simulation import chunks
 
 PG70 = GripperProfile(
@@ -119,7 +120,9 @@ def physical_poses() -> Callable[[str, int], list[tuple[Any, Any]]]:
 
         thing = example(name)
         _, positions, quaternions = chunks.poses_of(plan(thing, stop=40_000))
-        codes, _ = collision.Scene(thing.parts).classify(positions, quaternions, chunks.shape_of(PG70))
+        codes, _ = collision.Scene(thing.parts).classify(
+            ToolPoses(positions, quaternions), chunks.shape_of(PG70)
+        )
         rows = np.flatnonzero(codes == collision.CONTACT)
         assert len(rows) >= count
         rows = rows[np.linspace(0, len(rows) - 1, count).astype(int)]

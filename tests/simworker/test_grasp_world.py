@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb_geometry import collision
+from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.simulation.bodies import Closing, End
 from graspdb_simworker.simulation.chunks import Workpiece
 from graspdb_simworker.simulation.grasp_world import GraspWorld
@@ -22,7 +23,7 @@ FindPoses = Callable[[str, int], list[tuple[Any, Any]]]
 
 def travels(workpiece: Workpiece, poses: list[tuple[Any, Any]]) -> list[float]:
     positions, quaternions = (np.array([pose[k] for pose in poses]) for k in (0, 1))
-    codes, first = workpiece.scene.classify(positions, quaternions, workpiece.shape)
+    codes, first = workpiece.scene.classify(ToolPoses(positions, quaternions), workpiece.shape)
     assert (codes == collision.CONTACT).all()
     return [float(t) for t in np.minimum(first.min(axis=1), 0.5 * workpiece.shape.max_opening_m)]
 

@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_geometry._compiled.ridges import regions
 from graspdb_geometry.collision import Surface
 from graspdb_geometry.features.ridges import Ridges, Solid, parts_solid
+from graspdb_geometry.poses import Poses, checked
 
 __all__ = ["KINDS", "MARGIN_M", "JawPairs", "Kind", "pairs_of_mesh", "pairs_of_parts"]
 
@@ -97,12 +98,12 @@ class JawPairs:
         chosen = self.gaps_m <= opening_m
         return JawPairs(self.kinds[chosen], self.centres[chosen], self.axes[chosen], self.half[chosen])
 
-    def at(self, positions: npt.ArrayLike, quaternions_xyzw: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
-        """The pair that each grasp (n, 3), (n, 4) is at, -1 at none, and its closing axis' angle to c.
+    def at(self, poses: Poses) -> tuple[IntArray, FloatArray]:
+        """The pair that each of n grasps is at, -1 at none, and its closing axis' angle to c.
 
         Angles are in radians, 0 to pi / 2; NaN at none.
         """
-        p, axes = _poses(positions, quaternions_xyzw)
+        p, axes = _axes(poses)
         which = np.full(len(p), -1, dtype=np.int64)
         cosine = np.full(len(p), np.nan)
         if len(self) and len(p):
@@ -143,15 +144,15 @@ class JawPairs:
         rotations = Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=-1))
         return positions, np.asarray(rotations.as_quat()), share[pair] / number[pair]
 
-    def frames(self, positions: npt.ArrayLike, quaternions_xyzw: npt.ArrayLike) -> FloatArray:
+    def frames(self, poses: Poses) -> FloatArray:
         """Frames (n, 3, 3) of the pairs that grasps are at, their axes named as the gripper's.
 
         y is c, z that of the other two which the approach is nearest to, each with the sign nearest to the
         gripper's own axis, x = y x z. NaN at no pair, and where the closing axis is more than 45 degrees
         from c.
         """
-        which, angle = self.at(positions, quaternions_xyzw)
-        _, axes = _poses(positions, quaternions_xyzw)
+        which, angle = self.at(poses)
+        _, axes = _axes(poses)
         found = np.full((len(which), 3, 3), np.nan)
         known = np.flatnonzero((which >= 0) & (np.cos(np.nan_to_num(angle, nan=2.0)) > _ALIGNED))
         own, pair = axes[known], self.axes[which[known]] if len(self) else np.empty((0, 3, 3))
@@ -439,14 +440,10 @@ def _largest(regions: list[tuple[FloatArray, FloatArray, FloatArray]]) -> Region
     return centres[order], axes[order], half[order]
 
 
-def _poses(positions: npt.ArrayLike, quaternions_xyzw: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    p = np.ascontiguousarray(positions, dtype=np.float64)
-    q = np.asarray(quaternions_xyzw, dtype=np.float64)
-    if p.ndim != 2 or p.shape[1] != 3 or q.shape != (len(p), 4):
-        raise ValueError("positions must have shape (n, 3) and quaternions (n, 4)")
-    if not len(p):
-        return p, np.empty((0, 3, 3))
-    return p, np.asarray(Rotation.from_quat(q).as_matrix())
+def _axes(poses: Poses) -> tuple[FloatArray, FloatArray]:
+    """Positions and rotation matrices."""
+    p, q = checked(poses)
+    return p, np.asarray(Rotation.from_quat(q).as_matrix()) if len(p) else np.empty((0, 3, 3))
 
 
 def _sign(values: FloatArray) -> FloatArray:

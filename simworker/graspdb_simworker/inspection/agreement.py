@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import collision
+from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.inspection.stored_outcomes import StoredOutcomes
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.bodies import Part
@@ -81,7 +82,7 @@ def enough_poses(payload: SimulatePayload, parts: Sequence[Part], count: int) ->
         total = min(poses, chunks.grid_of(grid).candidate_total)
         larger = payload.model_copy(update={"grid": grid, "start": 0, "stop": total})
         _, positions, quaternions = chunks.poses_of(larger)
-        codes, _ = scene.classify(positions, quaternions, shape)
+        codes, _ = scene.classify(ToolPoses(positions, quaternions), shape)
         if total < poses or int((codes == collision.CONTACT).sum()) >= 3 * count:
             return larger
         poses *= 2

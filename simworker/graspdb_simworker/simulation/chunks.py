@@ -22,6 +22,7 @@ from graspdb.wire import GridPlan, GripperProfile, ResultRows, SimulatePayload, 
 from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.simulation.bodies import MIN_FINGER_SHARE, Gripper, Part, closing_force
 from graspdb_simworker.simulation.force_test import compile_force_test
 from graspdb_simworker.simulation.grasp_world import GraspWorld
@@ -52,7 +53,7 @@ class Workpiece:
     ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """What geometry says of tool poses (n, 3), (n, 4): its code (n,), and how far each finger can close
         before the first touches (n,), metres."""
-        codes, first_contact = self.scene.classify(positions, quaternions, self.shape)
+        codes, first_contact = self.scene.classify(ToolPoses(positions, quaternions), self.shape)
         return codes, np.minimum(first_contact.min(axis=1), 0.5 * self.shape.max_opening_m)
 
     def simulate(

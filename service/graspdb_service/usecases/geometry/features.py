@@ -13,6 +13,7 @@ from graspdb_geometry.collision import Surface
 from graspdb_geometry.features.antipodal import opposed_points
 from graspdb_geometry.features.jaw_pairs import JawPairs, pairs_of_mesh, pairs_of_parts
 from graspdb_geometry.features.ridges import Ridges, parts_solid, ridges_of_mesh, ridges_of_parts
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
@@ -120,7 +121,7 @@ class Features:
             ridges = self.ridges(row)
             return lambda positions, _: ridges.frames(positions)
         pairs = self.pairs(row, selected)
-        return pairs.frames
+        return lambda positions, quaternions: pairs.frames(ToolPoses(positions, quaternions))
 
     def _prepared(self, row: ObjectRow, opening_m: float, *, points: bool = False) -> _Prepared:
         """Ridges, for an opening the pairs, and, if asked for, opposed points."""

@@ -14,6 +14,7 @@ from graspdb_density import GraspDensity, Maximum, MixtureDensity, se3, search_s
 from graspdb_density.search.evolution import Score
 from graspdb_density.search.mode_search import Admissible, distinct_from
 from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.densities.success_models import Model
 from graspdb_service.usecases.geometry.collision import CollisionTest, shape_of
@@ -159,7 +160,9 @@ def _clear_of(
     def clear(positions: Floats, quaternions: Floats) -> Bools:
         hit = np.zeros(len(positions), dtype=np.bool_)
         for solid in limits.obstacles:
-            hit |= solid.collides(positions, quaternions, shape, threads=threads, retreat_m=distance)
+            hit |= solid.collides(
+                ToolPoses(positions, quaternions), shape, threads=threads, retreat_m=distance
+            )
         return ~hit
 
     return clear

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from graspdb.wire.reports import AnisotropyRelation
 from graspdb_density.success.block_bootstrap import shares
 from graspdb_geometry.features.jaw_pairs import KINDS, JawPairs
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.reports.common import LEVEL, finite
 from graspdb_service.usecases.trials.attempts import AllTrials
 
@@ -37,7 +38,7 @@ def relations(everything: AllTrials, pairs: JawPairs) -> list[AnisotropyRelation
     edges = np.radians(ANGLES_DEG)
     alone = np.ones(len(rows), dtype=bool)
     for kind in KINDS:
-        which, angle = pairs.of(kind).at(p, q)
+        which, angle = pairs.of(kind).at(ToolPoses(p, q))
         alone &= which < 0
         if not (pairs.kinds == KINDS.index(kind)).any():
             continue

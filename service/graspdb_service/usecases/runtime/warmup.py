@@ -10,6 +10,7 @@ import numpy as np
 from graspdb_density import GraspDensity, IsotropicKernel, Region, SuccessModel, choose_widths, se3
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import PG70
+from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.runtime.compute import Compute
 
 
@@ -31,12 +32,12 @@ def _exercise() -> None:
     corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]) * 0.02
     faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7]])
     scene = Scene([(corners, faces)])
-    Surface(corners, faces, watertight=False).collides(positions, quaternions, PG70)
+    Surface(corners, faces, watertight=False).collides(ToolPoses(positions, quaternions), PG70)
     kernel = IsotropicKernel(0.015, math.radians(15.0))
     region = Region([[0.0, 0.0, 1.0, 0.0]], approach=(0.0, 0.0, 1.0), approach_angle=1.0)
 
     def free(p: se3.Floats, q: se3.Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        return ~scene.collides(p, q, PG70)
+        return ~scene.collides(ToolPoses(p, q), PG70)
 
     choose_widths(positions, quaternions)
     success = rng.random(300) < 0.5
