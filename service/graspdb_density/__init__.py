@@ -10,9 +10,10 @@ from .kde.sample_kernel import SampledKernel
 from .kernels.diagonal import DiagonalKernel
 from .kernels.gaussian_mixture import AnisotropicKernel
 from .kernels.isotropic import HAAR_VOLUME, IsotropicKernel
-from .search.evolution import PoseNoise, expected, search_scored
-from .search.mode_search import Maximum, nearest
+from .search.mode_search import ModeSearch
+from .search.pose_noise import PoseNoise, expected
 from .search.region import Region
+from .search.scored_poses import Maximum, Separation
 from .success.kernel_regression import SuccessEstimate, SuccessModel
 
 __all__ = [
@@ -24,9 +25,11 @@ __all__ = [
     "IsotropicKernel",
     "Maximum",
     "MixtureDensity",
+    "ModeSearch",
     "PoseNoise",
     "Region",
     "SampledKernel",
+    "Separation",
     "SuccessEstimate",
     "SuccessModel",
     "WidthChoice",
@@ -36,8 +39,6 @@ __all__ = [
     "expected",
     "importance_weights",
     "mixture_weights",
-    "nearest",
     "se3",
-    "search_scored",
     "widths_prefix",
 ]

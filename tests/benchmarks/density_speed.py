@@ -45,6 +45,8 @@ from graspdb_density.bandwidth import mixture_fit
 from graspdb_density.kde import brute_force as reference
 from graspdb_density.kde.bhattacharyya import bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.isotropic import CUTOFF, scaled_radius
+from graspdb_density.search.mode_search import ModeSearch
+from graspdb_density.search.start_ranking import centre_sums
 
 sys.path.append(str(Path(__file__).parents[1] / "density"))
 from ellipsoid_shell import SEMI_AXES_M, shell
@@ -262,18 +264,19 @@ def maxima(rng: np.random.Generator) -> None:
         rows, more = shell(count, rng), shell(1_000, rng)
         density = GraspDensity.build(*rows, kernel=kernel)
         started = time.thread_time()
-        density.centre_sums()
+        known = centre_sums(density, None, 1)
         centres = time.thread_time() - started
+        search = ModeSearch(density)
         build, extend, best, ten = interleaved(
             ROUNDS,
             lambda r=rows, k=kernel: GraspDensity.build(*r, kernel=k),
-            lambda d=density, r=more: d.extend(*r).centre_sums(),
-            lambda d=density: d.maximum(region),
-            lambda d=density: d.maximum(region, count=10),
+            lambda d=density, r=more, k=known: centre_sums(d.extend(*r), k, 1),
+            lambda s=search: s.maxima(region),
+            lambda s=search: s.maxima(region, count=10),
         )
         print(
             f"{count:7d}  {1e3 * build:6.0f}  {1e3 * centres:8.0f}  {1e3 * extend:16.1f}"
-            f"  {1e3 * best:21.1f}  {1e3 * ten:9.1f}  {density.nbytes / 1e6:4.0f}"
+            f"  {1e3 * best:21.1f}  {1e3 * ten:9.1f}  {(density.nbytes + search.nbytes) / 1e6:4.0f}"
         )
 
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from graspdb_density import (
     GraspDensity,
     IsotropicKernel,
+    ModeSearch,
     PoseNoise,
     Region,
     SuccessModel,
     expected,
     se3,
-    search_scored,
 )
 
 Poses = tuple[se3.Floats, se3.Floats]
@@ -33,8 +33,8 @@ def test_the_density_itself_as_a_score_gives_its_maximum(seed: int, shell: Shell
     region = Region(
         half_spaces=Region.box([-0.15, -0.1, 0.0], [0.15, 0.1, 0.15]), approach=[0, 0, -1], approach_angle=0.8
     )
-    (climbed,) = density.maximum(region)
-    (scored,) = search_scored(density, density.log_density, region)
+    (climbed,) = ModeSearch(density).maxima(region)
+    (scored,) = ModeSearch(density).maxima(region, score=density.log_density)
     assert region.contains(scored.position[None], scored.quaternion_xyzw[None]).all()
     assert math.exp(scored.score - climbed.log_density) > 0.99
     assert scored.score == pytest.approx(scored.log_density)
@@ -42,7 +42,7 @@ def test_the_density_itself_as_a_score_gives_its_maximum(seed: int, shell: Shell
 
 def test_as_many_distinct_grasps_as_there_are(shell: Shell) -> None:
     density = GraspDensity.build(*shell(1_500, np.random.default_rng(0)), kernel=KERNEL)
-    found = search_scored(density, density.log_density, count=100)
+    found = ModeSearch(density).maxima(score=density.log_density, count=100)
     assert len(found) == 100
     scores = [item.score for item in found]
     assert scores == sorted(scores, reverse=True)
@@ -65,7 +65,7 @@ def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> Non
     won[:60] = False
     model = SuccessModel.build(p, q, won, kernel=KERNEL)
     density = GraspDensity.build(p[won], q[won], kernel=KERNEL)
-    found = search_scored(density, lambda a, b: model.evaluate(a, b).low, count=2)
+    found = ModeSearch(density).maxima(score=lambda a, b: model.evaluate(a, b).low, count=2)
     assert found[0].position[0] < -0.05
     assert found[0].score > found[1].score
     estimate = model.evaluate(found[0].position[None], found[0].quaternion_xyzw[None])
@@ -82,7 +82,7 @@ def test_refused_poses_are_never_returned(shell: Shell) -> None:
     def admissible(p: se3.Floats, q: se3.Floats) -> NDArray[np.bool_]:
         return np.asarray(p[:, 0] > 0.05, dtype=bool)
 
-    found = search_scored(density, density.log_density, count=3, admissible=admissible)
+    found = ModeSearch(density).maxima(score=density.log_density, count=3, admissible=admissible)
     assert found
     assert all(m.position[0] > 0.05 for m in found)
 
@@ -119,9 +119,9 @@ def test_robust_search_prefers_the_broad_peak() -> None:
     broad = np.array([-0.1, 0.0, 0.0]) + rng.normal(size=(140, 3)) * 0.012
     p = np.concatenate([sharp, broad])
     density = GraspDensity.build(p, np.tile(se3.IDENTITY, (200, 1)), kernel=IsotropicKernel(0.006, 0.3))
-    assert density.maximum()[0].position[0] > 0.0
+    assert ModeSearch(density).maxima()[0].position[0] > 0.0
     robust = expected(density.density, object_noise=PoseNoise(0.02, 0.0))
-    (best,) = search_scored(density, robust)
+    (best,) = ModeSearch(density).maxima(score=robust)
     assert best.position[0] < 0.0
 
 
@@ -132,4 +132,4 @@ def test_bad_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="samples"):
         expected(density.density, samples=0)
     with pytest.raises(ValueError, match="the score answered shape"):
-        search_scored(density, lambda p, q: np.zeros(1 + len(p)))
+        ModeSearch(density).maxima(score=lambda p, q: np.zeros(1 + len(p)))

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from graspdb_density import GraspDensity, IsotropicKernel, Region, nearest, se3
+from graspdb_density import GraspDensity, IsotropicKernel, ModeSearch, Region, Separation, se3
 from graspdb_density.search import start_ranking
-from graspdb_density.search.mode_search import Pool, Search
+from graspdb_density.search.mode_search import MeanShiftSearch
+from graspdb_density.search.start_ranking import centre_sums
 
 Poses = tuple[se3.Floats, se3.Floats]
 Shell = Callable[[int, np.random.Generator], Poses]
@@ -82,7 +83,7 @@ def test_against_exhaustive_search(seed: int, shell: Shell) -> None:
     rng = np.random.default_rng(seed)
     density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
     region = random_region(rng)
-    found = density.maximum(region)
+    found = ModeSearch(density).maxima(region)
     best = exhaustive(density, region, rng)
     if not found:
         # Nothing within the cut-off: then nothing anyone finds is worth more than a kernel's tail there.
@@ -95,8 +96,9 @@ def test_against_exhaustive_search(seed: int, shell: Shell) -> None:
 def test_global_maximum_is_the_highest_point(shell: Shell) -> None:
     rng = np.random.default_rng(20)
     density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
-    top = density.global_maximum()
-    assert top is density.global_maximum()
+    search = ModeSearch(density)
+    top = search.global_maximum()
+    assert top is search.global_maximum()
     assert math.exp(top.log_density - exhaustive(density, Region(), rng)) >= 0.999
     assert (density.log_density(*density.sample(5_000, rng)) <= top.log_density + 1e-3).all()
 
@@ -109,7 +111,7 @@ def test_never_infeasible_and_always_distinct(seed: int) -> None:
     symmetric = bool(rng.random() < 0.5)
     density = GraspDensity.build(*rows, kernel=KERNEL, symmetric=symmetric)
     region = random_region(rng)
-    found = density.maximum(region, count=4, min_separation_m=0.02, min_separation=math.radians(30.0))
+    found = ModeSearch(density).maxima(region, count=4, separation=Separation(0.02, math.radians(30.0)))
     for i, grasp in enumerate(found):
         assert region.contains(grasp.position[None], grasp.quaternion_xyzw[None]).all()
         assert math.isfinite(grasp.log_density)
@@ -134,7 +136,7 @@ def test_a_single_mode_yields_several_distinct_grasps() -> None:
     rng = np.random.default_rng(21)
     rows = rng.normal(size=(500, 3)) * 0.02, np.tile(se3.IDENTITY, (500, 1))
     density = GraspDensity.build(*rows, kernel=KERNEL)
-    found = density.maximum(count=5, min_separation_m=0.01, min_separation=0.3)
+    found = ModeSearch(density).maxima(count=5, separation=Separation(0.01, 0.3))
     assert len(found) == 5
 
 
@@ -144,7 +146,7 @@ def test_regions_without_a_feasible_row_are_reached_by_projection() -> None:
     region = Region(
         half_spaces=[[1.0, 0.0, 0.0, 0.03]], approach=[1.0, 0.0, 1.0], approach_angle=math.radians(30.0)
     )
-    (best,) = density.maximum(region)
+    (best,) = ModeSearch(density).maxima(region)
     np.testing.assert_allclose(best.position, [0.03, 0.0, 0.0], atol=1e-6)
     # Turned from z by the 15 degrees that bring it into the cone of 30 about an axis at 45.
     assert float(se3.angle_between(best.quaternion_xyzw, se3.IDENTITY)) == pytest.approx(
@@ -195,42 +197,37 @@ def test_the_closing_axis_has_no_sign_unless_asked() -> None:
     kernel = KERNEL
     density = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=kernel, symmetric=False)
     back = {"closing": [0.0, -1.0, 0.0], "closing_angle": 0.1}
-    assert density.maximum(Region(**back))
-    assert not density.maximum(Region(**back, closing_signed=True))
+    assert ModeSearch(density).maxima(Region(**back))
+    assert not ModeSearch(density).maxima(Region(**back, closing_signed=True))
     both = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=kernel)
-    (twin,) = both.maximum(Region(**back, closing_signed=True))
+    (twin,) = ModeSearch(both).maxima(Region(**back, closing_signed=True))
     assert float(se3.angle_between(twin.quaternion_xyzw, se3.JAW_TURN)) < 1e-3
 
 
-def test_out_of_reach_is_empty_and_nearest_says_where(shell: Shell) -> None:
+def test_nothing_is_found_out_of_reach(shell: Shell) -> None:
     rng = np.random.default_rng(24)
     density = GraspDensity.build(*shell(500, rng), kernel=KERNEL)
     region = Region(half_spaces=Region.box([1.0, 1.0, 1.0], [2.0, 2.0, 2.0]))
-    assert density.maximum(region) == []
-    near = nearest(density, region)
-    assert near is not None
-    np.testing.assert_allclose(near.position, [1.0, 1.0, 1.0], atol=1e-6)
-    assert near.log_density < -1_000.0
-    assert density.maximum(admissible=lambda p, q: np.zeros(len(p), dtype=bool)) == []
+    assert ModeSearch(density).maxima(region) == []
+    assert ModeSearch(density).maxima(admissible=lambda p, q: np.zeros(len(p), dtype=bool)) == []
     empty = Region(half_spaces=[[1.0, 0.0, 0.0, 0.1], [-1.0, 0.0, 0.0, 0.1]])
-    assert empty.is_empty()
-    assert density.maximum(empty) == []
-    assert nearest(density, empty) is None
-    assert not region.is_empty()
+    assert ModeSearch(density).maxima(empty) == []
+    for one, reached in ((empty, False), (region, True)):
+        assert one.project(np.zeros((1, 3)), se3.IDENTITY[None])[2].all() == reached
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed: int, shell: Shell) -> None:
     rng = np.random.default_rng(seed)
     density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
-    top = density.global_maximum()
+    top = ModeSearch(density).global_maximum()
 
     def admissible(p: se3.Floats, q: se3.Floats) -> NDArray[np.bool_]:
         # A forbidden ball about the global maximum and a forbidden half: a curved and a flat edge.
         free = np.linalg.norm(p - top.position, axis=1) > 0.02
         return np.asarray(free & (p[:, 2] > -0.5 * abs(top.position[2])), dtype=bool)
 
-    found = density.maximum(count=3, admissible=admissible)
+    found = ModeSearch(density).maxima(count=3, admissible=admissible)
     assert found
     for grasp in found:
         assert admissible(grasp.position[None], grasp.quaternion_xyzw[None]).all()
@@ -275,13 +272,20 @@ def test_bad_regions_are_refused(arguments: dict[str, object], message: str) -> 
 def test_bad_searches_are_refused() -> None:
     density = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=KERNEL)
     with pytest.raises(ValueError, match="count must be"):
-        density.maximum(count=0)
+        ModeSearch(density).maxima(count=0)
     with pytest.raises(ValueError, match="negative"):
-        density.maximum(min_separation_m=-1.0)
+        ModeSearch(density).maxima(separation=Separation(-1.0, 0.0))
     with pytest.raises(ValueError, match="lower corner"):
         Region.box([1.0, 0.0, 0.0], [0.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="admissible answered shape"):
-        density.maximum(admissible=lambda p, q: np.ones(1 + len(p), dtype=bool))
+        ModeSearch(density).maxima(admissible=lambda p, q: np.ones(1 + len(p), dtype=bool))
+
+
+def climbed_from(density: GraspDensity, region: Region, starts: se3.Poses, steps: int) -> se3.Poses:
+    """Ends of climbs from given poses."""
+    ranking = ModeSearch(density).ranking(2)
+    search = MeanShiftSearch(density, ranking, density.log_density, region, None, 2)
+    return search.climb(starts, steps)[1].poses
 
 
 def small_shell(count: int, shell: Shell, rng: np.random.Generator) -> Poses:
@@ -298,7 +302,7 @@ def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
     rng = np.random.default_rng(100 + seed)
     rows = small_shell(20_000, shell, rng)
     density = GraspDensity.build(*rows, kernel=KERNEL)
-    sample = density.ranking().sample
+    sample = centre_sums(density, None, 1).sample
     assert sample is not None
     assert 3_000 < sample.data.shape[1] < 8_000
     low = np.array([rng.uniform(-0.05, 0.0), -1.0, -1.0])
@@ -306,12 +310,12 @@ def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
     region = Region(
         half_spaces=Region.box(low, [1.0, 1.0, 1.0]), approach=approach[0], approach_angle=approach[1]
     )
-    found = density.maximum(region)
+    found = ModeSearch(density).maxima(region)
     # The same climb from the 400 truly best rows.
     values = np.where(region.contains(*rows), density.log_density(*rows, threads=2), -np.inf)
     best = np.argsort(-values)[:400]
-    ends = Search(density, region, None, 2).climb(Pool(rows[0][best], rows[1][best], np.zeros(400)), 200)[1]
-    top = density.log_density(ends.positions, ends.quaternions).max()
+    ends = climbed_from(density, region, se3.Poses(rows[0][best], rows[1][best]), 200)
+    top = density.log_density(ends.positions, ends.quaternions_xyzw).max()
     assert math.exp(found[0].log_density - top) >= 0.999
 
 
@@ -322,16 +326,17 @@ def test_sampled_centre_sums_are_unbiased_and_extended_alike(
     p, q = small_shell(9_000, shell, rng)
     weights, symmetric = rng.uniform(0.2, 3.0, 9_000), rng.random(9_000) < 0.7
     exact = GraspDensity.build(p, q, kernel=KERNEL, weights=weights, symmetric=symmetric)
-    truth = exact.centre_sums()
-    assert exact.ranking().sample is None
+    every = centre_sums(exact, None, 1)
+    truth = every.values
+    assert every.sample is None
     monkeypatch.setattr(start_ranking, "MOST_PAIRS", 3e7)
     first = slice(0, 8_500)
     old = GraspDensity.build(
         p[first], q[first], kernel=KERNEL, weights=weights[first], symmetric=symmetric[first]
     )
-    known = old.ranking()
+    known = centre_sums(old, None, 1)
     grown = old.extend(p[8_500:], q[8_500:], weights=weights[8_500:], symmetric=symmetric[8_500:])
-    now = grown.ranking()
+    now = centre_sums(grown, known, 1)
     assert known.sample is not None
     assert now.sample is not None
     assert 0 < now.sample.data.shape[1] - known.sample.data.shape[1] < 450
@@ -349,8 +354,9 @@ def test_rows_of_the_sample_do_not_outrank_others(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(start_ranking, "MOST_PAIRS", 0.0)
     grid = np.stack(np.meshgrid(*[np.arange(18.0)] * 3), axis=-1).reshape(-1, 3)
     density = GraspDensity.build(grid, np.tile(se3.IDENTITY, (len(grid), 1)), kernel=KERNEL)
-    assert density.ranking().sample is not None
-    np.testing.assert_allclose(density.centre_sums(), 0.5, rtol=1e-5)
+    sums = centre_sums(density, None, 1)
+    assert sums.sample is not None
+    np.testing.assert_allclose(sums.values, 0.5, rtol=1e-5)
 
 
 def test_planes_that_nearly_coincide_hold_no_climb_back(shell: Shell) -> None:
@@ -359,7 +365,7 @@ def test_planes_that_nearly_coincide_hold_no_climb_back(shell: Shell) -> None:
     slanted = np.array([-0.03, 0.999, -0.02, -0.05])
     region = Region(half_spaces=np.vstack([Region.box([0.1, -0.1, -0.15], [0.22, -0.03, 0.15]), slanted]))
     best = exhaustive(density, region, np.random.default_rng(6))
-    assert math.exp(density.maximum(region)[0].log_density - best) >= 0.999
+    assert math.exp(ModeSearch(density).maxima(region)[0].log_density - best) >= 0.999
 
 
 def test_runners_up_are_found_however_far_apart_they_must_be() -> None:
@@ -369,7 +375,7 @@ def test_runners_up_are_found_however_far_apart_they_must_be() -> None:
     p = np.concatenate([0.04 * rng.standard_normal((3_000, 3)), lone])
     q = np.concatenate([se3.random_quaternions(3_000, rng), np.tile(se3.IDENTITY, (4, 1))])
     density = GraspDensity.build(p, q, kernel=KERNEL)
-    found = density.maximum(count=5, min_separation_m=0.25, min_separation=math.pi)
+    found = ModeSearch(density).maxima(count=5, separation=Separation(0.25, math.pi))
     assert len(found) == 5
     places = np.array([grasp.position for grasp in found[1:]])
     apart = np.linalg.norm(places[:, None] - lone[None], axis=2)
@@ -440,12 +446,11 @@ def test_against_mean_shift_from_everywhere(seed: int, shell: Shell) -> None:
     # A start a thousandth as good as the best is left out: hours would go into the tails.
     value = density.log_density(p, q, threads=2)
     kept = value > value.max() - math.log(1e3) if len(value) else np.zeros(0, dtype=bool)
-    everything = Search(density, region, None, 2)
-    _, ends = everything.climb(Pool(p[kept], q[kept], np.exp(value[kept])), 60)
-    found = density.maximum(region)
+    ends = climbed_from(density, region, se3.Poses(p[kept], q[kept]), 60)
+    found = ModeSearch(density).maxima(region)
     if not found:
         assert not len(value) or value.max() < KERNEL.log_peak - 8.0
         return
-    best = density.log_density(ends.positions, ends.quaternions, threads=2).max()
+    best = density.log_density(ends.positions, ends.quaternions_xyzw, threads=2).max()
     assert region.contains(found[0].position[None], found[0].quaternion_xyzw[None]).all()
     assert math.exp(found[0].log_density - best) >= 0.999

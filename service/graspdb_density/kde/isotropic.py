@@ -10,28 +10,17 @@ Error. Against the float64 sum over every row (`reference`), see `GraspDensity.l
 from __future__ import annotations
 
 import math
-import threading
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import se3
-from .._compiled import isotropic
+from .._compiled import isotropic, nearest
 from .._compiled.threads import for_blocks
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats
-from ..search import mean_shift
-from ..search.guide import Guide, guide_for
-from ..search.start_ranking import CentreSums, centre_sums
 from . import brute_force
 from .cell_list import Cells
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ..search.mode_search import Maximum
-    from ..search.region import Region
 
 __all__ = ["CUTOFF", "TWIN_ROTATION", "WIDE_ROTATION", "GraspDensity"]
 
@@ -61,7 +50,6 @@ class GraspDensity:
         symmetric: NDArray[np.bool_],
         cells: Cells,
         unit: float,
-        ranking: CentreSums | None = None,
     ) -> None:
         self._kernel = kernel
         self._positions = positions
@@ -71,10 +59,6 @@ class GraspDensity:
         self._cells = cells
         self._unit = unit
         self._total = float(weights.sum())
-        self._lock = threading.Lock()
-        self._ranking = ranking
-        self._guide: Guide | None = None
-        self._global: Maximum | None = None
 
     # -- building
     # ---------------------------------------------------------------------------------------------------
@@ -140,7 +124,6 @@ class GraspDensity:
             np.concatenate([self._symmetric, flags]),
             cells,
             self._unit,
-            self._ranking,
         )
 
     # -- what it holds
@@ -149,6 +132,11 @@ class GraspDensity:
     @property
     def kernel(self) -> IsotropicKernel:
         return self._kernel
+
+    @property
+    def isotropic(self) -> GraspDensity:
+        """Itself: a mixture's is the density under the isotropic kernel nearest to its own."""
+        return self
 
     @property
     def size(self) -> int:
@@ -187,10 +175,9 @@ class GraspDensity:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of every array held, caches included."""
+        """Bytes of every array held."""
         own = (self._positions, self._quaternions, self._weights, self._symmetric)
-        cached = [part for part in (self._ranking, self._guide) if part is not None]
-        return sum(a.nbytes for a in own) + self._cells.nbytes + sum(part.nbytes for part in cached)
+        return sum(a.nbytes for a in own) + self._cells.nbytes
 
     @property
     def cells(self) -> Cells:
@@ -346,7 +333,7 @@ class GraspDensity:
         count = min(count, self.size)
         best, places = np.empty(count), np.empty(count, dtype=np.int64)
         radius = scaled_radius(CUTOFF)
-        mean_shift.nearest_rows(
+        nearest.nearest_rows(
             cells.data, cells.start, cells.table, cells.centre, cells.scale, position, quaternion,
             kernel.kappa, radius, best, places,
         )  # fmt: skip
@@ -359,8 +346,8 @@ class GraspDensity:
         cosine = np.where(self._symmetric, np.maximum(cosine, turned), cosine)
         squared = np.sum((self._positions - position) ** 2, axis=1) / kernel.sigma_position_m**2
         value = kernel.kappa * cosine - 0.5 * squared
-        nearest = np.argpartition(-value, count - 1)[:count]
-        return np.asarray(nearest[np.argsort(-value[nearest], kind="stable")])
+        highest = np.argpartition(-value, count - 1)[:count]
+        return np.asarray(highest[np.argsort(-value[highest], kind="stable")])
 
     def nearest_each(
         self, positions: Floats, quaternions: Floats, *, within: float
@@ -377,7 +364,7 @@ class GraspDensity:
         """
         cells = self._cells
         best, places = np.empty(len(positions)), np.empty(len(positions), dtype=np.int64)
-        mean_shift.nearest_each(
+        nearest.nearest_each(
             cells.data, cells.start, cells.table, cells.centre, cells.scale, positions, quaternions,
             self._kernel.kappa, within / math.sqrt(2.0), best, places,
         )  # fmt: skip
@@ -405,58 +392,6 @@ class GraspDensity:
         centre = np.where(turned[:, None], se3.jaw_twin(centre), centre)
         translations, turns = self._kernel.sample_displacements(count, rng)
         return self._positions[row] + translations, se3.multiply(centre, turns)
-
-    # -- maxima
-    # -----------------------------------------------------------------------------------------------------
-
-    def centre_sums(self, threads: int = 1) -> Floats:
-        """Kernel sum at every row (N,), estimated where the sums over all pairs would take long; cached."""
-        return self.ranking(threads).values
-
-    def ranking(self, threads: int = 1) -> CentreSums:
-        """What rows' centres are worth; carried over by `extend` and completed with what is new."""
-        with self._lock:
-            self._ranking = centre_sums(self, self._ranking, threads)
-            return self._ranking
-
-    def guide(self, threads: int = 1) -> Guide:
-        """What searches go by; made at the first."""
-        ranking = self.ranking(threads)
-        with self._lock:
-            if self._guide is None:
-                self._guide = guide_for(self, ranking)
-            return self._guide
-
-    def maximum(
-        self,
-        region: Region | None = None,
-        *,
-        count: int = 1,
-        min_separation_m: float = 0.01,
-        min_separation: float = math.radians(20.0),
-        admissible: Callable[[Floats, Floats], NDArray[np.bool_]] | None = None,
-        threads: int = 1,
-    ) -> list[Maximum]:
-        """The best grasps inside a region, best first; see `maximum.search`."""
-        from ..search.mode_search import search
-
-        return search(
-            self,
-            region,
-            count=count,
-            min_separation_m=min_separation_m,
-            min_separation=min_separation,
-            admissible=admissible,
-            threads=threads,
-        )
-
-    def global_maximum(self, threads: int = 1) -> Maximum:
-        """The highest point of the whole density, computed once; `relative` values divide by it."""
-        known = self._global
-        if known is None:
-            known = self.maximum(None, count=1, threads=threads)[0]
-            self._global = known
-        return known
 
 
 def brute_terms(kernel: IsotropicKernel, total: float) -> tuple[int, float]:

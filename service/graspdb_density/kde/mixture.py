@@ -20,9 +20,6 @@ from .._compiled.weighted import mixture_log_sum
 from ..kernels.gaussian_mixture import AnisotropicKernel
 from ..kernels.isotropic import HAAR_VOLUME
 from ..se3 import Floats
-from ..search.evolution import search_scored
-from ..search.mode_search import Admissible, Maximum
-from ..search.region import Region
 from .cell_list import Cells
 from .isotropic import GraspDensity, row_values
 from .weighted_sums import KernelRows
@@ -106,8 +103,7 @@ class MixtureDensity:
     ) -> MixtureDensity:
         """A density with further rows, weights in the unit of the first ones (None: their mean).
 
-        Equal to building from all rows within 1e-5 of the density; what is sorted stays sorted. Searches that
-        this density has been asked for go on from what they knew.
+        Equal to building from all rows within 1e-5 of the density; what is sorted stays sorted.
         """
         p, q = se3.as_poses(positions, quaternions_xyzw)
         if not len(p):
@@ -124,8 +120,7 @@ class MixtureDensity:
             frames=None if frames is None else np.concatenate([old.frames, more.frames]),
         )
         grown = copy.copy(self)
-        for name in ("isotropic", "_global"):
-            grown.__dict__.pop(name, None)
+        grown.__dict__.pop("isotropic", None)
         grown._total = self._total + float(w.sum())
         grown._hold(rows, self._cells.extend(p, q, w / self._unit, flags))
         if "isotropic" in self.__dict__:
@@ -240,36 +235,6 @@ class MixtureDensity:
     def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Draw grasps: positions (count, 3) and quaternions (count, 4)."""
         return self._rows.sample(count, rng)
-
-    def maximum(
-        self,
-        region: Region | None = None,
-        *,
-        count: int = 1,
-        min_separation_m: float = 0.01,
-        min_separation: float = math.radians(20.0),
-        admissible: Admissible | None = None,
-        threads: int = 1,
-    ) -> list[Maximum]:
-        """The best distinct grasps inside a region, as `GraspDensity.maximum`."""
-        return search_scored(
-            self.isotropic,
-            lambda p, q: self.log_density(p, q, threads=threads),
-            region,
-            count=count,
-            min_separation_m=min_separation_m,
-            min_separation=min_separation,
-            admissible=admissible,
-            threads=threads,
-        )
-
-    @cached_property
-    def _global(self) -> Maximum:
-        return self.maximum()[0]
-
-    def global_maximum(self) -> Maximum:
-        """The highest point, computed once."""
-        return self._global
 
     @property
     def symmetric(self) -> NDArray[np.bool_]:

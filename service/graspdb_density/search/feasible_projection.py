@@ -6,9 +6,7 @@ axes lie in their cones; one cone in closed form (turn the axis to the cone's ri
 two by sequential quadratic programming on the rotation vector, whose subproblem with two constraints is
 solved exactly.
 
-A region is passed as ``planes`` (K, 4) of unit normals n and offsets d (n.x >= d), ``spheres`` (S, 4) of
-centres and radii, and ``cones`` (10,): approach axis, its angle, closing axis, its angle, 1 where the closing
-axis keeps its sign, unused. A negative angle means no cone.
+A region reaches them as `Limits`.
 """
 
 # Numba infers the types of compiled functions.
@@ -17,18 +15,21 @@ axis keeps its sign, unused. A negative angle means no cone.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from .._compiled.options import exact
+from ..se3 import Floats
 
 __all__ = [
+    "Limits",
     "cone_excess",
     "contains_all",
     "position_excess",
+    "project",
     "project_all",
     "project_position",
-    "project_rotation",
 ]
 
 
@@ -37,16 +38,36 @@ MARGIN_M = 5e-10
 MARGIN = 1e-8
 
 
+class Limits(NamedTuple):
+    """A region, as compiled functions take it.
+
+    Attributes
+    ----------
+    planes : (K, 4)
+        Unit normals n and offsets d, metres: n.x >= d.
+    balls : (S, 4)
+        Centres and radii, metres.
+    cones : (9,)
+        Approach axis, its angle, closing axis, its angle, 1 where the closing axis keeps its sign. A negative
+        angle means no cone.
+    """
+
+    planes: Floats
+    balls: Floats
+    cones: Floats
+
+
 @exact
-def position_excess(planes, spheres, p):
+def position_excess(limits, p):
     """Distance by which a point misses the constraint it misses most, metres; at most 0 inside."""
+    planes, balls = limits.planes, limits.balls
     worst = -1e300
     for k in range(planes.shape[0]):
         miss = planes[k, 3] - (planes[k, 0] * p[0] + planes[k, 1] * p[1] + planes[k, 2] * p[2])
         worst = max(worst, miss)
-    for k in range(spheres.shape[0]):
-        x, y, z = p[0] - spheres[k, 0], p[1] - spheres[k, 1], p[2] - spheres[k, 2]
-        worst = max(worst, math.sqrt(x * x + y * y + z * z) - spheres[k, 3])
+    for k in range(balls.shape[0]):
+        x, y, z = p[0] - balls[k, 0], p[1] - balls[k, 1], p[2] - balls[k, 2]
+        worst = max(worst, math.sqrt(x * x + y * y + z * z) - balls[k, 3])
     return worst
 
 
@@ -154,7 +175,7 @@ def _least(g1, r1, g2, r2, v):
 
 
 @exact
-def project_rotation(cones, q):
+def _project_rotation(cones, q):
     """Turn q (4,) in place to the nearest rotation inside the cones; whether it got there."""
     first, second = cones[3] >= 0.0, cones[7] >= 0.0
     if not (first or second):
@@ -310,13 +331,14 @@ def _solved(gram, right):
 
 
 @exact
-def project_position(planes, spheres, p):
-    """Move p (3,) in place to the nearest point inside planes and spheres; whether it got there."""
-    count = planes.shape[0] + spheres.shape[0]
-    if count == 0 or position_excess(planes, spheres, p) <= 0.0:
+def project_position(limits, p):
+    """Move p (3,) in place to the nearest point inside planes and balls; whether it got there."""
+    planes, balls = limits.planes, limits.balls
+    count = planes.shape[0] + balls.shape[0]
+    if count == 0 or position_excess(limits, p) <= 0.0:
         return True
     before = p.copy()
-    if spheres.shape[0] == 0 and _nearest_in_polyhedron(planes, before, p):
+    if balls.shape[0] == 0 and _nearest_in_polyhedron(planes, before, p):
         return True
     memory = np.zeros((count, 3))
     for sweep in range(400):
@@ -335,34 +357,40 @@ def project_position(planes, spheres, p):
                     p[i] += shift * planes[k, i]
             else:
                 s = k - planes.shape[0]
-                x, y, z = p[0] - spheres[s, 0], p[1] - spheres[s, 1], p[2] - spheres[s, 2]
+                x, y, z = p[0] - balls[s, 0], p[1] - balls[s, 1], p[2] - balls[s, 2]
                 distance = math.sqrt(x * x + y * y + z * z)
-                radius = spheres[s, 3] - min(MARGIN_M, 0.5 * spheres[s, 3])
+                radius = balls[s, 3] - min(MARGIN_M, 0.5 * balls[s, 3])
                 share = 1.0 if distance <= radius else radius / distance
                 for i in range(3):
-                    target = spheres[s, i] + share * (p[i] - spheres[s, i])
+                    target = balls[s, i] + share * (p[i] - balls[s, i])
                     memory[k, i] = p[i] - target
                     p[i] = target
             for i in range(3):
                 moved = max(moved, abs(p[i] - before[i]))
-        if moved < 1e-12 or (sweep > 20 and position_excess(planes, spheres, p) <= 0.0 and moved < 1e-7):
+        if moved < 1e-12 or (sweep > 20 and position_excess(limits, p) <= 0.0 and moved < 1e-7):
             break
-    return position_excess(planes, spheres, p) <= 2.0 * MARGIN_M
+    return position_excess(limits, p) <= 2.0 * MARGIN_M
 
 
 @exact
-def contains_all(planes, spheres, cones, positions, quaternions, tolerance_m, tolerance, inside):
+def project(limits, p, q):
+    """Project a pose in place, position and rotation each by itself; whether it got there."""
+    there = project_position(limits, p)
+    return _project_rotation(limits.cones, q) and there
+
+
+@exact
+def contains_all(limits, positions, quaternions, tolerance_m, tolerance, inside):
     """Which poses (M,) are inside, within the tolerances."""
     for j in range(positions.shape[0]):
         inside[j] = (
-            position_excess(planes, spheres, positions[j]) <= tolerance_m
-            and cone_excess(cones, quaternions[j]) <= tolerance
+            position_excess(limits, positions[j]) <= tolerance_m
+            and cone_excess(limits.cones, quaternions[j]) <= tolerance
         )
 
 
 @exact
-def project_all(planes, spheres, cones, positions, quaternions, inside):
+def project_all(limits, positions, quaternions, inside):
     """Project poses in place; ``inside`` (M,) says which reached the region."""
     for j in range(positions.shape[0]):
-        there = project_position(planes, spheres, positions[j])
-        inside[j] = project_rotation(cones, quaternions[j]) and there
+        inside[j] = project(limits, positions[j], quaternions[j])

@@ -16,12 +16,12 @@ import math
 
 import numpy as np
 
-from .._compiled import exp, isotropic
+from .._compiled import exp, isotropic, nearest
 from .._compiled.options import exact, fast
 from . import feasible_projection
 
 F32 = np.float32
-__all__ = ["climb", "nearest_each", "nearest_rows", "scatter", "score_centres", "thin"]
+__all__ = ["PATH", "bound_centres", "climb", "scatter", "thin"]
 
 
 #: Columns of a path: position, quaternion, kernel sum.
@@ -31,29 +31,29 @@ _LONGEST, _FARTHEST = 40.0, 1.0
 #: A climb gathers kernels anew after so many kernel widths, and before it ends where it has moved more than
 #: the second.
 _STRAYED, _SETTLED = 0.8, 0.3
-_GATHERED = 512
 
 
 @exact
-def score_centres(landmarks, twins, planes, spheres, cones, sigma, kappa, reach_m, reach, scores, turned):
-    """Optimistic log density at the feasible pose nearest to every kernel centre, -inf where that is out of
-    reach.
+def bound_centres(centres, twins, limits, sigma, kappa, reach_m, reach, bounds, turned):
+    """Optimistic log of the kernel sum at the feasible pose nearest to every kernel centre, -inf where that
+    is out of reach.
 
-    ``log(sum) - excess^2 / (2 sigma^2) - kappa (1 - cos(angle / 2))``: the density at the centre less what
-    its own kernel loses on the way into the region. ``turned`` says where the jaw's twin is nearer to a
-    signed closing cone. ``landmarks`` (M, 8) are the centres' positions, quaternions and logs of their sums.
+    ``log(sum) - excess^2 / (2 sigma^2) - kappa (1 - cos(angle / 2))``: the sum at the centre less what its
+    own kernel loses on the way into the region. ``turned`` says where the jaw's twin is nearer to a signed
+    closing cone. ``centres`` (M, 8) are positions, quaternions and logs of their sums.
     """
+    cones = limits.cones
     signed = cones[8] > 0.5 and cones[7] >= 0.0
-    linear = planes.shape[0] + spheres.shape[0] > 0
+    linear = limits.planes.shape[0] + limits.balls.shape[0] > 0
     # Most centres are far outside a cone: a cosine tells without an arc cosine.
     least_approach = math.cos(min(cones[3] + reach, math.pi)) if cones[3] >= 0.0 else -2.0
     least_closing = math.cos(min(cones[7] + reach, math.pi)) if cones[7] >= 0.0 else -2.0
     p = np.empty(3)
-    for j in range(landmarks.shape[0]):
-        scores[j] = -np.inf
+    for j in range(centres.shape[0]):
+        bounds[j] = -np.inf
         turned[j] = False
         away, angle = 0.0, 0.0
-        row = landmarks[j]
+        row = centres[j]
         x, y, z, w = float(row[3]), float(row[4]), float(row[5]), float(row[6])
         if cones[3] >= 0.0:
             dot = (
@@ -79,13 +79,13 @@ def score_centres(landmarks, twins, planes, spheres, cones, sigma, kappa, reach_
             angle = max(angle, math.acos(min(max(dot, -1.0), 1.0)) - cones[7])
         if linear:
             p[0], p[1], p[2] = row[0], row[1], row[2]
-            away = max(feasible_projection.position_excess(planes, spheres, p), 0.0)
+            away = max(feasible_projection.position_excess(limits, p), 0.0)
             if away > reach_m:
                 continue
         loss = 0.5 * (away / sigma) ** 2
         if angle > 0.0:
             loss += kappa * (1.0 - math.cos(0.5 * angle))
-        scores[j] = row[7] - loss
+        bounds[j] = row[7] - loss
 
 
 @exact
@@ -125,19 +125,6 @@ def thin(positions, quaternions, first, limit, separation_m, separation, twins, 
 
 
 @fast
-def _exponents(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, out):
-    """Exponents of a run's nearest ends."""
-    for k in range(np.uint64(end - begin)):
-        i = np.uint64(begin) + k
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        out[k] = max(abs(a), abs(b)) - kappa - (dx * dx + dy * dy + dz * dz)
-
-
-@fast
 def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
     """Kernels whose exponent at a pose is above ``-cut``, into ``near`` (8, ...): as ``data``, but every end
     (twin, antipode) a kernel of its own with the sign that faces the pose. Answers how many there are.
@@ -151,8 +138,8 @@ def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
         for r in range(isotropic.runs_within(start, table, s, px, py, pz, math.sqrt(cut), runs)):
             begin = runs[r, 0]
             while begin < runs[r, 1]:
-                stop = min(begin + _GATHERED, runs[r, 1])
-                _exponents(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, buffer)
+                stop = min(begin + nearest.GATHERED, runs[r, 1])
+                nearest.exponents(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, buffer)
                 for i in range(stop - begin):
                     if buffer[i] <= least:
                         continue
@@ -228,16 +215,8 @@ def _sum(near, count, px, py, pz, qx, qy, qz, qw, kappa):
 
 
 @exact
-def _into(planes, spheres, cones, p, q):
-    """Project a pose in place; whether it got there."""
-    there = feasible_projection.project_position(planes, spheres, p)
-    return feasible_projection.project_rotation(cones, q) and there
-
-
-@exact
 def climb(
-    data, start, table, centre, scale, planes, spheres, cones, kappa, cut, positions, quaternions, gain,
-    path, lengths,
+    data, start, table, centre, scale, limits, kappa, cut, positions, quaternions, gain, path, lengths,
 ):  # fmt: skip
     """Climb from every pose (K, ...); ``path`` (K, steps, PATH) gets the feasible poses passed.
 
@@ -249,7 +228,7 @@ def climb(
     less than ``gain``.
     """
     runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
-    buffer = np.empty(_GATHERED, dtype=np.float32)
+    buffer = np.empty(nearest.GATHERED, dtype=np.float32)
     near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
     sums = np.empty(8)
     # Poses and steps in units of the kernel's widths: position over sigma, sqrt(kappa) times the quaternion.
@@ -309,7 +288,7 @@ def climb(
                     p[i] += sums[1 + i] / (here * scale)
                 for i in range(4):
                     q[i] = sums[4 + i] / length if length > 0.0 else q[i]
-                if not _into(planes, spheres, cones, p, q):
+                if not feasible_projection.project(limits, p, q):
                     break
                 step[0:3] = p / unit - x[0:3]
                 step[3:7] = q * turn - x[3:7]
@@ -338,7 +317,7 @@ def climb(
             norm = math.sqrt(norm)
             for i in range(4):
                 q[i] /= norm
-            if not _into(planes, spheres, cones, p, q):
+            if not feasible_projection.project(limits, p, q):
                 break
             # Half the slope times the way ahead, the gain of a parabola.
             if 0.5 * ahead * size < gain:
@@ -367,8 +346,8 @@ def _times(q, x, y, z, w, out):
 
 @exact
 def scatter(
-    data, start, table, centre, scale, planes, spheres, cones, kappa, cut, positions, quaternions, moves,
-    turns, tried_p, tried_q, values,
+    data, start, table, centre, scale, limits, kappa, cut, positions, quaternions, moves, turns,
+    tried_p, tried_q, values,
 ):  # fmt: skip
     """Feasible poses around each of some poses, with their sums.
 
@@ -379,7 +358,7 @@ def scatter(
     kernels with an exponent above ``-cut`` at the pose: right for comparisons around one pose.
     """
     runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
-    buffer = np.empty(_GATHERED, dtype=np.float32)
+    buffer = np.empty(nearest.GATHERED, dtype=np.float32)
     near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
     sums, k32 = np.empty(8), F32(kappa)
     for j in range(positions.shape[0]):
@@ -408,7 +387,7 @@ def scatter(
             angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
             s = sign * (0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle)
             _times(q, s * v[0], s * v[1], s * v[2], math.cos(0.5 * angle), to)
-            if not _into(planes, spheres, cones, at, to):
+            if not feasible_projection.project(limits, at, to):
                 values[j, 1 + t] = -1.0
                 continue
             values[j, 1 + t] = _sum(
@@ -416,51 +395,3 @@ def scatter(
                 F32((at[2] - centre[2]) * scale), F32(to[0] * kappa), F32(to[1] * kappa), F32(to[2] * kappa),
                 F32(to[3] * kappa), k32,
             )  # fmt: skip
-
-
-@fast
-def _insert(value, index, best, rows):
-    """Put a value into a descending list that is full, where it belongs."""
-    k = best.shape[0] - 1
-    while k > 0 and best[k - 1] < value:
-        best[k], rows[k] = best[k - 1], rows[k - 1]
-        k -= 1
-    best[k], rows[k] = value, index
-
-
-@fast
-def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, best, rows):
-    """The kernels within ``radius`` with the highest exponents at a pose: ``best`` (C,), descending, and
-    their places among the sorted kernels, ``rows`` (C,); -1e30 and -1 where there are no more.
-    """
-    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
-    buffer = np.empty(_GATHERED, dtype=np.float32)
-    px, py = (position[0] - centre[0]) * scale, (position[1] - centre[1]) * scale
-    pz = (position[2] - centre[2]) * scale
-    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
-    best[:] = -1e30
-    rows[:] = -1
-    last = best.shape[0] - 1
-    for s in range(table.shape[0]):
-        twin = F32(table[s, isotropic.TWIN])
-        for r in range(isotropic.runs_within(start, table, s, px, py, pz, radius, runs)):
-            begin = runs[r, 0]
-            while begin < runs[r, 1]:
-                stop = min(begin + _GATHERED, runs[r, 1])
-                _exponents(
-                    data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, buffer
-                )
-                for i in range(stop - begin):
-                    if buffer[i] > best[last]:
-                        _insert(buffer[i], begin + i, best, rows)
-                begin = stop
-
-
-@fast
-def nearest_each(data, start, table, centre, scale, positions, quaternions, kappa, radius, best, rows):
-    """Of every pose, the highest exponent (M,) within ``radius`` and whose it is, as `nearest_rows`."""
-    for j in range(positions.shape[0]):
-        nearest_rows(
-            data, start, table, centre, scale, positions[j], quaternions[j], kappa, radius, best[j : j + 1],
-            rows[j : j + 1],
-        )  # fmt: skip

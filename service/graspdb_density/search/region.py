@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import se3
 from ..se3 import Floats
 from . import feasible_projection
+from .feasible_projection import Limits
 
 __all__ = ["Region"]
 
@@ -52,9 +53,7 @@ class Region:
     closing_angle: float | None = None
     spheres: ArrayLike | None = None
     closing_signed: bool = False
-    planes: Floats = field(init=False, repr=False)
-    balls: Floats = field(init=False, repr=False)
-    cones: Floats = field(init=False, repr=False)
+    limits: Limits = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         planes = _rows(self.half_spaces, "half_spaces")
@@ -64,7 +63,7 @@ class Region:
         balls = _rows(self.spheres, "spheres")
         if np.any(balls[:, 3] < 0.0):
             raise ValueError("a sphere's radius is negative")
-        cones = np.zeros(10)
+        cones = np.zeros(9)
         cones[0:4] = _cone(self.approach, self.approach_angle, "approach")
         cones[4:8] = _cone(self.closing, self.closing_angle, "closing")
         cones[8] = float(self.closing_signed)
@@ -77,9 +76,7 @@ class Region:
                     "approach and closing contradict each other: the axes of a jaw are perpendicular and no "
                     f"rotation brings both into their cones (they miss by {math.degrees(excess):.3g} degrees)"
                 )
-        object.__setattr__(self, "planes", planes / length)
-        object.__setattr__(self, "balls", balls)
-        object.__setattr__(self, "cones", cones)
+        object.__setattr__(self, "limits", Limits(planes / length, balls, cones))
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike) -> Floats:
@@ -93,18 +90,11 @@ class Region:
             [np.hstack([np.eye(3), low[:, None]]), np.hstack([-np.eye(3), -high[:, None]])]
         ).astype(np.float64)
 
-    @property
-    def unbounded(self) -> bool:
-        """Whether nothing is constrained."""
-        return not len(self.planes) and not len(self.balls) and self.cones[3] < 0.0 and self.cones[7] < 0.0
-
     def contains(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> NDArray[np.bool_]:
         """Which poses (M,) lie inside, within 2e-9 m and 1e-7 rad."""
         p, q = se3.as_poses(positions, quaternions_xyzw)
         inside = np.empty(len(p), dtype=bool)
-        feasible_projection.contains_all(
-            self.planes, self.balls, self.cones, p, q, TOLERANCE_M, TOLERANCE, inside
-        )
+        feasible_projection.contains_all(self.limits, p, q, TOLERANCE_M, TOLERANCE, inside)
         return inside
 
     def project(
@@ -113,28 +103,20 @@ class Region:
         """Nearest poses inside, position and rotation each by itself, and which (M,) got there."""
         p, q = se3.as_poses(positions, quaternions_xyzw)
         inside = np.empty(len(p), dtype=bool)
-        feasible_projection.project_all(self.planes, self.balls, self.cones, p, q, inside)
+        feasible_projection.project_all(self.limits, p, q, inside)
         return p, q, inside
-
-    def is_empty(self) -> bool:
-        """Whether planes and spheres have no common point, as far as 400 sweeps of projections tell."""
-        start = self.balls[0, :3] if len(self.balls) else np.zeros(3)
-        return not feasible_projection.project_position(self.planes, self.balls, start.copy())
 
     def active(self, position: Floats, quaternion: Floats) -> tuple[str, ...]:
         """Names of what holds the pose: ``half_spaces[i]``, ``spheres[i]``, ``approach``, ``closing``."""
-        names = [
-            f"half_spaces[{i}]"
-            for i, slack in enumerate(self.planes[:, :3] @ position - self.planes[:, 3])
-            if slack < 1e-5
-        ]
-        distance = np.linalg.norm(position - self.balls[:, :3], axis=1)
-        names += [f"spheres[{i}]" for i, slack in enumerate(self.balls[:, 3] - distance) if slack < 1e-5]
-        for name, first in (("approach", 0), ("closing", 4)):
-            cone = np.full(10, -1.0)
-            cone[8] = self.cones[8]
-            cone[first : first + 4] = self.cones[first : first + 4]
-            if cone[first + 3] >= 0.0 and feasible_projection.cone_excess(cone, quaternion) > -1e-4:
+        planes, balls, cones = self.limits
+        inside = planes[:, :3] @ position - planes[:, 3]
+        names = [f"half_spaces[{i}]" for i in np.flatnonzero(inside < 1e-5)]
+        inside = balls[:, 3] - np.linalg.norm(position - balls[:, :3], axis=1)
+        names += [f"spheres[{i}]" for i in np.flatnonzero(inside < 1e-5)]
+        for name, angle, other in (("approach", 3, 7), ("closing", 7, 3)):
+            alone = cones.copy()
+            alone[other] = -1.0
+            if cones[angle] >= 0.0 and feasible_projection.cone_excess(alone, quaternion) > -1e-4:
                 names.append(name)
         return tuple(names)
 

@@ -1,18 +1,17 @@
-"""What a density is worth at its own centres: the ranking that searches start from.
+"""Where searches start: a density's rows by what it is worth at their centres, and what to climb among.
 
 Exact where that is cheap. Where most kernels reach each other (many grasps of a small object), the sums over
 all pairs would take many seconds; there a sample of the kernels stands for all. It is drawn systematically in
 the order of the cells with probability proportional to weight, so that it is spread over space evenly, and
 each drawn kernel counts by the inverse of its probability: the sums are unbiased and, at a maximum to which
 hundreds of kernels contribute, within some 10 %. Searches make up for that with more starts, and with exact
-sums for all they compare.
+sums for all they compare; they climb among such samples first and among all kernels last.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,12 @@ from numpy.typing import NDArray
 from .._compiled import isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
+from ..kde.isotropic import GraspDensity
 from ..se3 import Floats
 
-if TYPE_CHECKING:
-    from ..kde.isotropic import GraspDensity
+__all__ = ["CentreSums", "StartRanking", "centre_sums", "rank_starts"]
 
-__all__ = ["CentreSums", "centre_sums", "drawn"]
+Rows = NDArray[np.int64]
 
 #: Three standard deviations rank centres well enough; refinement uses the full reach.
 _RADIUS = 3.0 / math.sqrt(2.0)
@@ -34,6 +33,9 @@ MOST_PAIRS = 5e8
 _LEAST_SAMPLE = 4_096
 _PROBES = 256
 _QUERY_BLOCK = 1_024
+#: How many times the kernels of the sample the finer one has, and how many times its kernels there must be
+#: for it to pay.
+_FINER, _WORTH = 4.0, 2.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,12 +61,54 @@ class CentreSums:
         return self.values.nbytes + (0 if self.sample is None else self.sample.nbytes)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class StartRanking:
+    """A density's N rows, best centre first.
+
+    Attributes
+    ----------
+    order : (N,)
+        Rows by falling sum at their centres.
+    centres : (N, 8) float32
+        In that order: position in metres, quaternion, log of the kernel sum. A row fills one line of the
+        processor's cache.
+    twins : (N,)
+        In that order: whether the jaw is symmetric.
+    coarse_to_fine
+        Kernels to climb among: samples where there are any, and all of them last.
+    """
+
+    order: NDArray[np.intp]
+    centres: NDArray[np.float32]
+    twins: NDArray[np.bool_]
+    coarse_to_fine: tuple[Cells, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held, those of the sums and the density left out."""
+        own = self.order.nbytes + self.centres.nbytes + self.twins.nbytes
+        return own + sum(cells.nbytes for cells in self.coarse_to_fine[1:-1])
+
+
+def rank_starts(density: GraspDensity, sums: CentreSums) -> StartRanking:
+    """The ranking of a density's rows by the sums at their centres."""
+    order = np.argsort(-sums.values, kind="stable")
+    log_sums = np.log(np.maximum(sums.values, 1e-300))
+    centres = np.concatenate(
+        [density.positions, density.quaternions_xyzw, log_sums[:, None]], axis=1, dtype=np.float32
+    )[order]
+    whole, sample = density.cells, sums.sample
+    levels: tuple[Cells, ...] = (whole,) if sample is None else (sample, whole)
+    if sample is not None and _WORTH * _FINER * sample.data.shape[1] <= density.size:
+        finer = _systematic_sample(density, whole.rows.astype(np.int64), _FINER * sums.rate)
+        levels = sample, _cells(density, *finer), whole
+    return StartRanking(order, centres, density.symmetric[order], levels)
+
+
 def centre_sums(density: GraspDensity, known: CentreSums | None, threads: int) -> CentreSums:
     """The sums at all centres; ``known`` are those of the first rows, of before the density was extended."""
-    if known is not None and len(known.values) == density.size:
-        return known
     if known is not None and 8 * (density.size - len(known.values)) <= density.size:
-        return _extended(density, known, threads)
+        return _completed(density, known, threads)
     probes = np.linspace(0, density.size - 1, min(density.size, _PROBES)).astype(np.int64)
     pairs = density.size * float(_reached(density, probes).mean())
     rows = np.arange(density.size)
@@ -72,75 +116,63 @@ def centre_sums(density: GraspDensity, known: CentreSums | None, threads: int) -
         return CentreSums(_sums(density, density.cells, rows, threads))
     size = max(_LEAST_SAMPLE, density.size * MOST_PAIRS / pairs)
     rate = size / float(density.raw_weights.sum())
-    picked, weights = drawn(density, density.cells.rows.astype(np.int64), rate)
-    sample = Cells.build(
-        density.positions[picked],
-        density.quaternions_xyzw[picked],
-        weights,
-        density.symmetric[picked],
-        density.kernel.sigma_position_m,
-    )
+    drawn, weights = _systematic_sample(density, density.cells.rows.astype(np.int64), rate)
+    sample = _cells(density, drawn, weights)
     values = _sums(density, sample, rows, threads)
-    return CentreSums(_with_own(density, values, rows, picked, weights), sample, rate)
+    return CentreSums(_with_own(density, values, rows, drawn, weights), sample, rate)
 
 
-def _extended(density: GraspDensity, known: CentreSums, threads: int) -> CentreSums:
+def _completed(density: GraspDensity, known: CentreSums, threads: int) -> CentreSums:
     """Sums completed with what rows that came since add to the old ones, and with their own."""
     first = len(known.values)
     cells, new = density.cells, np.arange(first, density.size)
     sample, rate = known.sample, known.rate
     if sample is None:
-        adding, weights, within = new, density.raw_weights[new], cells
+        drawn, weights, within = new, density.raw_weights[new], cells
     else:
-        adding, weights = drawn(density, new, rate)
-        if len(adding):
+        drawn, weights = _systematic_sample(density, new, rate)
+        if len(drawn):
             sample = sample.extend(
-                density.positions[adding],
-                density.quaternions_xyzw[adding],
-                weights,
-                density.symmetric[adding],
+                density.positions[drawn], density.quaternions_xyzw[drawn], weights, density.symmetric[drawn]
             )
         within = sample
     values = np.zeros(density.size)
     values[:first] = known.values
     ordered = values[cells.rows]
-    if len(adding):
+    if len(drawn):
         isotropic.scatter_sums(
-            cells.arrays,
-            density.positions[adding], density.quaternions_xyzw[adding], weights, density.symmetric[adding],
+            cells.arrays, density.positions[drawn], density.quaternions_xyzw[drawn], weights,
+            density.symmetric[drawn],
             density.kernel.kappa, _RADIUS, density.wide, ordered,
         )  # fmt: skip
     values[cells.rows] = ordered
     values[new] = _sums(density, within, new, threads)
     if sample is not None:
-        values[new] = _with_own(density, values[new], new, adding, weights)
+        values[new] = _with_own(density, values[new], new, drawn, weights)
     return CentreSums(values, sample, rate)
 
 
-def _sums(density: GraspDensity, cells: Cells, rows: NDArray[np.int64], threads: int) -> Floats:
+def _sums(density: GraspDensity, cells: Cells, rows: Rows, threads: int) -> Floats:
     """Sums over ``cells`` at rows' centres."""
-    order = rows
-    if len(rows) == density.size:
-        # Neighbours one after the other: kernels stay in the processor's cache.
-        order = density.cells.rows.astype(np.int64)
+    # Of all rows, neighbours one after the other: kernels stay in the processor's cache.
+    whole = len(rows) == density.size
+    order = density.cells.rows.astype(np.int64) if whole else rows
     positions, quaternions = density.positions[order], density.quaternions_xyzw[order]
     out = np.empty(len(order))
 
     def work(begin: int, end: int) -> None:
         isotropic.sums(
-            cells.arrays, positions[begin:end],
-            quaternions[begin:end], density.kernel.kappa, _RADIUS, density.wide, out[begin:end],
+            cells.arrays, positions[begin:end], quaternions[begin:end], density.kernel.kappa, _RADIUS,
+            density.wide, out[begin:end],
         )  # fmt: skip
 
     for_blocks(work, len(order), block=_QUERY_BLOCK, threads=threads)
-    if order is rows:
-        return out
-    result = np.empty(len(order))
-    result[order] = out
-    return result
+    if whole:
+        out[order] = out.copy()
+    return out
 
 
-def drawn(density: GraspDensity, rows: NDArray[np.int64], rate: float) -> tuple[NDArray[np.int64], Floats]:
+def _systematic_sample(density: GraspDensity, rows: Rows, rate: float) -> tuple[Rows, Floats]:
     """Systematic sample of rows in the order given, with the weights that make its sums unbiased."""
     probability = np.minimum(rate * density.raw_weights[rows], 1.0)
     steps = np.floor(np.cumsum(probability) + 0.5)
@@ -148,20 +180,25 @@ def drawn(density: GraspDensity, rows: NDArray[np.int64], rate: float) -> tuple[
     return rows[chosen], density.raw_weights[rows[chosen]] / probability[chosen]
 
 
-def _with_own(
-    density: GraspDensity,
-    values: Floats,
-    rows: NDArray[np.int64],
-    picked: NDArray[np.int64],
-    weights: Floats,
-) -> Floats:
+def _cells(density: GraspDensity, rows: Rows, weights: Floats) -> Cells:
+    """Some rows' kernels, weighted anew."""
+    return Cells.build(
+        density.positions[rows],
+        density.quaternions_xyzw[rows],
+        weights,
+        density.symmetric[rows],
+        density.kernel.sigma_position_m,
+    )
+
+
+def _with_own(density: GraspDensity, values: Floats, rows: Rows, drawn: Rows, weights: Floats) -> Floats:
     """Estimated sums with every row's own kernel as it is: drawn rows would outrank their neighbours."""
     own = density.raw_weights.copy()
-    own[picked] -= weights
+    own[drawn] -= weights
     return values + (own * np.where(density.symmetric, 0.5, 1.0))[rows]
 
 
-def _reached(density: GraspDensity, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def _reached(density: GraspDensity, rows: Rows) -> Rows:
     """How many kernels are visited for the sum at each of some centres."""
     out = np.empty(len(rows), dtype=np.int64)
     cells = density.cells

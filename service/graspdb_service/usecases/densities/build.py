@@ -22,6 +22,7 @@ from graspdb_density import (
     GraspDensity,
     IsotropicKernel,
     MixtureDensity,
+    ModeSearch,
     SampledKernel,
     choose_widths,
     importance_weights,
@@ -78,6 +79,8 @@ class Built:
         one of equal determinants.
     shaped, sampled
         The density under the stored kernel, where one was asked for: of Gaussians, or of sampled components.
+    search
+        Beside the density under the kernel that was asked for.
     seq
         (N,) sequence numbers of its rows, ascending.
     proposal_density
@@ -104,6 +107,7 @@ class Built:
     chosen_from: int = 0
     shaped: MixtureDensity | None = None
     sampled: GraspDensity | None = None
+    search: ModeSearch | None = None
     success_kernel: DiagonalKernel | None = None
 
     @property
@@ -114,7 +118,8 @@ class Built:
     @property
     def nbytes(self) -> int:
         own = self.seq.nbytes + self.proposal_density.nbytes + self.swept.nbytes
-        held = sum(part.nbytes for part in (self.density, self.shaped, self.sampled) if part is not None)
+        parts = (self.density, self.shaped, self.sampled, self.search)
+        held = sum(part.nbytes for part in parts if part is not None)
         return own + held + 4_096
 
     @property
@@ -213,11 +218,20 @@ def build(
     if before is not None and before.chosen_from == built.chosen_from:
         built = replace(built, kernel=before.kernel)
         if old is not None and added is not None:
-            return replace(built, density=old.extend(*fresh[:2], weights=added, symmetric=symmetric))
+            longer = old.extend(*fresh[:2], weights=added, symmetric=symmetric)
+            return _searched(replace(built, density=longer), before)
     elif built.chosen_from:
         chosen = _choose(everything(), proposal, built.chosen_from, threads)
         built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
-    return replace(built, density=_isotropic(built.kernel, everything(), weights))
+    return _searched(replace(built, density=_isotropic(built.kernel, everything(), weights)), None)
+
+
+def _searched(built: Built, before: Built | None) -> Built:
+    """With the search in its density, an extended one where that is what there was before, extended."""
+    assert built.asked is not None
+    if before is None or before.search is None:
+        return replace(built, search=ModeSearch(built.asked, built.density))
+    return replace(built, search=before.search.extended(built.asked, built.density))
 
 
 def _isotropic(kernel: KernelInfo, poses: Poses, weights: Floats | None) -> GraspDensity:
@@ -249,26 +263,25 @@ def _shaped(
         old = None if before is None else before.density
         if before is not None and old is not None and before.sampled is not None and added is not None:
             alike = old.extend(*fresh[:2], weights=added, symmetric=fresh[2])
-            return replace(built, density=alike, sampled=_placed(before.sampled, kernel, fresh, added))
-        return replace(
-            built,
-            density=_isotropic(built.kernel, (position, quaternion, symmetric), weights),
-            sampled=kernel.placed(position, quaternion, weights=weights, symmetric=symmetric),
-        )
+            sampled = _placed(before.sampled, kernel, fresh, added)
+            return _searched(replace(built, density=alike, sampled=sampled), before)
+        alike = _isotropic(built.kernel, (position, quaternion, symmetric), weights)
+        sampled = kernel.placed(position, quaternion, weights=weights, symmetric=symmetric)
+        return _searched(replace(built, density=alike, sampled=sampled), None)
     if before is not None and before.shaped is not None and added is not None:
         frames = stored_kernel.axes_at(axes, *fresh[:2])
         shaped = before.shaped.extend(*fresh[:2], weights=added, symmetric=fresh[2], frames=frames)
-    else:
-        position, quaternion, symmetric = everything()
-        shaped = MixtureDensity(
-            position,
-            quaternion,
-            kernel=stored_kernel.load(stored),
-            weights=weights,
-            symmetric=symmetric,
-            frames=stored_kernel.axes_at(axes, position, quaternion),
-        )
-    return replace(built, density=shaped.isotropic, shaped=shaped)
+        return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
+    position, quaternion, symmetric = everything()
+    shaped = MixtureDensity(
+        position,
+        quaternion,
+        kernel=stored_kernel.load(stored),
+        weights=weights,
+        symmetric=symmetric,
+        frames=stored_kernel.axes_at(axes, position, quaternion),
+    )
+    return _searched(replace(built, density=shaped.isotropic, shaped=shaped), None)
 
 
 def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Poses, added: Floats) -> GraspDensity:

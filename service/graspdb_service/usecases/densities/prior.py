@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graspdb.wire import KernelInfo
-from graspdb_density import GraspDensity, IsotropicKernel
+from graspdb_density import GraspDensity, IsotropicKernel, ModeSearch
 from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.objects import ObjectRow
@@ -36,22 +36,26 @@ _MAX_BYTES = 128 * 2**20
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """The density, and its kernel in words."""
+    """The search in the density, and its kernel in words."""
 
-    density: GraspDensity
+    search: ModeSearch
     kernel: KernelInfo
+
+    @property
+    def density(self) -> GraspDensity:
+        return self.search.centres
 
 
 @dataclass(frozen=True, eq=False)
 class _Made:
     """None where every grasp on a pair collides."""
 
-    density: GraspDensity | None
+    search: ModeSearch | None
     pairs: int
 
     @property
     def nbytes(self) -> int:
-        return 4_096 + (0 if self.density is None else self.density.nbytes)
+        return 4_096 + (0 if self.search is None else self.search.density.nbytes + self.search.nbytes)
 
 
 @dataclass(frozen=True)
@@ -111,20 +115,23 @@ class Priors:
         def make(_: _Made | None) -> _Made:
             threads = self._compute.threads
             density = self._compute.run(lambda: density_on(opposed, test, kernel, symmetric, threads=threads))
-            return _Made(density, sum(len(pairs) for pairs in opposed))
+            search = None if density is None else ModeSearch(density)
+            return _Made(search, sum(len(pairs) for pairs in opposed))
 
         made = self._cache.get(key, lambda _: True, make)
-        if made.density is None:
+        if made.search is None:
             raise conflict(
                 "edges-unreachable",
                 f"The open gripper collides wherever it could close on two surfaces or edges of {row.slug!r}:"
                 " name another gripper, or sweep a grid",
             )
-        rule = f"about {made.density.size:,} grasps on {made.pairs:,} pairs of surfaces, edges and points"
+        rule = (
+            f"about {made.search.density.size:,} grasps on {made.pairs:,} pairs of surfaces, edges and points"
+        )
         info = KernelInfo(
             kind="isotropic", sigma_position_m=metres, sigma_rotation_deg=degrees, rule=f"edges: {rule}"
         )
-        return Prior(made.density, info)
+        return Prior(made.search, info)
 
     def known(self, row: ObjectRow, selected: Selected, choice: KernelChoice) -> Prior | None:
         """As :meth:`get`, None where there is none or it can't be known."""

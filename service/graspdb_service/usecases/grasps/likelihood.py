@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,14 +125,13 @@ def likelihood(
         built = built_for(ctx, slug, request)
         logs = relative = free = None
         if asked("density", "log_density", "relative"):
-            density = built.asked
-            if density is None:
+            search = built.search
+            if search is None:
                 logs, relative = np.full(count, -np.inf), np.zeros(count)
             else:
-                logs = _log_density(ctx, density, positions, quaternions, cutoff)
+                logs = _log_density(ctx, search.density, positions, quaternions, cutoff)
                 if asked("relative"):
-                    # Rounding may lift a pose at the very maximum above it.
-                    relative = np.minimum(np.exp(logs - _global_maximum(ctx, density)), 1.0)
+                    relative = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
         chances = asked("success_probability", "interval", "effective_trials")
         if chances or asked("collision_free"):
             test = ctx.scenes.test(built.object_row, built.selected)
@@ -182,13 +182,6 @@ def _free(ctx: Estimators, test: CollisionTest, positions: Floats, quaternions: 
 
     ctx.compute.blocks(len(positions), _BLOCK, work)
     return free
-
-
-def _global_maximum(ctx: Estimators, density: GraspDensity | MixtureDensity) -> float:
-    if isinstance(density, GraspDensity):
-        return ctx.compute.run(lambda: density.global_maximum(ctx.compute.threads)).log_density
-    # What a search found is ranked by the mixture; ``log_density`` is that of the isotropic kernel.
-    return ctx.compute.run(density.global_maximum).score
 
 
 # -- samples -----------------------------------------------------------------------------------------------

@@ -16,12 +16,13 @@ from graspdb_density import (
     GraspDensity,
     Maximum,
     MixtureDensity,
+    ModeSearch,
     PoseNoise,
     SuccessModel,
     expected,
     se3,
 )
-from graspdb_density.search.evolution import Score
+from graspdb_density.search.scored_poses import Score
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built, KernelChoice, kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -56,7 +57,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         built = ctx.densities.get(slug, Filters.of(request), choice)
         prior = None if built.density is not None else _prior(ctx, request, built, choice)
         kernel = built.kernel if prior is None else prior.kernel
-        question = _question(ctx, slug, request, built, built.density if prior is None else prior.density)
+        question = _question(ctx, slug, request, built, built.search if prior is None else prior.search)
         if question is None:
             return _answer(built, built.kernel, "no_successes", []), built.object_row.id
         ranking = question.ranking
@@ -103,11 +104,11 @@ def _answer(
 
 
 def _question(
-    ctx: Estimators, slug: str, request: GraspConstraints, built: Built, density: GraspDensity | None
+    ctx: Estimators, slug: str, request: GraspConstraints, built: Built, modes: ModeSearch | None
 ) -> Question | None:
     """A question about a density; None where there is nothing to choose from.
 
-    Before any success the density is the prior's, and ``built`` has none.
+    Before any success the search is in the prior, and ``built`` has none.
     """
     limits = constraints(request, jaw_symmetric=built.selected.jaw_symmetric)
     needed = request.collision_free or request.pregrasp_distance_m is not None or request.max_width_m
@@ -117,7 +118,7 @@ def _question(
         test = ctx.scenes.test(built.object_row, built.selected)
     if limits.obstacles and built.selected.profile is None:
         raise conflict("gripper-unknown", "Obstacles need the gripper's shape: name one (gripper=)")
-    if density is None:
+    if modes is None:
         return None
     model, chances = None, _wants_chances(request, built)
     if chances:
@@ -137,7 +138,7 @@ def _question(
     question = Question(
         request=request,
         built=built,
-        density=density,
+        search=modes,
         limits=limits,
         test=test,
         chances=chances,
@@ -301,26 +302,21 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     if not found:
         return []
     density, limits, test = question.density, question.limits, question.test
-    asked, prior = question.asked, question.built.density is None
+    prior = question.built.density is None
     positions = np.array([item.position for item in found])
     quaternions = np.array([item.quaternion_xyzw for item in found])
 
-    def known() -> tuple[Bools | None, Floats | None, list[list[int]], float]:
+    def known() -> tuple[Bools | None, Floats | None, list[list[int]], Floats]:
         free = None if test is None else test.free(positions, quaternions, threads=question.threads)
         widths = None if test is None else test.widths(positions, quaternions, threads=question.threads)
         nearest = [
             [] if prior else _nearest_trials(question.built, density, p, q)
             for p, q in zip(positions, quaternions, strict=True)
         ]
-        if asked is not density:
-            # It may have been searched by score, from the density under an isotropic kernel.
-            logs = asked.log_density(positions, quaternions, threads=question.threads)
-            found[:] = [replace(item, log_density=float(log)) for item, log in zip(found, logs, strict=True)]
-        if isinstance(asked, MixtureDensity):
-            return free, widths, nearest, asked.global_maximum().score
-        return free, widths, nearest, asked.global_maximum(question.threads).log_density
+        logs = np.array([item.log_density for item in found])
+        return free, widths, nearest, question.search.relative(logs, question.threads)
 
-    free, widths, nearest, top = ctx.compute.run(known)
+    free, widths, nearest, relative = ctx.compute.run(known)
     estimates = None
     if question.chances:
         estimates = ctx.successes.under(question.model, positions, quaternions, free)
@@ -348,7 +344,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
                     "score": math.exp(item.log_density) if question.score is None else item.score,
                     "density": math.exp(item.log_density),
                     "log_density": item.log_density,
-                    "relative": min(math.exp(item.log_density - top), 1.0),
+                    "relative": float(relative[i]),
                     **chances,
                     "collision_free": None if free is None else bool(free[i]),
                     "prior": prior,

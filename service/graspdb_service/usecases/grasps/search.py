@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import GraspConstraints, Ranking
-from graspdb_density import GraspDensity, Maximum, MixtureDensity, se3, search_scored
-from graspdb_density.search.evolution import Score
-from graspdb_density.search.mode_search import Admissible, distinct_from
+from graspdb_density import GraspDensity, Maximum, MixtureDensity, ModeSearch, Separation, se3
+from graspdb_density.search.mode_search import DISTINCT
+from graspdb_density.search.scored_poses import Admissible, Score, distinct_from
 from graspdb_geometry.grippers import GripperShape
 from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.densities.cache import Built
@@ -23,8 +23,6 @@ from graspdb_service.usecases.grasps.constraints import Constraints, Poses
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_SEPARATION_M = 0.01
-_SEPARATION_DEG = 20.0
 #: Successes shown to the collision test at a time while looking for the nearest admissible one.
 _CANDIDATES = 1_024
 #: A chance is told within so many standard deviations of a success, position and rotation together. Farther
@@ -40,7 +38,7 @@ class Question:
 
     request: GraspConstraints
     built: Built
-    density: GraspDensity
+    search: ModeSearch
     limits: Constraints
     test: CollisionTest | None
     chances: bool
@@ -58,16 +56,21 @@ class Question:
 
     @property
     def asked(self) -> GraspDensity | MixtureDensity:
-        """The density under the kernel asked for, where ``density`` is under an isotropic one."""
-        return self.built.asked or self.density
+        """The density under the kernel asked for."""
+        return self.search.density
 
     @property
-    def separation(self) -> tuple[float, float]:
-        """Metres and radians from which on two grasps are distinct."""
-        request = self.request
-        return (
-            _or(request.min_separation_m, _SEPARATION_M),
-            math.radians(_or(request.min_separation_deg, _SEPARATION_DEG)),
+    def density(self) -> GraspDensity:
+        """The density under an isotropic kernel."""
+        return self.search.centres
+
+    @property
+    def separation(self) -> Separation:
+        """From which on two grasps are distinct."""
+        metres, degrees = self.request.min_separation_m, self.request.min_separation_deg
+        return Separation(
+            DISTINCT.metres if metres is None else metres,
+            DISTINCT.radians if degrees is None else math.radians(degrees),
         )
 
 
@@ -78,7 +81,9 @@ def admissible_for(question: Question) -> Admissible | None:
     if question.of_chances:
         checks.append(NearSuccesses(question.density))
     if limits.exclude is not None and len(limits.exclude[0]):
-        checks.append(_away_from(limits.exclude, question.separation, bool(question.density.symmetric.all())))
+        excluded = se3.Poses(*limits.exclude)
+        twins = bool(question.density.symmetric.all())
+        checks.append(distinct_from(excluded, question.separation, twins=twins))
     distance = request.pregrasp_distance_m or 0.0
     if test is not None and request.collision_free is not False:
         known = test
@@ -148,12 +153,6 @@ def near_successes(density: GraspDensity, reach: float, threads: int) -> Callabl
     return NearSuccesses(density, reach)
 
 
-def _away_from(
-    poses: Poses, separation: tuple[float, float], twins: bool
-) -> Callable[[Floats, Floats], Bools]:
-    return distinct_from(*poses, separation_m=separation[0], separation=separation[1], twins=twins)
-
-
 def _clear_of(
     limits: Constraints, shape: GripperShape, distance: float, threads: int
 ) -> Callable[[Floats, Floats], Bools]:
@@ -172,29 +171,17 @@ def _clear_of(
 
 
 def found(question: Question) -> list[Maximum]:
-    request, density = question.request, question.density
+    """The best grasps, best first."""
     if question.limits.candidates is not None:
         return _ranked(question, question.limits.candidates)
-    separation_m, separation = question.separation
-    if question.score is None:
-        return question.asked.maximum(
-            question.limits.region,
-            count=request.count,
-            min_separation_m=separation_m,
-            min_separation=separation,
-            admissible=question.admissible,
-            threads=question.threads,
-        )
-    return search_scored(
-        density,
-        question.score,
+    return question.search.maxima(
         question.limits.region,
-        count=request.count,
-        min_separation_m=separation_m,
-        min_separation=separation,
+        count=question.request.count,
+        separation=question.separation,
         admissible=question.admissible,
-        pull=NearSuccesses(density).pull if question.of_chances else None,
+        score=question.score,
         rough=question.quick,
+        pull=NearSuccesses(question.density).pull if question.of_chances else None,
         threads=question.threads,
     )
 
@@ -221,8 +208,9 @@ def _ranked(question: Question, poses: Poses) -> list[Maximum]:
         if len(chosen) == request.count:
             break
         if separated and chosen:
-            away = _away_from((p[chosen], q[chosen]), question.separation, bool(density.symmetric.all()))
-            if not away(p[i : i + 1], q[i : i + 1])[0]:
+            before = se3.Poses(p[chosen], q[chosen])
+            apart = distinct_from(before, question.separation, twins=bool(density.symmetric.all()))
+            if not apart(p[i : i + 1], q[i : i + 1])[0]:
                 continue
         chosen.append(int(i))
     return [
@@ -251,7 +239,3 @@ def closest(question: Question) -> list[Maximum]:
             score = log if question.score is None else float(question.score(p[at], q[at])[0])
             return [Maximum(p[at][0], se3.canonical(q[at][0]), log, (), score)]
     return []
-
-
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value

@@ -7,7 +7,15 @@ import math
 
 import numpy as np
 
-from graspdb_density import GraspDensity, IsotropicKernel, Region, SuccessModel, choose_widths, se3
+from graspdb_density import (
+    GraspDensity,
+    IsotropicKernel,
+    ModeSearch,
+    Region,
+    SuccessModel,
+    choose_widths,
+    se3,
+)
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
@@ -47,13 +55,14 @@ def _exercise() -> None:
     density = density.extend(*density.sample(10, rng))
     density.log_density(positions, quaternions)
     density.log_density(positions[:3] + 1.0, quaternions[:3], cutoff=None)
-    density.maximum(region, count=2, admissible=free)
-    top = density.global_maximum()
+    search = ModeSearch(density)
+    search.maxima(region, count=2, admissible=free)
+    top = search.global_maximum()
 
     def elsewhere(p: se3.Floats, q: se3.Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         return np.asarray(np.linalg.norm(p - top.position, axis=1) > 0.005)
 
-    density.maximum(admissible=elsewhere)
+    search.maxima(admissible=elsewhere)
     density.nearest_rows(positions[0], quaternions[0], 5)
     density.nearest_each(positions[:5], quaternions[:5], within=2.0)
     model.lower_end(positions[:5], quaternions[:5])

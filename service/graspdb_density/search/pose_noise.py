@@ -1,0 +1,73 @@
+"""Scores averaged over noise of the object's pose and of the tool's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from .. import se3
+from ..se3 import Floats
+from .scored_poses import Score
+
+__all__ = ["PoseNoise", "expected"]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """Gaussian noise of a pose, deviations per axis in metres and radians.
+
+    As noise of the object's pose it acts on the left, about ``pivot`` (object frame, metres): 5 degrees at a
+    lever of 100 mm move a grasp by 9 mm. As tool noise it acts on the right and the pivot is the tool's
+    origin.
+    """
+
+    sigma_position_m: float
+    sigma_rotation: float
+    pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        values = (self.sigma_position_m, self.sigma_rotation, *self.pivot)
+        if not all(math.isfinite(v) for v in values) or min(values[:2]) < 0.0:
+            raise ValueError("noise must be finite and not negative")
+
+
+def expected(
+    value: Score,
+    *,
+    object_noise: PoseNoise | None = None,
+    tool_noise: PoseNoise | None = None,
+    samples: int = 64,
+) -> Score:
+    """The mean of ``value`` (a density or a probability, not a logarithm) under pose noise, itself a score.
+
+    The noise is a fixed scrambled Sobol set of ``samples`` draws, so that the mean is a smooth function of
+    the pose; its error falls nearly as 1 / samples.
+    """
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1, not {samples}")
+    normal = ndtri(
+        qmc.Sobol(12, rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(samples)))[:samples]
+    )
+    left_p, left_q = _draws(object_noise, normal[:, :6])
+    right_p, right_q = _draws(tool_noise, normal[:, 6:])
+    pivot = np.zeros(3) if object_noise is None else np.array(object_noise.pivot)
+
+    def mean(positions: ArrayLike, quaternions: ArrayLike) -> Floats:
+        p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+        seen_p = pivot + se3.rotate(left_q[:, None], p[None] - pivot) + left_p[:, None]
+        seen_q = se3.multiply(left_q[:, None], q[None])
+        at, to = se3.compose(seen_p, seen_q, right_p[:, None], right_q[:, None])
+        values = value(at.reshape(-1, 3), se3.normalise(to.reshape(-1, 4)))
+        return np.asarray(values.reshape(samples, len(p)).mean(axis=0), dtype=np.float64)
+
+    return mean
+
+
+def _draws(noise: PoseNoise | None, normal: Floats) -> tuple[Floats, Floats]:
+    scale = (0.0, 0.0) if noise is None else (noise.sigma_position_m, noise.sigma_rotation)
+    return normal[:, :3] * scale[0], se3.from_rotation_vector(normal[:, 3:] * scale[1])
