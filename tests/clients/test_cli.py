@@ -9,10 +9,18 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 import trimesh
+
+from graspdb.options import Corners
+from graspdb.resources.kernels import KernelOptions
+from graspdb.resources.objects import ObjectProperties
+from graspdb.resources.selection import Constraints, Selection
+from graspdb.resources.sweeps import SweepOptions
+from graspdb.resources.trials import TrialFilters, Upload
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -146,6 +154,35 @@ def test_grippers(run: Run, fresh_id: str, tmp_path: Path) -> None:
     file.write_text(json.dumps({k: v for k, v in profile.items() if v is not None} | {"force_n": 5}))
     assert run("grippers", "create", fresh_id, str(file), "--name", "Weak")[0] == 0
     assert "Weak" in run("grippers", "show", fresh_id)[1]
+
+
+@pytest.mark.parametrize(
+    ("command", "keywords"),
+    [
+        ("density", Selection),
+        ("best-grasp", Constraints),
+        ("sweep", SweepOptions),
+        ("trials add", Upload),
+        ("trials list", TrialFilters),
+        ("objects create", ObjectProperties),
+        ("kernels fit", KernelOptions),
+    ],
+)
+def test_commands_take_the_keywords_of_the_sdk(
+    help_of: Callable[..., str], command: str, keywords: type
+) -> None:
+    shown = help_of("graspdb", *command.split())
+    options = {
+        name: option
+        for name, hint in get_type_hints(keywords, include_extras=True).items()
+        for option in getattr(hint, "__metadata__", ())
+    }
+    assert options
+    for name, option in options.items():
+        ends = [option.lower, option.upper] if isinstance(option, Corners) else [name]
+        for flag in option.flag.split("/") if option.flag else [f"--{end.replace('_', '-')}" for end in ends]:
+            assert flag in shown, flag
+        assert option.help.split()[0] in shown
 
 
 @pytest.mark.usefixtures("worker")
