@@ -39,7 +39,8 @@ from graspdb_service.api import (
 )
 from graspdb_service.api.context import Context
 from graspdb_service.api.document import document
-from graspdb_service.api.routing import declared_parameters, media_type, refuse_unknown_parameters
+from graspdb_service.api.routing import declared_parameters, refuse_unknown_parameters
+from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
@@ -219,12 +220,11 @@ def _add_problems(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     def on_invalid(request: Request, error: RequestValidationError) -> Response:
         errors = error.errors()
-        sent = media_type(request)
-        if any(item["loc"] == ("body",) for item in errors) and sent and not sent.endswith("json"):
-            return answer(
-                request,
-                ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json"),
-            )
+        if any(item["loc"] == ("body",) for item in errors):
+            try:
+                require_json(request)
+            except ProblemError as problem:
+                return answer(request, problem)
         return answer(request, problem_of_validation(errors))
 
     @app.exception_handler(ObjectGone)

@@ -24,9 +24,10 @@ import numpy as np
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import se3
-from graspdb_service.storage import batches, objects, trials
+from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database
-from graspdb_service.storage.trials import TrialColumns
+from graspdb_service.storage.trials import batches, provenances, rows
+from graspdb_service.trial_columns import Provenance, TrialColumns
 
 TRIALS, SUCCESSES = 3_500_000, 167_000
 BATCH = 250_000
@@ -81,9 +82,9 @@ def write(folder: Path, total: int) -> None:
             row = objects.find(tx, SLUG)
             assert row is not None
             revision, first = objects.advance(tx, row.id, rows=len(columns), append=True)
-            columns.provenance[:] = trials.provenance(tx, row.id, "pg70", None, None)
+            columns.provenance[:] = provenances.ensure(tx, row.id, Provenance("pg70", None, None))
             batch_id, _ = batches.create(tx, row.id, revision=revision)
-            trials.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first)
+            rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first)
             last = first + len(columns) - 1
             batches.grow(tx, batch_id, first_seq=first, last_seq=last, inserted=len(columns), packed=0)
     database.dispose()

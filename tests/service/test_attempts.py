@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, GridPlan
-from graspdb_service.storage.attempts import PackedChunk
-from graspdb_service.storage.sweeps import SweepRow
-from graspdb_service.storage.trials import Columns
+from graspdb_service.storage.simulation.outcomes import PackedChunk
+from graspdb_service.storage.simulation.sweeps import SweepRow
+from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.attempts import NO_ATTEMPT, Stored, Swept, joined
 from graspdb_service.usecases.trials.selection import Selected
@@ -52,10 +52,12 @@ def stored(*sweeps: tuple[SweepRow, int], rows: int = 0) -> Stored:
         for start in range(0, grid.total, 100):
             stop = min(start + 100, grid.total)
             codes = outcome_of(grid.pose_indices(start, stop), seed)
-            chunks[-1].append(Swept(row, PackedChunk(row.id, start, stop, codes.tobytes()), None))
+            chunks[-1].append(
+                Swept(row, PackedChunk(row.id, start // 100, start, stop, codes.tobytes()), None)
+            )
     turns = [part[i] for i in range(max(map(len, chunks))) for part in chunks if i < len(part)]
     rng = np.random.default_rng(1)
-    columns = Columns(
+    columns = TrialColumns(
         seq=np.arange(rows), position=rng.normal(size=(rows, 3)),
         quaternion_xyzw=np.tile([0.0, 0, 0, 1], (rows, 1)), outcome=np.full(rows, COLLISION, dtype=np.uint8),
         proposal_density=np.full(rows, np.nan), provenance=np.full(rows, 7),

@@ -9,8 +9,10 @@ import httpx
 import numpy as np
 import pytest
 
-from graspdb_service.storage import batches, objects, trials
+from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database
+from graspdb_service.storage.trials import batches, provenances, rows
+from graspdb_service.trial_columns import Provenance, TrialColumns
 
 Q = [0.0, 0.0, 0.0, 1.0]
 GRASP: dict[str, Any] = {"position": [0, 0, 0.1], "quaternion_xyzw": Q, "outcome": "success"}
@@ -131,13 +133,13 @@ def test_columns_are_read_as_they_were_stored(
         revision, first = objects.advance(tx, row.id, rows=400, append=True)
         ids = np.array(
             [
-                trials.provenance(tx, row.id, "pg70", None, None),
-                trials.provenance(tx, row.id, None, "robot", "x"),
+                provenances.ensure(tx, row.id, Provenance("pg70", None, None)),
+                provenances.ensure(tx, row.id, Provenance(None, "robot", "x")),
             ]
         )
-        assert trials.provenance(tx, row.id, "pg70", None, None) == ids[0]
+        assert provenances.ensure(tx, row.id, Provenance("pg70", None, None)) == ids[0]
         batch, _ = batches.create(tx, row.id, revision=revision)
-        columns = trials.TrialColumns(
+        columns = TrialColumns(
             position,
             quaternion,
             rng.integers(0, 3, 400).astype(np.uint8),
@@ -146,16 +148,16 @@ def test_columns_are_read_as_they_were_stored(
             quality=quality,
             pose_index=np.arange(400, dtype=np.int64) * 2**40,
         )
-        trials.insert(tx, row.id, batch, columns, revision=revision, first_seq=first)
+        rows.insert(tx, row.id, batch, columns, revision=revision, first_seq=first)
         batches.grow(tx, batch, first_seq=first, last_seq=first + 399, inserted=400, packed=0)
     with database.read() as tx:
-        found = trials.read(tx, row.id, provenance_ids=None, successes_only=False)
-        successes = trials.read(
+        found = rows.read(tx, row.id, provenance_ids=None, successes_only=False)
+        successes = rows.read(
             tx, row.id, provenance_ids=[int(ids[1])], successes_only=True, after_seq=first + 99
         )
-        nothing = trials.read(tx, row.id, provenance_ids=[], successes_only=False)
-        rows = trials.page(tx, row.id, after_seq=0, limit=1000)
-        counts = trials.tallies(tx, row.id)
+        nothing = rows.read(tx, row.id, provenance_ids=[], successes_only=False)
+        page = rows.page(tx, row.id, after_seq=0, limit=1000)
+        counts = provenances.tallies(tx, row.id)
     assert found.seq.tolist() == list(range(first, first + 400))
     np.testing.assert_array_equal(found.position, position)
     np.testing.assert_array_equal(found.quaternion_xyzw, quaternion)
@@ -165,8 +167,8 @@ def test_columns_are_read_as_they_were_stored(
     chosen = (columns.outcome == 1) & (np.arange(400) >= 100) & (columns.provenance == ids[1])
     np.testing.assert_array_equal(successes.position, position[chosen])
     assert len(nothing) == 0
-    assert [item.pose_index for item in rows] == (np.arange(400) * 2**40).tolist()
-    assert [item.quality for item in rows] == [None if np.isnan(q) else q for q in quality]
+    assert page.pose_index.tolist() == (np.arange(400) * 2**40).tolist()
+    np.testing.assert_array_equal(page.quality, quality)
     expected = {(int(p), int(o)): 0 for p in ids for o in range(3)}
     for p, o in zip(columns.provenance, columns.outcome, strict=True):
         expected[int(p), int(o)] += 1

@@ -164,13 +164,13 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
     """Batches with and without proposal densities and grippers, failures between; one reader keeps pace."""
     make_object(http)
     reads: list[int] = []
-    read = densities_module.trials.read
+    read = densities_module.trial_rows.read
 
     def watched(*given: Any, **more: Any) -> Any:
         reads.append(more["after_seq"])
         return read(*given, **more)
 
-    monkeypatch.setattr(densities_module.trials, "read", watched)
+    monkeypatch.setattr(densities_module.trial_rows, "read", watched)
     rng = np.random.default_rng(4)
     proposals: list[Floats] = []
     done = 0

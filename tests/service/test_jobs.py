@@ -34,8 +34,8 @@ from graspdb_service.api.context import Context
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.storage import assets, objects, schema
-from graspdb_service.storage import jobs as job_rows
 from graspdb_service.storage.database import Database
+from graspdb_service.storage.simulation import jobs as job_rows
 from graspdb_service.usecases import grippers
 from graspdb_service.usecases.simulation import jobs, sweeps
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ValidationError
 
 from graspdb.wire import (
     ClaimRequest,
@@ -25,12 +23,11 @@ from graspdb_service.api.routing import (
     Limit,
     RawBody,
     encode_cursor,
-    media_type,
     number_cursor,
     scope,
 )
-from graspdb_service.problems import ProblemError
-from graspdb_service.usecases.geometry import meshes
+from graspdb_service.formats.json_bodies import read_model
+from graspdb_service.formats.negotiation import BINARY, GLB, JSON, media_type, unsupported
 from graspdb_service.usecases.simulation import jobs
 
 router = APIRouter(tags=["jobs"])
@@ -39,31 +36,11 @@ LeaseId = Annotated[
     str, Query(min_length=1, max_length=64, pattern=r"^[\x21-\x7e]+$", description="As the claim gave it.")
 ]
 JobId = str
-_RESULTS = {"application/json": SimulateResult, meshes.GLB: {"type": "string", "format": "binary"}}
+_RESULTS = {JSON: SimulateResult, GLB: BINARY}
 ProgressText = Annotated[
     str | None,
     Query(max_length=200, pattern=r"^[^\x00-\x1f]+$", description="How far the work is, for a person."),
 ]
-Model = TypeVar("Model", bound=BaseModel)
-
-
-def parse(model: type[Model], request: Request, body: bytes) -> Model:
-    """A body that the route reads itself, because it is large or its bytes count, as its model.
-
-    Raises
-    ------
-    ProblemError
-        415 for another media type than JSON.
-    RequestValidationError
-        For a body that does not fit, as FastAPI raises it.
-    """
-    sent = media_type(request)
-    if sent and not sent.endswith("json"):
-        raise ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json")
-    try:
-        return model.model_validate_json(body)
-    except ValidationError as error:
-        raise RequestValidationError(error.errors(include_input=False, include_url=False)) from None
 
 
 @router.post("/jobs/claim", **scope("jobs:work"))
@@ -90,9 +67,13 @@ def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: R
 
     The same body under the same lease again is answered the same again.
     """
-    if media_type(request) == meshes.GLB:
-        return jobs.complete_parts(ctx, id, lease_id, body)
-    return jobs.complete(ctx, id, lease_id, body, parse(SimulateResult, request, body))
+    try:
+        if media_type(request) == GLB:
+            return jobs.complete_parts(ctx, id, lease_id, body)
+        return jobs.complete(ctx, id, lease_id, body, read_model(request, body, SimulateResult))
+    except jobs.WrongResult as error:
+        wanted = {"simulate": f"JSON, as {JSON}", "decompose": f"a GLB, as {GLB}"}[error.kind]
+        raise unsupported(f"The result of a {error.kind} job is {wanted}") from None
 
 
 @router.put("/jobs/{id}/failure", **scope("jobs:work"))

@@ -7,13 +7,13 @@ from typing import Literal
 from fastapi import APIRouter, Request, Response
 
 from graspdb.wire import MeshInfo, PartsInfo
-from graspdb_service.api.routing import Ctx, RawBody, media_type, not_modified, scope
+from graspdb_service.api.routing import Ctx, RawBody, not_modified, scope
+from graspdb_service.formats.negotiation import BINARY, GLB, one_of
 from graspdb_service.usecases.geometry import meshes
 
 router = APIRouter(tags=["objects"])
 
-_BINARY = {"type": "string", "format": "binary"}
-_MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, _BINARY)
+_MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, BINARY)
 
 
 @router.put("/objects/{id}/mesh", **scope("admin", body=_MESH_BODY))
@@ -21,13 +21,13 @@ def put_mesh(
     ctx: Ctx, id: str, request: Request, body: RawBody, unit: Literal["m", "mm", "cm", "in"] = "m"
 ) -> MeshInfo:
     """Store the mesh: STL, OBJ, PLY or GLB as the raw body, said by Content-Type."""
-    return meshes.put_mesh(ctx, id, body, media=media_type(request), unit=unit)
+    return meshes.put_mesh(ctx, id, body, media=one_of(request, *meshes.MEDIA_TYPES), unit=unit)
 
 
 @router.get(
     "/objects/{id}/mesh",
     response_class=Response,
-    responses={200: {"content": {media: {"schema": _BINARY} for media in meshes.MEDIA_TYPES}}},
+    responses={200: {"content": {media: {"schema": BINARY} for media in meshes.MEDIA_TYPES}}},
     **scope("jobs:work"),
 )
 def get_mesh(ctx: Ctx, id: str, request: Request) -> Response:
@@ -35,16 +35,17 @@ def get_mesh(ctx: Ctx, id: str, request: Request) -> Response:
     return _bytes(request, *meshes.get_mesh(ctx, id))
 
 
-@router.put("/objects/{id}/convex-parts", **scope("admin", body={meshes.GLB: _BINARY}))
+@router.put("/objects/{id}/convex-parts", **scope("admin", body={GLB: BINARY}))
 def put_convex_parts(ctx: Ctx, id: str, request: Request, body: RawBody) -> PartsInfo:
     """Store the convex parts: a GLB in metres with one geometry a part, object frame."""
-    return meshes.put_parts(ctx, id, body, media=media_type(request))
+    one_of(request, GLB)
+    return meshes.put_parts(ctx, id, body)
 
 
 @router.get(
     "/objects/{id}/convex-parts",
     response_class=Response,
-    responses={200: {"content": {meshes.GLB: {"schema": _BINARY}}}},
+    responses={200: {"content": {GLB: {"schema": BINARY}}}},
     **scope("jobs:work"),
 )
 def get_convex_parts(ctx: Ctx, id: str, request: Request) -> Response:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated, Any, TypeVar
 
-import orjson
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, BeforeValidator, ValidationError
+from pydantic import BaseModel, BeforeValidator
 
 from graspdb.wire import (
     BestGraspRequest,
@@ -28,20 +26,11 @@ from graspdb.wire.base import Position, Quaternion
 from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
-from graspdb_service.api.routing import Ctx, RawBody, etag, media_type, not_modified, scope
-from graspdb_service.formats.arrow import ARROW
-from graspdb_service.formats.columns import (
-    BINARY,
-    accepted,
-    columns_arrow,
-    columns_json,
-    read_arrow_poses,
-    read_object,
-    read_poses,
-)
-from graspdb_service.formats.json_pieces import LongArray
-from graspdb_service.formats.trial_json import JSON
-from graspdb_service.problems import ProblemError
+from graspdb_service.api.routing import Ctx, RawBody, etag, not_modified, scope
+from graspdb_service.formats.columns import columns_arrow, columns_json
+from graspdb_service.formats.json_bodies import read_object, validated
+from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted, media_type
+from graspdb_service.formats.poses import read_arrow_poses, read_poses
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.grasps import likelihood, proposals
 from graspdb_service.usecases.grasps import question as bestgrasp
@@ -49,7 +38,6 @@ from graspdb_service.usecases.trials.selection import Filters
 
 router = APIRouter(tags=["queries"])
 
-T = TypeVar("T", bound=BaseModel)
 Q = TypeVar("Q", bound=Selection)
 
 
@@ -132,11 +120,11 @@ def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
     kind = accepted(request, JSON, ARROW)
     if media_type(request) == ARROW:
         content, positions, quaternions = read_arrow_poses(body)
-        options = _validated(LikelihoodOptions, content)
+        options = validated(content, LikelihoodOptions)
     else:
-        content = _json_body(request, body)
+        content = read_object(request, body)
         poses = content.pop("poses", None)
-        options = _validated(LikelihoodOptions, content)
+        options = validated(content, LikelihoodOptions)
         positions, quaternions = read_poses(poses)
     answer = likelihood.likelihood(ctx, id, options, positions, quaternions, options.include)
     return _likelihoods(answer, {"Vary": "Accept"}, arrow=kind == ARROW)
@@ -162,7 +150,7 @@ def get_best_grasp(
 )
 def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
     """As GET, the constraints as JSON; also half spaces, obstacles, candidates and poses to exclude."""
-    query = _validated(BestGraspRequest, _json_body(request, body))
+    query = validated(read_object(request, body), BestGraspRequest, most=MAX_OBSTACLE_POINTS)
     answer, _ = bestgrasp.best_grasps(ctx, id, query)
     return _json(answer)
 
@@ -219,39 +207,6 @@ def _likelihoods(
         columns["interval"] = {"level": LEVEL, "low": low, "high": high}
     head = {"revision": answer.revision, "kernel": answer.kernel.model_dump()}
     return (columns_arrow if arrow else columns_json)(head, columns, headers)
-
-
-def _json_body(request: Request, body: bytes) -> dict[str, Any]:
-    sent = media_type(request)
-    if sent and not sent.endswith("json"):
-        raise ProblemError(415, "unsupported-media-type", "Send JSON, with Content-Type: application/json")
-    return read_object(body)
-
-
-def _validated(model: type[T], content: Any) -> T:
-    try:
-        return model.model_validate(_as_lists(content))
-    except ValidationError as error:
-        raise RequestValidationError(error.errors(include_input=False)) from None
-
-
-def _as_lists(content: Any) -> Any:
-    """Long arrays as lists, cut where no model takes more."""
-    if isinstance(content, dict):
-        return {name: _as_lists(value) for name, value in content.items()}
-    if not isinstance(content, LongArray):
-        return content
-    items: list[Any] = []
-    try:
-        for piece in content:
-            items += piece
-            if len(items) > MAX_OBSTACLE_POINTS:
-                break
-    except orjson.JSONDecodeError:
-        raise ProblemError(
-            400, "invalid-json", "The body is not valid JSON", errors=[("body", "not valid JSON")]
-        ) from None
-    return items
 
 
 def _json(answer: BaseModel, tag: str | None = None) -> Response:

@@ -35,6 +35,7 @@ from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.queries import SelectionQuery
 from graspdb_service.api.routing import Ctx, etag, not_modified, scope
+from graspdb_service.formats.negotiation import accepted
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.report_runs import RunRow
 from graspdb_service.usecases.reports import runs, summary
@@ -303,7 +304,7 @@ def _format(request: Request) -> Format:
     ProblemError
         406 where none of ours is accepted, or a figure where nothing can draw it.
     """
-    wanted = _wanted(request.headers.get("accept", ""))
+    wanted = _MEDIA[accepted(request, *_MEDIA)]
     if wanted != "json" and importlib.util.find_spec("matplotlib") is None:
         raise ProblemError(
             406,
@@ -311,35 +312,6 @@ def _format(request: Request) -> Format:
             "Figures need matplotlib on the server: pip install 'graspdb[plot]'; take JSON",
         )
     return wanted
-
-
-def _wanted(accept: str) -> Format:
-    """The format with the highest weight, JSON among equals.
-
-    Raises
-    ------
-    ProblemError
-        406 where none of ours is accepted.
-    """
-    weights: dict[Format, float] = {}
-    for part in accept.split(",") if accept.strip() else ["*/*"]:
-        media, *parameters = (item.strip().lower() for item in part.split(";"))
-        weight = 1.0
-        for item in parameters:
-            name, _, value = item.partition("=")
-            if name.strip() == "q":
-                try:
-                    weight = float(value)
-                except ValueError:
-                    weight = 0.0
-        for known, name in _MEDIA.items():
-            whole = media in ("*/*", known.partition("/")[0] + "/*")
-            if media == known or (whole and name not in weights):
-                weights[name] = weight
-    accepted = {name: weight for name, weight in weights.items() if weight > 0.0}
-    if not accepted:
-        raise ProblemError(406, "not-acceptable", f"A report comes as {', '.join(_MEDIA)}")
-    return max(_MEDIA.values(), key=lambda name: accepted.get(name, 0.0))
 
 
 def _figure(run: RunRow, wanted: Literal["png", "svg"]) -> bytes:

@@ -96,11 +96,6 @@ Limit = Annotated[int, Query(ge=1, le=1_000, description="At most this many item
 Cursor = Annotated[str | None, Query(max_length=500, description="`next` of the page before.")]
 
 
-def media_type(request: Request) -> str:
-    """The body's media type without parameters, lower case; empty where none is given."""
-    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
-
-
 def encode_cursor(position: int | str | None) -> str | None:
     """An opaque cursor of the place after which the next page starts; None at the end."""
     if position is None:

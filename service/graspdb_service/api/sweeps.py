@@ -10,7 +10,6 @@ from fastapi.responses import StreamingResponse
 
 from graspdb.wire import OUTCOMES, Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.sweeps import SweepState
-from graspdb_service.api.jobs import parse
 from graspdb_service.api.routing import (
     Ctx,
     Cursor,
@@ -21,9 +20,9 @@ from graspdb_service.api.routing import (
     name_cursor,
     scope,
 )
-from graspdb_service.formats.arrow import ARROW
-from graspdb_service.formats.columns import BINARY, accepted, columns_json
-from graspdb_service.formats.trial_json import JSON
+from graspdb_service.formats.columns import columns_json
+from graspdb_service.formats.json_bodies import read_model
+from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
 from graspdb_service.usecases.simulation import sweeps
 
 router = APIRouter(tags=["sweeps"])
@@ -45,7 +44,7 @@ def create_sweep(
 ) -> object:
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
     draws from its density. Workers take its chunks."""
-    spec = parse(SweepCreate, request, body or b"{}")
+    spec = read_model(request, body or b"{}", SweepCreate)
     made = sweeps.create(ctx, id, spec, key=key, request=body)
     response.headers["Location"] = made.location
     return made.body

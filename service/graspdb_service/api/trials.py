@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import orjson
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import StreamingResponse
 
 from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, TrialIn, TrialOut, TrialsIn
 from graspdb.wire.trials import TrialColumnsIn
@@ -18,17 +16,15 @@ from graspdb_service.api.routing import (
     RawBody,
     encode_cursor,
     etag,
-    media_type,
     not_modified,
     number_cursor,
     scope,
     tagged_json,
 )
-from graspdb_service.formats.arrow import ARROW
-from graspdb_service.formats.columns import BINARY, accepted
-from graspdb_service.formats.trial_json import JSON, NDJSON
+from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
+from graspdb_service.formats.trials import page_response, stream_response
 from graspdb_service.usecases import objects
-from graspdb_service.usecases.trials import batches, posting
+from graspdb_service.usecases.trials import batches, listing, posting
 
 router = APIRouter(tags=["trials"])
 
@@ -80,7 +76,7 @@ def list_trials(
 ) -> Response:
     """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) or an Arrow
     stream (`Accept: application/vnd.apache.arrow.stream`) all of them."""
-    chosen = posting.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
+    chosen = listing.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
     kind = accepted(request, JSON, NDJSON, ARROW)
     after = number_cursor(cursor)
     row, _ = objects.get(ctx.database, id)
@@ -89,20 +85,10 @@ def list_trials(
     if fresh is not None:
         return fresh
     headers = {"ETag": tag, "Vary": "Accept"}
-    if kind == NDJSON and limit is None:
-        lines = posting.stream(ctx, id, chosen, after=after)
-        return StreamingResponse(lines, media_type=NDJSON, headers=headers)
-    if kind == ARROW and limit is None:
-        stream = posting.stream_arrow(ctx, id, chosen, after=after)
-        return StreamingResponse(stream, media_type=ARROW, headers=headers)
-    items, last = posting.page(ctx, id, chosen, after=after, limit=limit or 100)
-    if kind == ARROW:
-        body = posting.page_arrow(items, encode_cursor(last))
-    elif kind == NDJSON:
-        body = b"".join(orjson.dumps(item, option=orjson.OPT_APPEND_NEWLINE) for item in items)
-    else:
-        body = orjson.dumps({"items": items, "next": encode_cursor(last)})
-    return Response(body, media_type=kind, headers=headers)
+    if kind != JSON and limit is None:
+        return stream_response(listing.pages(ctx.database, id, chosen, after=after), kind, headers)
+    page, last = listing.page(ctx.database, id, chosen, after=after, limit=limit or 100)
+    return page_response(page, encode_cursor(last), kind, headers)
 
 
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))

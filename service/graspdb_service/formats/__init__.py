@@ -1,1 +1,1 @@
-"""Bodies in and out: JSON, NDJSON, columns, Arrow IPC."""
+"""HTTP formats: bodies to checked arrays, arrays to answers, and which of them a request means."""

@@ -20,7 +20,6 @@ from graspdb_service.problems import ProblemError, invalid
 
 Floats = NDArray[np.float64]
 
-ARROW = "application/vnd.apache.arrow.stream"
 #: Key of the schema's metadata that holds, as JSON, what else a request or an answer says.
 METADATA = b"graspdb"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES
 from graspdb_service.formats import arrow
-from graspdb_service.formats.trial_json import COLUMNS, Fields, TrialBatch, check, refuse_too_many
+from graspdb_service.formats.trial_fields import NAMES, Faults, Fields, check, defaults_of, refuse_too_many
+from graspdb_service.formats.trial_json import metadata_of
 from graspdb_service.problems import invalid
+from graspdb_service.trial_columns import TrialBatch, TrialPage
 
 _SCALARS = ("proposal_density", "quality", "width_m")
 _TEXTS = ("gripper", "source", "protocol")
@@ -29,9 +31,9 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
     Raises
     ------
     ProblemError
-        As :func:`graspdb_service.formats.trial_json.parse`.
+        As :func:`graspdb_service.formats.trial_json.parse`, 415 without pyarrow.
     """
-    table = arrow.Table(body, COLUMNS)
+    table = arrow.Table(body, NAMES)
     if not table.count:
         raise invalid("columns.position", "at least one trial")
     refuse_too_many(table.count, limit)
@@ -54,7 +56,9 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
         items = table.objects(name)
         if items is not None:
             lists[name] = items if convert is None else [None if x is None else convert(x) for x in items]
-    return check(Fields(lists, table.count, lambda i, name: f"columns.{name}.{i}"), table.options)
+    faults = Faults()
+    defaults = defaults_of(table.options, faults, "columns")
+    return check(Fields(lists, table.count, lambda i, name: f"columns.{name}.{i}"), defaults, faults)
 
 
 def _outcomes(table: arrow.Table) -> NDArray[np.uint8]:
@@ -91,7 +95,18 @@ def _document(value: Any) -> Any:
 # -- out -----------------------------------------------------------------------------------------------------
 
 
-def schema(told: dict[str, Any] | None = None) -> Any:
+def stream(pages: Iterable[TrialPage], told: dict[str, Any] | None = None) -> Iterator[bytes]:
+    """Stored trials as an Arrow IPC stream; what else is ``told`` stands in its schema's metadata.
+
+    Raises
+    ------
+    ProblemError
+        406 without pyarrow.
+    """
+    return arrow.stream(_schema(told), (_record_batch(page) for page in pages if len(page.columns)))
+
+
+def _schema(told: dict[str, Any] | None = None) -> Any:
     """The columns of stored trials, as ``GET /objects/{id}/trials`` has them."""
     pa = arrow.library()
     return arrow.schema_of(
@@ -114,20 +129,28 @@ def schema(told: dict[str, Any] | None = None) -> Any:
     )
 
 
-def batch_of(items: Sequence[dict[str, Any]]) -> Any:
-    """Rows as :mod:`graspdb_service.usecases.trials.posting` reads them, in columns."""
-    pa, columns = arrow.library(), []
-    for field in schema():
-        values = [item[field.name] for item in items]
-        if field.name in ("position", "quaternion_xyzw"):
-            width = field.type.list_size
-            columns.append(arrow.vectors(np.array(values, dtype=np.float64).reshape(-1, width), width))
-        elif field.name == "outcome":
-            codes = np.array([OUTCOME_CODES[name] for name in values], dtype=np.uint8)
-            columns.append(arrow.outcome_names(codes))
-        elif field.name == "metadata":
-            texts = [None if value is None else orjson.dumps(value).decode() for value in values]
-            columns.append(pa.array(texts, pa.string()))
-        else:
-            columns.append(pa.array(values, field.type))
-    return pa.record_batch(columns, schema=schema())
+def _record_batch(page: TrialPage) -> Any:
+    pa, columns = arrow.library(), page.columns
+    schema = _schema()
+    batches = [page.batches[number] for number in columns.batch.tolist()]
+    provenances = [page.provenances[number] for number in columns.provenance.tolist()]
+    arrays: dict[str, Any] = {
+        "seq": columns.seq,
+        "revision": columns.revision,
+        "batch": [batch.key for batch in batches],
+        "position": arrow.vectors(columns.position, 3),
+        "quaternion_xyzw": arrow.vectors(columns.quaternion_xyzw, 4),
+        "outcome": arrow.outcome_names(columns.outcome),
+        **{name: [getattr(item, name) for item in provenances] for name in _TEXTS},
+        **{name: arrow.numbers(getattr(columns, name)) for name in _SCALARS},
+        "pose_covariance": columns.pose_covariance,
+        "measured_at": columns.measured_at,
+        "metadata": [None if value is None else orjson.dumps(value).decode() for value in metadata_of(page)],
+        "sweep": [batch.sweep for batch in batches],
+        "pose_index": pa.array(columns.pose_index, mask=columns.pose_index < 0),
+    }
+    filled = [
+        column if isinstance(column, pa.Array) else pa.array(column, schema.field(name).type)
+        for name, column in arrays.items()
+    ]
+    return pa.record_batch(filled, schema=schema)

@@ -9,9 +9,8 @@ from datetime import UTC, datetime
 from sqlalchemy import delete, exists, or_, select
 from sqlalchemy.exc import IntegrityError
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, insert_or
 from graspdb_service.storage.tables import assets, objects
-from graspdb_service.storage.upsert import insert
 
 
 def put(tx: Tx, content: bytes, media_type: str) -> str:
@@ -20,7 +19,7 @@ def put(tx: Tx, content: bytes, media_type: str) -> str:
     values = {"sha256": sha256, "media_type": media_type, "content": content, "created_at": datetime.now(UTC)}
     # An update that changes nothing still locks a row that exists: nobody drops it before we refer to it.
     tx.execute(
-        insert(tx, assets)
+        insert_or(tx, assets)
         .values(values)
         .on_conflict_do_update(index_elements=[assets.c.sha256], set_={"created_at": assets.c.created_at})
     )

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
-from sqlalchemy import Connection, Double, Engine, create_engine, event, make_url, text
+from sqlalchemy import Connection, Double, Engine, Table, create_engine, event, make_url, text
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.ext.compiler import compiles
@@ -33,6 +34,14 @@ def _sqlite_now(element: unix_now, compiler: Any, **_: Any) -> str:
 @compiles(unix_now, "postgresql")
 def _postgres_now(element: unix_now, compiler: Any, **_: Any) -> str:
     return "extract(epoch from clock_timestamp())::double precision"
+
+
+def insert_or(tx: Tx, table: Table) -> postgresql.Insert:
+    """An INSERT with ``on_conflict_do_nothing`` and ``on_conflict_do_update`` for the database of ``tx``."""
+    if tx.dialect.name == "sqlite":
+        # The same methods under another type.
+        return sqlite.insert(table)  # type: ignore[return-value]
+    return postgresql.insert(table)
 
 
 class UnsupportedDatabase(ValueError):

@@ -9,9 +9,8 @@ from typing import Any
 
 from sqlalchemy import Row, select
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, insert_or
 from graspdb_service.storage.tables import grippers
-from graspdb_service.storage.upsert import insert
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def page(tx: Tx, *, after: str, limit: int) -> list[GripperRow]:
 def create(tx: Tx, gripper: str, name: str | None, profile: dict[str, Any], *, builtin: bool = False) -> bool:
     """Insert a gripper; False where the id is taken."""
     statement = (
-        insert(tx, grippers)
+        insert_or(tx, grippers)
         .values(id=gripper, name=name, profile=profile, builtin=builtin, created_at=datetime.now(UTC))
         .on_conflict_do_nothing()
         .returning(grippers.c.id)

@@ -8,9 +8,8 @@ from typing import Any
 
 from sqlalchemy import select, update
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, insert_or
 from graspdb_service.storage.tables import idempotency_keys
-from graspdb_service.storage.upsert import insert
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | Non
     PostgreSQL at the unique index, SQLite at BEGIN IMMEDIATE.
     """
     statement = (
-        insert(tx, idempotency_keys)
+        insert_or(tx, idempotency_keys)
         .values(
             scope=scope,
             key=key,

@@ -9,9 +9,8 @@ from typing import Any
 
 from sqlalchemy import Row, and_, delete, exists, or_, select, update
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, insert_or
 from graspdb_service.storage.tables import batches, idempotency_keys, jobs, objects, sweeps, trials
-from graspdb_service.storage.upsert import insert
 
 
 class ObjectGone(LookupError):
@@ -44,7 +43,7 @@ def create(tx: Tx, slug: str, properties: Mapping[str, Any]) -> bool:
     """Insert an object with these column values; False where the slug is taken."""
     now = datetime.now(UTC)
     values = {"slug": slug, "revision": 0, "epoch": 0, "last_seq": 0, "created_at": now, "updated_at": now}
-    statement = insert(tx, objects).values({**properties, **values}).on_conflict_do_nothing()
+    statement = insert_or(tx, objects).values({**properties, **values}).on_conflict_do_nothing()
     return tx.execute(statement.returning(objects.c.id)).first() is not None
 
 

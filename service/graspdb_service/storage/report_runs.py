@@ -9,9 +9,8 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, and_, delete, or_, select, update
 
-from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.database import Tx, insert_or, unix_now
 from graspdb_service.storage.tables import objects, report_runs
-from graspdb_service.storage.upsert import insert
 
 #: The option that stands for the checks there are: another one whenever they change.
 CHECKS = "checks"
@@ -68,7 +67,7 @@ def ask(tx: Tx, question: Question, *, id: str, lease_id: str, lease_s: float) -
     """
     lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
     made = tx.execute(
-        insert(tx, report_runs)
+        insert_or(tx, report_runs)
         .values(
             id=id,
             object_id=question.object_id,

@@ -6,9 +6,10 @@ from typing import Any
 
 from graspdb.wire import OUTCOMES, MeshInfo, ObjectCreate, ObjectInfo, ObjectPatch, PartsInfo
 from graspdb_service.problems import conflict, not_found
-from graspdb_service.storage import assets, objects, trials
+from graspdb_service.storage import assets, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.identifiers import is_slug
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or
 
@@ -47,14 +48,14 @@ def get(database: Database, slug: str) -> tuple[ObjectRow, ObjectInfo]:
     """One object: as stored, and as the wire has it."""
     with database.read() as tx:
         row = require(tx, slug)
-        return row, info(row, trials.outcome_counts(tx, [row.id])[row.id])
+        return row, info(row, provenances.outcome_counts(tx, [row.id])[row.id])
 
 
 def page(database: Database, *, after: str, limit: int) -> tuple[list[ObjectInfo], str | None]:
     """A page of objects by id, and where the next one starts."""
     with database.read() as tx:
         rows = objects.page(tx, after=after, limit=limit + 1)
-        counts = trials.outcome_counts(tx, [row.id for row in rows])
+        counts = provenances.outcome_counts(tx, [row.id for row in rows])
     items = [info(row, counts[row.id]) for row in rows[:limit]]
     return items, items[-1].id if len(rows) > limit else None
 
@@ -69,7 +70,7 @@ def change(database: Database, slug: str, patch: ObjectPatch) -> ObjectInfo:
             objects.advance(tx, row.id, append=False)
             objects.change(tx, row.id, different)
             row = require(tx, slug)
-        return info(row, trials.outcome_counts(tx, [row.id])[row.id])
+        return info(row, provenances.outcome_counts(tx, [row.id])[row.id])
 
 
 def remove(database: Database, slug: str) -> None:

@@ -31,9 +31,9 @@ from graspdb_density import (
 from graspdb_density.bandwidth.selection import FIRST_CHOICE
 from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
 from graspdb_service.problems import ProblemError
-from graspdb_service.storage import trials
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.proposal_density import Exposure
 from graspdb_service.usecases.geometry.features import Axes
@@ -161,7 +161,7 @@ def build(
     row: ObjectRow,
     selected: Selected,
     exposure: Exposure,
-    rows: trials.Columns,
+    rows: TrialColumns,
     before: Built | None,
     threads: int,
 ) -> Built:
@@ -172,7 +172,6 @@ def build(
     ProblemError
         413 for more components than a density may have.
     """
-    assert rows.batch is not None
     symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
     fresh = rows.position, rows.quaternion_xyzw, symmetric
     seq, proposal = rows.seq, rows.proposal_density

@@ -12,10 +12,11 @@ from graspdb.wire import KernelSpec, Selection
 from graspdb_density.kde.isotropic import CUTOFF
 from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
-from graspdb_service.storage import kernels, trials
+from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.trials import rows as trial_rows
 from graspdb_service.usecases.densities import build, proposal_density, stored_kernel
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.geometry.features import Features
@@ -200,7 +201,7 @@ class Densities:
             if before is not None and before.epoch != row.epoch:
                 before = None
             exposure = proposal_density.read(tx, row.id, selected)
-            rows = trials.read(
+            rows = trial_rows.read(
                 tx,
                 row.id,
                 provenance_ids=list(selected.provenances),

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from graspdb.wire import GridPlan
 from graspdb_density.kde.importance_weights import pooled_density
-from graspdb_service.storage import attempts, sweeps
-from graspdb_service.storage.attempts import TriedGrid
 from graspdb_service.storage.database import Tx
+from graspdb_service.storage.simulation import outcomes
+from graspdb_service.storage.simulation.outcomes import TriedGrid
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
 
@@ -100,7 +100,7 @@ class Exposure:
 
 def read(tx: Tx, object_id: int, selected: Selected) -> Exposure:
     """The exposure of a selection as the transaction sees it."""
-    grids = attempts.tried_grids(tx, object_id, provenance_ids=selected.provenances)
+    grids = outcomes.tried_grids(tx, object_id, provenance_ids=selected.provenances)
     lattices: dict[str, dict[tuple[object, ...], list[TriedGrid]]] = {}
     for grid in grids:
         same = (grid.grid["region"] and str(grid.grid["region"]), _order(grid))
@@ -108,7 +108,7 @@ def read(tx: Tx, object_id: int, selected: Selected) -> Exposure:
     # A sweep alone on its lattice has tried what it stored; those that share one have repeated each other.
     keys = [grid.repeat_key for grid in grids]
     shared = [grid.sweep_id for grid in grids if keys.count(grid.repeat_key) > 1]
-    ranges = sweeps.done_ranges(tx, shared) if shared else {}
+    ranges = outcomes.done_ranges(tx, shared) if shared else {}
     found = (_lattice(alike.values(), ranges) for alike in lattices.values())
     return Exposure(
         tuple(lattice for lattice in found if lattice is not None), frozenset(g.batch_id for g in grids)

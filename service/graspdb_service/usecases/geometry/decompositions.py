@@ -13,11 +13,11 @@ from graspdb.wire import DecomposePayload, GridPlan, MeshInfo
 from graspdb.wire.sweeps import WaitingFor
 from graspdb_geometry import meshes
 from graspdb_service.problems import ProblemError, conflict
-from graspdb_service.storage import decompositions, sweeps
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.jobs import JobRow, job_ids
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.sweeps import SweepRow
+from graspdb_service.storage.simulation import decompositions, sweeps
+from graspdb_service.storage.simulation.jobs import JobRow, job_ids
+from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.usecases.trials import sweep_plan
 
 #: A bounding box thinner than this share of its longest side holds a sheet, and no solid.

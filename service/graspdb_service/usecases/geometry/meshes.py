@@ -12,15 +12,16 @@ from graspdb.wire import BoundingBox, MeshInfo, PartsInfo
 from graspdb_geometry import meshes
 from graspdb_geometry.deviation import deviation
 from graspdb_geometry.meshes import Inspection, Mesh, MeshError, Part
+from graspdb_service.formats.negotiation import GLB
 from graspdb_service.problems import ProblemError, conflict, not_found
-from graspdb_service.storage import assets, objects, trials
+from graspdb_service.storage import assets, objects
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
 
-GLB = "model/gltf-binary"
 MEDIA_TYPES = meshes.MEDIA_TYPES
 
 # Parts come from the mesh, rounded or slightly inflated: within this they describe the same object.
@@ -36,7 +37,7 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
     Raises
     ------
     ProblemError
-        413, 415 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
+        413 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
     """
     sha256 = hashlib.sha256(content).hexdigest()
     with ctx.database.read() as tx:
@@ -68,16 +69,14 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
     return info
 
 
-def put_parts(ctx: Runtime, slug: str, content: bytes, *, media: str) -> PartsInfo:
+def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
     """Check and store an object's convex parts, a GLB in metres with one geometry a part.
 
     Raises
     ------
     ProblemError
-        413, 415 and 422 for what can't be used; 409 for other parts once a sweep exists.
+        413 and 422 for what can't be used; 409 for other parts once a sweep exists.
     """
-    if media != GLB:
-        raise _unsupported((GLB,), media)
     sha256 = hashlib.sha256(content).hexdigest()
     with ctx.database.read() as tx:
         row = require(tx, slug)
@@ -168,8 +167,6 @@ def get_parts(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
 
 
 def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str = "mesh") -> Inspection:
-    if media not in MEDIA_TYPES:
-        raise _unsupported(MEDIA_TYPES, media)
     limit = ctx.settings.max_mesh_bytes
     if len(content) > limit:
         raise ProblemError(
@@ -194,15 +191,6 @@ def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str 
         raise _refused(error) from None
 
 
-def _unsupported(allowed: tuple[str, ...], media: str) -> ProblemError:
-    return ProblemError(
-        415,
-        "unsupported-media-type",
-        f"Send {' or '.join(allowed)} and say which by Content-Type",
-        detail=f"Content-Type was {media or 'missing'}",
-    )
-
-
 def _refused(error: MeshError) -> ProblemError:
     return ProblemError(
         422, "mesh-not-usable", f"Not usable: {error.message}", errors=[(error.field, error.message)]
@@ -219,7 +207,7 @@ def _is_stored(row: ObjectRow, sha256: str, media: str, unit: str) -> bool:
 def _refuse_another_mesh(tx: Tx, row: ObjectRow) -> None:
     if row.mesh_sha256 is None:
         return
-    if objects.has_sweeps(tx, row.id) or any(trials.outcome_counts(tx, [row.id])[row.id].values()):
+    if objects.has_sweeps(tx, row.id) or any(provenances.outcome_counts(tx, [row.id])[row.id].values()):
         raise conflict(
             "mesh-in-use",
             f"{row.slug!r} has trials or sweeps made with its mesh: register another object for another mesh",

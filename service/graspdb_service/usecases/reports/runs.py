@@ -28,10 +28,11 @@ from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service import __version__
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.settings import Settings
-from graspdb_service.storage import checks, kernels, report_runs
+from graspdb_service.storage import kernels, report_runs
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.report_runs import Question, RunRow
+from graspdb_service.storage.simulation import outcomes
 from graspdb_service.usecases.densities.cache import Densities, KernelChoice, kernel_of
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.kernels import fit
@@ -113,7 +114,7 @@ class ReportRuns:
         if report in _OF_CHECKS or given.get("matching") == "success":
             # Checks change no revision: what of them there is belongs to the question.
             with self._database.read() as tx:
-                given[report_runs.CHECKS] = checks.stamp(tx, row.id)
+                given[report_runs.CHECKS] = outcomes.checks_stamp(tx, row.id)
         asked = Asked(report, selected.filters, choice, given)
         document = asked.document()
         digest = hashlib.sha256(json.dumps([document, __version__], sort_keys=True).encode()).hexdigest()

@@ -22,7 +22,7 @@ from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.success.calibration import ReliabilityBin, calibrate
 from graspdb_service.problems import conflict
-from graspdb_service.storage import trials
+from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import LEVEL, Sources, finite, head, interval
 from graspdb_service.usecases.reports.verification import share
@@ -141,12 +141,12 @@ def _selected(sources: Sources, built: Built, source: str) -> Selected | None:
     chosen = built.selected
     with sources.database.read() as tx:
         counts: dict[int, dict[str, int]] = {}
-        for provenance, code, rows, packed in trials.tallies(tx, built.object_row.id):
+        for provenance, code, rows, packed in provenances.tallies(tx, built.object_row.id):
             if rows + packed:
                 counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
         own = [
             item
-            for item in trials.provenances(tx, built.object_row.id)
+            for item in provenances.of_object(tx, built.object_row.id)
             if item.id in counts and item.source == source and item.gripper in (None, chosen.gripper)
         ]
     if any(item.protocol == chosen.protocol for item in own):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import SummaryRate, SummaryReport, SummaryRow
-from graspdb_service.storage import grippers, objects, trials
+from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.reports.common import LEVEL
 from graspdb_service.usecases.reports.verification import share
 
@@ -48,12 +49,12 @@ def summary(database: Database) -> SummaryReport:
 
 def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
     counts: dict[int, dict[str, int]] = {}
-    for provenance, code, stored, packed in trials.tallies(tx, item.id):
+    for provenance, code, stored, packed in provenances.tallies(tx, item.id):
         if stored + packed:
             counts.setdefault(provenance, {})[OUTCOMES[code]] = stored + packed
     symmetric: dict[str | None, bool] = {None: True}
     rows = []
-    for origin in trials.provenances(tx, item.id):
+    for origin in provenances.of_object(tx, item.id):
         if origin.id not in counts:
             continue
         if origin.gripper not in symmetric:

@@ -13,8 +13,8 @@ from scipy.special import betaincinv
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, KernelInfo
 from graspdb.wire.reports import CheckCall, ReportRange, SimulatedDraws
 from graspdb_density import IsotropicKernel
-from graspdb_service.storage import checks, sweeps
 from graspdb_service.storage.database import Database
+from graspdb_service.storage.simulation import outcomes, sweeps
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import LEVEL
 from graspdb_service.usecases.trials import sweep_plan
@@ -43,7 +43,9 @@ def read(database: Database, built: Built) -> list[Check]:
     """The checks of a selection's gripper and protocol; simulation errors are left out."""
     selected = built.selected
     with database.read() as tx:
-        found = checks.chunks(tx, built.object_row.id, gripper=selected.gripper, protocol=selected.protocol)
+        found = outcomes.checked(
+            tx, built.object_row.id, gripper=selected.gripper, protocol=selected.protocol
+        )
         plan = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in found}))
         poses = [sweep_plan.chunk_poses(tx, plan[chunk.sweep_id], chunk.start, chunk.stop) for chunk in found]
     result = []

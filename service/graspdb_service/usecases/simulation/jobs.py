@@ -27,10 +27,15 @@ from graspdb.wire import (
 )
 from graspdb.wire.jobs import FailureNoted
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
-from graspdb_service.storage import batches, jobs, objects, sweeps, trials
+from graspdb_service.storage import objects
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.jobs import JobRow
-from graspdb_service.storage.sweeps import SweepRow
+from graspdb_service.storage.simulation import jobs, sweeps
+from graspdb_service.storage.simulation import outcomes as packed
+from graspdb_service.storage.simulation.jobs import JobRow
+from graspdb_service.storage.simulation.sweeps import SweepRow
+from graspdb_service.storage.trials import batches, provenances
+from graspdb_service.storage.trials import rows as trial_rows
+from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.geometry import decompositions, meshes
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
@@ -44,6 +49,14 @@ _MAX_LOOKS = 50
 
 _SUCCESS = OUTCOME_CODES["success"]
 _COLLISION = OUTCOME_CODES["collision"]
+
+
+class WrongResult(Exception):
+    """A result of another kind than the job's."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__(kind)
+        self.kind = kind
 
 
 class _LostLease(Exception):
@@ -217,14 +230,14 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             if job.state != "leased" or job.lease_id != lease_id:
                 raise _lost(job)
             if job.kind != "simulate":
-                raise _wrong_kind(job)
+                raise WrongResult(job.kind)
             sweep = sweeps.find(tx, job.sweep_id or "")
             if sweep is None:
                 raise _lost(job)
             stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
             twins = _twins(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
-            ranges = sweeps.done_ranges(tx, list(twins))
-            seen = sweeps.count_done(tx, list(twins))
+            ranges = packed.done_ranges(tx, list(twins))
+            seen = packed.count_done(tx, list(twins))
         outcomes = _outcomes(result, job)
         if stored is None:
             grid = sweep_plan.grid_of(sweep)
@@ -268,7 +281,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
         if (earlier := _replay(job, lease_id, sha256)) is not None:
             return earlier
         if job.kind != "decompose":
-            raise _wrong_kind(job)
+            raise WrongResult(job.kind)
         if job.state != "leased" or job.lease_id != lease_id:
             raise _lost(job)
         source = decompositions.source(tx, job)
@@ -305,7 +318,7 @@ class _Chunk:
     """A checked result: every outcome, and what of it is new to the object."""
 
     outcomes: npt.NDArray[np.uint8]
-    rows: trials.TrialColumns
+    rows: TrialColumns
     packed: dict[int, int]
     counts: dict[str, dict[str, int]]
 
@@ -358,7 +371,7 @@ def _chunk(
         raise invalid("rows.pose_index", f"pose {missing} succeeded, so it must have a row")
     kept = place[fresh[place]]
     new = fresh[place]
-    columns = trials.TrialColumns(
+    columns = TrialColumns(
         position=poses.position[kept],
         quaternion_xyzw=poses.quaternion_xyzw[kept],
         outcome=outcomes[kept],
@@ -406,14 +419,14 @@ def _store(
                 revision, first_seq = sweeps.lock_and_read_revision(tx, sweep.object_id), 0
         except objects.ObjectGone:
             raise _LostLease from None
-        if twins and sweeps.count_done(tx, twins) != seen:
+        if twins and packed.count_done(tx, twins) != seen:
             raise _Overtaken
         accepted = ResultAccepted(job=job.id, revision=revision, inserted=rows)
         if not jobs.complete(
             tx, job.id, lease_id, sha256=sha256, answer=accepted.model_dump(), counts=chunk.counts
         ):
             raise _LostLease
-        sweeps.store_outcomes(
+        packed.store(
             tx,
             job_id=job.id,
             sweep_id=sweep.id,
@@ -426,8 +439,10 @@ def _store(
         if batch is None:
             raise _LostLease
         if collects:
-            trials.insert(tx, sweep.object_id, batch.id, chunk.rows, revision=revision, first_seq=first_seq)
-            trials.add_packed(tx, sweep.provenance_id, chunk.packed)
+            trial_rows.insert(
+                tx, sweep.object_id, batch.id, chunk.rows, revision=revision, first_seq=first_seq
+            )
+            provenances.add_packed(tx, sweep.provenance_id, chunk.packed)
         batches.grow(
             tx,
             batch.id,
@@ -439,11 +454,6 @@ def _store(
         )
         jobs.credit_worker(tx, job.worker, job.stop - job.start)
     return accepted
-
-
-def _wrong_kind(job: JobRow) -> ProblemError:
-    wanted = {"simulate": "JSON, as application/json", "decompose": f"a GLB, as {meshes.GLB}"}[job.kind]
-    return ProblemError(415, "unsupported-media-type", f"The result of a {job.kind} job is {wanted}")
 
 
 def _found(job: JobRow | None, job_id: str) -> JobRow:

@@ -27,10 +27,14 @@ from graspdb.wire import (
 from graspdb.wire.sweeps import FailedChunk
 from graspdb_service.formats import arrow
 from graspdb_service.problems import conflict, invalid, not_found
-from graspdb_service.storage import batches, grippers, jobs, sweeps, trials
+from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.sweeps import POSE_COLUMNS, Progress, SweepRow
+from graspdb_service.storage.simulation import jobs, sweeps
+from graspdb_service.storage.simulation import outcomes as packed
+from graspdb_service.storage.simulation.sweeps import POSE_COLUMNS, Progress, SweepRow
+from graspdb_service.storage.trials import batches, provenances
+from graspdb_service.trial_columns import Provenance
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import likelihood
@@ -67,7 +71,7 @@ class _World:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What to simulate: a grid, or poses (n, 8) as :func:`graspdb_service.storage.sweeps.create` has them."""
+    """What to simulate: a grid, or poses (n, 8) as :func:`sweeps.create` takes them."""
 
     kind: str
     count: int
@@ -128,7 +132,9 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, re
         if waiting:
             decompositions.ask(tx, locked, created_ms)
         sweep_id = _new_id(created_ms)
-        provenance_id = trials.provenance(tx, locked.id, spec.gripper, "simulation", spec.protocol)
+        provenance_id = provenances.ensure(
+            tx, locked.id, Provenance(spec.gripper, "simulation", spec.protocol)
+        )
         sweeps.create(
             tx,
             sweep_id=sweep_id,
@@ -411,7 +417,7 @@ def outcomes(ctx: Estimators, sweep_id: str, *, limit: int, cursor: str | None) 
     with ctx.database.read() as tx:
         row = _require(tx, sweep_id)
         # One pose more than asked for tells whether there is another page.
-        chunks = sweeps.outcome_chunks(tx, sweep_id, first_number=number, poses=limit + skip + 1)
+        chunks = packed.page(tx, sweep_id, first_number=number, poses=limit + skip + 1)
         stored = {chunk.number: sweep_plan.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
     grid = sweep_plan.grid_of(row) if row.plan == "grid" else None
     index, position = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]

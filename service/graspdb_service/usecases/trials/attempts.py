@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import HAAR_VOLUME
 from graspdb_geometry.grids import PoseGrid
-from graspdb_service.storage import attempts, sweeps, trials
-from graspdb_service.storage.attempts import PackedChunk
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.sweeps import SweepRow
+from graspdb_service.storage.simulation import outcomes, sweeps
+from graspdb_service.storage.simulation.outcomes import PackedChunk
+from graspdb_service.storage.simulation.sweeps import SweepRow
+from graspdb_service.storage.trials import rows as trial_rows
+from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
 from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
@@ -73,7 +75,7 @@ class Swept:
 class Stored:
     """Attempts as a transaction read them; :func:`joined` makes arrays of them outside it."""
 
-    rows: trials.Columns
+    rows: TrialColumns
     swept: list[Swept]
     selected: Selected
     without: Sequence[int]
@@ -127,9 +129,7 @@ def fetch(
     Sweeps that share poses with chunks from before count them again: who extends what there was compares
     :attr:`Stored.repeat_keys`, and reads all of it where two sweeps are of one grid.
     """
-    chunks = attempts.packed_chunks(
-        tx, object_id, provenance_ids=selected.tried, after_revision=after_revision
-    )
+    chunks = outcomes.collected(tx, object_id, provenance_ids=selected.tried, after_revision=after_revision)
     plan = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
     swept = [
         Swept(
@@ -139,7 +139,7 @@ def fetch(
         )
         for chunk in chunks
     ]
-    rows = trials.read(
+    rows = trial_rows.read(
         tx,
         object_id,
         provenance_ids=sorted(selected.tried),

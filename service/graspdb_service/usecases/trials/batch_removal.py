@@ -11,11 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb_service.storage import attempts, batches, sweeps, trials
-from graspdb_service.storage.attempts import DoneChunk
-from graspdb_service.storage.batches import BatchRow
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.sweeps import SweepRow
+from graspdb_service.storage.simulation import outcomes, sweeps
+from graspdb_service.storage.simulation.outcomes import DoneChunk
+from graspdb_service.storage.simulation.sweeps import SweepRow
+from graspdb_service.storage.trials import batches, provenances
+from graspdb_service.storage.trials import rows as trial_rows
+from graspdb_service.storage.trials.batches import BatchRow
 from graspdb_service.usecases.trials import sweep_plan
 
 Ints = NDArray[np.int64]
@@ -52,10 +54,10 @@ class Inheritance:
             assert heir is not None
             assert heir.provenance_id is not None
             if share.rows:
-                trials.move(tx, batch.object_id, from_batch=batch.id, to_batch=heir.id, ranges=share.rows)
+                trial_rows.move(tx, batch.object_id, from_batch=batch.id, to_batch=heir.id, ranges=share.rows)
             if share.packed:
-                sweeps.add_packed_counts(tx, share.chunk.job_id, share.packed)
-                trials.add_packed(tx, heir.provenance_id, share.packed)
+                outcomes.add_packed_counts(tx, share.chunk.job_id, share.packed)
+                provenances.add_packed(tx, heir.provenance_id, share.packed)
             batches.inherit(
                 tx,
                 heir.id,
@@ -85,7 +87,7 @@ def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
     seq = np.empty(0, dtype=np.int64)
     place = seq
     if batch.first_seq is not None and batch.last_seq is not None:
-        seq, posed = trials.swept_rows(tx, batch.object_id, batch.id, batch.first_seq, batch.last_seq)
+        seq, posed = trial_rows.read_swept(tx, batch.object_id, batch.id, batch.first_seq, batch.last_seq)
         place = np.searchsorted(index, posed)
     row_of = np.full(len(index), -1, dtype=np.int64)
     row_of[place] = np.arange(len(seq))
@@ -107,7 +109,7 @@ def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
             continue
         left[at[gets]] = False
         rows = row_of[at[gets]]
-        codes = np.frombuffer(attempts.outcomes_of(tx, chunk.job_id), dtype=np.uint8)[gets][rows < 0]
+        codes = np.frombuffer(outcomes.outcomes_of(tx, chunk.job_id), dtype=np.uint8)[gets][rows < 0]
         numbers = np.bincount(codes, minlength=1)
         shares.append(
             _Share(
@@ -125,7 +127,7 @@ def _chunks(tx: Tx, sweep: SweepRow) -> tuple[dict[str, SweepRow], list[DoneChun
     """The other sweeps over the grid, and the finished chunks of all of them in commit order."""
     key = sweep.snapshot["repeat_key"]
     heirs = {other.id: other for other in sweeps.siblings(tx, sweep) if other.snapshot["repeat_key"] == key}
-    return heirs, attempts.done_chunks(tx, [sweep.id, *heirs]) if heirs else []
+    return heirs, outcomes.done_chunks(tx, [sweep.id, *heirs]) if heirs else []
 
 
 def _seen(chunks: list[DoneChunk]) -> tuple[str, ...]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, BatchInfo
 from graspdb_service.problems import ProblemError, conflict, not_found
-from graspdb_service.storage import batches, objects
-from graspdb_service.storage.batches import BatchRow
+from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.trials import batches
+from graspdb_service.storage.trials.batches import BatchRow
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.trials import batch_removal

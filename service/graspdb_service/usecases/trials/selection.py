@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from graspdb.wire import OUTCOMES, GripperProfile, Selection
 from graspdb_service.problems import conflict, not_found
-from graspdb_service.storage import grippers, trials
+from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
+from graspdb_service.storage.trials import provenances
 
 
 @dataclass(frozen=True)
@@ -79,13 +80,13 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
     if filters.gripper is not None:
         profiles[filters.gripper] = _profile(tx, filters.gripper)
     counts: dict[int, dict[str, int]] = {}
-    for provenance, code, rows, packed in trials.tallies(tx, object_id):
+    for provenance, code, rows, packed in provenances.tallies(tx, object_id):
         if rows + packed:
             counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = [
         item
-        for item in trials.provenances(tx, object_id)
+        for item in provenances.of_object(tx, object_id)
         if item.id in counts
         and filters.source in (None, item.source)
         and (filters.gripper is None or item.gripper in (None, filters.gripper))

@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from graspdb.wire import GridPlan
 from graspdb_geometry.grids import PoseGrid
-from graspdb_service.storage import sweeps
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.sweeps import SweepRow
+from graspdb_service.storage.simulation import sweeps
+from graspdb_service.storage.simulation.sweeps import SweepRow
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

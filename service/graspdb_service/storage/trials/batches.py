@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Row, Select, case, delete, func, insert, or_, select, update
 
-from graspdb_service.storage import sweeps as sweep_rows
-from graspdb_service.storage import trials as trial_rows
 from graspdb_service.storage.database import Tx
+from graspdb_service.storage.simulation import outcomes
 from graspdb_service.storage.tables import batches, idempotency_keys, packed_outcomes, sweeps, trials
+from graspdb_service.storage.trials import provenances
+from graspdb_service.trial_columns import BatchOrigin
 
 
 @dataclass(frozen=True)
@@ -120,11 +121,11 @@ def page(tx: Tx, object_id: int, *, after: int, limit: int) -> list[BatchRow]:
     return [_batch(row) for row in tx.execute(query.order_by(batches.c.id).limit(limit))]
 
 
-def names(tx: Tx, ids: Iterable[int]) -> dict[int, tuple[str, str | None, dict[str, Any] | None]]:
-    """Key, sweep and metadata of batches by internal id."""
+def origins(tx: Tx, ids: Iterable[int]) -> dict[int, BatchOrigin]:
+    """Batches by internal id, as their trials name them."""
     query = select(batches.c.id, batches.c.key, batches.c.sweep_id, batches.c.metadata)
     rows = tx.execute(query.where(batches.c.id.in_(sorted(set(ids)))))
-    return {int(number): (key, sweep, metadata) for number, key, sweep, metadata in rows}
+    return {int(number): BatchOrigin(*origin) for number, *origin in rows}
 
 
 def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
@@ -146,7 +147,7 @@ def outcome_counts(tx: Tx, batch: BatchRow) -> dict[int, int]:
         if batch.purpose == "check":
             return _packed_codes(tx, batch.sweep_id)
         # Not every code of the packed outcomes: poses that another sweep had stored before count there.
-        _, counts = sweep_rows.packed_counts(tx, batch.sweep_id)
+        _, counts = outcomes.packed_counts(tx, batch.sweep_id)
     for (_, outcome), number in row_counts(tx, batch).items():
         counts[outcome] = counts.get(outcome, 0) + number
     return counts
@@ -161,13 +162,13 @@ def remove(tx: Tx, batch: BatchRow) -> None:
     rows = row_counts(tx, batch)
     if batch.sweep_id is not None:
         if batch.purpose == "collect" and batch.provenance_id is not None:
-            _, packed = sweep_rows.packed_counts(tx, batch.sweep_id)
-            trial_rows.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items()})
+            _, packed = outcomes.packed_counts(tx, batch.sweep_id)
+            provenances.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items()})
         tx.execute(delete(packed_outcomes).where(packed_outcomes.c.sweep_id == batch.sweep_id))
     if batch.first_seq is not None:
         tx.execute(delete(trials).where(*_rows(batch)))
     for (provenance_id, outcome), number in rows.items():
-        trial_rows.add_tally(tx, provenance_id, outcome, rows=-number)
+        provenances.add_tally(tx, provenance_id, outcome, rows=-number)
     tx.execute(update(idempotency_keys).where(idempotency_keys.c.batch_key == batch.key).values(revoked=True))
     tx.execute(delete(batches).where(batches.c.id == batch.id))
 

@@ -19,9 +19,8 @@ from sqlalchemy import ColumnElement, Select, String, and_, exists, func, or_, s
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
 
-from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.database import Tx, insert_or, unix_now
 from graspdb_service.storage.tables import jobs, workers
-from graspdb_service.storage.upsert import insert
 
 STALE_LEASE_ERROR = (
     "the lease ran out {attempts} times: the job stalls or kills its worker"
@@ -250,7 +249,7 @@ def end_exhausted(tx: Tx, job: JobRow) -> bool:
 
 def see_worker(tx: Tx, name: str, capabilities: Sequence[str]) -> None:
     """Register a worker, or note that it is still there."""
-    statement = insert(tx, workers).values(
+    statement = insert_or(tx, workers).values(
         name=name, capabilities=list(capabilities), last_seen=unix_now(), jobs_done=0, poses_done=0
     )
     news = {"capabilities": statement.excluded.capabilities, "last_seen": statement.excluded.last_seen}

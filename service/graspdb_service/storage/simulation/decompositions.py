@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import and_, insert, select, update
 
 from graspdb_service.storage.database import Tx, unix_now
-from graspdb_service.storage.jobs import JobRow
+from graspdb_service.storage.simulation.jobs import JobRow
 from graspdb_service.storage.tables import jobs, objects
 
 _COLUMNS = [jobs.c[name] for name in JobRow.__dataclass_fields__]

@@ -1,4 +1,4 @@
-"""Sweeps: their plan and snapshot, their jobs, and the packed outcomes of finished chunks."""
+"""Sweeps: their plan and snapshot, and their jobs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, 
 
 from graspdb_service.storage.database import Tx, unix_now
 from graspdb_service.storage.objects import ObjectGone
-from graspdb_service.storage.tables import batches, jobs, objects, packed_outcomes, sweeps
+from graspdb_service.storage.tables import batches, jobs, objects, sweeps
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
 POSE_COLUMNS = 8
@@ -58,16 +58,6 @@ class Progress:
     failed: list[tuple[int, int, str]]
     recent_poses: int
     window_s: float
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """The packed outcomes of one finished chunk: uint8 codes of the plan's poses ``start`` to ``stop``."""
-
-    number: int
-    start: int
-    stop: int
-    outcomes: bytes
 
 
 _STORED = [
@@ -353,42 +343,6 @@ def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> npt.NDArray[np.float6
     return np.frombuffer(content or b"", dtype="<f8").reshape(-1, POSE_COLUMNS)
 
 
-def store_outcomes(
-    tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, outcomes: bytes
-) -> None:
-    """Keep a chunk's uint8 outcome codes, one for every pose of it."""
-    tx.execute(
-        insert(packed_outcomes).values(
-            job_id=job_id, sweep_id=sweep_id, number=number, revision=revision, outcomes=outcomes
-        )
-    )
-
-
-def outcome_chunks(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[Chunk]:
-    """Finished chunks from ``first_number`` on, in order, until they hold at least ``poses`` poses."""
-    listed = (
-        select(jobs.c.id, jobs.c.number, jobs.c.start, jobs.c.stop)
-        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
-        .where(packed_outcomes.c.sweep_id == sweep_id, packed_outcomes.c.number >= first_number)
-        .order_by(packed_outcomes.c.number)
-    )
-    wanted: dict[str, tuple[int, int, int]] = {}
-    enough = 0
-    for job_id, number, start, stop in tx.execute(listed):
-        wanted[job_id] = (number, start, stop)
-        enough += stop - start
-        if enough >= poses:
-            break
-    chunks = []
-    ids = list(wanted)
-    for first in range(0, len(ids), 500):
-        query = select(packed_outcomes.c.job_id, packed_outcomes.c.outcomes).where(
-            packed_outcomes.c.job_id.in_(ids[first : first + 500])
-        )
-        chunks += [Chunk(*wanted[job_id], bytes(content)) for job_id, content in tx.execute(query)]
-    return sorted(chunks, key=lambda chunk: chunk.number)
-
-
 def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
     """Other collecting grid sweeps of the same object, gripper, protocol and fidelity, with their batch."""
     query = _query().where(
@@ -401,53 +355,3 @@ def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
         batches.c.id.is_not(None),
     )
     return [SweepRow(**row._mapping) for row in tx.execute(query.order_by(sweeps.c.id))]
-
-
-def done_ranges(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
-    """Places (start, stop) in their plans of the finished chunks of these sweeps."""
-    query = (
-        select(jobs.c.sweep_id, jobs.c.start, jobs.c.stop)
-        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
-        .order_by(jobs.c.sweep_id, jobs.c.start)
-    )
-    found: dict[str, list[tuple[int, int]]] = {sweep_id: [] for sweep_id in sweep_ids}
-    for sweep_id, start, stop in tx.execute(query):
-        found[sweep_id].append((int(start), int(stop)))
-    return found
-
-
-def count_done(tx: Tx, sweep_ids: Sequence[str]) -> int:
-    """Finished chunks of these sweeps that still have their batch."""
-    query = (
-        select(func.count())
-        .select_from(jobs)
-        .join(batches, batches.c.sweep_id == jobs.c.sweep_id)
-        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
-    )
-    return int(tx.scalar(query) or 0)
-
-
-def add_packed_counts(tx: Tx, job_id: str, counts: Mapping[int, int]) -> None:
-    """Count further packed outcomes of a finished chunk as added to the tallies by it; under the object's
-    lock."""
-    stored = dict(tx.execute(select(jobs.c.counts).where(jobs.c.id == job_id)).scalar_one())
-    packed = dict(stored["packed"])
-    for code, number in counts.items():
-        packed[str(code)] = packed.get(str(code), 0) + number
-    tx.execute(update(jobs).where(jobs.c.id == job_id).values(counts={**stored, "packed": packed}))
-
-
-def packed_counts(tx: Tx, sweep_id: str) -> tuple[int, dict[int, int]]:
-    """The provenance and, by outcome code, the packed outcomes that this sweep added to its tallies.
-
-    Empty for a check, whose outcomes are counted nowhere.
-    """
-    provenance_id = tx.scalar(select(sweeps.c.provenance_id).where(sweeps.c.id == sweep_id))
-    if provenance_id is None:
-        raise LookupError(sweep_id)
-    counts: dict[int, int] = {}
-    query = select(jobs.c.counts).where(jobs.c.sweep_id == sweep_id, jobs.c.state == "done")
-    for (stored,) in tx.execute(query):
-        for code, count in stored["packed"].items():
-            counts[int(code)] = counts.get(int(code), 0) + count
-    return provenance_id, counts

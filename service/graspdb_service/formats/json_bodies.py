@@ -1,0 +1,92 @@
+"""JSON bodies that a route reads itself, because they are large or their bytes count."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import orjson
+from fastapi import Request
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel, ValidationError
+
+from graspdb_service.formats.json_pieces import LongArray, loads
+from graspdb_service.formats.negotiation import require_json
+from graspdb_service.problems import ProblemError, invalid
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_model(request: Request, body: bytes, model: type[Model]) -> Model:
+    """A body as its model, as FastAPI would read and refuse it.
+
+    Raises
+    ------
+    ProblemError
+        415 for another media type than JSON.
+    RequestValidationError
+        For a body that does not fit.
+    """
+    require_json(request)
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        raise RequestValidationError(error.errors(include_input=False, include_url=False)) from None
+
+
+def read_object(request: Request, body: bytes) -> dict[str, Any]:
+    """A JSON object, its long arrays as :class:`LongArray`; NaN and Infinity are refused here.
+
+    Raises
+    ------
+    ProblemError
+        415 for another media type, 400 where the body is no JSON, 422 where it is no object.
+    """
+    require_json(request)
+    try:
+        value = loads(body)
+    except orjson.JSONDecodeError as error:
+        raise no_json(error) from None
+    if not isinstance(value, dict):
+        raise invalid("body", "must be a JSON object")
+    return value
+
+
+def validated(content: Any, model: type[Model], *, most: int = 0) -> Model:
+    """What :func:`read_object` read as a model; long arrays are cut where no model takes more than ``most``.
+
+    Raises
+    ------
+    RequestValidationError
+        For content that does not fit.
+    """
+    try:
+        return model.model_validate(_as_lists(content, most))
+    except ValidationError as error:
+        raise RequestValidationError(error.errors(include_input=False)) from None
+
+
+def _as_lists(content: Any, most: int) -> Any:
+    if isinstance(content, dict):
+        return {name: _as_lists(value, most) for name, value in content.items()}
+    if not isinstance(content, LongArray):
+        return content
+    items: list[Any] = []
+    try:
+        for piece in content:
+            items += piece
+            if len(items) > most:
+                break
+    except orjson.JSONDecodeError as error:
+        raise no_json(error) from None
+    return items
+
+
+def no_json(error: ValueError) -> ProblemError:
+    """400 for a body that is no JSON."""
+    return ProblemError(
+        400,
+        "invalid-json",
+        "The body is not valid JSON (NaN and Infinity are none)",
+        detail=str(error)[:200],
+        errors=[("body", "not valid JSON")],
+    )

@@ -1,0 +1,47 @@
+"""Trials in whichever format a request has, or wants, them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import orjson
+from fastapi import Response
+from fastapi.responses import StreamingResponse
+
+from graspdb_service.formats import trial_arrow, trial_json
+from graspdb_service.formats.negotiation import ARROW, JSON, NDJSON, unsupported
+from graspdb_service.trial_columns import TrialBatch, TrialPage
+
+
+def parse(body: bytes, media: str, *, limit: int) -> TrialBatch:
+    """Check a body of ``POST /objects/{id}/trials``.
+
+    Raises
+    ------
+    ProblemError
+        415 for another media type, 413 for more than ``limit`` trials, 422 naming the fields that are wrong.
+    """
+    if media in ("", JSON):
+        return trial_json.parse(body, limit=limit)
+    if media in (NDJSON, "application/ndjson", "application/jsonl"):
+        return trial_json.parse_lines(body, limit=limit)
+    if media == ARROW:
+        return trial_arrow.parse(body, limit=limit)
+    raise unsupported(f"Trials come as {JSON}, {NDJSON} or {ARROW}: say which by Content-Type", media)
+
+
+def stream_response(pages: Iterator[TrialPage], kind: str, headers: dict[str, str]) -> Response:
+    """Trials page by page, as lines or as an Arrow stream."""
+    content = trial_arrow.stream(pages) if kind == ARROW else map(trial_json.lines, pages)
+    return StreamingResponse(content, media_type=kind, headers=headers)
+
+
+def page_response(page: TrialPage, following: str | None, kind: str, headers: dict[str, str]) -> Response:
+    """A page of trials; where the next one starts stands beside them, but for lines."""
+    if kind == ARROW:
+        body = b"".join(trial_arrow.stream([page], {"next": following}))
+    elif kind == NDJSON:
+        body = trial_json.lines(page)
+    else:
+        body = orjson.dumps({"items": trial_json.documents(page), "next": following})
+    return Response(body, media_type=kind, headers=headers)

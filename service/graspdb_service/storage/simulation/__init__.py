@@ -1,0 +1,1 @@
+"""Sweeps, the queue of their jobs, and the packed outcomes that workers hand in."""

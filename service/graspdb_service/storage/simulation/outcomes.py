@@ -1,0 +1,234 @@
+"""Packed outcomes: one code for every pose of a finished chunk, and how much of each grid was tried.
+
+Outcomes of a sweep that checks are stored alike, and counted nowhere but in the reports that ask for them. A
+sweep without its batch is one whose outcomes were deleted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Select, func, insert, select, update
+
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
+
+
+@dataclass(frozen=True)
+class PackedChunk:
+    """Outcome codes (uint8) of the places ``start`` to ``stop`` of a sweep's plan."""
+
+    sweep_id: str
+    number: int
+    start: int
+    stop: int
+    outcomes: bytes
+
+
+def store(tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, outcomes: bytes) -> None:
+    """Keep a chunk's uint8 outcome codes, one for every pose of it."""
+    tx.execute(
+        insert(packed_outcomes).values(
+            job_id=job_id, sweep_id=sweep_id, number=number, revision=revision, outcomes=outcomes
+        )
+    )
+
+
+def page(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[PackedChunk]:
+    """Finished chunks from ``first_number`` on, in order, until they hold at least ``poses`` poses."""
+    listed = (
+        select(jobs.c.id, jobs.c.number, jobs.c.start, jobs.c.stop)
+        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
+        .where(packed_outcomes.c.sweep_id == sweep_id, packed_outcomes.c.number >= first_number)
+        .order_by(packed_outcomes.c.number)
+    )
+    wanted: dict[str, tuple[int, int, int]] = {}
+    enough = 0
+    for job_id, number, start, stop in tx.execute(listed):
+        wanted[job_id] = (number, start, stop)
+        enough += stop - start
+        if enough >= poses:
+            break
+    chunks = []
+    ids = list(wanted)
+    for first in range(0, len(ids), 500):
+        query = select(packed_outcomes.c.job_id, packed_outcomes.c.outcomes).where(
+            packed_outcomes.c.job_id.in_(ids[first : first + 500])
+        )
+        chunks += [
+            PackedChunk(sweep_id, *wanted[job_id], bytes(content)) for job_id, content in tx.execute(query)
+        ]
+    return sorted(chunks, key=lambda chunk: chunk.number)
+
+
+def collected(
+    tx: Tx, object_id: int, *, provenance_ids: Collection[int], after_revision: int = 0
+) -> list[PackedChunk]:
+    """Chunks of an object's collecting sweeps stored after a revision, in commit order."""
+    query = _of_object(object_id, "collect").where(
+        sweeps.c.provenance_id.in_(sorted(provenance_ids)), packed_outcomes.c.revision > after_revision
+    )
+    return _read(tx, query.order_by(packed_outcomes.c.revision, packed_outcomes.c.number))
+
+
+def checked(tx: Tx, object_id: int, *, gripper: str | None, protocol: str | None) -> list[PackedChunk]:
+    """Finished chunks of an object's checks with a gripper and protocol (None: any), in the plans' order."""
+    query = _of_object(object_id, "check")
+    if gripper is not None:
+        query = query.where(sweeps.c.gripper == gripper)
+    if protocol is not None:
+        query = query.where(sweeps.c.protocol == protocol)
+    return _read(tx, query.order_by(sweeps.c.id, packed_outcomes.c.number))
+
+
+def _of_object(object_id: int, purpose: str) -> Select[Any]:
+    return (
+        select(
+            packed_outcomes.c.sweep_id,
+            packed_outcomes.c.number,
+            jobs.c.start,
+            jobs.c.stop,
+            packed_outcomes.c.outcomes,
+        )
+        .join(jobs, jobs.c.id == packed_outcomes.c.job_id)
+        .join(sweeps, sweeps.c.id == packed_outcomes.c.sweep_id)
+        .join(batches, batches.c.sweep_id == sweeps.c.id)
+        .where(sweeps.c.object_id == object_id, sweeps.c.purpose == purpose)
+    )
+
+
+def _read(tx: Tx, query: Select[Any]) -> list[PackedChunk]:
+    return [PackedChunk(s, int(n), int(a), int(b), bytes(o)) for s, n, a, b, o in tx.execute(query)]
+
+
+def checks_stamp(tx: Tx, object_id: int) -> str:
+    """Another one whenever an object's finished checks change, which its revision does not tell."""
+    query = (
+        select(sweeps.c.id, func.count())
+        .join(batches, batches.c.sweep_id == sweeps.c.id)
+        .join(packed_outcomes, packed_outcomes.c.sweep_id == sweeps.c.id)
+        .where(sweeps.c.object_id == object_id, sweeps.c.purpose == "check")
+        .group_by(sweeps.c.id)
+        .order_by(sweeps.c.id)
+    )
+    digest = hashlib.sha256()
+    for sweep_id, chunks in tx.execute(query):
+        digest.update(f"{sweep_id}:{chunks};".encode())
+    return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class DoneChunk:
+    """A finished chunk of a sweep: the places of its plan, and the revision that stored it."""
+
+    job_id: str
+    sweep_id: str
+    start: int
+    stop: int
+    revision: int
+
+
+def done_chunks(tx: Tx, sweep_ids: Collection[str]) -> list[DoneChunk]:
+    """Finished chunks of these sweeps in commit order, their outcomes left unread."""
+    query = (
+        select(jobs.c.id, jobs.c.sweep_id, jobs.c.start, jobs.c.stop, packed_outcomes.c.revision)
+        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
+        .where(jobs.c.sweep_id.in_(sorted(sweep_ids)), jobs.c.state == "done")
+        .order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
+    )
+    return [DoneChunk(i, s, int(a), int(b), int(r)) for i, s, a, b, r in tx.execute(query)]
+
+
+def outcomes_of(tx: Tx, job_id: str) -> bytes:
+    """The outcome codes (uint8) of a finished chunk."""
+    query = select(packed_outcomes.c.outcomes).where(packed_outcomes.c.job_id == job_id)
+    return bytes(tx.execute(query).scalar_one())
+
+
+def done_ranges(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
+    """Places (start, stop) in their plans of the finished chunks of these sweeps."""
+    query = (
+        select(jobs.c.sweep_id, jobs.c.start, jobs.c.stop)
+        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
+        .order_by(jobs.c.sweep_id, jobs.c.start)
+    )
+    found: dict[str, list[tuple[int, int]]] = {sweep_id: [] for sweep_id in sweep_ids}
+    for sweep_id, start, stop in tx.execute(query):
+        found[sweep_id].append((int(start), int(stop)))
+    return found
+
+
+def count_done(tx: Tx, sweep_ids: Sequence[str]) -> int:
+    """Finished chunks of these sweeps that still have their batch."""
+    query = (
+        select(func.count())
+        .select_from(jobs)
+        .join(batches, batches.c.sweep_id == jobs.c.sweep_id)
+        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
+    )
+    return int(tx.scalar(query) or 0)
+
+
+def add_packed_counts(tx: Tx, job_id: str, counts: Mapping[int, int]) -> None:
+    """Count further packed outcomes of a finished chunk as added to the tallies by it; under the object's
+    lock."""
+    stored = dict(tx.execute(select(jobs.c.counts).where(jobs.c.id == job_id)).scalar_one())
+    packed = dict(stored["packed"])
+    for code, number in counts.items():
+        packed[str(code)] = packed.get(str(code), 0) + number
+    tx.execute(update(jobs).where(jobs.c.id == job_id).values(counts={**stored, "packed": packed}))
+
+
+def packed_counts(tx: Tx, sweep_id: str) -> tuple[int, dict[int, int]]:
+    """The provenance and, by outcome code, the packed outcomes that this sweep added to its tallies.
+
+    Empty for a check, whose outcomes are counted nowhere.
+    """
+    provenance_id = tx.scalar(select(sweeps.c.provenance_id).where(sweeps.c.id == sweep_id))
+    if provenance_id is None:
+        raise LookupError(sweep_id)
+    counts: dict[int, int] = {}
+    query = select(jobs.c.counts).where(jobs.c.sweep_id == sweep_id, jobs.c.state == "done")
+    for (stored,) in tx.execute(query):
+        for code, count in stored["packed"].items():
+            counts[int(code)] = counts.get(int(code), 0) + count
+    return provenance_id, counts
+
+
+@dataclass(frozen=True)
+class TriedGrid:
+    """A collecting grid sweep that has stored something.
+
+    ``kept`` counts the distinct poses it tried that no other sweep had stored before; ``grid`` is the plan as
+    :class:`graspdb.wire.GridPlan` has it.
+    """
+
+    sweep_id: str
+    batch_id: int
+    repeat_key: str
+    grid: dict[str, Any]
+    kept: int
+
+
+def tried_grids(tx: Tx, object_id: int, *, provenance_ids: Collection[int]) -> list[TriedGrid]:
+    """Grids of which something was tried, in the order the sweeps were made. Reads no job, however many."""
+    kept = batches.c.inserted + batches.c.packed
+    query = (
+        select(sweeps.c.id, batches.c.id, sweeps.c.snapshot, kept)
+        .join(batches, batches.c.sweep_id == sweeps.c.id)
+        .where(
+            sweeps.c.object_id == object_id,
+            sweeps.c.purpose == "collect",
+            sweeps.c.plan == "grid",
+            sweeps.c.provenance_id.in_(sorted(provenance_ids)),
+            kept > 0,
+        )
+        .order_by(sweeps.c.id)
+    )
+    return [
+        TriedGrid(sweep, int(batch), snapshot["repeat_key"], snapshot["grid"], int(number))
+        for sweep, batch, snapshot, number in tx.execute(query)
+    ]

@@ -1,0 +1,92 @@
+"""Provenances, what some of an object's trials have in common, and the tallies of each by outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sqlalchemy import and_, func, insert, select
+
+from graspdb_service.storage.database import Tx, insert_or
+from graspdb_service.storage.tables import provenances
+from graspdb_service.storage.tables import tallies as tallied
+from graspdb_service.trial_columns import Provenance
+
+
+class ProvenanceRow(NamedTuple):
+    """A :class:`Provenance` as stored."""
+
+    id: int
+    gripper: str | None
+    source: str | None
+    protocol: str | None
+
+
+def ensure(tx: Tx, object_id: int, provenance: Provenance) -> int:
+    """The id of this combination, made if it is new. Call it under the object's lock."""
+    names = provenance._asdict()
+    same = [provenances.c[name].is_not_distinct_from(value) for name, value in names.items()]
+    known = tx.execute(
+        select(provenances.c.id).where(provenances.c.object_id == object_id, and_(*same)).limit(1)
+    ).scalar()
+    if known is not None:
+        return int(known)
+    statement = insert(provenances).values(object_id=object_id, **names).returning(provenances.c.id)
+    return int(tx.execute(statement).scalar_one())
+
+
+def of_object(tx: Tx, object_id: int) -> list[ProvenanceRow]:
+    """Every combination the object's trials (or planned sweeps) have."""
+    columns = (provenances.c[name] for name in ProvenanceRow._fields)
+    query = select(*columns).where(provenances.c.object_id == object_id).order_by(provenances.c.id)
+    return [ProvenanceRow(*row) for row in tx.execute(query)]
+
+
+def add_tally(tx: Tx, provenance_id: int, outcome: int, *, rows: int = 0, packed: int = 0) -> None:
+    """Count trials of a provenance and an outcome code; negative numbers take them out."""
+    statement = insert_or(tx, tallied).values(
+        provenance_id=provenance_id, outcome=outcome, row_count=rows, packed_count=packed
+    )
+    tx.execute(
+        statement.on_conflict_do_update(
+            index_elements=[tallied.c.provenance_id, tallied.c.outcome],
+            set_={
+                "row_count": tallied.c.row_count + statement.excluded.row_count,
+                "packed_count": tallied.c.packed_count + statement.excluded.packed_count,
+            },
+        )
+    )
+
+
+def add_packed(tx: Tx, provenance_id: int, counts: dict[int, int]) -> None:
+    """Count packed outcomes by code; negative numbers take them out."""
+    for outcome, number in sorted(counts.items()):
+        if number:
+            add_tally(tx, provenance_id, outcome, packed=number)
+
+
+def tallies(tx: Tx, object_id: int) -> list[tuple[int, int, int, int]]:
+    """``(provenance_id, outcome_code, rows, packed)`` for all the object's trials."""
+    query = (
+        select(tallied)
+        .join(provenances, provenances.c.id == tallied.c.provenance_id)
+        .where(provenances.c.object_id == object_id)
+        .order_by(tallied.c.provenance_id, tallied.c.outcome)
+    )
+    return [(int(p), int(o), int(r), int(k)) for p, o, r, k in tx.execute(query)]
+
+
+def outcome_counts(tx: Tx, object_ids: Sequence[int]) -> dict[int, dict[int, int]]:
+    """Rows and packed outcomes together, by object and outcome code."""
+    found: dict[int, dict[int, int]] = {object_id: {} for object_id in object_ids}
+    total = func.sum(tallied.c.row_count + tallied.c.packed_count)
+    query = (
+        select(provenances.c.object_id, tallied.c.outcome, total)
+        .join(tallied, provenances.c.id == tallied.c.provenance_id)
+        .where(provenances.c.object_id.in_(object_ids))
+        .group_by(provenances.c.object_id, tallied.c.outcome)
+    )
+    for object_id, outcome, number in tx.execute(query):
+        if number:
+            found[int(object_id)][int(outcome)] = int(number)
+    return found

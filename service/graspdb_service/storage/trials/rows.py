@@ -1,0 +1,310 @@
+"""Rows of trials: columns in, columns out, on the drivers' fast paths.
+
+SQLAlchemy builds no statement a row here: SQLite takes tuples by ``executemany``, PostgreSQL binary COPY.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from itertools import chain
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import bindparam, update
+
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.tables import trials
+from graspdb_service.storage.trials import binary_copy, provenances
+from graspdb_service.storage.trials.binary_copy import json_text
+from graspdb_service.trial_columns import Floats, Ints, TrialColumns
+
+SUCCESS = 1
+COPY_ROWS = 50_000
+
+_POSE = ("px", "py", "pz", "qx", "qy", "qz", "qw")
+_NUMBERS = ("proposal_density", "quality", "width_m")
+_DOCUMENTS = ("pose_covariance", "metadata")
+
+
+def insert(
+    tx: Tx, object_id: int, batch_id: int, columns: TrialColumns, *, revision: int, first_seq: int
+) -> None:
+    """Store trials under the sequence numbers that ``objects.advance`` reserved, and count them."""
+    if len(columns) == 0:
+        return
+    shared = {"object_id": object_id, "revision": revision, "batch_id": batch_id}
+    if tx.dialect.name == "sqlite":
+        _insert_tuples(tx, shared, columns, first_seq)
+    else:
+        for start in range(0, len(columns), COPY_ROWS):
+            _copy_in(tx, shared, columns, first_seq, slice(start, min(start + COPY_ROWS, len(columns))))
+    pairs, counts = np.unique(
+        np.stack([columns.provenance, columns.outcome.astype(np.int64)], axis=1), axis=0, return_counts=True
+    )
+    for (provenance_id, outcome), number in zip(pairs.tolist(), counts.tolist(), strict=True):
+        provenances.add_tally(tx, provenance_id, outcome, rows=number)
+
+
+def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
+    # What all rows share stands in the statement, and what none has is left out: binding is half the time.
+    lists: dict[str, Iterable[Any]] = {
+        "seq": range(first_seq, first_seq + len(columns)),
+        "provenance_id": columns.provenance.tolist(),
+        "outcome": columns.outcome.tolist(),
+        **dict(zip(_POSE[:3], columns.position.T.tolist(), strict=True)),
+        **dict(zip(_POSE[3:], columns.quaternion_xyzw.T.tolist(), strict=True)),
+    }
+    for name in _NUMBERS:
+        values: Floats = getattr(columns, name)
+        missing = np.isnan(values)
+        if not missing.all():
+            given = values.astype(object)
+            given[missing] = None
+            lists[name] = given.tolist()
+    if len(columns.pose_index):
+        lists["pose_index"] = columns.pose_index.tolist()
+    converters: dict[str, Callable[[Any], str]] = {"measured_at": _sqlite_time}
+    for name in ("measured_at", *_DOCUMENTS):
+        items, convert = getattr(columns, name), converters.get(name, json_text)
+        if items:
+            lists[name] = [None if item is None else convert(item) for item in items]
+    names = ", ".join([*shared, *lists])
+    places = ", ".join([str(int(value)) for value in shared.values()] + ["?"] * len(lists))
+    rows = zip(*lists.values(), strict=True)
+    cursor = tx.connection.cursor()
+    try:
+        # The driver takes any iterator: no list of tuples is built.
+        cursor.executemany(f"INSERT INTO trials ({names}) VALUES ({places})", rows)  # type: ignore[arg-type]
+    finally:
+        cursor.close()
+
+
+def _sqlite_time(value: datetime) -> str:
+    return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
+
+
+def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int, part: slice) -> None:
+    count = part.stop - part.start
+    values: dict[str, Any] = {
+        **shared,
+        "seq": np.arange(first_seq + part.start, first_seq + part.stop),
+        "provenance_id": columns.provenance[part],
+        "outcome": columns.outcome[part],
+        **dict(zip(_POSE[:3], columns.position[part].T, strict=True)),
+        **dict(zip(_POSE[3:], columns.quaternion_xyzw[part].T, strict=True)),
+    }
+    nulls: dict[str, NDArray[np.bool_]] = {}
+    for name in _NUMBERS:
+        column: Floats = getattr(columns, name)[part]
+        missing = np.isnan(column)
+        if not missing.all():
+            values[name], nulls[name] = column, missing
+    if len(columns.pose_index):
+        values["pose_index"] = columns.pose_index[part]
+    times = columns.measured_at[part]
+    if times:
+        nulls["measured_at"] = np.array([time is None for time in times])
+        values["measured_at"] = np.array([binary_copy.microseconds(time) for time in times], dtype=np.int64)
+    documents = {name: getattr(columns, name)[part] for name in _DOCUMENTS if getattr(columns, name)}
+    content = binary_copy.encode(count, values, nulls, list(documents.values()))
+    cursor = tx.connection.cursor()
+    try:
+        names = ", ".join([*values, *documents])
+        with cursor.copy(f"COPY trials ({names}) FROM STDIN (FORMAT BINARY)") as copy:
+            copy.write(content)
+    finally:
+        cursor.close()
+
+
+def move(
+    tx: Tx, object_id: int, *, from_batch: int, to_batch: int, ranges: Sequence[tuple[int, int]]
+) -> None:
+    """Give the trials of a batch in these ranges of sequence numbers to another; under the object's lock."""
+    statement = (
+        update(trials)
+        .where(
+            trials.c.object_id == object_id,
+            trials.c.batch_id == from_batch,
+            trials.c.seq.between(bindparam("first"), bindparam("last")),
+        )
+        .values(batch_id=to_batch)
+    )
+    tx.execute(statement, [{"first": first, "last": last} for first, last in ranges])
+
+
+# --- reading columns ------------------------------------------------------------------------------------
+
+_READ = ("seq", *_POSE, "proposal_density", "provenance_id", "outcome")
+
+
+def read(
+    tx: Tx,
+    object_id: int,
+    *,
+    provenance_ids: Sequence[int] | None,
+    successes_only: bool,
+    after_seq: int = 0,
+    swept: bool = True,
+    without: Sequence[int] = (),
+    batches: bool = False,
+) -> TrialColumns:
+    """What the maths needs of an object's trials, ascending ``seq``, those after ``after_seq``.
+
+    ``swept=False`` leaves out those that a sweep stored, ``without`` those with these outcome codes;
+    ``batches`` reads which batch each is of.
+    """
+    columns = (*_READ, "batch_id") if batches else _READ
+    where = [f"object_id = {int(object_id)}", f"seq > {int(after_seq)}"]
+    if not swept:
+        # Only a sweep's trials have a place in a plan.
+        where.append("pose_index IS NULL")
+    if without:
+        where.append(f"outcome NOT IN ({', '.join(str(int(code)) for code in without)})")
+    if successes_only:
+        # Said literally, as the partial index has it.
+        where.append(f"outcome = {SUCCESS}")
+    where += _of_provenances(provenance_ids)
+    condition = " AND ".join(where)
+    return (_read_tuples if tx.dialect.name == "sqlite" else _copy_out)(tx, columns, condition)
+
+
+def _of_provenances(ids: Sequence[int] | None) -> list[str]:
+    if ids is None:
+        return []
+    return [f"provenance_id IN ({', '.join(str(int(number)) for number in ids) or 'NULL'})"]
+
+
+def _read_tuples(tx: Tx, columns: Sequence[str], where: str) -> TrialColumns:
+    # NULL would make an array of Python objects; no proposal density is negative.
+    names = ", ".join(f"coalesce({name}, -1.0)" if name == "proposal_density" else name for name in columns)
+    cursor = tx.connection.cursor()
+    try:
+        cursor.execute(f"SELECT {names} FROM trials WHERE {where} ORDER BY seq")
+        # Straight into an array: lists of rows would take longer, and much more memory.
+        rows = cast("Iterable[Sequence[float]]", cursor)
+        table = np.fromiter(chain.from_iterable(rows), dtype=np.float64).reshape(-1, len(columns))
+    finally:
+        cursor.close()
+    return TrialColumns(
+        seq=table[:, 0].astype(np.int64),
+        position=np.ascontiguousarray(table[:, 1:4]),
+        quaternion_xyzw=np.ascontiguousarray(table[:, 4:8]),
+        proposal_density=np.where(table[:, 8] < 0, np.nan, table[:, 8]),
+        provenance=table[:, 9].astype(np.int64),
+        outcome=table[:, 10].astype(np.uint8),
+        # Empty where it was not read.
+        batch=table[:, 11:].ravel().astype(np.int64),
+    )
+
+
+def _copy_out(tx: Tx, columns: Sequence[str], where: str) -> TrialColumns:
+    names = ", ".join(
+        f"coalesce({name}, 'NaN'::float8)" if name == "proposal_density" else name for name in columns
+    )
+    cursor = tx.connection.cursor()
+    try:
+        query = f"COPY (SELECT {names} FROM trials WHERE {where} ORDER BY seq) TO STDOUT (FORMAT BINARY)"
+        with cursor.copy(query) as copy:
+            table = binary_copy.decode(b"".join(copy), columns)
+    finally:
+        cursor.close()
+    return TrialColumns(
+        seq=table["seq"].astype(np.int64),
+        position=np.stack([table[name].astype(np.float64) for name in _POSE[:3]], axis=1),
+        quaternion_xyzw=np.stack([table[name].astype(np.float64) for name in _POSE[3:]], axis=1),
+        proposal_density=table["proposal_density"].astype(np.float64),
+        provenance=table["provenance_id"].astype(np.int64),
+        outcome=table["outcome"].astype(np.uint8),
+        batch=table["batch_id"].astype(np.int64) if "batch_id" in columns else np.empty(0, dtype=np.int64),
+    )
+
+
+def read_swept(tx: Tx, object_id: int, batch_id: int, first: int, last: int) -> tuple[Ints, Ints]:
+    """Sequence numbers and pose indices of the trials a sweep's batch stored, ascending ``seq``."""
+    table = _fetch(
+        tx,
+        f"SELECT seq, pose_index FROM trials WHERE object_id = {int(object_id)}"
+        f" AND seq BETWEEN {int(first)} AND {int(last)} AND batch_id = {int(batch_id)} ORDER BY seq",
+    )
+    pairs = np.array(table, dtype=np.int64).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _fetch(tx: Tx, query: str) -> list[Any]:
+    cursor = tx.connection.cursor()
+    try:
+        cursor.execute(query)
+        return list(cursor.fetchall())
+    finally:
+        cursor.close()
+
+
+# --- reading everything ---------------------------------------------------------------------------------
+
+_ALL = (
+    "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, *_NUMBERS,
+    "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS,
+)  # fmt: skip
+
+
+def page(
+    tx: Tx,
+    object_id: int,
+    *,
+    after_seq: int,
+    limit: int,
+    up_to_seq: int | None = None,
+    outcome: int | None = None,
+    provenance_ids: Sequence[int] | None = None,
+    batch_id: int | None = None,
+    since_revision: int | None = None,
+) -> TrialColumns:
+    """Up to ``limit`` trials after a sequence number; ``since_revision`` keeps what was stored after it."""
+    where = [f"object_id = {int(object_id)}", f"seq > {int(after_seq)}", *_of_provenances(provenance_ids)]
+    for condition, value in (
+        ("seq <=", up_to_seq),
+        # Said literally, as the partial index has it.
+        ("outcome =", outcome),
+        ("batch_id =", batch_id),
+        ("revision >", since_revision),
+    ):
+        if value is not None:
+            where.append(f"{condition} {int(value)}")
+    rows = _fetch(
+        tx,
+        f"SELECT {', '.join(_ALL)} FROM trials WHERE {' AND '.join(where)} ORDER BY seq LIMIT {int(limit)}",
+    )
+    cells = list(zip(*rows, strict=True)) or [()] * len(_ALL)
+    integers = [np.array(cells[i], dtype=np.int64) for i in (0, 1, 2, 3, 15)]
+    # None becomes NaN.
+    numbers = [np.array(cells[i], dtype=np.float64) for i in range(5, 15)]
+    return TrialColumns(
+        seq=integers[0],
+        revision=integers[1],
+        batch=integers[2],
+        provenance=integers[3],
+        outcome=np.array(cells[4], dtype=np.uint8),
+        position=np.stack(numbers[:3], axis=1),
+        quaternion_xyzw=np.stack(numbers[3:7], axis=1),
+        proposal_density=numbers[7],
+        quality=numbers[8],
+        width_m=numbers[9],
+        pose_index=integers[4],
+        measured_at=[_time(value) for value in cells[16]],
+        pose_covariance=[_document(value) for value in cells[17]],
+        metadata=[_document(value) for value in cells[18]],
+    )
+
+
+def _time(value: Any) -> datetime | None:
+    """PostgreSQL's driver makes times of them, SQLite keeps text."""
+    if isinstance(value, str):
+        return datetime.fromisoformat(value).replace(tzinfo=UTC)
+    return None if value is None else cast("datetime", value).astimezone(UTC)
+
+
+def _document(value: Any) -> Any:
+    return json.loads(value) if isinstance(value, str) else value

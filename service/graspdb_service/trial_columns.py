@@ -1,0 +1,105 @@
+"""Trials in columns: one value from a request's body to the database, and from there to the maths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from datetime import datetime
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def _floats() -> Floats:
+    return np.empty(0)
+
+
+def _ints() -> Ints:
+    return np.empty(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class TrialColumns:
+    """Trials (n,). A column that no trial has, or that was not read, is empty.
+
+    Attributes
+    ----------
+    position, quaternion_xyzw : (n, 3) m, (n, 4)
+        The tool in the object frame; the quaternion is unit.
+    outcome : (n,) uint8
+        Codes, see :data:`graspdb.wire.OUTCOME_CODES`.
+    provenance
+        Which :class:`Provenance`: its place in a list that comes with the columns, once stored its id.
+    proposal_density, quality, width_m
+        1/(m^3 rad^3), no unit, m; NaN where a trial has none.
+    pose_index
+        Which pose of its sweep's plan a trial is of; -1 where it is of no sweep.
+    measured_at, pose_covariance, metadata
+        A value or None a trial: aware times, 6x6 nested lists, documents.
+    seq, revision, batch
+        As stored, ascending ``seq``; ``batch`` is internal.
+    """
+
+    position: Floats
+    quaternion_xyzw: Floats
+    outcome: NDArray[np.uint8]
+    provenance: Ints = field(default_factory=_ints)
+    proposal_density: Floats = field(default_factory=_floats)
+    quality: Floats = field(default_factory=_floats)
+    width_m: Floats = field(default_factory=_floats)
+    pose_index: Ints = field(default_factory=_ints)
+    measured_at: Sequence[datetime | None] = ()
+    pose_covariance: Sequence[list[list[float]] | None] = ()
+    metadata: Sequence[dict[str, Any] | None] = ()
+    seq: Ints = field(default_factory=_ints)
+    revision: Ints = field(default_factory=_ints)
+    batch: Ints = field(default_factory=_ints)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def first(self, count: int) -> TrialColumns:
+        """The first ``count`` trials."""
+        return TrialColumns(**{item.name: getattr(self, item.name)[:count] for item in fields(self)})
+
+
+class Provenance(NamedTuple):
+    """What some of an object's trials have in common."""
+
+    gripper: str | None
+    source: str | None
+    protocol: str | None
+
+
+class BatchOrigin(NamedTuple):
+    """The batch that trials came in: its key, the sweep that wrote it, and the metadata beside it."""
+
+    key: str
+    sweep: str | None
+    metadata: dict[str, Any] | None
+
+
+@dataclass(frozen=True, eq=False)
+class TrialBatch:
+    """Checked trials of one request, ready to store.
+
+    ``field_of_gripper`` names the field that a gripper came in, for what only the database can tell.
+    """
+
+    columns: TrialColumns
+    provenances: Sequence[Provenance]
+    metadata: dict[str, Any] | None
+    field_of_gripper: Callable[[str], str]
+
+
+@dataclass(frozen=True, eq=False)
+class TrialPage:
+    """Stored trials with what their internal ids stand for."""
+
+    columns: TrialColumns
+    provenances: Mapping[int, Provenance]
+    batches: Mapping[int, BatchOrigin]

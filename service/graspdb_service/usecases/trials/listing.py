@@ -1,0 +1,88 @@
+"""Reading trials back: a page, or all of them page by page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from graspdb.wire import OUTCOME_CODES
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.trials import batches, provenances, rows
+from graspdb_service.trial_columns import Provenance, TrialPage
+from graspdb_service.usecases.identifiers import is_uuid
+from graspdb_service.usecases.objects import require
+
+STREAM_ROWS = 5_000
+
+
+@dataclass(frozen=True)
+class TrialFilter:
+    """Which rows to read: exact names, and ``since_revision`` for what was stored after it."""
+
+    outcome: str | None = None
+    source: str | None = None
+    gripper: str | None = None
+    protocol: str | None = None
+    batch: str | None = None
+    since_revision: int | None = None
+
+
+def page(
+    database: Database, slug: str, chosen: TrialFilter, *, after: int, limit: int
+) -> tuple[TrialPage, int | None]:
+    """A page of trials in commit order, and the sequence number after which the next one starts."""
+    with database.read() as tx:
+        found = _read(tx, require(tx, slug), chosen, after, limit + 1)
+    columns = found.columns.first(limit)
+    following = int(columns.seq[-1]) if len(found.columns) > limit else None
+    return replace(found, columns=columns), following
+
+
+def pages(database: Database, slug: str, chosen: TrialFilter, *, after: int) -> Iterator[TrialPage]:
+    """Every trial there is now; no transaction outlasts a page, however slow the reader."""
+    with database.read() as tx:
+        row = require(tx, slug)
+
+    def read(after: int) -> Iterator[TrialPage]:
+        while True:
+            with database.read() as tx:
+                found = _read(tx, row, chosen, after, STREAM_ROWS, row.last_seq)
+            yield found
+            if len(found.columns) < STREAM_ROWS:
+                return
+            after = int(found.columns.seq[-1])
+
+    return read(after)
+
+
+def _read(
+    tx: Tx, row: ObjectRow, chosen: TrialFilter, after: int, limit: int, up_to: int | None = None
+) -> TrialPage:
+    names = {number: Provenance(*name) for number, *name in provenances.of_object(tx, row.id)}
+    wanted = [chosen.gripper, chosen.source, chosen.protocol]
+    passing = [
+        number
+        for number, name in names.items()
+        if all(want in (None, have) for want, have in zip(wanted, name, strict=True))
+    ]
+    batch_id = None
+    if chosen.batch is not None:
+        batch = batches.find(tx, row.id, chosen.batch) if is_uuid(chosen.batch) else None
+        if batch is None or batch.first_seq is None or batch.last_seq is None:
+            limit = 0
+        else:
+            batch_id, after = batch.id, max(after, batch.first_seq - 1)
+            up_to = batch.last_seq if up_to is None else min(up_to, batch.last_seq)
+    columns = rows.page(
+        tx,
+        row.id,
+        after_seq=after,
+        limit=limit,
+        up_to_seq=up_to,
+        outcome=None if chosen.outcome is None else OUTCOME_CODES[chosen.outcome],
+        provenance_ids=passing if any(wanted) else None,
+        batch_id=batch_id,
+        since_revision=chosen.since_revision,
+    )
+    return TrialPage(columns, names, batches.origins(tx, columns.batch.tolist()))
