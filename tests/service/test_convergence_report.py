@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from graspdb.wire.reports import ConvergenceOptions
 from graspdb_density import se3
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.api.context import Context
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases.densities.cache import KernelChoice
-from graspdb_service.usecases.reports import convergence, registry
-from graspdb_service.usecases.reports.registry import Asked
-from graspdb_service.usecases.trials.selection import Filters
+from graspdb_service.usecases.reports import convergence
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -59,13 +57,12 @@ def replicas(database_url: str, serve: Serve) -> Iterator[tuple[httpx.Client, ht
         yield one, other
 
 
-def _at_once(url: str, kernel: str | None, options: dict[str, str]) -> dict[str, Any]:
+def _at_once(url: str, **options: Any) -> dict[str, Any]:
     """The report as a process computes it that has nothing yet."""
     context = Context.create(Settings(database_url=url), Database(url))
     try:
-        _, selected = context.densities.current("thing", Filters())
-        asked = Asked("convergence", selected.filters, KernelChoice(stored=kernel), options)
-        found = registry.compute(context.reports._sources, "thing", asked, lambda _: None)
+        key = context.reports.key("thing", "convergence", ConvergenceOptions(**options))
+        found = context.reports.compute("thing", key.parameters, lambda _: None)
     finally:
         context.close()
     return found.model_dump(mode="json")
@@ -112,7 +109,7 @@ def test_new_trials_are_added_to_what_was_summed(
         assert answer.status_code == 200, answer.text
         assert kept == [extended]
         report: dict[str, Any] = answer.json()
-        _assert_same(report, _at_once(database_url, None, {}))
+        _assert_same(report, _at_once(database_url))
         return report
 
     posted(0, 260)
@@ -171,4 +168,4 @@ def test_a_stored_kernels_curve_and_its_match_grow(
             answer = http.get(f"/objects/thing/reports/convergence?kernel={kernel}&matching={matching}")
             assert answer.status_code == 200, answer.text
             assert kept == extended
-            _assert_same(answer.json(), _at_once(sqlite_url, kernel, {"matching": matching}))
+            _assert_same(answer.json(), _at_once(sqlite_url, kernel=kernel, matching=matching))

@@ -18,6 +18,7 @@ from graspdb_service.api.context import Context
 from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
+from graspdb_service.usecases.kernels import fit
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
@@ -126,7 +127,7 @@ def test_a_dead_processs_fit_is_taken_over(http: httpx.Client, database_url: str
     row, _ = context.densities.current("thing", Filters())
     request = KernelCreate.model_validate(AUTO)
     with context.database.write() as tx:
-        context.reports.enter_fit(tx, "mine", "gone", row, request)
+        context.runs.enter(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")
         report_runs.release(tx, "mine", "gone")
     run = ended(http, "/report-runs/mine")
     assert run["state"] == "done"

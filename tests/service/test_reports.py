@@ -22,7 +22,7 @@ from graspdb_density.vicinity.anisotropy import empirical
 from graspdb_geometry.poses import ToolPoses
 from graspdb_service.storage import objects, report_runs
 from graspdb_service.storage.database import Database
-from graspdb_service.storage.report_runs import Question
+from graspdb_service.storage.report_runs import RunKey
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -381,10 +381,10 @@ def test_a_dead_holders_run_is_taken_over_and_a_living_ones_is_not(
         assert row is not None
         stored = report_runs.get(tx, mine["id"])
         assert stored is not None
-        question = Question(row.id, row.revision, "convergence", "0" * 64, stored.parameters)
+        key = RunKey(row.id, row.revision, "convergence", "0" * 64, stored.parameters)
         other = str(uuid.uuid4())
-        assert report_runs.ask(tx, question, id=other, lease_id="theirs", lease_s=60)
-        assert not report_runs.ask(tx, question, id=str(uuid.uuid4()), lease_id="late", lease_s=60)
+        assert report_runs.ask(tx, key, id=other, lease_id="theirs", lease_s=60)
+        assert not report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id="late", lease_s=60)
         assert report_runs.renew(tx, {other: ("late", 0.5)}, lease_s=60) == set()
         assert report_runs.renew(tx, {other: ("theirs", 0.5)}, lease_s=60) == {other}
     run = ok(http.get(f"/report-runs/{other}"))

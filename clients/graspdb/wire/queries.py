@@ -40,15 +40,26 @@ class KernelSpec(Request):
     cutoff: Annotated[float, Field(ge=2.0, le=20.0)] | None = None
 
 
-class Selection(Request):
-    """Which trials a density is built from, and with which kernel."""
+class TrialSelection(Request):
+    """Which trials a question is about."""
 
     gripper: Slug | None = None
     protocol: Slug | None = None
     source: Source | None = None
+
+
+class Selection(TrialSelection):
+    """Which trials a density is built from, and with which kernel."""
+
     kernel: KernelSpec | Slug | None = None
     sigma_position_m: WidthM | None = None
     sigma_rotation_deg: WidthDeg | None = None
+
+
+class SelectionQuery(Selection):
+    """A selection in a query string, where a kernel is a name with widths beside it."""
+
+    kernel: Slug | None = None
 
 
 class KernelInfo(Response):

@@ -1,14 +1,21 @@
-"""Reports: tolerance around a success, whether there are enough trials, whether numbers can be believed."""
+"""Reports: tolerance around a success, whether there are enough trials, whether numbers can be believed.
+
+Each is declared here once, in `REPORTS`: what it answers, by which options, with which model. Routes, runs,
+the SDK and the command line follow.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from graspdb.wire.base import Response, Triple
-from graspdb.wire.queries import KernelInfo
+from graspdb.wire.base import Direction, Help, Request, Response, Slug, Triple
+from graspdb.wire.kernels import Alignment
+from graspdb.wire.queries import KernelInfo, SelectionQuery, TrialSelection, WidthDeg, WidthM
 
 ReportName = Literal[
     "convergence",
@@ -19,6 +26,7 @@ ReportName = Literal[
     "kernel-similarity",
     "sources",
 ]
+REPORT_NAMES: tuple[ReportName, ...] = get_args(ReportName)
 Method = Literal["empirical", "density"]
 Matching = Literal["determinants", "likelihood", "success"]
 RunState = Literal["running", "done", "failed", "cancelled"]
@@ -81,6 +89,14 @@ class ConvergenceCurve(Response):
     kernel: KernelInfo
     points: list[ConvergencePoint]
     verdict: Verdict
+
+
+class ConvergenceOptions(SelectionQuery):
+    """``matching`` says how the isotropic kernel beside a stored one is chosen."""
+
+    matching: Annotated[
+        Matching | None, Help("determinants, likelihood or success, beside a stored kernel.")
+    ] = None
 
 
 class ConvergenceReport(Report):
@@ -178,6 +194,13 @@ class AnisotropyHypothesis(Response):
     high: float | None
     verdict: Literal["confirmed", "denied", "undecided"]
     bound: Literal["lower", "upper", "both"] | None = None
+
+
+class AnisotropyOptions(SelectionQuery):
+    """``empirical`` counts pairs of trials; ``density`` compares the density of successes with attempts'."""
+
+    method: Annotated[Method, Help("empirical or density.")] = "empirical"
+    alignment: Annotated[Alignment, Help("gripper, object, edge or surface-pair.")] = "gripper"
 
 
 class AnisotropyReport(Report):
@@ -279,6 +302,45 @@ class ProjectionProfile(Response):
     high: list[float]
 
 
+def _alone(value: Any) -> Any:
+    """The text in a list of one, as a query string gives it."""
+    if isinstance(value, (list, tuple)) and len(value) == 1 and isinstance(value[0], str):
+        return value[0].strip()
+    return value
+
+
+def _axis(value: Any) -> Any:
+    """``x``, ``-z`` ... for a unit vector."""
+    value = _alone(value)
+    text = value.strip() if isinstance(value, str) else ""
+    letter = text.removeprefix("-").removeprefix("+")
+    if letter not in ("x", "y", "z"):
+        return value
+    sign = -1.0 if text.startswith("-") else 1.0
+    return [sign if letter == name else 0.0 for name in "xyz"]
+
+
+Axis = Annotated[Direction, BeforeValidator(_axis)]
+"""A direction, or the name of an axis such as ``-z``."""
+
+
+class ProjectionOptions(SelectionQuery):
+    """The plane, ``xy``, ``xz`` or ``yz`` or its normal ``nx,ny,nz`` (none: the one that shows most), and
+    which way grasps point: ``approach`` is that of tool z, ``direction`` that of tool x, across the jaw, with
+    either sign; within a cone whose half angle follows.
+    """
+
+    plane: Annotated[
+        Literal["xy", "xz", "yz"] | Axis | None,
+        BeforeValidator(_alone),
+        Help("xy, xz, yz or the plane's normal x,y,z."),
+    ] = None
+    approach: Annotated[Axis | None, Help("only grasps whose tool z points along x,y,z (or -z ...).")] = None
+    approach_cone_deg: Annotated[float, Field(gt=0, le=180), Help("half angle, 30 by default.")] = 30.0
+    direction: Annotated[Axis | None, Help("only grasps whose tool x lies along x,y,z (or z ...).")] = None
+    direction_cone_deg: Annotated[float, Field(gt=0, le=90), Help("half angle, 30 by default.")] = 30.0
+
+
 class ProjectionReport(Report):
     """The density on a plane, depth and rotation integrated out; of grasps that point a given way, or of all.
 
@@ -370,6 +432,15 @@ class SimilarityPoint(Response):
     error: float
 
 
+class KernelSimilarityOptions(TrialSelection):
+    """Which displacements count (a cube's half edge, the largest turn), and the width of a component."""
+
+    window_position_m: Annotated[float, Field(gt=0, le=1.0), Help("half edge of the window.")] = 0.04
+    window_rotation_deg: Annotated[float, Field(gt=0, le=180.0), Help("largest turn.")] = 180.0
+    component_position_m: Annotated[float, Field(ge=0.001, le=0.2), Help("width of a sample.")] = 0.01
+    component_rotation_deg: Annotated[float, Field(ge=1.0, le=40.0), Help("width of a sample.")] = 10.0
+
+
 class KernelSimilarityReport(Report):
     """Figure 13: how many samples, or Gaussians, the kernel needs to be like the statistics it comes from.
 
@@ -426,6 +497,16 @@ class SourceComparison(Response):
     auc: float | None = None
     bins: list[CalibrationBin] = Field(default_factory=list)
     similarity: SourceSimilarity | None = None
+
+
+class SourcesOptions(Request):
+    """The gripper, the protocol of the simulated trials, and the widths of the kernel that predicts."""
+
+    source: ClassVar[Literal["simulation"]] = "simulation"
+    gripper: Slug | None = None
+    protocol: Slug | None = None
+    sigma_position_m: WidthM | None = None
+    sigma_rotation_deg: WidthDeg | None = None
 
 
 class SourcesReport(Report):
@@ -488,14 +569,54 @@ AnyReport = (
     | KernelSimilarityReport
     | SourcesReport
 )
-REPORTS: dict[str, type[AnyReport]] = {
-    "convergence": ConvergenceReport,
-    "anisotropy": AnisotropyReport,
-    "calibration": CalibrationReport,
-    "projection": ProjectionReport,
-    "bandwidth": BandwidthReport,
-    "kernel-similarity": KernelSimilarityReport,
-    "sources": SourcesReport,
+ReportOptions = TrialSelection | SourcesOptions
+
+
+@dataclass(frozen=True)
+class ReportSpec:
+    """A report as declared: what it answers, what it can be asked by, and what it says."""
+
+    question: str
+    options: type[ReportOptions]
+    result: type[AnyReport]
+
+
+REPORTS: Mapping[str, ReportSpec] = {
+    "projection": ReportSpec(
+        "Where do grasps succeed? The density on a plane, of all grasps or of those that point one way.",
+        ProjectionOptions,
+        ProjectionReport,
+    ),
+    "convergence": ReportSpec(
+        "Have we tried enough? Similarity and held-out likelihood against the number of successes.",
+        ConvergenceOptions,
+        ConvergenceReport,
+    ),
+    "anisotropy": ReportSpec(
+        "How far off may the gripper be? Success by displacement from successes, tolerances by axis.",
+        AnisotropyOptions,
+        AnisotropyReport,
+    ),
+    "calibration": ReportSpec(
+        "Can success probabilities be believed? Judged on outcomes of blocks of space left out.",
+        SelectionQuery,
+        CalibrationReport,
+    ),
+    "bandwidth": ReportSpec(
+        "How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks.",
+        TrialSelection,
+        BandwidthReport,
+    ),
+    "kernel-similarity": ReportSpec(
+        "How many samples, or Gaussians, does a kernel need to be like its statistics? (figure 13)",
+        KernelSimilarityOptions,
+        KernelSimilarityReport,
+    ),
+    "sources": ReportSpec(
+        "Does simulation tell what robots find? Predictions at real poses, and how alike densities are.",
+        SourcesOptions,
+        SourcesReport,
+    ),
 }
 
 

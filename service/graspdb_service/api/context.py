@@ -12,15 +12,18 @@ from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.geometry.features import Features
-from graspdb_service.usecases.reports.runs import ReportRuns
+from graspdb_service.usecases.kernels import fit
+from graspdb_service.usecases.reports.registry import Reports
 from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.runtime.runs import Runs
 
 
 @dataclass(kw_only=True)
 class Context(Estimators):
     """The parts of one service process."""
 
-    reports: ReportRuns
+    reports: Reports
+    runs: Runs
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
@@ -28,6 +31,8 @@ class Context(Estimators):
         features = Features(database, compute)
         densities = Densities(database, compute, features, settings.max_density_cache_bytes)
         scenes = Scenes(database, compute, features)
+        reports = Reports(settings, database, densities, scenes)
+        fits = fit.run_kind(densities, features, settings.threads)
         return cls(
             settings=settings,
             database=database,
@@ -36,10 +41,11 @@ class Context(Estimators):
             scenes=scenes,
             priors=Priors(compute, scenes),
             successes=Successes(database, compute, settings.max_density_cache_bytes),
-            reports=ReportRuns(settings, database, densities, scenes),
+            reports=reports,
+            runs=Runs(database, wait_s=settings.report_wait_s, kinds={fit.RUN: fits, **reports.run_kinds()}),
         )
 
     def close(self) -> None:
-        self.reports.close()
+        self.runs.close()
         self.compute.close()
         self.database.dispose()

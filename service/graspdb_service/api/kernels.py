@@ -41,7 +41,7 @@ def create_kernel(
     With ``components: "auto"`` this may take longer than a request should: then the answer is 202 with the
     run that fits it, whose ``result`` is the kernel.
     """
-    made = stored.create(ctx, ctx.reports, request, key=key, body=body)
+    made = stored.create(ctx, ctx.runs, request, key=key, body=body)
     if made.status == 202:
         return JSONResponse(made.body, 202, headers={"Location": made.location, "Retry-After": "2"})
     response.headers["Location"] = made.location

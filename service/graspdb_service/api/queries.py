@@ -23,7 +23,7 @@ from graspdb.wire import (
     Slug,
 )
 from graspdb.wire.base import Position, Quaternion
-from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn
+from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn, SelectionQuery
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing import Ctx, RawBody, etag, not_modified, scope
@@ -48,12 +48,6 @@ def _listed(value: Any) -> Any:
             part.strip() for item in value for part in (item.split(",") if isinstance(item, str) else [item])
         ]
     return value
-
-
-class SelectionQuery(Selection):
-    """A selection in a query string, where a kernel is a name with widths beside it."""
-
-    kernel: Slug | None = None
 
 
 class LikelihoodQuery(SelectionQuery):

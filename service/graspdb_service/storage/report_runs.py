@@ -41,8 +41,8 @@ class RunRow:
 
 
 @dataclass(frozen=True)
-class Question:
-    """What a run computes."""
+class RunKey:
+    """What a run computes, and which earlier one is the same."""
 
     object_id: int
     revision: int
@@ -56,13 +56,13 @@ def get(tx: Tx, id: str) -> RunRow | None:
     return _one(tx, report_runs.c.id == id)
 
 
-def find(tx: Tx, question: Question) -> RunRow | None:
-    """The run of a question, whatever became of it."""
-    return _one(tx, _same(question))
+def find(tx: Tx, key: RunKey) -> RunRow | None:
+    """The run of a key, whatever became of it."""
+    return _one(tx, _same(key))
 
 
-def ask(tx: Tx, question: Question, *, id: str, lease_id: str, lease_s: float) -> bool:
-    """Take a question's run: make it, or start anew what was cancelled, failed through no fault of the
+def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str, lease_s: float) -> bool:
+    """Take a key's run: make it, or start anew what was cancelled, failed through no fault of the
     request, or whose holder is gone. False where it is done or somebody else's.
     """
     lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
@@ -70,11 +70,11 @@ def ask(tx: Tx, question: Question, *, id: str, lease_id: str, lease_s: float) -
         insert_or(tx, report_runs)
         .values(
             id=id,
-            object_id=question.object_id,
-            revision=question.revision,
-            report=question.report,
-            parameters_key=question.parameters_key,
-            parameters=question.parameters,
+            object_id=key.object_id,
+            revision=key.revision,
+            report=key.report,
+            parameters_key=key.parameters_key,
+            parameters=key.parameters,
             state="running",
             progress=0.0,
             created_at=datetime.now(UTC),
@@ -84,27 +84,27 @@ def ask(tx: Tx, question: Question, *, id: str, lease_id: str, lease_s: float) -
         .returning(report_runs.c.id)
     ).first()
     if made is None:
-        return _take(tx, _same(question), lease)
-    _delete_superseded(tx, question)
+        return _take(tx, _same(key), lease)
+    _delete_superseded(tx, key)
     return True
 
 
-def _delete_superseded(tx: Tx, question: Question) -> None:
+def _delete_superseded(tx: Tx, key: RunKey) -> None:
     """Delete answers to the same question about a past state of the object or of its checks: they are asked
     for no more. Who computes one goes on.
     """
     runs = select(report_runs.c.id, report_runs.c.revision, report_runs.c.parameters).where(
-        report_runs.c.object_id == question.object_id,
-        report_runs.c.report == question.report,
-        report_runs.c.revision <= question.revision,
+        report_runs.c.object_id == key.object_id,
+        report_runs.c.report == key.report,
+        report_runs.c.revision <= key.revision,
         or_(report_runs.c.state != "running", report_runs.c.lease_expires_at < unix_now()),
     )
-    wanted = _without_checks(question.parameters)
+    wanted = _without_checks(key.parameters)
     superseded = [
         run.id
         for run in tx.execute(runs)
         if _without_checks(run.parameters) == wanted
-        and (run.revision < question.revision or run.parameters != question.parameters)
+        and (run.revision < key.revision or run.parameters != key.parameters)
     ]
     tx.execute(delete(report_runs).where(report_runs.c.id.in_(superseded)))
 
@@ -189,11 +189,11 @@ def _held(id: str, lease_id: str) -> ColumnElement[bool]:
     return and_(report_runs.c.id == id, report_runs.c.lease_id == lease_id, report_runs.c.state == "running")
 
 
-def _same(question: Question) -> ColumnElement[bool]:
+def _same(key: RunKey) -> ColumnElement[bool]:
     return and_(
-        report_runs.c.object_id == question.object_id,
-        report_runs.c.parameters_key == question.parameters_key,
-        report_runs.c.revision == question.revision,
+        report_runs.c.object_id == key.object_id,
+        report_runs.c.parameters_key == key.parameters_key,
+        report_runs.c.revision == key.revision,
     )
 
 

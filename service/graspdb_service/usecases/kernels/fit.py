@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -24,14 +25,20 @@ from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacem
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict, invalid
+from graspdb_service.storage import kernels
 from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.report_runs import RunKey, RunRow
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice
 from graspdb_service.usecases.geometry.features import Axes, Features
+from graspdb_service.usecases.runtime.runs import Result, RunKind
 from graspdb_service.usecases.trials.selection import Filters
 
 Fitted = tuple[list[dict[str, Any]], dict[str, Any]]
 """A kernel's components, and what is told of the fit."""
+RUN = "kernel"
+"""What runs that fit a kernel are named where others have their report's name; the kernel has their id."""
 
 #: Displacements that stand for all of them where a sample is compared with them.
 _WHOLE = 20_000
@@ -230,3 +237,26 @@ def info(row: KernelRow) -> StoredKernel:
         provenance=KernelProvenance.model_validate(row.provenance),
         created_at=row.created_at,
     )
+
+
+def run_key(row: ObjectRow, id: str, request: KernelCreate) -> RunKey:
+    """Of the run that fits the kernel of this id: every request makes one of its own, nobody else's."""
+    document = {"report": RUN, "run": id, "request": request.model_dump(mode="json", exclude_unset=True)}
+    return RunKey(row.id, row.revision, RUN, hashlib.sha256(id.encode()).hexdigest(), document)
+
+
+def run_kind(densities: Densities, features: Features, threads: int) -> RunKind:
+    """Runs that fit kernels."""
+
+    def compute(run: RunRow, progress: Progress) -> Result:
+        fields = fitted(
+            densities,
+            features,
+            KernelCreate.model_validate(run.parameters["request"]),
+            threads=threads,
+            computed=lambda work: work(),
+            progress=progress,
+        )
+        return lambda tx: info(kernels.create(tx, run.id, **fields)).model_dump_json()
+
+    return RunKind("fit", compute)

@@ -28,7 +28,7 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.reports.runs import ReportRuns, model
+from graspdb_service.usecases.runtime.runs import Runs, model
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,7 @@ _SAME = 1e-9
 
 
 def create(
-    ctx: Estimators, runs: ReportRuns, request: KernelCreate, *, key: str | None, body: bytes
+    ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | None, body: bytes
 ) -> Created:
     """Store a kernel, or with ``components=auto`` start the run that fits it (status 202) unless it is done
     at once.
@@ -219,7 +219,7 @@ def _fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
 
 
 def _started(
-    ctx: Estimators, runs: ReportRuns, request: KernelCreate, *, scope: str, key: str | None, body: bytes
+    ctx: Estimators, runs: Runs, request: KernelCreate, *, scope: str, key: str | None, body: bytes
 ) -> Created:
     """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
     assert request.object is not None
@@ -228,7 +228,7 @@ def _started(
     id = str(uuid.uuid4())
 
     def make(tx: Tx) -> Created:
-        runs.enter_fit(tx, id, lease, row, request)
+        runs.enter(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
         return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
     made = replay_or(ctx.database, scope=scope, key=key, request=body, create=make)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.wire.kernels import Alignment
 from graspdb.wire.reports import (
     AnisotropyHistogram,
     AnisotropyHypothesis,
+    AnisotropyOptions,
     AnisotropyReport,
     AnisotropyTolerance,
+    Method,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
 from graspdb_density.kde.weighted_sums import Progress
@@ -21,7 +23,6 @@ from graspdb_density.vicinity.anisotropy import (
     LEAST_SUCCESSES,
     Anisotropy,
     Frames,
-    Histogram,
     Tolerance,
     attempt_density,
     empirical,
@@ -34,12 +35,13 @@ from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports import surface_pairs
 from graspdb_service.usecases.reports.common import (
     LEVEL,
-    Sources,
+    ReportInputs,
+    as_model,
     attempts_of,
+    enough,
     finite,
     head,
     need_failures,
-    said,
 )
 from graspdb_service.usecases.trials.attempts import AllTrials
 
@@ -68,17 +70,10 @@ _MIDDLE = 0.03
 
 
 def anisotropy_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: AnisotropyOptions, progress: Progress
 ) -> AnisotropyReport:
-    """The report by ``method`` and ``alignment``.
-
-    Raises
-    ------
-    ProblemError
-        409 for too few trials, no failures, or an alignment that the object's geometry does not have.
-    """
-    method, alignment = options["method"], options["alignment"]
-    frames = _frames(sources, built, alignment)
+    method, alignment = options.method, options.alignment
+    frames = stored_kernel.axes(alignment, built.object_row, built.selected, inputs.scenes.features)
     successes = built.selected.successes
     if successes < LEAST_SUCCESSES:
         raise conflict(
@@ -86,59 +81,49 @@ def anisotropy_report(
             f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
             f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
         )
-    everything = attempts_of(sources, built)
+    everything = attempts_of(inputs, built)
     need_failures(everything, "What a success tells about its vicinity", 1)
-    measure = _measure(sources, built, method, everything)
+    measure = _measure(inputs, built, method, everything)
     # The same grasps along the gripper's axes, for what alignment changes.
     share = 1.0 if alignment == "gripper" else 0.5
-    found = said(lambda: measure(alignment, frames, lambda done: progress(share * done)))
+    found = enough(lambda: measure(alignment, frames, lambda done: progress(share * done)))
     expected = [] if alignment == "object" else wide_axes(found)
     if alignment != "gripper":
-        blurred = said(lambda: measure("gripper", None, lambda done: progress(share * (1.0 + done))))
+        blurred = enough(lambda: measure("gripper", None, lambda done: progress(share * (1.0 + done))))
         expected.append(sharpened(found, blurred))
-    pairs = sources.scenes.features.known_pairs(built.object_row, built.selected)
+    pairs = inputs.scenes.features.known_pairs(built.object_row, built.selected)
     related = [] if pairs is None else surface_pairs.relations(everything, pairs)
-    tolerances, warnings = _told(found, built)
+    tolerances, warnings = _tolerances(found, built)
     if found.aligned < found.grasps and alignment != "gripper":
-        what = (
-            "no edge lies within 30 mm of them, or two do" if alignment == "edge" else "they are at no pair"
-        )
+        near = alignment == "edge"
+        what = "no edge lies within 30 mm of them, or two do" if near else "they are at no pair"
         warnings.append(
             f"{found.grasps - found.aligned:,} of {found.grasps:,} grasps were displaced along the gripper's"
             f" axes: {what}"
         )
-    return AnisotropyReport.model_validate(
-        {
-            **head(built),
-            "text": _tolerances_text(tolerances, alignment)
-            + _hypotheses_text(expected)
-            + surface_pairs.in_words(related),
-            "warnings": warnings,
-            "method": method,
-            "alignment": alignment,
-            "level": LEVEL,
-            "grasps": found.grasps,
-            "attempts": len(everything),
-            "translation_pairs": found.translation_pairs,
-            "rotation_pairs": found.rotation_pairs,
-            "kernel": None if method == "empirical" else built.kernel,
-            "tolerances": tolerances,
-            "translations": [_histogram(item) for item in found.translations],
-            "rotations": [_histogram(item) for item in found.rotations],
-            "aligned": found.aligned,
-            "hypotheses": [_hypothesis(item) for item in expected],
-            "relations": related,
-        }
+    text = _tolerances_text(tolerances, alignment) + _hypotheses_text(expected)
+    return AnisotropyReport(
+        **{**head(built), "text": text + surface_pairs.in_words(related)},
+        warnings=warnings,
+        method=method,
+        alignment=alignment,
+        grasps=found.grasps,
+        attempts=len(everything),
+        translation_pairs=found.translation_pairs,
+        rotation_pairs=found.rotation_pairs,
+        kernel=None if method == "empirical" else built.kernel,
+        tolerances=tolerances,
+        translations=[as_model(AnisotropyHistogram, item) for item in found.translations],
+        rotations=[as_model(AnisotropyHistogram, item) for item in found.rotations],
+        aligned=found.aligned,
+        hypotheses=[as_model(AnisotropyHypothesis, item) for item in expected],
+        relations=related,
     )
 
 
-def _frames(sources: Sources, built: Built, alignment: str) -> Frames | None:
-    return stored_kernel.axes(alignment, built.object_row, built.selected, sources.scenes.features)
-
-
 def _measure(
-    sources: Sources, built: Built, method: str, everything: AllTrials
-) -> Callable[[str, Frames | None, Progress], Anisotropy]:
+    inputs: ReportInputs, built: Built, method: Method, everything: AllTrials
+) -> Callable[[Alignment, Frames | None, Progress], Anisotropy]:
     """The method, ready for any alignment; the same grasps and resamples every time."""
     if method == "density":
         density = built.density
@@ -147,10 +132,10 @@ def _measure(
         return lambda alignment, frames, progress: smoothed(
             density,
             local,
-            alignment=_alignment(alignment),
+            alignment=alignment,
             frames=frames,
             level=LEVEL,
-            threads=sources.threads,
+            threads=inputs.threads,
             progress=progress,
         )
     weights = None
@@ -164,7 +149,7 @@ def _measure(
         everything.success,
         rotation_keys=None if keys is None else keys[0],
         position_keys=None if keys is None else keys[1],
-        alignment=_alignment(alignment),
+        alignment=alignment,
         frames=frames,
         symmetric=symmetric,
         weights=weights,
@@ -173,7 +158,7 @@ def _measure(
     )
 
 
-def _told(found: Anisotropy, built: Built) -> tuple[list[AnisotropyTolerance], list[str]]:
+def _tolerances(found: Anisotropy, built: Built) -> tuple[list[AnisotropyTolerance], list[str]]:
     """Tolerances, and what to mind of them."""
     tolerances = [_tolerance(item) for item in found.tolerances]
     hidden = [item.axis for item in tolerances if item.within] if found.method == "density" else []
@@ -200,10 +185,6 @@ def _told(found: Anisotropy, built: Built) -> tuple[list[AnisotropyTolerance], l
     return tolerances, warnings
 
 
-def _alignment(name: str) -> Any:
-    return name
-
-
 def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Floats, Floats], Floats]:
     """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
     rows = np.arange(len(everything))
@@ -225,37 +206,9 @@ def _tolerance(item: Tolerance) -> AnisotropyTolerance:
     off = distance > _MIDDLE * distance.max(initial=0.0)
     nearest = float(distance[off].min()) if off.any() else math.nan
     within = bool(math.isfinite(item.half_width) and item.half_width < nearest)
-    return AnisotropyTolerance(
-        axis=item.axis,
-        unit="rad" if item.axis.startswith("r") else "m",
-        half_width=finite(nearest if within else item.half_width),
-        low=None if within else finite(item.low),
-        high=None if within else finite(item.high),
-        minus=finite(item.minus),
-        plus=finite(item.plus),
-        beyond=item.beyond,
-        within=within,
-        displacement=item.displacement.tolist(),
-        probability=item.probability.tolist(),
-        profile_low=item.profile_low.tolist(),
-        profile_high=item.profile_high.tolist(),
-        count=item.count.tolist(),
-    )
-
-
-def _histogram(item: Histogram) -> AnisotropyHistogram:
-    def numbers(values: Floats) -> list[list[float | None]]:
-        return [[finite(value) for value in row] for row in values.tolist()]
-
-    return AnisotropyHistogram(
-        axes=item.axes,
-        edges=(item.edges[0].tolist(), item.edges[1].tolist()),
-        slice_m=item.slice_m,
-        probability=numbers(item.probability),
-        low=numbers(item.low),
-        high=numbers(item.high),
-        count=item.count.tolist(),
-    )
+    shown = {"half_width": finite(nearest), "low": None, "high": None} if within else {}
+    unit = "rad" if item.axis.startswith("r") else "m"
+    return as_model(AnisotropyTolerance, item, unit=unit, within=within, **shown)
 
 
 def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> str:
@@ -274,17 +227,6 @@ def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> s
     if not parts:
         return "No tolerance can be told from these trials; the warnings say why."
     return f"A good grasp forgives {', '.join(parts)} ({_AXES[alignment]})."
-
-
-def _hypothesis(item: Hypothesis) -> AnisotropyHypothesis:
-    return AnisotropyHypothesis(
-        name=item.name,
-        ratio=finite(item.ratio),
-        low=finite(item.low),
-        high=finite(item.high),
-        verdict=item.verdict,
-        bound=item.bound,
-    )
 
 
 def _hypotheses_text(found: list[Hypothesis]) -> str:

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
-from graspdb.wire import KernelInfo
+import numpy as np
+
+from graspdb.wire.queries import TrialSelection
 from graspdb.wire.reports import BandwidthPoint, BandwidthReport, SimulatedDraws
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.reports import verification
-from graspdb_service.usecases.reports.common import LEVEL, Sources, finite, head, said
+from graspdb_service.usecases.reports.common import (
+    ReportInputs,
+    as_model,
+    enough,
+    head,
+    isotropic_info,
+    share,
+)
+from graspdb_service.usecases.simulation import verification
 
 #: Widths whose draws are to be simulated, as factors on the recommended ones; 15, 30 and 45 mm in the paper.
 _FACTORS = (0.5, 1.0, 2.0, 3.0)
@@ -21,76 +32,81 @@ _ERRORS = 1.28
 
 
 def bandwidth_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: TrialSelection, progress: Progress
 ) -> BandwidthReport:
-    """The report.
-
-    Raises
-    ------
-    ProblemError
-        409 for too few successes, saying how many are needed.
-    """
     density = built.density
     if density is None:
         raise conflict(
             "too-few-trials",
             "Widths are told apart from 200 successes on; there are 0, so 200 more are needed",
         )
-    scores = said(
+    scores = enough(
         lambda: score_widths(
             density.positions,
             density.quaternions_xyzw,
             weights=density.weights,
             symmetric=density.symmetric,
-            threads=sources.threads,
+            threads=inputs.threads,
             progress=progress,
         )
     )
     best = max((s for s in scores if math.isfinite(s.log_likelihood)), key=lambda s: s.log_likelihood)
     near = [s.kernel for s in scores if s.below_best <= _ERRORS * s.below_best_error]
     near.append(best.kernel)
-    drawn = verification.draws(verification.read(sources.database, built))
+    drawn = simulated_draws(verification.read(inputs.database, built))
     turns = [math.degrees(k.sigma_rotation) for k in near]
     report = BandwidthReport(
         **head(built),
-        text="",
         warnings=_warnings(scores, best, drawn),
-        level=LEVEL,
         kernel=built.kernel,
         rows=min(density.size, MOST_ROWS),
         held_out=min(density.size, MOST_HELD_OUT),
         grid=[_point(item) for item in scores],
-        recommended=_info(best.kernel, "likeliest given other blocks, of all successes"),
+        recommended=isotropic_info(best.kernel, "likeliest given other blocks, of all successes"),
         range_m=(min(k.sigma_position_m for k in near), max(k.sigma_position_m for k in near)),
         range_deg=(min(turns), max(turns)),
         draws=drawn,
-        calls=verification.calls(built, _missing(best.kernel, drawn), _physics(built)),
+        calls=verification.calls(built, _missing(best.kernel, drawn)),
     )
     return report.model_copy(update={"text": _text(report)})
 
 
-def _physics(built: Built) -> str | None:
-    """The protocol to simulate by: that of the trials where it is one that is simulated."""
-    return built.selected.protocol if built.selected.protocol in ("wrench", "lift") else None
-
-
-def _info(kernel: IsotropicKernel, rule: str) -> KernelInfo:
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
-        rule=rule,
-    )
+def simulated_draws(found: Sequence[verification.Check]) -> list[SimulatedDraws]:
+    """What became of draws, those of one kernel and protocol together, the narrowest first."""
+    together: dict[tuple[Any, ...], list[verification.Check]] = {}
+    for item in found:
+        if item.plan == "sample" and item.kernel is not None and len(item.codes):
+            k = item.kernel
+            widths = round(k.sigma_position_m, 9), round(k.sigma_rotation_deg, 6)
+            key = (k.id or "", *widths, item.protocol)
+            together.setdefault(key, []).append(item)
+    result = []
+    for items in together.values():
+        codes = np.concatenate([item.codes for item in items])
+        outcomes = verification.tally(codes)
+        won, hit = outcomes.get("success", 0), outcomes.get("collision", 0)
+        kernel = items[-1].kernel
+        assert kernel is not None
+        result.append(
+            SimulatedDraws(
+                kernel=kernel,
+                protocol=items[0].protocol,
+                draws=len(codes),
+                outcomes=outcomes,
+                success=share(won, len(codes)),
+                collision=share(hit, len(codes)),
+                free_success=share(won, len(codes) - hit),
+            )
+        )
+    return sorted(result, key=lambda d: (d.kernel.id or "", d.kernel.sigma_position_m, d.protocol))
 
 
 def _point(item: WidthScore) -> BandwidthPoint:
-    return BandwidthPoint(
+    return as_model(
+        BandwidthPoint,
+        item,
         sigma_position_m=item.kernel.sigma_position_m,
         sigma_rotation_deg=math.degrees(item.kernel.sigma_rotation),
-        log_likelihood=finite(item.log_likelihood),
-        error=finite(item.error),
-        below_best=finite(item.below_best),
-        below_best_error=finite(item.below_best_error),
     )
 
 

@@ -7,15 +7,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from graspdb.wire import OUTCOME_CODES
+from graspdb.wire.queries import SelectionQuery
 from graspdb.wire.reports import (
     CalibrationBin,
     CalibrationReport,
     CheckedGrasps,
+    ReportRange,
 )
 from graspdb_density import GraspDensity, SuccessModel, importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.success.calibration import (
-    ReliabilityBin,
+    Blocks,
+    Calibration,
     area_under_curve,
     assign_blocks,
     calibrate,
@@ -26,17 +29,19 @@ from graspdb_density.vicinity.anisotropy import LEAST_SUCCESSES
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
-from graspdb_service.usecases.reports import verification
 from graspdb_service.usecases.reports.common import (
     LEVEL,
-    Sources,
+    ReportInputs,
+    as_model,
+    enough,
     finite,
     head,
     interval,
     need_failures,
-    said,
+    share,
 )
-from graspdb_service.usecases.trials import attempts as alltrials
+from graspdb_service.usecases.simulation import verification
+from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
 
 Floats = NDArray[np.float64]
@@ -61,12 +66,12 @@ def _model(everything: AllTrials, rows: NDArray[np.int64], kernel: SuccessKernel
 
 
 def calibration_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: SelectionQuery, progress: Progress
 ) -> CalibrationReport:
-    test = sources.scenes.test(built.object_row, built.selected)
+    test = inputs.scenes.test(built.object_row, built.selected)
     # Where geometry tells them apart, those that collided are only judged, and few of them.
     most = None if test is None else _KEPT_COLLIDED
-    everything = alltrials.read(sources.database, built.object_row, built.selected, most_collided=most)
+    everything = attempts.read(inputs.database, built.object_row, built.selected, most_collided=most)
     successes = int(everything.success.sum())
     if everything.attempts < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
         raise conflict(
@@ -77,14 +82,58 @@ def calibration_report(
     need_failures(everything, "Calibration", LEAST_FAILURES)
     density = built.density
     assert density is not None
-    kernel = density.kernel
-    edge = 3.0 * kernel.sigma_position_m
-    blocks = said(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
+    edge = 3.0 * density.kernel.sigma_position_m
+    blocks = enough(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
     judged, weights = _judged(everything)
+    predicted, ranked = _predictions(inputs, built, everything, test, blocks, judged, progress)
+    won, collided, block = everything.success[judged], everything.collided[judged], blocks.block[judged]
+    whole = calibrate(predicted, won, weights=weights, blocks=block, level=LEVEL)
+    apart = None
+    free = ~collided
+    if test is not None and collided.any() and won[free].any() and not won[free].all():
+        apart = _skill(
+            calibrate(predicted[free], won[free], weights=weights[free], blocks=block[free], level=LEVEL)
+        )
+    checked = _checked(inputs, built, everything, test)
+    report = CalibrationReport(
+        **head(built),
+        kernel=built.kernel,
+        attempts=everything.attempts,
+        successes=successes,
+        judged=len(judged),
+        blocks=blocks.count,
+        block_edge_m=edge,
+        folds=blocks.folds,
+        collisions_known=test is not None,
+        share=float(np.average(won, weights=weights)),
+        brier=whole.brier,
+        skill=_skill(whole),
+        free_skill=apart,
+        ece=finite(whole.ece),
+        auc_probability=finite(whole.auc),
+        auc_density=finite(area_under_curve(ranked, won, weights=weights)),
+        bins=[as_model(CalibrationBin, item) for item in whole.bins],
+        checked=checked,
+        warnings=_warnings(built.object_row.slug, geometry=test is not None, checked=checked is not None),
+    )
+    return report.model_copy(update={"text": _calibration_text(report)})
+
+
+def _predictions(
+    inputs: ReportInputs,
+    built: Built,
+    everything: AllTrials,
+    test: CollisionTest | None,
+    blocks: Blocks,
+    judged: NDArray[np.int64],
+    progress: Progress,
+) -> tuple[Floats, Floats]:
+    """The success probability and the log density of every judged attempt, without the blocks of its fold."""
+    assert built.density is not None
+    kernel = built.density.kernel
     p, q = everything.position[judged], everything.quaternion[judged]
-    won, collided = everything.success[judged], everything.collided[judged]
-    free = None if test is None else test.free(p, q, threads=sources.threads)
     predicted, ranked = np.zeros(len(judged)), np.full(len(judged), -np.inf)
+    free = None if test is None else test.free(p, q, threads=inputs.threads)
     learned = everything.collided if test is not None else np.zeros(len(everything), dtype=bool)
     proposal_known = not np.isnan(everything.proposal).all()
     for fold in range(blocks.folds):
@@ -95,7 +144,7 @@ def calibration_report(
             continue
         model = _model(everything, train, built.success_kernel or kernel)
         progress((fold + 0.5) / blocks.folds)
-        predicted[held] = model.evaluate(p[held], q[held], threads=sources.threads).probability
+        predicted[held] = model.evaluate(p[held], q[held], threads=inputs.threads).probability
         kept = train[everything.success[train]]
         if kept.size:
             own = GraspDensity.build(
@@ -105,84 +154,38 @@ def calibration_report(
                 weights=importance_weights(everything.proposal[kept]) if proposal_known else None,
                 symmetric=everything.symmetric[kept],
             )
-            ranked[held] = own.log_density(p[held], q[held], threads=sources.threads)
+            ranked[held] = own.log_density(p[held], q[held], threads=inputs.threads)
     if free is not None:
         predicted[~free] = 0.0
-    block = blocks.block[judged]
-    whole = calibrate(predicted, won, weights=weights, blocks=block, level=LEVEL)
-    apart = None
-    if test is not None and collided.any() and won[~collided].any() and not won[~collided].all():
-        alone = calibrate(
-            predicted[~collided],
-            won[~collided],
-            weights=weights[~collided],
-            blocks=block[~collided],
-            level=LEVEL,
-        )
-        apart = interval(alone.skill, alone.skill_low, alone.skill_high)
-    share = float(np.average(won, weights=weights))
-    checked = _checked(sources, built, everything, test)
+    return predicted, ranked
+
+
+def _skill(item: Calibration) -> ReportRange:
+    return interval(item.skill, item.skill_low, item.skill_high)
+
+
+def _warnings(slug: str, *, geometry: bool, checked: bool) -> list[str]:
     warnings = []
-    if test is None:
+    if not geometry:
         warnings.append(
             "mesh or gripper is not known: collisions count as ordinary failures, which costs much skill"
         )
-    if checked is None:
-        slug = built.object_row.slug
+    if not checked:
         warnings.append(
             "no best grasps have been simulated again: ask for some and simulate them with"
             f' POST /objects/{slug}/best-grasp {{"count": 25}} and POST /objects/{slug}/sweeps'
             ' {"poses": [...], "fidelity": "fine", "purpose": "check"}, as best_grasps(count=25, verify=True)'
             f" and `graspdb best-grasp {slug} --count 25 --verify` do"
         )
-    report = CalibrationReport(
-        **head(built),
-        text="",
-        level=LEVEL,
-        kernel=built.kernel,
-        attempts=everything.attempts,
-        successes=successes,
-        judged=len(judged),
-        blocks=blocks.count,
-        block_edge_m=edge,
-        folds=blocks.folds,
-        collisions_known=test is not None,
-        share=share,
-        brier=whole.brier,
-        skill=interval(whole.skill, whole.skill_low, whole.skill_high),
-        free_skill=apart,
-        ece=finite(whole.ece),
-        auc_probability=finite(whole.auc),
-        auc_density=finite(area_under_curve(ranked, won, weights=weights)),
-        bins=[_bin(item) for item in whole.bins],
-        checked=checked,
-        warnings=warnings,
-    )
-    return report.model_copy(update={"text": _calibration_text(report)})
-
-
-def _bin(item: ReliabilityBin) -> CalibrationBin:
-    return CalibrationBin(
-        lower=item.lower,
-        upper=item.upper,
-        count=item.count,
-        weight=item.weight,
-        predicted=finite(item.predicted),
-        observed=finite(item.observed),
-        low=finite(item.low),
-        high=finite(item.high),
-    )
+    return warnings
 
 
 def _checked(
-    sources: Sources, built: Built, everything: AllTrials, test: CollisionTest | None
+    inputs: ReportInputs, built: Built, everything: AllTrials, test: CollisionTest | None
 ) -> CheckedGrasps | None:
     """Grasps given to checks against what is predicted of them: no prediction rests on a check's outcome."""
-    found = [
-        item
-        for item in verification.read(sources.database, built)
-        if item.plan == "poses" and len(item.codes)
-    ]
+    read = verification.read(inputs.database, built)
+    found = [item for item in read if item.plan == "poses" and len(item.codes)]
     if not found:
         return None
     p = np.concatenate([item.position for item in found])
@@ -199,19 +202,22 @@ def _checked(
     predicted = np.zeros(len(p))
     if near.any():
         model = _model(everything, np.flatnonzero(near), diagonal or kernel)
-        predicted = model.evaluate(p, q, threads=sources.threads).probability.copy()
+        predicted = model.evaluate(p, q, threads=inputs.threads).probability.copy()
     if test is not None:
-        predicted[~test.free(p, q, threads=sources.threads)] = 0.0
+        predicted[~test.free(p, q, threads=inputs.threads)] = 0.0
     outcomes = verification.tally(codes)
     won = outcomes.get("success", 0)
     success = np.isin(codes, [OUTCOME_CODES["success"]])
     return CheckedGrasps(
         grasps=len(codes),
         successes=won,
-        rate=verification.share(won, len(codes)),
+        rate=share(won, len(codes)),
         predicted=float(predicted.mean()),
         outcomes=outcomes,
-        bins=[_bin(item) for item in reliability(predicted, success, bins=_CHECKED_BINS, level=LEVEL)],
+        bins=[
+            as_model(CalibrationBin, item)
+            for item in reliability(predicted, success, bins=_CHECKED_BINS, level=LEVEL)
+        ],
     )
 
 

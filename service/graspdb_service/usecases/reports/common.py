@@ -1,4 +1,4 @@
-"""What the reports share: what they are computed from, and how too few trials are said."""
+"""What the reports share: what they are computed from, how numbers go to the wire, and too few trials."""
 
 from __future__ import annotations
 
@@ -7,25 +7,36 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from graspdb.wire.reports import (
-    ReportRange,
-)
+import numpy as np
+from pydantic import BaseModel
+from scipy.special import betaincinv
+
+from graspdb.wire import KernelInfo
+from graspdb.wire.reports import ReportRange
+from graspdb_density import IsotropicKernel
+from graspdb_density.bandwidth.matching import Match
+from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.problems import conflict
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import Built, Densities
 from graspdb_service.usecases.geometry.collision import Scenes
-from graspdb_service.usecases.reports.convergence_cache import KeptCurves
+from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
+from graspdb_service.usecases.trials.selection import Filters
 
 T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
 
 LEVEL = 0.9
 """Probability that the intervals of reports hold."""
+#: What a kept match takes, roughly, and all of them may.
+_MATCH_BYTES, _MATCHES_BYTES = 1_024, 2**20
 
 
 @dataclass(frozen=True)
-class Sources:
+class ReportInputs:
     """What reports are computed from."""
 
     database: Database
@@ -35,16 +46,55 @@ class Sources:
     curves: KeptCurves
 
 
-def said(call: Callable[[], T]) -> T:
-    """What the maths refuses as too few trials, as a problem that says so."""
-    try:
-        return call()
-    except ValueError as error:
-        text = str(error)
-        raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
+class KeptCurves:
+    """Convergence curves kept from one report to the next, so that new trials are added to what was summed.
+
+    What a kept curve was made of it tells itself (see `incremental_bootstrap`): after a deletion, other
+    weights or another process's commits it is extended or computed anew as its grasps demand, and reports of
+    several processes agree.
+
+    Parameters
+    ----------
+    max_bytes
+        What all of them together may take; a curve of 20,000 points takes about 10 MB.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._curves: SingleFlightCache[tuple[int, Filters, str | None, float, float], GrowingCurve]
+        self._curves = SingleFlightCache(max_bytes, lambda curve: curve.nbytes)
+        self._matches: SingleFlightCache[tuple[bytes, str], Match]
+        self._matches = SingleFlightCache(_MATCHES_BYTES, lambda _: _MATCH_BYTES)
+
+    def grown(
+        self,
+        built: Built,
+        matched: Match | None,
+        grow: Callable[[GrowingCurve | None, Progress], GrowingCurve],
+        progress: Progress,
+    ) -> GrowingCurve:
+        """The curve of a density, or of the isotropic kernel matched to it, made by ``grow`` of the one kept
+        before.
+        """
+        kernel = built.kernel
+        widths = (
+            (kernel.sigma_position_m, kernel.sigma_rotation_deg)
+            if matched is None
+            else (matched.kernel.sigma_position_m, matched.kernel.sigma_rotation)
+        )
+        key = (built.object_row.id, built.selected.filters, kernel.id, *widths)
+        # A curve that nothing is to be added to comes back as it is.
+        return self._curves.get(key, lambda _: False, lambda before: grow(before, progress))
+
+    def match(self, curve: GrowingCurve, rule: str, make: Callable[[], Match]) -> Match:
+        """The isotropic kernel matched to a curve's: the same until the curve is computed anew."""
+        return self._matches.get((curve.generation, rule), lambda _: True, lambda _: make())
+
+
+# -- to the wire
 
 
 def head(built: Built) -> dict[str, Any]:
+    """What every report says first; its text follows."""
     selected = built.selected
     return {
         "object": built.object_row.slug,
@@ -52,7 +102,23 @@ def head(built: Built) -> dict[str, Any]:
         "gripper": selected.gripper,
         "protocol": selected.protocol,
         "source": selected.source,
+        "level": LEVEL,
+        "text": "",
     }
+
+
+def as_model(model: type[M], item: object, **more: Any) -> M:
+    """A model of an item's fields of the same names; what is not finite becomes null."""
+    names = [name for name in model.model_fields if name not in more and hasattr(item, name)]
+    return model.model_validate({**{name: _plain(getattr(item, name)) for name in names}, **more})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def finite(value: float) -> float | None:
@@ -63,8 +129,38 @@ def interval(value: float, low: float, high: float) -> ReportRange:
     return ReportRange(value=finite(value), low=finite(low), high=finite(high))
 
 
-def attempts_of(sources: Sources, built: Built) -> AllTrials:
-    return attempts.read(sources.database, built.object_row, built.selected)
+def share(won: float, tried: float) -> ReportRange:
+    """A share of independent trials with Jeffreys' interval, which includes what was seen."""
+    if not tried > 0:
+        return ReportRange(value=None, low=None, high=None)
+    value, tail = won / tried, 0.5 * (1.0 - LEVEL)
+    low, high = (float(betaincinv(won + 0.5, tried - won + 0.5, t)) for t in (tail, 1.0 - tail))
+    return ReportRange(value=value, low=min(low, value), high=max(high, value))
+
+
+def isotropic_info(kernel: IsotropicKernel, rule: str) -> KernelInfo:
+    return KernelInfo(
+        kind="isotropic",
+        sigma_position_m=kernel.sigma_position_m,
+        sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
+        rule=rule,
+    )
+
+
+# -- what there has to be
+
+
+def enough(call: Callable[[], T]) -> T:
+    """What the maths refuses as too few trials, as a problem that says so."""
+    try:
+        return call()
+    except ValueError as error:
+        text = str(error)
+        raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
+
+
+def attempts_of(inputs: ReportInputs, built: Built) -> AllTrials:
+    return attempts.read(inputs.database, built.object_row, built.selected)
 
 
 def need_failures(everything: AllTrials, what: str, least: int) -> None:

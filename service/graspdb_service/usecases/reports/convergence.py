@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from graspdb.wire import KernelInfo
 from graspdb.wire.reports import ConvergenceCurve as CurveModel
 from graspdb.wire.reports import (
+    ConvergenceOptions,
     ConvergencePoint,
     ConvergenceReport,
     ReportRange,
     SimulatedDraws,
 )
 from graspdb.wire.reports import Verdict as VerdictModel
-from graspdb_density import GraspDensity, IsotropicKernel
+from graspdb_density import GraspDensity, IsotropicKernel, MixtureDensity
 from graspdb_density.bandwidth.matching import (
     Match,
     match_determinants,
@@ -32,8 +33,17 @@ from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.reports import verification
-from graspdb_service.usecases.reports.common import LEVEL, Sources, head, interval, said
+from graspdb_service.usecases.reports.bandwidth import simulated_draws
+from graspdb_service.usecases.reports.common import (
+    LEVEL,
+    ReportInputs,
+    as_model,
+    enough,
+    head,
+    interval,
+    isotropic_info,
+)
+from graspdb_service.usecases.simulation import verification
 
 Floats = NDArray[np.float64]
 
@@ -54,68 +64,67 @@ _SUCCESS_FACTORS, _LEAST_WIDTHS, _ALIKE = (0.4, 0.6, 0.8, 1.0, 1.25), 3, 0.02
 
 
 def convergence_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: ConvergenceOptions, progress: Progress
 ) -> ConvergenceReport:
-    density = built.density
-    # Said before anything is computed.
-    said(lambda: curve_sizes(0 if density is None else density.size))
+    density, shaped = built.density, built.shaped
+    # What is missing is said before anything is computed.
+    enough(lambda: curve_sizes(0 if density is None else density.size))
     assert density is not None
     if built.sampled is not None:
         raise conflict(
             "kernel-sampled",
             "Convergence is measured under isotropic and anisotropic kernels, not under sampled ones",
         )
-    matching = options.get("matching") if built.shaped is None else options.get("matching", "determinants")
-    if matching is not None and built.shaped is None:
-        raise conflict(
-            "nothing-to-match", "matching compares an anisotropic kernel with an isotropic one: name kernel="
-        )
-    # Missing checks are said before anything is computed.
-    match: Match | None = None
-    ends: tuple[Match, ...] = ()
-    if matching == "success" and built.shaped is not None:
-        match, ends = _by_success(sources, built)
-    share = 1.0 if built.shaped is None else 0.5
-    kernel: Kernel = density.kernel if built.shaped is None else built.shaped.kernel
-    frames = None
-    if built.shaped is not None and built.kernel.alignment not in (None, "gripper"):
-        # As the density has them: those of new trials only were looked for.
-        frames = built.shaped.frames
-    grown = _curve(sources, built, None, kernel, frames, _part_of(progress, 0.0, share))
-    curve = grown.curve
-    curves = [_curve_model("isotropic" if built.shaped is None else "anisotropic", built.kernel, curve)]
-    extra: dict[str, Any] = {}
-    if built.shaped is not None:
-        match = match or _matched(sources, density, grown, kernel, frames, str(matching))
-        others = []
-        # The matched kernel, and where its width is known by draws the narrowest and widest that may match.
-        for part, other in enumerate((match, *ends)):
-            each = 0.5 / (1 + len(ends))
-            told = _part_of(progress, 0.5 + each * part, each)
-            others.append(_curve(sources, built, other, other.kernel, None, told).curve)
-        curves.append(_curve_model("isotropic, matched", _isotropic_info(match), others[0]))
-        ratio = needed_ratio(curve, others[0], ends=others[1:], level=LEVEL)
-        extra = {"matching": matching, "matched": match.reached, "ratio": interval(*ratio)}
-    judged = curves[0].verdict
-    warnings = (
-        [] if judged.exponent > 0 else ["the curve does not rise: it is noise, or all grasps are alike"]
-    )
+    if shaped is None:
+        if options.matching is not None:
+            raise conflict(
+                "nothing-to-match",
+                "matching compares an anisotropic kernel with an isotropic one: name kernel=",
+            )
+        grown = _curve(inputs, built, None, density.kernel, None, progress)
+        return _report(built, grown, [_curve_model("isotropic", built.kernel, grown.curve)])
+    rule = options.matching or "determinants"
+    match, ends = _by_success(inputs, built, shaped) if rule == "success" else (None, ())
+    # As the density has them: those of new trials only were looked for.
+    frames = None if built.kernel.alignment in (None, "gripper") else shaped.frames
+    grown = _curve(inputs, built, None, shaped.kernel, frames, _part_of(progress, 0.0, 0.5))
+    match = match or _matched(inputs, density, grown, shaped.kernel, frames, rule)
+    others = []
+    # The matched kernel, and where its width is known by draws the narrowest and widest that may match.
+    for part, other in enumerate((match, *ends)):
+        each = 0.5 / (1 + len(ends))
+        told = _part_of(progress, 0.5 + each * part, each)
+        others.append(_curve(inputs, built, other, other.kernel, None, told).curve)
+    ratio = interval(*needed_ratio(grown.curve, others[0], ends=others[1:], level=LEVEL))
+    curves = [
+        _curve_model("anisotropic", built.kernel, grown.curve),
+        _curve_model(
+            "isotropic, matched", isotropic_info(match.kernel, f"matched by {match.rule}"), others[0]
+        ),
+    ]
+    return _report(built, grown, curves, match, matching=rule, matched=match.reached, ratio=ratio)
+
+
+def _report(
+    built: Built, grown: GrowingCurve, curves: list[CurveModel], match: Match | None = None, **matched: Any
+) -> ConvergenceReport:
+    warnings = []
+    if not curves[0].verdict.exponent > 0:
+        warnings.append("the curve does not rise: it is noise, or all grasps are alike")
     if match is not None and not match.reached:
         warnings.append(
             f"no width tried matches by {match.rule}: {match.achieved:.3g} comes nearest to"
             f" {match.target:.3g}"
         )
     return ConvergenceReport(
-        **head(built),
-        text=_convergence_text(curves[0], extra.get("ratio")),
-        level=LEVEL,
-        held_out=curve.held_out,
+        **{**head(built), "text": _convergence_text(curves[0], matched.get("ratio"))},
+        held_out=grown.curve.held_out,
         subsets=SUBSETS,
         replicates=REPLICATES,
         method=_METHOD.format(prefix=grown.prefix),
         curves=curves,
         warnings=warnings,
-        **extra,
+        **matched,
     )
 
 
@@ -124,7 +133,7 @@ def _part_of(progress: Progress, begin: float, share: float) -> Progress:
 
 
 def _curve(
-    sources: Sources,
+    inputs: ReportInputs,
     built: Built,
     matched: Match | None,
     kernel: Kernel,
@@ -147,15 +156,15 @@ def _curve(
             subsets=SUBSETS,
             replicates=REPLICATES,
             points=POINTS,
-            threads=sources.threads,
+            threads=inputs.threads,
             progress=progress,
         )
 
-    return said(lambda: sources.curves.grown(built, matched, grow, progress))
+    return enough(lambda: inputs.curves.grown(built, matched, grow, progress))
 
 
 def _matched(
-    sources: Sources,
+    inputs: ReportInputs,
     density: GraspDensity,
     grown: GrowingCurve,
     kernel: Kernel,
@@ -177,14 +186,16 @@ def _matched(
             p[train], q[train], used, weights=w[train], symmetric=density.symmetric[train],
             frames=None if isinstance(used, IsotropicKernel) else frames,
         )  # fmt: skip
-        return float(np.average(rows.log_density(p[held], q[held], threads=sources.threads), weights=w[held]))
+        return float(np.average(rows.log_density(p[held], q[held], threads=inputs.threads), weights=w[held]))
 
-    return sources.curves.match(
+    return inputs.curves.match(
         grown, rule, lambda: match_likelihood(likelihood(kernel), match.kernel, likelihood)
     )
 
 
-def _by_success(sources: Sources, built: Built) -> tuple[Match, tuple[Match, ...]]:
+def _by_success(
+    inputs: ReportInputs, built: Built, shaped: MixtureDensity
+) -> tuple[Match, tuple[Match, ...]]:
     """The isotropic kernel whose simulated draws succeed as often as those of the stored one, and the
     narrowest and widest that may, as the draws are few; none where no width tried succeeds as often.
 
@@ -193,9 +204,8 @@ def _by_success(sources: Sources, built: Built) -> tuple[Match, tuple[Match, ...
     ProblemError
         409 ``checks-needed`` while draws of either have not been simulated, with the sweeps that do it.
     """
-    assert built.shaped is not None
-    base = match_determinants(built.shaped.kernel).kernel
-    drawn = verification.draws(verification.read(sources.database, built))
+    base = match_determinants(shaped.kernel).kernel
+    drawn = simulated_draws(verification.read(inputs.database, built))
     target = next((item for item in drawn if item.kernel.id == built.kernel.id), None)
     found: dict[float, SimulatedDraws] = {}
     for item in drawn:
@@ -211,8 +221,7 @@ def _by_success(sources: Sources, built: Built) -> tuple[Match, tuple[Match, ...
     near = {f for f in _SUCCESS_FACTORS if any(abs(g / f - 1.0) < _ALIKE for g in found)}
     missing += [scaled(base, f) for f in _SUCCESS_FACTORS if f not in near]
     if target is None or len(found) < _LEAST_WIDTHS:
-        protocol = built.selected.protocol
-        calls = verification.calls(built, missing, protocol if protocol in ("wrench", "lift") else None)
+        calls = verification.calls(built, missing)
         raise conflict(
             "checks-needed",
             "Matching by success compares draws of this kernel and of isotropic ones at several widths, which"
@@ -235,45 +244,21 @@ def _by_success(sources: Sources, built: Built) -> tuple[Match, tuple[Match, ...
     return match, tuple(replace(match, kernel=kernel) for kernel in kernels)
 
 
-def _isotropic_info(match: Match) -> KernelInfo:
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=match.kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(match.kernel.sigma_rotation),
-        rule=f"matched by {match.rule}",
-    )
-
-
 def _curve_model(label: str, kernel: KernelInfo, curve: ConvergenceCurve) -> CurveModel:
     judged = verdict(curve, level=LEVEL)
     needed = judged.needed
     least, best, most = judged.more
-    return CurveModel(
-        label=label,
-        kernel=kernel,
-        points=[
-            ConvergencePoint(
-                grasps=point.grasps,
-                similarity=point.similarity,
-                deviation=point.deviation,
-                log_likelihood=point.log_likelihood,
-                log_likelihood_error=point.log_likelihood_error,
-            )
-            for point in curve.points
-        ],
-        verdict=VerdictModel.model_validate(
-            {
-                "state": judged.state,
-                "grasps": judged.grasps,
-                "target": needed.target,
-                "similarity": interval(judged.similarity, judged.low, judged.high),
-                "needed": interval(needed.grasps, needed.low, needed.high),
-                "more": interval(best, least, most),
-                "extrapolated": needed.extrapolated,
-                "exponent": judged.exponent,
-            }
-        ),
+    told = as_model(
+        VerdictModel,
+        judged,
+        target=needed.target,
+        similarity=interval(judged.similarity, judged.low, judged.high),
+        needed=interval(needed.grasps, needed.low, needed.high),
+        more=interval(best, least, most),
+        extrapolated=needed.extrapolated,
     )
+    points = [as_model(ConvergencePoint, point) for point in curve.points]
+    return CurveModel(label=label, kernel=kernel, points=points, verdict=told)
 
 
 def _convergence_text(curve: CurveModel, ratio: ReportRange | None) -> str:

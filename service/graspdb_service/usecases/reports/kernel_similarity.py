@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from graspdb.wire.reports import KernelSimilarityReport, SimilarityPoint
+from graspdb.wire.queries import TrialSelection
+from graspdb.wire.reports import KernelSimilarityOptions, KernelSimilarityReport, SimilarityPoint
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.bandwidth.component_count import mixture_curve
 from graspdb_density.bandwidth.mixture_fit import (
@@ -19,28 +20,17 @@ from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelP
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.reports.common import LEVEL, Sources, head
+from graspdb_service.usecases.reports.common import ReportInputs, head
 
 #: Displacements that stand for the full statistics, and what the paper limits a kernel to.
 _REFERENCE, _PAPER = 20_000, 900
 
 
 def kernel_similarity_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: KernelSimilarityOptions, progress: Progress
 ) -> KernelSimilarityReport:
-    """The report.
-
-    Raises
-    ------
-    ProblemError
-        409 for too few successes, or displacements between them, saying how many are needed.
-    """
-    window = DisplacementWindow(
-        float(options["window_position_m"]), math.radians(float(options["window_rotation_deg"]))
-    )
-    widths = IsotropicKernel(
-        float(options["component_position_m"]), math.radians(float(options["component_rotation_deg"]))
-    )
+    window = DisplacementWindow(options.window_position_m, math.radians(options.window_rotation_deg))
+    widths = IsotropicKernel(options.component_position_m, math.radians(options.component_rotation_deg))
     found = _displacements(built, window)
     progress(0.1)
     rng = np.random.default_rng(0)
@@ -53,7 +43,7 @@ def kernel_similarity_report(
         window=window,
         rng=rng,
         reference=_REFERENCE,
-        threads=sources.threads,
+        threads=inputs.threads,
     )
     progress(0.4)
     mixtures = mixture_curve(
@@ -62,24 +52,19 @@ def kernel_similarity_report(
         window=window,
         rng=rng,
         reference=_REFERENCE,
-        threads=sources.threads,
+        threads=inputs.threads,
         progress=lambda done: progress(0.4 + 0.6 * done),
     )
     report = KernelSimilarityReport(
         **head(built),
-        text="",
-        level=LEVEL,
-        window_position_m=window.position_m,
-        window_rotation_deg=math.degrees(window.rotation),
-        component_position_m=widths.sigma_position_m,
-        component_rotation_deg=math.degrees(widths.sigma_rotation),
+        **options.model_dump(exclude=set(TrialSelection.model_fields)),
         successes=built.selected.successes,
         displacements=len(found.vectors),
         reference=min(_REFERENCE, len(found.vectors)),
         samples=[_point(item) for item in samples],
         mixtures=[_point(item) for item in mixtures],
     )
-    return report.model_copy(update={"text": _text(report)})
+    return report.model_copy(update={"text": _text(report, window, widths)})
 
 
 def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
@@ -113,9 +98,14 @@ def _point(item: SampledKernelPoint) -> SimilarityPoint:
     return SimilarityPoint(count=item.samples, similarity=item.similarity, error=item.standard_error)
 
 
-def _text(report: KernelSimilarityReport) -> str:
-    window = f"{1e3 * report.window_position_m:.0f} mm and {report.window_rotation_deg:.0f} deg"
-    widths = f"{1e3 * report.component_position_m:.0f} mm and {report.component_rotation_deg:.0f} deg"
+def _text(report: KernelSimilarityReport, window: DisplacementWindow, widths: IsotropicKernel) -> str:
+    told = [
+        f"{1e3 * metres:.0f} mm and {math.degrees(turn):.0f} deg"
+        for metres, turn in (
+            (window.position_m, window.rotation),
+            (widths.sigma_position_m, widths.sigma_rotation),
+        )
+    ]
     parts = []
     nearest = min(report.samples, key=lambda item: abs(item.count - _PAPER))
     parts.append(f"{nearest.count:,} samples have a similarity of {nearest.similarity:.2f}")
@@ -125,4 +115,4 @@ def _text(report: KernelSimilarityReport) -> str:
     parts.append(f"1 Gaussian {first.similarity:.2f}")
     if enough.count > 1:
         parts.append(f"a mixture of {enough.count} {enough.similarity:.2f}")
-    return f"{', '.join(parts)} (window {window}, components {widths})."
+    return f"{', '.join(parts)} (window {told[0]}, components {told[1]})."

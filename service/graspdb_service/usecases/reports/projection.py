@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from graspdb.wire.reports import ProjectionProfile, ProjectionReport
+from graspdb.wire.base import Triple
+from graspdb.wire.reports import ProjectionOptions, ProjectionProfile, ProjectionReport
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
 from graspdb_geometry import meshes
@@ -18,7 +18,7 @@ from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.reports.common import LEVEL, Sources, head, interval
+from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, interval
 
 Floats = NDArray[np.float64]
 
@@ -29,15 +29,9 @@ _FEW = 50
 
 
 def projection_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: ProjectionOptions, progress: Progress
 ) -> ProjectionReport:
     """The density on a plane.
-
-    Parameters
-    ----------
-    options
-        ``plane`` (a key of :data:`PLANES` or a normal as JSON; none: the one that shows most of the grasps),
-        ``approach`` and ``direction`` (vectors as JSON) with ``*_cone_deg``.
 
     Raises
     ------
@@ -51,14 +45,13 @@ def projection_report(
             "A projection needs at least 1 successful trial, and there is none: post trials"
             f" (POST /objects/{built.object_row.slug}/trials) or sweep a grid first",
         )
-    name, plane = _plane(options.get("plane"), built.density.positions)
-    approach, direction = _vector(options.get("approach")), _vector(options.get("direction"))
-    cones = {key: float(options[key]) for key in ("approach_cone_deg", "direction_cone_deg")}
+    name, plane = _plane(options.plane, built.density.positions)
+    approach, direction = _vector(options.approach), _vector(options.direction)
     wanted = Orientation(
         approach=approach,
-        approach_cone=math.radians(cones["approach_cone_deg"]),
+        approach_cone=math.radians(options.approach_cone_deg),
         direction=direction,
-        direction_cone=math.radians(cones["direction_cone_deg"]),
+        direction_cone=math.radians(options.direction_cone_deg),
     )
     found = marginal(density, plane, wanted, level=LEVEL)
     progress(0.8)
@@ -69,14 +62,10 @@ def projection_report(
             f"None of the {built.density.size:,} successful grasps points that way: widen approach_cone_deg"
             " or direction_cone_deg, or leave approach or direction out",
         )
-    warnings = []
-    if found.passing < _FEW:
-        warnings.append(f"the picture rests on {found.passing:,} grasps: single ones show")
+    few = found.passing < _FEW
     report = ProjectionReport(
         **head(built),
-        text="",
-        warnings=warnings,
-        level=LEVEL,
+        warnings=[f"the picture rests on {found.passing:,} grasps: single ones show"] if few else [],
         kernel=built.kernel,
         grasps=built.density.size,
         passing=found.passing,
@@ -86,36 +75,36 @@ def projection_report(
         across=_triple(plane.across),
         upward=_triple(plane.upward),
         approach=None if approach is None else _triple(approach),
-        approach_cone_deg=None if approach is None else cones["approach_cone_deg"],
+        approach_cone_deg=None if approach is None else options.approach_cone_deg,
         direction=None if direction is None else _triple(direction),
-        direction_cone_deg=None if direction is None else cones["direction_cone_deg"],
+        direction_cone_deg=None if direction is None else options.direction_cone_deg,
         across_m=_rounded(found.across_edges, 6),
         upward_m=_rounded(found.upward_edges, 6),
         values=np.round(found.value / peak, 4).tolist(),
         peak_per_m2=peak,
         profiles=_profiles(found, plane),
-        outline=_outline(sources, built, plane),
+        outline=_outline(inputs, built, plane),
         drawn=found.drawn,
     )
     return report.model_copy(update={"text": _text(report, found)})
 
 
-def _plane(given: str | None, positions: Floats) -> tuple[str, Plane]:
+def _plane(given: str | Triple | None, positions: Floats) -> tuple[str, Plane]:
     if given is None:
         extent = np.ptp(positions, axis=0)
         hidden = int(np.argmin(extent))
         given = "".join(letter for i, letter in enumerate("xyz") if i != hidden)
-    if given in PLANES:
+    if isinstance(given, str):
         return given, Plane.facing(np.array(PLANES[given]))
-    normal = np.array(json.loads(given), dtype=np.float64)
+    normal = np.array(given, dtype=np.float64)
     return "facing " + ",".join(f"{x:.3g}" for x in normal), Plane.facing(normal)
 
 
-def _vector(given: str | None) -> Floats | None:
-    return None if given is None else np.array(json.loads(given), dtype=np.float64)
+def _vector(given: Triple | None) -> Floats | None:
+    return None if given is None else np.array(given, dtype=np.float64)
 
 
-def _triple(values: Floats) -> tuple[float, float, float]:
+def _triple(values: Floats) -> Triple:
     x, y, z = (round(float(value), 9) + 0.0 for value in values)
     return x, y, z
 
@@ -146,10 +135,10 @@ def _profiles(found: Marginal, plane: Plane) -> list[ProjectionProfile]:
     ]
 
 
-def _outline(sources: Sources, built: Built, plane: Plane) -> list[list[tuple[float, float]]]:
+def _outline(inputs: ReportInputs, built: Built, plane: Plane) -> list[list[tuple[float, float]]]:
     """The silhouette of every convex part, or of the mesh's hull; nothing without geometry."""
     polygons = []
-    for corners in _corners(sources.database, built.object_row):
+    for corners in _corners(inputs.database, built.object_row):
         flat = np.stack([corners @ plane.across, corners @ plane.upward], axis=1)
         try:
             hull = flat[ConvexHull(flat).vertices]

@@ -1,66 +1,39 @@
-"""The reports, computed: parameters to the documents of :mod:`graspdb.wire.reports`."""
+"""The reports of one service process: what a request asks for, as a run's key, and how a run computes it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import hashlib
+import json
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from graspdb.wire.reports import AnyReport
+from graspdb.wire import Selection
+from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.usecases.densities.cache import Built, KernelChoice
+from graspdb_service import __version__
+from graspdb_service.settings import Settings
+from graspdb_service.storage import report_runs
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.report_runs import RunKey, RunRow
+from graspdb_service.storage.simulation import outcomes
+from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice, kernel_of
+from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.reports.anisotropy import anisotropy_report
 from graspdb_service.usecases.reports.bandwidth import bandwidth_report
 from graspdb_service.usecases.reports.calibration import calibration_report
-from graspdb_service.usecases.reports.common import Sources
+from graspdb_service.usecases.reports.common import KeptCurves, ReportInputs
 from graspdb_service.usecases.reports.convergence import convergence_report
 from graspdb_service.usecases.reports.kernel_similarity import kernel_similarity_report
 from graspdb_service.usecases.reports.projection import projection_report
 from graspdb_service.usecases.reports.sources import sources_report
+from graspdb_service.usecases.runtime.runs import Result, RunKind
 from graspdb_service.usecases.trials.selection import Filters
 
-
-@dataclass(frozen=True)
-class Asked:
-    """Parameters of a report, everything resolved: the same ones give the same report of a revision."""
-
-    report: str
-    filters: Filters
-    kernel: KernelChoice
-    options: dict[str, str]
-
-    def document(self) -> dict[str, Any]:
-        """As a run keeps it."""
-        return {
-            "report": self.report,
-            "filters": vars(self.filters),
-            "kernel": vars(self.kernel),
-            "options": self.options,
-        }
-
-    @classmethod
-    def of(cls, document: dict[str, Any]) -> Asked:
-        return cls(
-            document["report"],
-            Filters(**document["filters"]),
-            KernelChoice(**document["kernel"]),
-            document["options"],
-        )
-
-
-def compute(sources: Sources, slug: str, asked: Asked, progress: Progress) -> AnyReport:
-    """The report.
-
-    Raises
-    ------
-    ProblemError
-        409 where the trials don't suffice, saying what is missing and how much of it.
-    """
-    built = sources.densities.get(slug, asked.filters, asked.kernel)
-    return _REPORTS[asked.report](sources, built, asked.options, progress)
-
-
-_REPORTS: dict[str, Callable[[Sources, Built, dict[str, str], Progress], AnyReport]] = {
+#: Kept convergence curves may take this part of what densities may.
+_CURVES_SHARE = 4
+#: Reports that say what became of simulated checks.
+_OF_CHECKS = ("bandwidth", "calibration")
+_COMPUTE: Mapping[str, Callable[[ReportInputs, Built, Any, Progress], AnyReport]] = {
     "anisotropy": anisotropy_report,
     "bandwidth": bandwidth_report,
     "calibration": calibration_report,
@@ -69,3 +42,63 @@ _REPORTS: dict[str, Callable[[Sources, Built, dict[str, str], Progress], AnyRepo
     "projection": projection_report,
     "sources": sources_report,
 }
+
+
+class Reports:
+    """What runs of reports are keyed by, and how they are computed."""
+
+    def __init__(self, settings: Settings, database: Database, densities: Densities, scenes: Scenes) -> None:
+        curves = KeptCurves(settings.max_density_cache_bytes // _CURVES_SHARE)
+        self._inputs = ReportInputs(database, densities, scenes, settings.threads, curves)
+
+    def key(self, slug: str, report: str, options: ReportOptions) -> RunKey:
+        """The run of a report, everything resolved: the same parameters give the same report of a revision.
+
+        Raises
+        ------
+        ProblemError
+            404 and 409 as the selection.
+        """
+        selection = Selection(**{name: getattr(options, name, None) for name in Selection.model_fields})
+        choice, _ = kernel_of(selection)
+        densities = self._inputs.densities
+        row, selected = densities.current(slug, Filters.of(selection))
+        if choice.stored is not None:
+            choice = KernelChoice(stored=densities.stored(row, selected, choice.stored).id)
+        own = options.model_dump(mode="json", exclude=set(Selection.model_fields), exclude_none=True)
+        if report in _OF_CHECKS or own.get("matching") == "success":
+            # Checks change no revision: what of them there is belongs to the question.
+            with self._inputs.database.read() as tx:
+                own[report_runs.CHECKS] = outcomes.checks_stamp(tx, row.id)
+        parameters = {
+            "report": report,
+            "filters": vars(selected.filters),
+            "kernel": vars(choice),
+            "options": own,
+        }
+        digest = hashlib.sha256(json.dumps([parameters, __version__], sort_keys=True).encode()).hexdigest()
+        return RunKey(row.id, row.revision, report, digest, parameters)
+
+    def compute(self, slug: str, parameters: Mapping[str, Any], progress: Progress) -> AnyReport:
+        """The report by the parameters of a run.
+
+        Raises
+        ------
+        ProblemError
+            409 where the trials don't suffice, saying what is missing and how much of it.
+        """
+        report = parameters["report"]
+        own = {name: value for name, value in parameters["options"].items() if name != report_runs.CHECKS}
+        options = REPORTS[report].options.model_validate(own)
+        filters, kernel = Filters(**parameters["filters"]), KernelChoice(**parameters["kernel"])
+        built = self._inputs.densities.get(slug, filters, kernel)
+        return _COMPUTE[report](self._inputs, built, options, progress)
+
+    def run_kinds(self) -> dict[str, RunKind]:
+        """Runs that compute reports."""
+
+        def compute(run: RunRow, progress: Progress) -> Result:
+            result = self.compute(run.object, run.parameters, progress).model_dump_json()
+            return lambda tx: result
+
+        return dict.fromkeys(REPORTS, RunKind("report", compute))

@@ -9,23 +9,34 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from graspdb.wire import OUTCOMES, KernelInfo
+from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import (
     CalibrationBin,
     ReportRange,
     SourceComparison,
     SourceSimilarity,
+    SourcesOptions,
     SourcesReport,
 )
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.success.calibration import ReliabilityBin, calibrate
+from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import conflict
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.reports.common import LEVEL, Sources, finite, head, interval
-from graspdb_service.usecases.reports.verification import share
+from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.reports.common import (
+    LEVEL,
+    ReportInputs,
+    as_model,
+    attempts_of,
+    finite,
+    head,
+    interval,
+    isotropic_info,
+    share,
+)
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
 from graspdb_service.usecases.trials.selection import Selected
@@ -46,63 +57,27 @@ _POINTS = 8_000
 
 
 def sources_report(
-    sources: Sources, built: Built, options: dict[str, str], progress: Progress
+    inputs: ReportInputs, built: Built, options: SourcesOptions, progress: Progress
 ) -> SourcesReport:
-    """Compare each source of real trials with simulation.
-
-    Parameters
-    ----------
-    built
-        Of the simulated trials.
-
-    Raises
-    ------
-    ProblemError
-        409 where simulation has too few attempts, or no other source has any trial, saying what is needed.
-    """
-    simulated = attempts.read(sources.database, built.object_row, built.selected)
-    slug = built.object_row.slug
-    if len(simulated) < LEAST_SIMULATED or built.density is None:
-        raise conflict(
-            "too-few-trials",
-            f"A comparison needs at least {LEAST_SIMULATED} simulated attempts and 1 success in them; there"
-            f" are {len(simulated)} and {built.selected.successes}: sweep a grid"
-            f" (POST /objects/{slug}/sweeps)",
-        )
-    real = {source: found for source in REAL if (found := _selected(sources, built, source)) is not None}
-    if not real:
-        raise conflict(
-            "too-few-trials",
-            "There are no trials of a robot, a human or an import to compare simulation with: post at least"
-            f" {LEAST_TRIALS} (POST /objects/{slug}/trials with source robot)",
-        )
-    kernel = built.density.kernel
-    test = sources.scenes.test(built.object_row, built.selected)
-    trials_of = {source: _all(sources, built, selected) for source, selected in real.items()}
+    """Compare each source of real trials with simulation, whose trials ``built`` is of."""
+    simulated = attempts_of(inputs, built)
+    real = _real(inputs, built, simulated)
+    assert built.density is not None
+    test = inputs.scenes.test(built.object_row, built.selected)
+    trials_of = {source: _all(inputs, built, selected) for source, selected in real.items()}
     progress(0.3)
+    kernel = built.density.kernel
     model = _model(simulated, list(trials_of.values()), kernel, collisions_known=test is not None)
     progress(0.5)
     compared = []
     for number, (source, selected) in enumerate(real.items()):
         progress(0.5 + 0.5 * number / len(real))
         everything = trials_of[source]
-        predicted = np.zeros(len(everything))
-        reached = np.zeros(len(everything), dtype=bool)
-        if model is not None:
-            answer = model.evaluate(everything.position, everything.quaternion, threads=sources.threads)
-            predicted = answer.probability.copy()
-            reached = answer.effective_trials >= _WITHIN_REACH
-        if test is not None:
-            free = test.free(everything.position, everything.quaternion, threads=sources.threads)
-            predicted[~free] = 0.0
-            # Geometry tells of a collision wherever it is.
-            reached |= ~free
-        compared.append(_compared(sources, built, source, selected, everything, predicted, reached))
+        predicted, reached = _predictions(everything, model, test, inputs.threads)
+        compared.append(_compared(inputs, built, selected, everything, predicted, reached))
     report = SourcesReport(
         **{**head(built), "source": None},
-        text="",
         warnings=_warnings(compared, collisions_known=test is not None),
-        level=LEVEL,
         kernel=built.kernel,
         attempts=len(simulated),
         successes=int(simulated.success.sum()),
@@ -111,6 +86,50 @@ def sources_report(
         sources=compared,
     )
     return report.model_copy(update={"text": _text(report)})
+
+
+def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str, Selected]:
+    """The trials to compare with, by source.
+
+    Raises
+    ------
+    ProblemError
+        409 where simulation has too few attempts, or no other source has any trial, saying what is needed.
+    """
+    slug = built.object_row.slug
+    if len(simulated) < LEAST_SIMULATED or built.density is None:
+        raise conflict(
+            "too-few-trials",
+            f"A comparison needs at least {LEAST_SIMULATED} simulated attempts and 1 success in them; there"
+            f" are {len(simulated)} and {built.selected.successes}: sweep a grid"
+            f" (POST /objects/{slug}/sweeps)",
+        )
+    real = {source: found for source in REAL if (found := _selected(inputs, built, source)) is not None}
+    if not real:
+        raise conflict(
+            "too-few-trials",
+            "There are no trials of a robot, a human or an import to compare simulation with: post at least"
+            f" {LEAST_TRIALS} (POST /objects/{slug}/trials with source robot)",
+        )
+    return real
+
+
+def _predictions(
+    everything: AllTrials, model: SuccessModel | None, test: CollisionTest | None, threads: int
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """What simulation predicts at the poses of trials, and whether they are within its reach."""
+    predicted = np.zeros(len(everything))
+    reached = np.zeros(len(everything), dtype=bool)
+    if model is not None:
+        answer = model.evaluate(everything.position, everything.quaternion, threads=threads)
+        predicted = answer.probability.copy()
+        reached = answer.effective_trials >= _WITHIN_REACH
+    if test is not None:
+        free = test.free(everything.position, everything.quaternion, threads=threads)
+        predicted[~free] = 0.0
+        # Geometry tells of a collision wherever it is.
+        reached |= ~free
+    return predicted, reached
 
 
 def _model(
@@ -134,12 +153,12 @@ def _model(
     )
 
 
-def _selected(sources: Sources, built: Built, source: str) -> Selected | None:
+def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | None:
     """A source's trials with the gripper of the simulated ones, of their protocol where it has any, else all;
     None without trials.
     """
     chosen = built.selected
-    with sources.database.read() as tx:
+    with inputs.database.read() as tx:
         counts: dict[int, dict[str, int]] = {}
         for provenance, code, rows, packed in provenances.tallies(tx, built.object_row.id):
             if rows + packed:
@@ -169,16 +188,15 @@ def _selected(sources: Sources, built: Built, source: str) -> Selected | None:
     )
 
 
-def _all(sources: Sources, built: Built, selected: Selected) -> AllTrials:
+def _all(inputs: ReportInputs, built: Built, selected: Selected) -> AllTrials:
     """Every trial of a source, of one that posts successes only, too."""
     whole = replace(selected, tried=frozenset(selected.provenances))
-    return attempts.read(sources.database, built.object_row, whole)
+    return attempts.read(inputs.database, built.object_row, whole)
 
 
 def _compared(
-    sources: Sources,
+    inputs: ReportInputs,
     built: Built,
-    source: str,
     selected: Selected,
     everything: AllTrials,
     predicted: Floats,
@@ -188,8 +206,9 @@ def _compared(
     count = len(everything)
     successes = int(won.sum())
     known = reached & np.isfinite(predicted)
+    assert selected.source is not None
     comparison = SourceComparison(
-        source=source,
+        source=selected.source,
         protocols=[] if selected.protocol is None else selected.protocol.split(", "),
         trials=count,
         successes=successes,
@@ -198,10 +217,9 @@ def _compared(
         predicted=finite(float(predicted[known].mean())) if known.any() else None,
         predicted_at_successes=float(predicted[known & won].mean()) if (known & won).any() else None,
         within_reach=int(known.sum()),
-        similarity=_similarity(sources, built, everything),
+        similarity=_similarity(inputs, built, everything),
     )
-    tells = bool(selected.tried)
-    if not tells or int(known.sum()) < LEAST_TRIALS:
+    if not selected.tried or int(known.sum()) < LEAST_TRIALS:
         return comparison
     p, y = predicted[known], won[known]
     whole = calibrate(p, y, bins=_BINS, level=LEVEL)
@@ -219,25 +237,12 @@ def _compared(
             "brier": whole.brier,
             "skill": interval(whole.skill, whole.skill_low, whole.skill_high),
             "auc": finite(whole.auc),
-            "bins": [_bin(item) for item in whole.bins],
+            "bins": [as_model(CalibrationBin, item) for item in whole.bins],
         }
     )
 
 
-def _bin(item: ReliabilityBin) -> CalibrationBin:
-    return CalibrationBin(
-        lower=item.lower,
-        upper=item.upper,
-        count=item.count,
-        weight=item.weight,
-        predicted=finite(item.predicted),
-        observed=finite(item.observed),
-        low=finite(item.low),
-        high=finite(item.high),
-    )
-
-
-def _similarity(sources: Sources, built: Built, everything: AllTrials) -> SourceSimilarity | None:
+def _similarity(inputs: ReportInputs, built: Built, everything: AllTrials) -> SourceSimilarity | None:
     """Of the densities of both, under one kernel, and of as many simulated successes drawn at random."""
     density = built.density
     won = np.flatnonzero(everything.success)
@@ -248,41 +253,31 @@ def _similarity(sources: Sources, built: Built, everything: AllTrials) -> Source
     kernel = IsotropicKernel(sigma, max(density.kernel.sigma_rotation, math.radians(15.0)))
     rng = np.random.default_rng(0)
 
-    def under(rows: NDArray[np.int64]) -> GraspDensity:
+    def under(rows: NDArray[np.int64], weights: Floats | None) -> GraspDensity:
         return GraspDensity.build(
             density.positions[rows],
             density.quaternions_xyzw[rows],
             kernel=kernel,
-            weights=density.weights[rows],
+            weights=weights,
             symmetric=density.symmetric[rows],
         )
 
-    whole = under(np.arange(density.size))
+    whole = under(np.arange(density.size), density.weights)
     real = GraspDensity.build(
         everything.position[won],
         everything.quaternion[won],
         kernel=kernel,
         symmetric=everything.symmetric[won],
     )
-    found = bhattacharyya(real, whole, rng, points=_POINTS, threads=sources.threads)
+    found = bhattacharyya(real, whole, rng, points=_POINTS, threads=inputs.threads)
     count = min(len(won), density.size)
     alone = []
     for _ in range(_SUBSETS):
         rows = rng.choice(density.size, size=count, replace=True, p=density.weights)
-        one = GraspDensity.build(
-            density.positions[rows],
-            density.quaternions_xyzw[rows],
-            kernel=kernel,
-            symmetric=density.symmetric[rows],
-        )
-        alone.append(bhattacharyya(one, whole, rng, points=_POINTS, threads=sources.threads).value)
+        one = under(rows, None)
+        alone.append(bhattacharyya(one, whole, rng, points=_POINTS, threads=inputs.threads).value)
     return SourceSimilarity(
-        kernel=KernelInfo(
-            kind="isotropic",
-            sigma_position_m=sigma,
-            sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
-            rule="that of simulation, at least 15 mm and 15 deg",
-        ),
+        kernel=isotropic_info(kernel, "that of simulation, at least 15 mm and 15 deg"),
         value=found.value,
         error=found.standard_error,
         expected=ReportRange(value=float(np.mean(alone)), low=min(alone), high=max(alone)),

@@ -8,8 +8,7 @@ from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
-from graspdb_service.usecases.reports.common import LEVEL
-from graspdb_service.usecases.reports.verification import share
+from graspdb_service.usecases.reports.common import LEVEL, share
 
 #: What each way of counting leaves out, by its name.
 _LEFT_OUT: dict[str, tuple[str, ...]] = {

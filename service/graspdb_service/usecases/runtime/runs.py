@@ -1,16 +1,13 @@
-"""Report runs: computed once for a revision and its parameters, whoever asks and of whichever replica.
-
-Fits of kernels that take long are runs, too: each makes the kernel of its own id.
+"""Runs: what takes long, computed once for a revision and its parameters, whoever asks, of whichever replica.
 
 A run is a row with a lease. Who asks first takes it and computes; others, of other processes too, wait for
 the row or are told where it will be. A holder that dies stops renewing, and the next who asks takes over.
-Reports are computed one at a time on a thread of their own beside the compute pool: a minute's work must not
+Runs are computed one at a time on a thread of their own beside the compute pool: a minute's work must not
 hold a query's place.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import threading
@@ -21,26 +18,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
-from graspdb.wire import Selection
-from graspdb.wire.kernels import KernelCreate
 from graspdb.wire.reports import ReportRun
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service import __version__
 from graspdb_service.problems import ProblemError, conflict, not_found
-from graspdb_service.settings import Settings
-from graspdb_service.storage import kernels, report_runs
+from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.report_runs import Question, RunRow
-from graspdb_service.storage.simulation import outcomes
-from graspdb_service.usecases.densities.cache import Densities, KernelChoice, kernel_of
-from graspdb_service.usecases.geometry.collision import Scenes
-from graspdb_service.usecases.kernels import fit
-from graspdb_service.usecases.reports import registry
-from graspdb_service.usecases.reports.common import Sources
-from graspdb_service.usecases.reports.convergence_cache import KeptCurves
-from graspdb_service.usecases.reports.registry import Asked
-from graspdb_service.usecases.trials.selection import Filters
+from graspdb_service.storage.report_runs import RunKey, RunRow
 
 log = logging.getLogger("graspdb")
 
@@ -51,16 +34,19 @@ _MAX_WAITING = 8
 _LEASE_S = 30.0
 _TICK_S = 2.0
 _POLL_S = 0.1
-#: Kept convergence curves may take this part of what densities may.
-_CURVES_SHARE = 4
 #: What the request is to blame for, and would be again: kept as the run's answer.
 _KEPT_STATUSES = (404, 409, 413, 422)
 
+Result = Callable[[Tx], str]
+"""A run's result as JSON, made in the transaction that ends the run."""
 
-#: What runs that fit a kernel are called where others have their report's name.
-FIT = "kernel"
-#: Reports that say what became of simulated checks.
-_OF_CHECKS = ("bandwidth", "calibration")
+
+@dataclass(frozen=True)
+class RunKind:
+    """What runs of a kind are called in messages, and how they are computed."""
+
+    noun: str
+    compute: Callable[[RunRow, Progress], Result]
 
 
 class Cancelled(Exception):
@@ -76,15 +62,21 @@ class _Held:
     stop: threading.Event = field(default_factory=threading.Event)
 
 
-class ReportRuns:
-    """The report runs of one service process, over a database that others may share."""
+class Runs:
+    """The runs of one service process, over a database that others may share.
 
-    def __init__(self, settings: Settings, database: Database, densities: Densities, scenes: Scenes) -> None:
+    Parameters
+    ----------
+    wait_s
+        How long a request waits for a result.
+    kinds
+        By what a run's row names as its report.
+    """
+
+    def __init__(self, database: Database, *, wait_s: float, kinds: Mapping[str, RunKind]) -> None:
         self._database = database
-        self._densities = densities
-        self._wait_s = settings.report_wait_s
-        curves = KeptCurves(settings.max_density_cache_bytes // _CURVES_SHARE)
-        self._sources = Sources(database, densities, scenes, settings.threads, curves)
+        self._wait_s = wait_s
+        self._kinds = kinds
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="graspdb-report")
         self._waiting = threading.BoundedSemaphore(_MAX_WAITING)
         self._held: dict[str, _Held] = {}
@@ -93,45 +85,26 @@ class ReportRuns:
         self._closed = threading.Event()
         self._ticker: threading.Thread | None = None
 
-    # -- what the routes ask
+    # -- what is asked
 
-    def report(
-        self, slug: str, report: str, selection: Selection, options: Mapping[str, str | None]
-    ) -> RunRow:
-        """The run of a report: done, or under way after the wait.
+    def ask(self, key: RunKey) -> RunRow:
+        """The run of a key: done, or under way after the wait.
 
         Raises
         ------
         ProblemError
-            404 and 409 as the selection; what the report itself was refused for; 429 where too many are
+            What the computation itself was refused for; 409 where it was cancelled; 429 where too many are
             under way.
         """
-        choice, _ = kernel_of(selection)
-        row, selected = self._densities.current(slug, Filters.of(selection))
-        if choice.stored is not None:
-            choice = KernelChoice(stored=self._densities.stored(row, selected, choice.stored).id)
-        given = {name: value for name, value in options.items() if value is not None}
-        if report in _OF_CHECKS or given.get("matching") == "success":
-            # Checks change no revision: what of them there is belongs to the question.
-            with self._database.read() as tx:
-                given[report_runs.CHECKS] = outcomes.checks_stamp(tx, row.id)
-        asked = Asked(report, selected.filters, choice, given)
-        document = asked.document()
-        digest = hashlib.sha256(json.dumps([document, __version__], sort_keys=True).encode()).hexdigest()
-        question = Question(row.id, row.revision, report, digest, document)
         with self._database.read() as tx:
-            run = report_runs.find(tx, question)
+            run = report_runs.find(tx, key)
         if run is None or not _settled(run):
-            run = self._joined(question)
+            run = self._joined(key)
         return self._answered(run)
 
-    def enter_fit(self, tx: Tx, id: str, lease_id: str, row: ObjectRow, request: KernelCreate) -> None:
-        """Enter the run that fits a kernel, of the same id; `follow` it once the transaction is through."""
-        # Every request makes a kernel of its own: its run is nobody else's.
-        document = {"report": FIT, "run": id, "request": request.model_dump(mode="json", exclude_unset=True)}
-        digest = hashlib.sha256(id.encode()).hexdigest()
-        question = Question(row.id, row.revision, FIT, digest, document)
-        report_runs.ask(tx, question, id=id, lease_id=lease_id, lease_s=_LEASE_S)
+    def enter(self, tx: Tx, key: RunKey, *, id: str, lease_id: str) -> None:
+        """Enter a run of this id that is nobody else's; `follow` it once the transaction is through."""
+        report_runs.ask(tx, key, id=id, lease_id=lease_id, lease_s=_LEASE_S)
 
     def follow(self, id: str, lease_id: str | None) -> RunRow:
         """A run done, or under way after the wait; computed here where this process holds its lease.
@@ -139,7 +112,7 @@ class ReportRuns:
         Raises
         ------
         ProblemError
-            As :meth:`report`.
+            As :meth:`ask`.
         """
         run = self._row(id)
         if lease_id is not None:
@@ -150,7 +123,7 @@ class ReportRuns:
         """The run once it has ended well, or as it is when the wait is over."""
         if run.state == "running":
             run = self._waited(run)
-        what = "fit" if run.report == FIT else "report"
+        what = self._kinds[run.report].noun
         if run.state == "cancelled":
             raise conflict("report-cancelled", f"The {what} was cancelled: ask again to compute it anew")
         if run.problem is not None:
@@ -226,12 +199,12 @@ class ReportRuns:
                 )
         return str(uuid.uuid4())
 
-    def _joined(self, question: Question) -> RunRow:
-        """The question's run, taken by this process where nobody has it."""
+    def _joined(self, key: RunKey) -> RunRow:
+        """The key's run, taken by this process where nobody has it."""
         lease = self.place()
         with self._database.write() as tx:
-            mine = report_runs.ask(tx, question, id=str(uuid.uuid4()), lease_id=lease, lease_s=_LEASE_S)
-            run = report_runs.find(tx, question)
+            mine = report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id=lease, lease_s=_LEASE_S)
+            run = report_runs.find(tx, key)
         if run is None:
             # A newer revision's run has swept this one away meanwhile.
             raise conflict("object-changed", "The object has just changed: ask again")
@@ -278,11 +251,11 @@ class ReportRuns:
             if held.stop.is_set():
                 raise Cancelled
 
-        made: Callable[[Tx], str] | None = None
+        made: Result | None = None
         problem: dict[str, Any] | None = None
         try:
             progress(0.0)
-            made = self._computed(run, progress)
+            made = self._kinds[run.report].compute(run, progress)
         except Cancelled:
             self._drop(run.id)
             return
@@ -312,23 +285,6 @@ class ReportRuns:
             log.exception("report run %s could not be stored", run.id)
         finally:
             self._drop(run.id)
-
-    def _computed(self, run: RunRow, progress: Progress) -> Callable[[Tx], str]:
-        """What a run asks for, computed; in the transaction that ends the run, its result."""
-        if run.report != FIT:
-            asked = Asked.of(run.parameters)
-            result = registry.compute(self._sources, run.object, asked, progress).model_dump_json()
-            return lambda tx: result
-        sources = self._sources
-        fields = fit.fitted(
-            sources.densities,
-            sources.scenes.features,
-            KernelCreate.model_validate(run.parameters["request"]),
-            threads=sources.threads,
-            computed=lambda work: work(),
-            progress=progress,
-        )
-        return lambda tx: fit.info(kernels.create(tx, run.id, **fields)).model_dump_json()
 
     def _drop(self, id: str) -> None:
         with self._changed:
