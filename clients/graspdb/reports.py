@@ -5,27 +5,31 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
-from graspdb.options import known_keywords
+from graspdb.figures import FILE_FORMATS, draw, render
+from graspdb.options import Option, known_keywords
+from graspdb.poses import vector
 from graspdb.resources.runs import RunProgress, wait_for_run
 from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.transport import Transport
 from graspdb.wire.reports import (
-    REPORTS,
+    REPORT_NAMES,
     AnisotropyReport,
     AnisotropyTolerance,
+    AnyReport,
     BandwidthReport,
     CalibrationReport,
     CheckCall,
     ConvergenceReport,
     KernelSimilarityReport,
     ProjectionReport,
+    SimilarityPoint,
     SourceComparison,
     SourcesReport,
     SummaryReport,
@@ -51,9 +55,8 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-R = TypeVar("R", bound=ReportModel | SummaryReport)
+R = TypeVar("R", bound=AnyReport | SummaryReport)
 M = TypeVar("M", bound=ReportModel)
-Progress = RunProgress
 
 
 class Report(Generic[R]):
@@ -74,15 +77,14 @@ class Report(Generic[R]):
 
     def plot(self) -> Figure:
         """The figure, as the service draws it; a notebook shows it. Needs matplotlib (extra ``plot``)."""
-        from graspdb.figures import draw
-
-        # Every model of a report that there is, is one that can be drawn.
-        raw: Any = self.raw
-        return draw(raw)
+        return draw(self.raw)
 
     def save(self, path: str | Path) -> None:
         """Write the figure to a ``.png`` or ``.svg`` file."""
-        Path(path).write_bytes(_rendered(self.raw, path))
+        suffix = Path(path).suffix.lower()
+        if suffix not in FILE_FORMATS:
+            raise ValueError(f"figures are .png or .svg files, not {suffix or path!r}")
+        Path(path).write_bytes(render(self.raw, FILE_FORMATS[suffix]))
 
     @property
     def _of(self) -> str:
@@ -98,17 +100,6 @@ class Report(Generic[R]):
         return f"<p><b>{html.escape(self._of)}</b><br>{html.escape(self.text)}</p>" + (
             f"<ul>{mind}</ul>" if mind else ""
         )
-
-
-def _rendered(raw: Any, path: str | Path) -> bytes:
-    from graspdb.figures import render
-
-    suffix = Path(path).suffix.lower()
-    if suffix == ".png":
-        return render(raw, "png")
-    if suffix == ".svg":
-        return render(raw, "svg")
-    raise ValueError(f"figures are .png or .svg files, not {suffix or path!r}")
 
 
 class Convergence(Report[ConvergenceReport]):
@@ -253,35 +244,91 @@ class Summary(Report[SummaryReport]):
         return found
 
 
-def _curve(points: Any) -> tuple[NDArray[np.int64], Floats]:
-    counts = np.array([point.count for point in points], dtype=np.int64)
-    return counts, np.array([point.similarity for point in points], dtype=np.float64)
+def _curve(points: Iterable[SimilarityPoint]) -> tuple[NDArray[np.int64], Floats]:
+    counts, similarities = zip(*((point.count, point.similarity) for point in points), strict=True)
+    return np.array(counts, dtype=np.int64), np.array(similarities, dtype=np.float64)
 
 
-def _column(values: Any) -> Floats:
+def _column(values: Iterable[float | None]) -> Floats:
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+class Waiting(TypedDict, total=False):
+    """Reports wait until they are computed; ``progress`` is called with the run meanwhile, and ``timeout_s``
+    ends the wait, not the computation: asking again goes on waiting.
+    """
+
+    progress: RunProgress | None
+    timeout_s: float | None
+
+
+class TrialOptions(TrialSelection, Waiting, total=False):
+    """Which trials a report is about."""
+
+
+class DensityOptions(Selection, Waiting, total=False):
+    """Which trials a report is about, and the kernel."""
+
+
+class ConvergenceOptions(DensityOptions, total=False):
+    """Options of `Reports.convergence`."""
+
+    matching: Annotated[
+        str | None, Option("convergence: determinants, likelihood or success, beside a stored kernel.")
+    ]
+
+
+class AnisotropyOptions(DensityOptions, total=False):
+    """Options of `Reports.anisotropy`."""
+
+    method: Annotated[str | None, Option("anisotropy: empirical or density.")]
+    alignment: Annotated[str | None, Option("anisotropy: gripper, object, edge or surface-pair.")]
+
+
+class ProjectionOptions(DensityOptions, total=False):
+    """Options of `Reports.projection`."""
+
+    plane: Annotated[str | ArrayLike | None, Option("projection: xy, xz, yz or the plane's normal x,y,z.")]
+    approach: Annotated[
+        str | ArrayLike | None,
+        Option("projection: only grasps whose tool z points along x,y,z (or -z ...)."),
+    ]
+    approach_cone_deg: Annotated[float | None, Option("projection: half angle, 30 by default.")]
+    direction: Annotated[
+        str | ArrayLike | None,
+        Option("projection: only grasps whose tool x lies along x,y,z (or z ...)."),
+    ]
+    direction_cone_deg: Annotated[float | None, Option("projection: half angle, 30 by default.")]
+
+
+class KernelSimilarityOptions(TrialOptions, total=False):
+    """Options of `Reports.kernel_similarity`."""
+
+    window_position_m: Annotated[float | None, Option("kernel-similarity: half edge of the window.")]
+    window_rotation_deg: Annotated[float | None, Option("kernel-similarity: largest turn.")]
+    component_position_m: Annotated[float | None, Option("kernel-similarity: width of a sample.")]
+    component_rotation_deg: Annotated[float | None, Option("kernel-similarity: width of a sample.")]
+
+
+class SourcesOptions(Waiting, total=False):
+    """Options of `Reports.sources`."""
+
+    gripper: str | None
+    protocol: str | None
+    sigma_position_m: float | None
+    sigma_rotation_deg: float | None
 
 
 class Reports:
     """``mug.reports``. They take the selection of trials, most of them the kernel, too: see
-    :class:`Selection`.
-
-    They wait until the report is computed; ``progress`` is called with its run meanwhile, and ``timeout_s``
-    ends the wait, not the computation: asking again goes on waiting.
+    :class:`Selection`; and how to wait for them: see :class:`Waiting`.
     """
 
     def __init__(self, transport: Transport, path: str) -> None:
         self._transport = transport
         self._path = path
 
-    def convergence(
-        self,
-        *,
-        matching: str | None = None,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-        **selection: Unpack[Selection],
-    ) -> Convergence:
+    def convergence(self, **options: Unpack[ConvergenceOptions]) -> Convergence:
         """Whether there are enough successful grasps, and how many more it takes.
 
         Parameters
@@ -297,21 +344,9 @@ class Reports:
         Conflict
             For too few successes, saying how many are needed.
         """
-        params = {
-            "matching": matching,
-            **_asked(selection, "convergence"),
-        }
-        return Convergence(self._get("convergence", ConvergenceReport, params, progress, timeout_s))
+        return Convergence(self._get(ConvergenceReport, ConvergenceOptions, options))
 
-    def anisotropy(
-        self,
-        *,
-        method: str | None = None,
-        alignment: str | None = None,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-        **selection: Unpack[Selection],
-    ) -> Anisotropy:
+    def anisotropy(self, **options: Unpack[AnisotropyOptions]) -> Anisotropy:
         """How far a good grasp may be displaced along and about every axis.
 
         Parameters
@@ -322,36 +357,13 @@ class Reports:
             Axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the nearest) or
             ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
         """
-        params = {
-            "method": method,
-            "alignment": alignment,
-            **_asked(selection, "anisotropy"),
-        }
-        return Anisotropy(self._get("anisotropy", AnisotropyReport, params, progress, timeout_s))
+        return Anisotropy(self._get(AnisotropyReport, AnisotropyOptions, options))
 
-    def calibration(
-        self,
-        *,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-        **selection: Unpack[Selection],
-    ) -> Calibration:
+    def calibration(self, **options: Unpack[DensityOptions]) -> Calibration:
         """How often grasps hold that are predicted to, judged on trials the prediction has not seen."""
-        params = _asked(selection, "calibration")
-        return Calibration(self._get("calibration", CalibrationReport, params, progress, timeout_s))
+        return Calibration(self._get(CalibrationReport, DensityOptions, options))
 
-    def projection(
-        self,
-        *,
-        plane: str | ArrayLike | None = None,
-        approach: str | ArrayLike | None = None,
-        approach_cone_deg: float | None = None,
-        direction: str | ArrayLike | None = None,
-        direction_cone_deg: float | None = None,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-        **selection: Unpack[Selection],
-    ) -> Projection:
+    def projection(self, **options: Unpack[ProjectionOptions]) -> Projection:
         """The density on a plane: where grasps succeed.
 
         Parameters
@@ -362,85 +374,29 @@ class Reports:
             Only grasps whose tool z (``approach``) or tool x (``direction``, with either sign) points along
             this vector or axis (``"-z"``), within the cone.
         """
-        params = {
-            "plane": _axis(plane),
-            "approach": _axis(approach),
-            "approach_cone_deg": approach_cone_deg,
-            "direction": _axis(direction),
-            "direction_cone_deg": direction_cone_deg,
-            **_asked(selection, "projection"),
-        }
-        return Projection(self._get("projection", ProjectionReport, params, progress, timeout_s))
+        return Projection(self._get(ProjectionReport, ProjectionOptions, options))
 
-    def bandwidth(
-        self,
-        *,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-        **selection: Unpack[TrialSelection],
-    ) -> Bandwidth:
+    def bandwidth(self, **options: Unpack[TrialOptions]) -> Bandwidth:
         """Which widths the kernel should have, and how often draws at several widths succeed.
 
         Those are simulated by sweeps of purpose ``check``; ``calls`` says which are missing.
         """
-        params = known_keywords(TrialSelection, selection, "bandwidth")
-        return Bandwidth(self._get("bandwidth", BandwidthReport, params, progress, timeout_s))
+        return Bandwidth(self._get(BandwidthReport, TrialOptions, options))
 
-    def kernel_similarity(
-        self,
-        *,
-        window_position_m: float | None = None,
-        window_rotation_deg: float | None = None,
-        component_position_m: float | None = None,
-        component_rotation_deg: float | None = None,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-        **selection: Unpack[TrialSelection],
-    ) -> KernelSimilarity:
+    def kernel_similarity(self, **options: Unpack[KernelSimilarityOptions]) -> KernelSimilarity:
         """How many samples, or Gaussians, a kernel needs (figure 13).
 
-        Parameters
-        ----------
-        window_position_m, window_rotation_deg
-            Displacements that count: a cube's half edge and the largest turn.
-        component_position_m, component_rotation_deg
-            Widths of every sample's component.
+        Displacements count within a window (a cube's half edge, the largest turn); every sample's component
+        has the component's widths.
         """
-        params = {
-            "window_position_m": window_position_m,
-            "window_rotation_deg": window_rotation_deg,
-            "component_position_m": component_position_m,
-            "component_rotation_deg": component_rotation_deg,
-            **known_keywords(TrialSelection, selection, "kernel_similarity"),
-        }
-        return KernelSimilarity(
-            self._get("kernel-similarity", KernelSimilarityReport, params, progress, timeout_s)
-        )
+        return KernelSimilarity(self._get(KernelSimilarityReport, KernelSimilarityOptions, options))
 
-    def sources(
-        self,
-        *,
-        gripper: str | None = None,
-        protocol: str | None = None,
-        sigma_position_m: float | None = None,
-        sigma_rotation_deg: float | None = None,
-        progress: Progress | None = None,
-        timeout_s: float | None = None,
-    ) -> Sources:
+    def sources(self, **options: Unpack[SourcesOptions]) -> Sources:
         """Whether simulation tells what robots find.
 
-        Parameters
-        ----------
-        protocol
-            Of the simulated trials; real ones of that protocol are taken where there are any, else all.
+        ``protocol`` is that of the simulated trials; real ones of it are taken where there are any, else all.
         """
-        params = {
-            "gripper": gripper,
-            "protocol": protocol,
-            "sigma_position_m": sigma_position_m,
-            "sigma_rotation_deg": sigma_rotation_deg,
-        }
-        return Sources(self._get("sources", SourcesReport, params, progress, timeout_s))
+        return Sources(self._get(SourcesReport, SourcesOptions, options))
 
     def simulate(self, calls: Iterable[CheckCall | Mapping[str, Any]]) -> list[Sweep]:
         """Make the sweeps that a report names as missing: checks, which enter no density.
@@ -461,16 +417,15 @@ class Reports:
             made.append(Sweep(self._transport, wire.SweepInfo.model_validate(answer)))
         return made
 
-    def _get(
-        self,
-        name: str,
-        model: type[M],
-        params: Mapping[str, Any],
-        progress: Progress | None,
-        timeout_s: float | None,
-    ) -> M:
+    def _get(self, model: type[M], keywords: type[Any], options: Mapping[str, Any]) -> M:
+        name: str = model.model_fields["report"].default
+        params = query(known_keywords(keywords, options, name.replace("-", "_")))
+        progress, timeout_s = (params.pop(key, None) for key in ("progress", "timeout_s"))
         answer = self._transport.request(
-            "GET", f"{self._path}/reports/{name}", params=params, headers={"Accept": "application/json"}
+            "GET",
+            f"{self._path}/reports/{name}",
+            params={key: _in_query(key, value) for key, value in params.items()},
+            headers={"Accept": "application/json"},
         )
         found = answer.json()
         if answer.status_code == 202:
@@ -479,7 +434,7 @@ class Reports:
         return model.model_validate(found)
 
     def __repr__(self) -> str:
-        return f"<reports: {', '.join(REPORTS)}>"
+        return f"<reports: {', '.join(REPORT_NAMES)}>"
 
 
 class AllReports:
@@ -497,15 +452,6 @@ class AllReports:
         return "<reports: summary>"
 
 
-def _axis(value: str | ArrayLike | None) -> str | None:
-    """An axis's or plane's name as it is, a vector as a query takes it."""
-    if value is None or isinstance(value, str):
-        return value
-    numbers = np.asarray(value, dtype=np.float64)
-    if numbers.shape != (3,):
-        raise ValueError(f"a direction has three components; this one has the shape {numbers.shape}")
-    return ",".join(repr(float(x)) for x in numbers)
-
-
-def _asked(selection: Mapping[str, Any], method: str) -> dict[str, Any]:
-    return query(known_keywords(Selection, selection, method))
+def _in_query(name: str, value: Any) -> Any:
+    """A vector as a query takes it; names and numbers are as they are."""
+    return value if np.ndim(value) == 0 else ",".join(map(repr, vector(name, value, "x, y, z")))

@@ -114,7 +114,7 @@ def test_projections(thing: GraspObject, run: Run) -> None:
     assert 0.2 < found.share < 1
     drawn_on_the_page(found, thing.id)
     drawn_on_the_page(thing.reports.projection(), "all grasps")
-    with pytest.raises(ValueError, match="three components"):
+    with pytest.raises(ValueError, match="approach has shape"):
         thing.reports.projection(approach=[1, 2])
     code, out, err = run("report", thing.id, "projection", "--plane", "xz", "--approach", "z")
     assert (code, "of the density approaches within 30 deg of z" in out) == (0, True), err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,98 +22,50 @@ from graspdb.cli.common import (
 )
 from graspdb.cli.options import takes_options
 from graspdb.errors import ChecksNeeded
+from graspdb.figures import FILE_FORMATS
 from graspdb.reports import (
-    Bandwidth,
-    Calibration,
-    Convergence,
-    KernelSimilarity,
+    AnisotropyOptions,
+    ConvergenceOptions,
+    KernelSimilarityOptions,
+    ProjectionOptions,
     Reports,
-    Sources,
-    Summary,
 )
-from graspdb.resources.selection import Selection
 from graspdb.wire import OUTCOMES
-from graspdb.wire.reports import REPORTS, ReportRange
+from graspdb.wire.reports import (
+    REPORT_NAMES,
+    REPORTS,
+    BandwidthReport,
+    CalibrationReport,
+    ConvergenceReport,
+    KernelSimilarityReport,
+    ReportRange,
+    SourcesReport,
+    SummaryReport,
+)
 
-#: What each report takes, by the names of the SDK.
-_SELECTION = ("gripper", "protocol", "source")
-_KERNEL = ("kernel", "sigma_position_m", "sigma_rotation_deg")
-OPTIONS: dict[str, tuple[str, ...]] = {
-    "convergence": ("matching", *_SELECTION, *_KERNEL),
-    "anisotropy": ("method", "alignment", *_SELECTION, *_KERNEL),
-    "calibration": (*_SELECTION, *_KERNEL),
-    "projection": (
-        "plane",
-        "approach",
-        "approach_cone_deg",
-        "direction",
-        "direction_cone_deg",
-        *_SELECTION,
-        *_KERNEL,
-    ),
-    "bandwidth": _SELECTION,
-    "kernel-similarity": (
-        "window_position_m",
-        "window_rotation_deg",
-        "component_position_m",
-        "component_rotation_deg",
-        *_SELECTION,
-    ),
-    "sources": ("gripper", "protocol", "sigma_position_m", "sigma_rotation_deg"),
-    "summary": (),
-}
+_NAMES = ", ".join(REPORT_NAMES)
+Table = tuple[tuple[str, ...], list[tuple[Any, ...]]]
+
+
+class Options(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, total=False):
+    """Of all reports."""
 
 
 @takes_options
 def report(
     context: typer.Context,
     id: ObjectId,
-    selection: Selection,
+    options: Options,
     name: Annotated[
         str | None,
         typer.Argument(
             metavar="[REPORT]",
-            help=f"One of: {', '.join(REPORTS)}. Instead of both, `graspdb report summary`: all objects.",
+            help=f"One of: {_NAMES}. Instead of both, `graspdb report summary`: all objects.",
             show_default=False,
         ),
     ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="Write the figure to this .png or .svg file.", dir_okay=False)
-    ] = None,
-    matching: Annotated[
-        str | None,
-        typer.Option(help="convergence: determinants, likelihood or success, beside a stored kernel."),
-    ] = None,
-    method: Annotated[str | None, typer.Option(help="anisotropy: empirical or density.")] = None,
-    alignment: Annotated[
-        str | None, typer.Option(help="anisotropy: gripper, object, edge or surface-pair.")
-    ] = None,
-    plane: Annotated[
-        str | None, typer.Option(help="projection: xy, xz, yz or the plane's normal x,y,z.")
-    ] = None,
-    approach: Annotated[
-        str | None, typer.Option(help="projection: only grasps whose tool z points along x,y,z (or -z ...).")
-    ] = None,
-    approach_cone_deg: Annotated[
-        float | None, typer.Option("--approach-cone-deg", help="projection: half angle, 30 by default.")
-    ] = None,
-    direction: Annotated[
-        str | None, typer.Option(help="projection: only grasps whose tool x lies along x,y,z (or z ...).")
-    ] = None,
-    direction_cone_deg: Annotated[
-        float | None, typer.Option("--direction-cone-deg", help="projection: half angle, 30 by default.")
-    ] = None,
-    window_position_m: Annotated[
-        float | None, typer.Option("--window-position-m", help="kernel-similarity: half edge of the window.")
-    ] = None,
-    window_rotation_deg: Annotated[
-        float | None, typer.Option("--window-rotation-deg", help="kernel-similarity: largest turn.")
-    ] = None,
-    component_position_m: Annotated[
-        float | None, typer.Option("--component-position-m", help="kernel-similarity: width of a sample.")
-    ] = None,
-    component_rotation_deg: Annotated[
-        float | None, typer.Option("--component-rotation-deg", help="kernel-similarity: width of a sample.")
     ] = None,
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Have a worker simulate the draws that the report lacks.")
@@ -125,15 +78,12 @@ def report(
     if name is None and id == "summary":
         name = "summary"
     if name is None or (name not in REPORTS and name != "summary"):
-        raise typer.BadParameter(
-            f"{name or 'nothing'!r} is none of: {', '.join(REPORTS)}", param_hint="REPORT"
-        )
-    if figure is not None and figure.suffix.lower() not in (".png", ".svg"):
+        raise typer.BadParameter(f"{name or 'nothing'!r} is none of: {_NAMES}", param_hint="REPORT")
+    if figure is not None and figure.suffix.lower() not in FILE_FORMATS:
         raise typer.BadParameter("figures are .png or .svg files", param_hint="--figure")
-    named = [option for options in OPTIONS.values() for option in options]
-    given = {option: value for option in named if (value := context.params.get(option)) is not None}
-    for option in given:
-        if option not in OPTIONS[name]:
+    known = REPORTS[name].options.model_fields if name in REPORTS else ()
+    for option in options:
+        if option not in known:
             raise typer.BadParameter(
                 f"the {name} report has no such option", param_hint=f"--{option.replace('_', '-')}"
             )
@@ -143,7 +93,7 @@ def report(
         with state.client() as db:
             found = db.reports.summary()
     else:
-        found = _computed(state, id, name, given, simulate)
+        found = _computed(state, id, name, options, simulate)
     if figure is not None:
         found.save(figure)
     if state.json:
@@ -156,7 +106,7 @@ def report(
         ERRORS.print(f"Figure: {figure}")
 
 
-def _computed(state: State, id: str, name: str, options: dict[str, Any], simulate: bool) -> Any:
+def _computed(state: State, id: str, name: str, options: Options, simulate: bool) -> Any:
     """The report, with a bar while the service computes it, and before that while it is simulated."""
     with state.client() as db:
         reports = db.objects.get(id).reports
@@ -174,7 +124,7 @@ def _computed(state: State, id: str, name: str, options: dict[str, Any], simulat
         return _asked(reports, id, name, options)
 
 
-def _asked(reports: Reports, id: str, name: str, options: dict[str, Any]) -> Any:
+def _asked(reports: Reports, id: str, name: str, options: Options) -> Any:
     with run_bar(f"{name} of {id}") as show:
         return getattr(reports, name.replace("-", "_"))(**options, progress=show)
 
@@ -182,154 +132,135 @@ def _asked(reports: Reports, id: str, name: str, options: dict[str, Any]) -> Any
 def _show(found: Any) -> None:
     raw = found.raw
     rows: dict[str, Any] = {"": found.text}
-    if not isinstance(found, Summary):
+    if not isinstance(raw, SummaryReport):
         rows = {"object": f"{raw.object}, revision {raw.revision}", **rows}
-    if isinstance(found, Calibration):
-        rows |= {
-            "Brier skill": _range(raw.skill),
-            "over attempts that did not collide": _range(raw.free_skill),
-            "calibration error above 0.1": number(raw.ece),
-            "AUC of probability and density": f"{number(raw.auc_probability)}, {number(raw.auc_density)}",
-        }
-        if raw.checked is not None:
-            rows["simulated again"] = (
-                f"{raw.checked.successes:,} of {raw.checked.grasps:,} succeeded: {_range(raw.checked.rate)},"
-                f" predicted {number(raw.checked.predicted)}"
-            )
+    if isinstance(raw, CalibrationReport):
+        rows |= _scores(raw)
     show_rows(rows)
-    for table in _tables(found):
-        show_table(table[0], table[1], empty="Nothing.")
+    for columns, cells in _TABLES.get(raw.report, lambda _: [])(raw):
+        show_table(columns, cells, empty="Nothing.")
     for call in getattr(raw, "calls", []):
         ERRORS.print(
             f"Missing: {call.method} {call.path} {json.dumps(call.body)}", soft_wrap=True, markup=False
         )
 
 
-Table = tuple[tuple[str, ...], list[tuple[Any, ...]]]
+def _scores(raw: CalibrationReport) -> dict[str, str]:
+    rows = {
+        "Brier skill": _range(raw.skill),
+        "over attempts that did not collide": _range(raw.free_skill),
+        "calibration error above 0.1": number(raw.ece),
+        "AUC of probability and density": f"{number(raw.auc_probability)}, {number(raw.auc_density)}",
+    }
+    checked = raw.checked
+    if checked is not None:
+        rows["simulated again"] = (
+            f"{checked.successes:,} of {checked.grasps:,} succeeded: {_range(checked.rate)},"
+            f" predicted {number(checked.predicted)}"
+        )
+    return rows
 
 
-def _tables(found: Any) -> list[Table]:
-    """What is shown below the words, by kind of report."""
-    raw = found.raw
-    if isinstance(found, Convergence):
-        return [
-            (
-                (f"grasps ({curve.label})", "similarity", "deviation", "held-out log density"),
-                [
-                    (p.grasps, f"{p.similarity:.4f}", f"{p.deviation:.4f}", f"{p.log_likelihood:.3f}")
-                    for p in curve.points
-                ],
-            )
-            for curve in raw.curves
-        ]
-    if isinstance(found, Calibration):
-        return [
-            (
-                ("predicted", "came true", "interval", "attempts"),
-                [
-                    (
-                        number(b.predicted),
-                        number(b.observed),
-                        f"{number(b.low)} to {number(b.high)}",
-                        b.count,
-                    )
-                    for b in raw.bins
-                    if b.count
-                ],
-            )
-        ]
-    if isinstance(found, Bandwidth):
-        best = sorted(raw.grid, key=lambda p: -(p.log_likelihood or -1e99))[:8]
-        tables: list[Table] = [
-            (
-                ("position [mm]", "rotation [°]", "held-out log density", "below the best"),
-                [
-                    (
-                        f"{1e3 * p.sigma_position_m:.1f}",
-                        f"{p.sigma_rotation_deg:.1f}",
-                        number(p.log_likelihood),
-                        f"{number(p.below_best)} ± {number(p.below_best_error)}",
-                    )
-                    for p in best
-                ],
-            )
-        ]
-        if raw.draws:
-            tables.append(
+def _convergence(raw: ConvergenceReport) -> list[Table]:
+    return [
+        (
+            (f"grasps ({curve.label})", "similarity", "deviation", "held-out log density"),
+            [
+                (p.grasps, f"{p.similarity:.4f}", f"{p.deviation:.4f}", f"{p.log_likelihood:.3f}")
+                for p in curve.points
+            ],
+        )
+        for curve in raw.curves
+    ]
+
+
+def _calibration(raw: CalibrationReport) -> list[Table]:
+    bins = [
+        (number(b.predicted), number(b.observed), f"{number(b.low)} to {number(b.high)}", b.count)
+        for b in raw.bins
+        if b.count
+    ]
+    return [(("predicted", "came true", "interval", "attempts"), bins)]
+
+
+def _bandwidth(raw: BandwidthReport) -> list[Table]:
+    best = [
+        (
+            f"{1e3 * p.sigma_position_m:.1f}",
+            f"{p.sigma_rotation_deg:.1f}",
+            number(p.log_likelihood),
+            f"{number(p.below_best)} ± {number(p.below_best_error)}",
+        )
+        for p in sorted(raw.grid, key=lambda p: -(p.log_likelihood or -1e99))[:8]
+    ]
+    draws = [
+        (
+            f"{1e3 * d.kernel.sigma_position_m:.1f} mm, {d.kernel.sigma_rotation_deg:.1f}°",
+            d.protocol,
+            d.draws,
+            *map(_range, (d.success, d.collision, d.free_success)),
+        )
+        for d in raw.draws
+    ]
+    columns = ("draws at", "protocol", "simulated", "succeed", "collide", "succeed of the rest")
+    return [
+        (("position [mm]", "rotation [°]", "held-out log density", "below the best"), best),
+        *([(columns, draws)] if draws else []),
+    ]
+
+
+def _kernel_similarity(raw: KernelSimilarityReport) -> list[Table]:
+    return [
+        ((what, "similarity", "error"), [(p.count, f"{p.similarity:.3f}", f"{p.error:.3f}") for p in points])
+        for what, points in (("samples", raw.samples), ("Gaussians", raw.mixtures))
+    ]
+
+
+def _sources(raw: SourcesReport) -> list[Table]:
+    columns = ("source", "trials", "succeeded", "predicted", "agreement", "Brier skill", "density similarity")
+    return [
+        (
+            columns,
+            [
                 (
-                    ("draws at", "protocol", "simulated", "succeed", "collide", "succeed of the rest"),
-                    [
-                        (
-                            f"{1e3 * d.kernel.sigma_position_m:.1f} mm, {d.kernel.sigma_rotation_deg:.1f}°",
-                            d.protocol,
-                            d.draws,
-                            _range(d.success),
-                            _range(d.collision),
-                            _range(d.free_success),
-                        )
-                        for d in raw.draws
-                    ],
+                    item.source,
+                    item.trials,
+                    _range(item.share),
+                    number(item.predicted),
+                    _range(item.agreement),
+                    _range(item.skill),
+                    "unknown"
+                    if item.similarity is None
+                    else f"{item.similarity.value:.2f} (chance alone {_range(item.similarity.expected)})",
                 )
-            )
-        return tables
-    if isinstance(found, KernelSimilarity):
-        return [
-            (
-                (what, "similarity", "error"),
-                [(p.count, f"{p.similarity:.3f}", f"{p.error:.3f}") for p in points],
-            )
-            for what, points in (("samples", raw.samples), ("Gaussians", raw.mixtures))
-        ]
-    if isinstance(found, Sources):
-        return [
-            (
-                (
-                    "source",
-                    "trials",
-                    "succeeded",
-                    "predicted",
-                    "agreement",
-                    "Brier skill",
-                    "density similarity",
-                ),
-                [
-                    (
-                        item.source,
-                        item.trials,
-                        _range(item.share),
-                        number(item.predicted),
-                        _range(item.agreement),
-                        _range(item.skill),
-                        "unknown"
-                        if item.similarity is None
-                        else f"{item.similarity.value:.2f} (chance alone {_range(item.similarity.expected)})",
-                    )
-                    for item in raw.sources
-                ],
-            )
-        ]
-    if isinstance(found, Summary):
-        outcomes = [name for name in OUTCOMES if any(name in row.outcomes for row in raw.rows)]
-        return [
-            (
-                ("object", "gripper", "protocol", "source", *outcomes),
-                [
-                    (
-                        row.object,
-                        row.gripper,
-                        row.protocol,
-                        row.source,
-                        *(row.outcomes.get(name, 0) for name in outcomes),
-                    )
-                    for row in raw.rows
-                ],
-            ),
-            (
-                ("object", "source", *raw.rules),
-                [(row.object, row.source, *(_percent(item.rate) for item in row.rates)) for row in raw.rows],
-            ),
-        ]
-    return []
+                for item in raw.sources
+            ],
+        )
+    ]
+
+
+def _summary(raw: SummaryReport) -> list[Table]:
+    outcomes = [name for name in OUTCOMES if any(name in row.outcomes for row in raw.rows)]
+    counts = [
+        (row.object, row.gripper, row.protocol, row.source, *(row.outcomes.get(o, 0) for o in outcomes))
+        for row in raw.rows
+    ]
+    rates = [(row.object, row.source, *(_percent(item.rate) for item in row.rates)) for row in raw.rows]
+    return [
+        (("object", "gripper", "protocol", "source", *outcomes), counts),
+        (("object", "source", *raw.rules), rates),
+    ]
+
+
+_TABLES: dict[str, Callable[[Any], list[Table]]] = {
+    "bandwidth": _bandwidth,
+    "calibration": _calibration,
+    "convergence": _convergence,
+    "kernel-similarity": _kernel_similarity,
+    "sources": _sources,
+    "summary": _summary,
+}
+"""What is shown below the words."""
 
 
 def _percent(value: ReportRange) -> str:

@@ -25,7 +25,11 @@ from graspdb.wire.reports import AnyReport, SummaryReport
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw", "render"]
+__all__ = ["FILE_FORMATS", "Format", "draw", "render"]
+
+Format = Literal["png", "svg"]
+FILE_FORMATS: dict[str, Format] = {".png": "png", ".svg": "svg"}
+"""The formats of figures by the suffix of a file."""
 
 _DRAW: dict[type[Any], Callable[[Any], Figure]] = {
     reports.AnisotropyReport: draw_anisotropy,
@@ -42,7 +46,7 @@ _DPI = 120
 _LOCK = threading.Lock()
 
 
-def render(report: AnyReport | SummaryReport, format: Literal["png", "svg"]) -> bytes:
+def render(report: AnyReport | SummaryReport, format: Format) -> bytes:
     """The figure of a report as a file's bytes."""
     with _LOCK:
         target = io.BytesIO()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -38,13 +37,6 @@ UNIT_TOLERANCE = 1e-3
 
 MAX_NESTING = 32
 """How deep a user's metadata may nest: every JSON library on its way can still read and write that."""
-
-
-@dataclass(frozen=True)
-class Help:
-    """What an option is called for on the command line: ``Annotated[float, Help("largest turn.")]``."""
-
-    text: str
 
 
 class Request(BaseModel):

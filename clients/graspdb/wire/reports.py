@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field
 
-from graspdb.wire.base import Direction, Help, Request, Response, Slug, Triple
+from graspdb.wire.base import Direction, Request, Response, Slug, Triple
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.queries import KernelInfo, SelectionQuery, TrialSelection, WidthDeg, WidthM
 
@@ -94,9 +94,7 @@ class ConvergenceCurve(Response):
 class ConvergenceOptions(SelectionQuery):
     """``matching`` says how the isotropic kernel beside a stored one is chosen."""
 
-    matching: Annotated[
-        Matching | None, Help("determinants, likelihood or success, beside a stored kernel.")
-    ] = None
+    matching: Matching | None = None
 
 
 class ConvergenceReport(Report):
@@ -199,8 +197,8 @@ class AnisotropyHypothesis(Response):
 class AnisotropyOptions(SelectionQuery):
     """``empirical`` counts pairs of trials; ``density`` compares the density of successes with attempts'."""
 
-    method: Annotated[Method, Help("empirical or density.")] = "empirical"
-    alignment: Annotated[Alignment, Help("gripper, object, edge or surface-pair.")] = "gripper"
+    method: Method = "empirical"
+    alignment: Alignment = "gripper"
 
 
 class AnisotropyReport(Report):
@@ -330,15 +328,11 @@ class ProjectionOptions(SelectionQuery):
     either sign; within a cone whose half angle follows.
     """
 
-    plane: Annotated[
-        Literal["xy", "xz", "yz"] | Axis | None,
-        BeforeValidator(_alone),
-        Help("xy, xz, yz or the plane's normal x,y,z."),
-    ] = None
-    approach: Annotated[Axis | None, Help("only grasps whose tool z points along x,y,z (or -z ...).")] = None
-    approach_cone_deg: Annotated[float, Field(gt=0, le=180), Help("half angle, 30 by default.")] = 30.0
-    direction: Annotated[Axis | None, Help("only grasps whose tool x lies along x,y,z (or z ...).")] = None
-    direction_cone_deg: Annotated[float, Field(gt=0, le=90), Help("half angle, 30 by default.")] = 30.0
+    plane: Annotated[Literal["xy", "xz", "yz"] | Axis | None, BeforeValidator(_alone)] = None
+    approach: Axis | None = None
+    approach_cone_deg: Annotated[float, Field(gt=0, le=180)] = 30.0
+    direction: Axis | None = None
+    direction_cone_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
 
 
 class ProjectionReport(Report):
@@ -435,10 +429,10 @@ class SimilarityPoint(Response):
 class KernelSimilarityOptions(TrialSelection):
     """Which displacements count (a cube's half edge, the largest turn), and the width of a component."""
 
-    window_position_m: Annotated[float, Field(gt=0, le=1.0), Help("half edge of the window.")] = 0.04
-    window_rotation_deg: Annotated[float, Field(gt=0, le=180.0), Help("largest turn.")] = 180.0
-    component_position_m: Annotated[float, Field(ge=0.001, le=0.2), Help("width of a sample.")] = 0.01
-    component_rotation_deg: Annotated[float, Field(ge=1.0, le=40.0), Help("width of a sample.")] = 10.0
+    window_position_m: Annotated[float, Field(gt=0, le=1.0)] = 0.04
+    window_rotation_deg: Annotated[float, Field(gt=0, le=180.0)] = 180.0
+    component_position_m: Annotated[float, Field(ge=0.001, le=0.2)] = 0.01
+    component_rotation_deg: Annotated[float, Field(ge=1.0, le=40.0)] = 10.0
 
 
 class KernelSimilarityReport(Report):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
@@ -20,7 +20,7 @@ from graspdb_service.usecases.runtime import runs
 
 router = APIRouter(tags=["reports"])
 
-_FIGURES: dict[str, Literal["png", "svg"]] = {"image/png": "png", "image/svg+xml": "svg"}
+_FIGURES: dict[str, figures.Format] = {"image/png": "png", "image/svg+xml": "svg"}
 _JSON = "application/json"
 _RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
