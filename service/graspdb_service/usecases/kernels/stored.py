@@ -28,8 +28,8 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.runs import Runs, model
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
+from graspdb_service.usecases.runtime.runs import Runs, model
 
 Floats = NDArray[np.float64]
 
@@ -41,9 +41,7 @@ _MOST_SHIFT_M = 1.0
 _SAME = 1e-9
 
 
-def create(
-    ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | None, body: bytes
-) -> Created:
+def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
     """Store a kernel, or with ``components=auto`` start the run that fits it (status 202) unless it is done
     at once.
 
