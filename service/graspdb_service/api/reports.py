@@ -13,15 +13,14 @@ from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions, ReportRun, R
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing import Ctx, etag, not_modified, scope
-from graspdb_service.formats.negotiation import accepted
+from graspdb_service.formats.negotiation import JSON, PNG, SVG, accepted
 from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.reports import summary
 from graspdb_service.usecases.runtime import runs
 
 router = APIRouter(tags=["reports"])
 
-_FIGURES: dict[str, figures.Format] = {"image/png": "png", "image/svg+xml": "svg"}
-_JSON = "application/json"
+_FIGURES: dict[str, figures.Format] = {PNG: "png", SVG: "svg"}
 _RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The report; its figure where Accept prefers image/png or image/svg+xml",
@@ -81,7 +80,7 @@ def _answer(ctx: Context, slug: str, name: str, request: Request, options: Repor
         return Response(
             runs.model(run).model_dump_json(),
             status_code=202,
-            media_type=_JSON,
+            media_type=JSON,
             headers={"Location": f"/report-runs/{run.id}", "Retry-After": "2"},
         )
     assert run.result is not None
@@ -110,8 +109,8 @@ def _media(request: Request) -> str:
     ProblemError
         406 where none of ours is accepted, or a figure where nothing can draw it.
     """
-    media = accepted(request, _JSON, *_FIGURES)
-    if media != _JSON and importlib.util.find_spec("matplotlib") is None:
+    media = accepted(request, JSON, *_FIGURES)
+    if media != JSON and importlib.util.find_spec("matplotlib") is None:
         raise ProblemError(
             406,
             "not-acceptable",
