@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from . import isotropic
+from .isotropic import MAX_RUNS, TWIN, place, runs_within
+from .isotropic_runs import cosines, single, squared
 from .options import fast
 
 F32 = np.float32
@@ -18,16 +19,12 @@ GATHERED = 512
 
 
 @fast
-def exponents(data, begin, end, px, py, pz, qx, qy, qz, qw, kappa, twin, out):
+def exponents(data, begin, end, at, twin, out):
     """Exponents of a run's nearest ends."""
     for k in range(np.uint64(end - begin)):
         i = np.uint64(begin) + k
-        dx = data[0, i] - px
-        dy = data[1, i] - py
-        dz = data[2, i] - pz
-        a = data[3, i] * qx + data[4, i] * qy + data[5, i] * qz + data[6, i] * qw
-        b = (data[3, i] * qy - data[4, i] * qx + data[5, i] * qw - data[6, i] * qz) * twin
-        out[k] = max(abs(a), abs(b)) - kappa - (dx * dx + dy * dy + dz * dz)
+        own, other = cosines(data, i, at)
+        out[k] = max(abs(own), abs(other * twin)) - at.kappa - squared(data, i, at)
 
 
 @fast
@@ -41,27 +38,24 @@ def _insert(value, index, best, rows):
 
 
 @fast
-def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, best, rows):
+def nearest_rows(cells, position, quaternion, kappa, radius, best, rows):
     """The kernels within ``radius`` with the highest exponents at a pose: ``best`` (C,), descending, and
     their places among the sorted kernels, ``rows`` (C,); -1e30 and -1 where there are no more.
     """
-    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
+    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
     buffer = np.empty(GATHERED, dtype=np.float32)
-    px, py = (position[0] - centre[0]) * scale, (position[1] - centre[1]) * scale
-    pz = (position[2] - centre[2]) * scale
-    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    at = place(cells, position, quaternion, kappa)
+    near = single(at)
     best[:] = -1e30
     rows[:] = -1
     last = best.shape[0] - 1
-    for s in range(table.shape[0]):
-        twin = F32(table[s, isotropic.TWIN])
-        for r in range(isotropic.runs_within(start, table, s, px, py, pz, radius, runs)):
+    for s in range(cells.table.shape[0]):
+        twin = F32(cells.table[s, TWIN])
+        for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
             begin = runs[r, 0]
             while begin < runs[r, 1]:
                 stop = min(begin + GATHERED, runs[r, 1])
-                exponents(
-                    data, begin, stop, F32(px), F32(py), F32(pz), q0, q1, q2, q3, F32(kappa), twin, buffer
-                )
+                exponents(cells.data, begin, stop, near, twin, buffer)
                 for i in range(stop - begin):
                     if buffer[i] > best[last]:
                         _insert(buffer[i], begin + i, best, rows)
@@ -69,10 +63,8 @@ def nearest_rows(data, start, table, centre, scale, position, q, kappa, radius, 
 
 
 @fast
-def nearest_each(data, start, table, centre, scale, positions, quaternions, kappa, radius, best, rows):
+def nearest_each(cells, positions, quaternions, kappa, radius, best, rows):
     """Of every pose, the highest exponent (M,) within ``radius`` and whose it is, as `nearest_rows`."""
     for j in range(positions.shape[0]):
-        nearest_rows(
-            data, start, table, centre, scale, positions[j], quaternions[j], kappa, radius, best[j : j + 1],
-            rows[j : j + 1],
-        )  # fmt: skip
+        one = slice(j, j + 1)
+        nearest_rows(cells, positions[j], quaternions[j], kappa, radius, best[one], rows[one])

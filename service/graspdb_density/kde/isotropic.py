@@ -333,10 +333,7 @@ class GraspDensity:
         count = min(count, self.size)
         best, places = np.empty(count), np.empty(count, dtype=np.int64)
         radius = scaled_radius(CUTOFF)
-        nearest.nearest_rows(
-            cells.data, cells.start, cells.table, cells.centre, cells.scale, position, quaternion,
-            kernel.kappa, radius, best, places,
-        )  # fmt: skip
+        nearest.nearest_rows(cells.arrays, position, quaternion, kernel.kappa, radius, best, places)
         # Nothing outside the ball has an exponent above that of its surface.
         if best[-1] > -radius * radius:
             return np.asarray(cells.rows[places], dtype=np.intp)
@@ -364,10 +361,8 @@ class GraspDensity:
         """
         cells = self._cells
         best, places = np.empty(len(positions)), np.empty(len(positions), dtype=np.int64)
-        nearest.nearest_each(
-            cells.data, cells.start, cells.table, cells.centre, cells.scale, positions, quaternions,
-            self._kernel.kappa, within / math.sqrt(2.0), best, places,
-        )  # fmt: skip
+        radius = within / math.sqrt(2.0)
+        nearest.nearest_each(cells.arrays, positions, quaternions, self._kernel.kappa, radius, best, places)
         found = places >= 0
         rows = np.where(found, cells.rows[places], -1).astype(np.intp)
         return rows, np.where(found, np.sqrt(np.maximum(-2.0 * best, 0.0)), np.inf)

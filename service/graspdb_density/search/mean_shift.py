@@ -1,4 +1,4 @@
-"""Compiled parts of the search for maxima: scoring kernel centres against a region, thinning, climbing.
+"""Mean shift, compiled: kernel centres against a region, thinning, climbing, random steps.
 
 Climbing is projected mean shift. Every step maximises a lower bound of the log density that touches it at the
 present pose: a quadratic in position, whose maximiser over a convex set is the projection of the mean-shift
@@ -17,8 +17,9 @@ import math
 import numpy as np
 
 from .._compiled import exp, isotropic, nearest
+from .._compiled.isotropic_runs import cosines, offset, single, squared
 from .._compiled.options import exact, fast
-from . import feasible_projection
+from .feasible_projection import position_excess, project
 
 F32 = np.float32
 __all__ = ["PATH", "bound_centres", "climb", "scatter", "thin"]
@@ -79,7 +80,7 @@ def bound_centres(centres, twins, limits, sigma, kappa, reach_m, reach, bounds, 
             angle = max(angle, math.acos(min(max(dot, -1.0), 1.0)) - cones[7])
         if linear:
             p[0], p[1], p[2] = row[0], row[1], row[2]
-            away = max(feasible_projection.position_excess(limits, p), 0.0)
+            away = max(position_excess(limits, p), 0.0)
             if away > reach_m:
                 continue
         loss = 0.5 * (away / sigma) ** 2
@@ -125,42 +126,37 @@ def thin(positions, quaternions, first, limit, separation_m, separation, twins, 
 
 
 @fast
-def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
+def _gather(cells, at, cut, runs, buffer, near):
     """Kernels whose exponent at a pose is above ``-cut``, into ``near`` (8, ...): as ``data``, but every end
     (twin, antipode) a kernel of its own with the sign that faces the pose. Answers how many there are.
     """
-    fx, fy, fz, k = F32(px), F32(py), F32(pz), F32(kappa)
-    q0, q1, q2, q3 = F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa)
+    data, table, here = cells.data, cells.table, single(at)
     least = F32(-cut)
     count = 0
     for s in range(table.shape[0]):
         twin = F32(table[s, isotropic.TWIN])
-        for r in range(isotropic.runs_within(start, table, s, px, py, pz, math.sqrt(cut), runs)):
+        for r in range(isotropic.runs_within(cells.start, table, s, at.x, at.y, at.z, math.sqrt(cut), runs)):
             begin = runs[r, 0]
             while begin < runs[r, 1]:
                 stop = min(begin + nearest.GATHERED, runs[r, 1])
-                nearest.exponents(data, begin, stop, fx, fy, fz, q0, q1, q2, q3, k, twin, buffer)
+                nearest.exponents(data, begin, stop, here, twin, buffer)
                 for i in range(stop - begin):
                     if buffer[i] <= least:
                         continue
                     j = begin + i
                     u0, u1, u2, u3 = data[3, j], data[4, j], data[5, j], data[6, j]
-                    dx, dy, dz = data[0, j] - fx, data[1, j] - fy, data[2, j] - fz
-                    base = -k - (dx * dx + dy * dy + dz * dz)
+                    base = -here.kappa - squared(data, j, here)
                     for end in range(4 if twin > F32(0.0) else 2):
                         if end == 2:
                             # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z).
                             u0, u1, u2, u3 = u1, -u0, u3, -u2
                         elif end > 0:
                             u0, u1, u2, u3 = -u0, -u1, -u2, -u3
-                        if base + u0 * q0 + u1 * q1 + u2 * q2 + u3 * q3 > least and count < near.shape[1]:
-                            near[0, count], near[1, count], near[2, count] = (
-                                data[0, j],
-                                data[1, j],
-                                data[2, j],
-                            )
-                            near[3, count], near[4, count] = u0, u1
-                            near[5, count], near[6, count] = u2, u3
+                        exponent = base + u0 * here.qx + u1 * here.qy + u2 * here.qz + u3 * here.qw
+                        if exponent > least and count < near.shape[1]:
+                            for axis in range(3):
+                                near[axis, count] = data[axis, j]
+                            near[3, count], near[4, count], near[5, count], near[6, count] = u0, u1, u2, u3
                             near[7, count] = data[7, j]
                             count += 1
                 begin = stop
@@ -168,56 +164,71 @@ def _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near):
 
 
 @fast
-def _moments(near, begin, end, px, py, pz, qx, qy, qz, qw, kappa, sums):
-    """Add to ``sums`` (8,) k, k (p_i - p) and the pull k mu_i of gathered kernels, scaled units."""
-    s = F32(0.0)
-    sx, sy, sz = F32(0.0), F32(0.0), F32(0.0)
-    m0, m1, m2, m3 = F32(0.0), F32(0.0), F32(0.0), F32(0.0)
-    for i in range(np.uint64(begin), np.uint64(end)):
-        dx = near[0, i] - px
-        dy = near[1, i] - py
-        dz = near[2, i] - pz
-        u0, u1, u2, u3 = near[3, i], near[4, i], near[5, i], near[6, i]
-        a = u0 * qx + u1 * qy + u2 * qz + u3 * qw
-        k = near[7, i] * exp.exp(a - kappa - (dx * dx + dy * dy + dz * dz))
-        s += k
-        sx += k * dx
-        sy += k * dy
-        sz += k * dz
-        m0 += k * u0
-        m1 += k * u1
-        m2 += k * u2
-        m3 += k * u3
-    sums[0] += s
-    sums[1] += sx
-    sums[2] += sy
-    sums[3] += sz
-    sums[4] += m0
-    sums[5] += m1
-    sums[6] += m2
-    sums[7] += m3
+def _moments(near, count, at, sums):
+    """Sums (8,) of k, k (p_i - p) and the pull k mu_i over gathered kernels, scaled units."""
+    sums[:] = 0.0
+    for begin in range(0, count, isotropic.BLOCK):
+        s = F32(0.0)
+        sx, sy, sz = F32(0.0), F32(0.0), F32(0.0)
+        m0, m1, m2, m3 = F32(0.0), F32(0.0), F32(0.0), F32(0.0)
+        for i in range(np.uint64(begin), np.uint64(min(begin + isotropic.BLOCK, count))):
+            dx, dy, dz = offset(near, i, at)
+            k = near[7, i] * exp.exp(cosines(near, i, at)[0] - at.kappa - squared(near, i, at))
+            s += k
+            sx += k * dx
+            sy += k * dy
+            sz += k * dz
+            m0 += k * near[3, i]
+            m1 += k * near[4, i]
+            m2 += k * near[5, i]
+            m3 += k * near[6, i]
+        for i, part in enumerate((s, sx, sy, sz, m0, m1, m2, m3)):
+            sums[i] += part
 
 
 @fast
-def _sum(near, count, px, py, pz, qx, qy, qz, qw, kappa):
-    """Sum of gathered kernels at a pose; (qx..qw) is kappa times the quaternion."""
+def _sum(near, count, at):
+    """Sum of gathered kernels at a pose."""
     total = np.float64(0.0)
     for begin in range(0, count, isotropic.BLOCK):
         s = F32(0.0)
         for i in range(np.uint64(begin), np.uint64(min(begin + isotropic.BLOCK, count))):
-            dx = near[0, i] - px
-            dy = near[1, i] - py
-            dz = near[2, i] - pz
-            a = near[3, i] * qx + near[4, i] * qy + near[5, i] * qz + near[6, i] * qw
-            s += near[7, i] * exp.exp(a - kappa - (dx * dx + dy * dy + dz * dz))
+            s += near[7, i] * exp.exp(cosines(near, i, at)[0] - at.kappa - squared(near, i, at))
         total += s
     return total
 
 
 @exact
-def climb(
-    data, start, table, centre, scale, limits, kappa, cut, positions, quaternions, gain, path, lengths,
-):  # fmt: skip
+def _in_widths(p, q, unit, turn, x):
+    """A pose (7,) in units of the kernel's widths: position over sigma, sqrt(kappa) times the quaternion."""
+    for i in range(3):
+        x[i] = p[i] / unit
+    for i in range(4):
+        x[3 + i] = q[i] * turn
+
+
+@exact
+def _stride(x, step, last_x, last_step, known):
+    """How far to go along a step, as a multiple of it, and its squared length.
+
+    The inverse curvature that the last two poses saw along their difference (Barzilai and Borwein, 1988), of
+    the projected step: along a curved limit, the limit's curvature counts.
+    """
+    moved, bent, size = 0.0, 0.0, 0.0
+    for i in range(7):
+        size += step[i] * step[i]
+        if known:
+            moved += (x[i] - last_x[i]) ** 2
+            bent += (x[i] - last_x[i]) * (last_step[i] - step[i])
+    if not known:
+        return 1.0, size
+    stride = moved / bent if bent * _LONGEST > moved else _LONGEST
+    return max(1.0, min(stride, _FARTHEST / math.sqrt(size) if size > 0.0 else 1.0)), size
+
+
+# long: a climb's state stays in one loop; taken apart, every piece would pass a dozen arrays on.
+@exact
+def climb(cells, limits, kappa, cut, positions, quaternions, gain, path, lengths):
     """Climb from every pose (K, ...); ``path`` (K, steps, PATH) gets the feasible poses passed.
 
     Kernels are gathered once around a pose and used while the climb stays near: those with an exponent above
@@ -229,10 +240,9 @@ def climb(
     """
     runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
     buffer = np.empty(nearest.GATHERED, dtype=np.float32)
-    near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
+    near = np.empty((8, 2 * cells.data.shape[1] + 1024), dtype=np.float32)
     sums = np.empty(8)
-    # Poses and steps in units of the kernel's widths: position over sigma, sqrt(kappa) times the quaternion.
-    unit, turn = 1.0 / (scale * math.sqrt(2.0)), math.sqrt(kappa)
+    unit, turn = 1.0 / (cells.scale * math.sqrt(2.0)), math.sqrt(kappa)
     p, q, x, step, gathered = np.empty(3), np.empty(4), np.empty(7), np.empty(7), np.empty(7)
     last_x, last_step, best_x, best_step = np.empty(7), np.empty(7), np.empty(7), np.empty(7)
     for j in range(positions.shape[0]):
@@ -242,27 +252,19 @@ def climb(
         count = -1
         lengths[j] = 0
         while lengths[j] < path.shape[1]:
-            px, py, pz = (p[0] - centre[0]) * scale, (p[1] - centre[1]) * scale, (p[2] - centre[2]) * scale
+            at = isotropic.place(cells, p, q, kappa)
+            _in_widths(p, q, unit, turn, x)
             apart = 0.0
             if count >= 0:
-                for i in range(3):
-                    apart += (p[i] / unit - gathered[i]) ** 2
-                for i in range(4):
-                    apart += (q[i] * turn - gathered[3 + i]) ** 2
+                for i in range(7):
+                    apart += (x[i] - gathered[i]) ** 2
             if count < 0 or apart > _STRAYED * _STRAYED:
-                count = _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near)
-                gathered[0:3] = p / unit
-                gathered[3:7] = q * turn
+                count = _gather(cells, at, cut, runs, buffer, near)
+                gathered[:] = x
                 apart = 0.0
                 # Other kernels, other sums: what was seen before is no measure.
                 best, known, plain, worst, older = -1.0, False, True, 0.0, 0.0
-            sums[:] = 0.0
-            for begin in range(0, count, isotropic.BLOCK):
-                _moments(
-                    near, begin, min(begin + isotropic.BLOCK, count), F32(px), F32(py), F32(pz),
-                    F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa), F32(kappa),
-                    sums,
-                )  # fmt: skip
+            _moments(near, count, single(at), sums)
             here = sums[0]
             if here <= 0.0:
                 break
@@ -281,46 +283,32 @@ def climb(
                 worst, older = best, best
             else:
                 worst, older = here, worst if best > 0.0 else here
-                x[0:3] = p / unit
-                x[3:7] = q * turn
                 length = math.sqrt(sums[4] ** 2 + sums[5] ** 2 + sums[6] ** 2 + sums[7] ** 2)
                 for i in range(3):
-                    p[i] += sums[1 + i] / (here * scale)
+                    p[i] += sums[1 + i] / (here * cells.scale)
                 for i in range(4):
                     q[i] = sums[4 + i] / length if length > 0.0 else q[i]
-                if not feasible_projection.project(limits, p, q):
+                if not project(limits, p, q):
                     break
-                step[0:3] = p / unit - x[0:3]
-                step[3:7] = q * turn - x[3:7]
+                _in_widths(p, q, unit, turn, step)
+                step -= x
                 if here > best:
                     best, top = here, lengths[j] - 1
                     best_x[:] = x
                     best_step[:] = step
                 plain = False
-            # The inverse curvature that the last two poses saw along their difference (Barzilai, Borwein), of
-            # the projected step: along a curved limit, the limit's curvature counts.
-            ahead, moved, bent, size = 1.0, 0.0, 0.0, 0.0
-            for i in range(7):
-                size += step[i] * step[i]
-                if known:
-                    moved += (x[i] - last_x[i]) ** 2
-                    bent += (x[i] - last_x[i]) * (last_step[i] - step[i])
-            if known:
-                ahead = moved / bent if bent * _LONGEST > moved else _LONGEST
-                ahead = max(1.0, min(ahead, _FARTHEST / math.sqrt(size) if size > 0.0 else 1.0))
-            for i in range(3):
-                p[i] = (x[i] + ahead * step[i]) * unit
+            stride, size = _stride(x, step, last_x, last_step, known)
             norm = 0.0
+            for i in range(3):
+                p[i] = (x[i] + stride * step[i]) * unit
             for i in range(4):
-                q[i] = x[3 + i] + ahead * step[3 + i]
+                q[i] = x[3 + i] + stride * step[3 + i]
                 norm += q[i] * q[i]
-            norm = math.sqrt(norm)
-            for i in range(4):
-                q[i] /= norm
-            if not feasible_projection.project(limits, p, q):
+            q /= math.sqrt(norm)
+            if not project(limits, p, q):
                 break
             # Half the slope times the way ahead, the gain of a parabola.
-            if 0.5 * ahead * size < gain:
+            if 0.5 * stride * size < gain:
                 if apart < _SETTLED * _SETTLED:
                     break
                 # At rest among the kernels of a while ago: gather anew.
@@ -346,52 +334,41 @@ def _times(q, x, y, z, w, out):
 
 @exact
 def scatter(
-    data, start, table, centre, scale, limits, kappa, cut, positions, quaternions, moves, turns,
-    tried_p, tried_q, values,
+    cells, limits, kappa, cut, positions, quaternions, moves, turns, tried_p, tried_q, values
 ):  # fmt: skip
     """Feasible poses around each of some poses, with their sums.
 
     Around pose k, the tries are its position plus ``moves[k, t]`` (metres) and its quaternion turned by the
     rotation vectors ``turns[k, t]`` (radians, tool frame), both the other way where that is uphill, projected
-    into the region. ``values`` (K, 1 + T)
-    gets the sum at the pose itself and at every try, -1 where the projection failed. They are sums over the
-    kernels with an exponent above ``-cut`` at the pose: right for comparisons around one pose.
+    into the region. ``values`` (K, 1 + T) gets the sum at the pose itself and at every try, -1 where the
+    projection failed. They are sums over the kernels with an exponent above ``-cut`` at the pose: right for
+    comparisons around one pose.
     """
     runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
     buffer = np.empty(nearest.GATHERED, dtype=np.float32)
-    near = np.empty((8, 2 * data.shape[1] + 1024), dtype=np.float32)
-    sums, k32 = np.empty(8), F32(kappa)
+    near = np.empty((8, 2 * cells.data.shape[1] + 1024), dtype=np.float32)
+    sums = np.empty(8)
     for j in range(positions.shape[0]):
         p, q = positions[j], quaternions[j]
-        px, py, pz = (p[0] - centre[0]) * scale, (p[1] - centre[1]) * scale, (p[2] - centre[2]) * scale
-        count = _gather(data, start, table, px, py, pz, q, kappa, cut, runs, buffer, near)
-        sums[:] = 0.0
-        for begin in range(0, count, isotropic.BLOCK):
-            _moments(
-                near, begin, min(begin + isotropic.BLOCK, count), F32(px), F32(py), F32(pz),
-                F32(q[0] * kappa), F32(q[1] * kappa), F32(q[2] * kappa), F32(q[3] * kappa), k32, sums,
-            )  # fmt: skip
+        at = isotropic.place(cells, p, q, kappa)
+        count = _gather(cells, at, cut, runs, buffer, near)
+        _moments(near, count, single(at), sums)
         values[j, 0] = sums[0]
         for t in range(moves.shape[1]):
-            at, to, v = tried_p[j, t], tried_q[j, t], turns[j, t]
+            to_p, to_q, v = tried_p[j, t], tried_q[j, t], turns[j, t]
             slope = 0.0
             for i in range(3):
-                slope += 2.0 * scale * sums[1 + i] * moves[j, t, i]
+                slope += 2.0 * cells.scale * sums[1 + i] * moves[j, t, i]
             # Half of q (v, 0), the change of q to first order.
-            _times(q, v[0], v[1], v[2], 0.0, to)
+            _times(q, v[0], v[1], v[2], 0.0, to_q)
             for i in range(4):
-                slope += 0.5 * kappa * sums[4 + i] * to[i]
+                slope += 0.5 * kappa * sums[4 + i] * to_q[i]
             sign = -1.0 if slope < 0.0 else 1.0
             for i in range(3):
-                at[i] = p[i] + sign * moves[j, t, i]
+                to_p[i] = p[i] + sign * moves[j, t, i]
             angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
             s = sign * (0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle)
-            _times(q, s * v[0], s * v[1], s * v[2], math.cos(0.5 * angle), to)
-            if not feasible_projection.project(limits, at, to):
-                values[j, 1 + t] = -1.0
-                continue
-            values[j, 1 + t] = _sum(
-                near, count, F32((at[0] - centre[0]) * scale), F32((at[1] - centre[1]) * scale),
-                F32((at[2] - centre[2]) * scale), F32(to[0] * kappa), F32(to[1] * kappa), F32(to[2] * kappa),
-                F32(to[3] * kappa), k32,
-            )  # fmt: skip
+            _times(q, s * v[0], s * v[1], s * v[2], math.cos(0.5 * angle), to_q)
+            values[j, 1 + t] = -1.0
+            if project(limits, to_p, to_q):
+                values[j, 1 + t] = _sum(near, count, single(isotropic.place(cells, to_p, to_q, kappa)))

@@ -221,9 +221,8 @@ class MeanShiftSearch(MultiStart):
         def work(begin: int, end: int) -> None:
             part = slice(begin, end)
             mean_shift.climb(
-                cells.data, cells.start, cells.table, cells.centre, cells.scale, self.region.limits,
-                self.density.kernel.kappa, cut, starts.positions[part], starts.quaternions_xyzw[part], _GAIN,
-                path[part], lengths[part],
+                cells.arrays, self.region.limits, self.density.kernel.kappa, cut, starts.positions[part],
+                starts.quaternions_xyzw[part], _GAIN, path[part], lengths[part],
             )  # fmt: skip
 
         for_blocks(work, count, block=4, threads=self.threads)
@@ -285,9 +284,8 @@ class MeanShiftSearch(MultiStart):
         def work(begin: int, end: int) -> None:
             part = slice(begin, end)
             mean_shift.scatter(
-                cells.data, cells.start, cells.table, cells.centre, cells.scale, self.region.limits,
-                kernel.kappa, _AROUND, at.poses.positions[part], at.poses.quaternions_xyzw[part], moves[part],
-                turns[part], p[part], q[part], values[part],
+                cells.arrays, self.region.limits, kernel.kappa, _AROUND, at.poses.positions[part],
+                at.poses.quaternions_xyzw[part], moves[part], turns[part], p[part], q[part], values[part],
             )  # fmt: skip
 
         for_blocks(work, count, block=8, threads=self.threads)
