@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -133,6 +134,25 @@ def test_it_stops_when_it_is_not_wanted_any_more() -> None:
             wanted=lambda: time.monotonic() < began + 0.5,
             command=command,
         )
+
+
+def test_it_ends_with_a_killed_worker(
+    tmp_path: Path, descendants: Callable[[], list[str]], eventually: Callable[..., Any]
+) -> None:
+    (tmp_path / "mesh.stl").write_bytes(trimesh.creation.torus(30, 10, 256, 128).export(file_type="stl"))
+    script = (
+        "import pathlib, sys; from graspdb.wire import DecomposePayload;"
+        "from graspdb_simworker.decomposition.supervisor import Limits, decompose;"
+        "decompose(DecomposePayload.model_validate_json(sys.argv[1]), pathlib.Path(sys.argv[2]).read_bytes(),"
+        " limits=Limits(), progress=lambda note: print(note, flush=True))"
+    )
+    arguments = [PAYLOAD.model_dump_json(), str(tmp_path / "mesh.stl")]
+    with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as worker:
+        assert worker.stdout is not None
+        assert b"threshold" in worker.stdout.readline()
+        time.sleep(np.random.default_rng().uniform(0.0, 1.0))
+        worker.kill()
+        eventually(lambda: not descendants(), 10)
 
 
 @pytest.fixture

@@ -34,13 +34,6 @@ def mug_glb() -> bytes:
     return example("mug").parts_glb()
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it never happened"
-        time.sleep(0.02)
-
-
 def alive(pid: int) -> bool:
     with contextlib.suppress(FileNotFoundError):
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
@@ -142,18 +135,43 @@ def test_a_chunk_that_is_not_wanted_any_more_kills_its_child(payload_of: MakePay
         assert len(runner.run(payload_of("mug", stop=50), mug_glb).outcomes) == 50
 
 
-def test_a_child_whose_worker_is_gone_ends_itself(payload_of: MakePayload, mug_glb: bytes) -> None:
-    process = subprocess.Popen(local.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert process.stdin is not None
-    assert process.stdout is not None
-    assert channel.receive(process.stdout.fileno(), silence_s=60.0)[0] == channel.READY
-    chunk = messages.Chunk(payload_of("mug", stop=100_000).model_dump_json(), {}, 10.0, mug_glb)
-    channel.send(process.stdin.fileno(), channel.CHUNK, messages.pack_chunk(chunk))
-    assert channel.receive(process.stdout.fileno(), silence_s=60.0)[0] == channel.BEFORE
-    # In mid-chunk the pipes close, as they do when a worker is killed.
-    process.stdin.close()
-    process.stdout.close()
-    wait_for(lambda: process.poll() is not None)
+WORKER = """
+import pathlib, sys
+from graspdb.wire import SimulatePayload
+from graspdb_simworker.process.local import LocalRunner
+payload, parts, *command = sys.argv[1:]
+LocalRunner(command, pose_s=600.0).run(
+    SimulatePayload.model_validate_json(payload),
+    pathlib.Path(parts).read_bytes(),
+    progress=lambda done: print(done, flush=True),
+)
+"""
+
+
+@pytest.mark.parametrize("moment", ["early", "simulating", "hung"])
+def test_a_child_ends_with_a_killed_worker(
+    payload_of: MakePayload,
+    physical_poses: FindPoses,
+    mug_glb: bytes,
+    tmp_path: Path,
+    descendants: Callable[[], list[str]],
+    eventually: Callable[..., Any],
+    moment: str,
+) -> None:
+    poses = physical_poses("mug", 2)
+    payload = payload_of("mug", poses=poses) if moment == "hung" else payload_of("mug", stop=100_000)
+    command = (*FAULTY, "hang", *map(repr, poses[1][0])) if moment == "hung" else local.COMMAND
+    (tmp_path / "parts.glb").write_bytes(mug_glb)
+    arguments = [payload.model_dump_json(), str(tmp_path / "parts.glb"), *command]
+    with subprocess.Popen([sys.executable, "-c", WORKER, *arguments], stdout=subprocess.PIPE) as worker:
+        assert worker.stdout is not None
+        if moment == "early":
+            eventually(lambda: len(descendants()) == 2)
+            time.sleep(np.random.default_rng().uniform(0.0, 2.0))
+        else:
+            assert worker.stdout.readline() == b"1\n"
+        worker.kill()
+        eventually(lambda: not descendants(), 10)
 
 
 def test_messages_survive_the_pipe_and_broken_pipes_are_noticed() -> None:

@@ -16,6 +16,7 @@ from pydantic import BeforeValidator, Field
 from graspdb.wire.base import Direction, Request, Response, Slug, Triple
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.queries import KernelInfo, SelectionQuery, TrialSelection, WidthDeg, WidthM
+from graspdb.wire.states import AnyRunState
 
 ReportName = Literal[
     "convergence",
@@ -29,7 +30,6 @@ ReportName = Literal[
 REPORT_NAMES: tuple[ReportName, ...] = get_args(ReportName)
 Method = Literal["empirical", "density"]
 Matching = Literal["determinants", "likelihood", "success"]
-RunState = Literal["running", "done", "failed", "cancelled"]
 
 
 class Report(Response):
@@ -625,7 +625,7 @@ class ReportRun(Response):
     report: ReportName | Literal["kernel"]
     revision: int
     parameters: dict[str, Any]
-    state: RunState
+    state: AnyRunState
     progress: float
     result: dict[str, Any] | None = None
     problem: dict[str, Any] | None = None

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 
 from graspdb.wire.base import Pose, Position, Quadruple, Request, Response, Slug, Triple
 from graspdb.wire.queries import KernelSpec, PoseColumns
+from graspdb.wire.states import AnySweepState
 
-SweepState = Literal["queued", "running", "done", "failed", "cancelled"]
 Protocol = Literal["wrench", "lift"]
 Fidelity = Literal["standard", "fine"]
 Purpose = Literal["collect", "check"]
@@ -82,7 +82,7 @@ class WaitingFor(Response):
 
     kind: Literal["decompose"]
     job: str
-    state: SweepState
+    state: AnySweepState
     attempts: int
     worker: str | None = None
     progress: str | None = None
@@ -103,7 +103,7 @@ class SweepInfo(Response):
     plan: Literal["grid", "poses", "sample"]
     grid: GridSpec | None = None
     seed: int | None = None
-    state: SweepState
+    state: AnySweepState
     chunks: int
     chunks_done: int
     chunks_failed: int

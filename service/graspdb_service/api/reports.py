@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graspdb import figures
 from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions, ReportRun, ReportSpec, SummaryReport
+from graspdb.wire.states import RunState
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing import Ctx, etag, not_modified, scope
@@ -76,7 +77,7 @@ def _answer(ctx: Context, slug: str, name: str, request: Request, options: Repor
     """The report, or its figure; 202 and where it will be while it is computed."""
     media = _media(request)
     run = ctx.runs.ask(ctx.reports.key(slug, name, options))
-    if run.state == "running":
+    if run.state == RunState.RUNNING:
         return Response(
             runs.model(run).model_dump_json(),
             status_code=202,

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from graspdb.wire import OUTCOMES, Page, SweepCreate, SweepInfo, SweepOutcomes
-from graspdb.wire.sweeps import SweepState
+from graspdb.wire.states import AnySweepState
 from graspdb_service.api.routing import (
     Ctx,
     Cursor,
@@ -54,7 +54,7 @@ def create_sweep(
 def list_sweeps(
     ctx: Ctx,
     object: Annotated[str | None, Query(max_length=64, description="Of this object only.")] = None,
-    state: Annotated[SweepState | None, Query(description="In this state only.")] = None,
+    state: Annotated[AnySweepState | None, Query(description="In this state only.")] = None,
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> Page[SweepInfo]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, and_, delete, or_, select, update
 
+from graspdb.wire.states import RunState
 from graspdb_service.storage.database import Tx, insert_or, unix_now
 from graspdb_service.storage.tables import objects, report_runs
 
@@ -75,7 +76,7 @@ def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str, lease_s: float) -> bool:
             report=key.report,
             parameters_key=key.parameters_key,
             parameters=key.parameters,
-            state="running",
+            state=RunState.RUNNING,
             progress=0.0,
             created_at=datetime.now(UTC),
             **lease,
@@ -97,7 +98,7 @@ def _delete_superseded(tx: Tx, key: RunKey) -> None:
         report_runs.c.object_id == key.object_id,
         report_runs.c.report == key.report,
         report_runs.c.revision <= key.revision,
-        or_(report_runs.c.state != "running", report_runs.c.lease_expires_at < unix_now()),
+        or_(report_runs.c.state != RunState.RUNNING, report_runs.c.lease_expires_at < unix_now()),
     )
     wanted = _without_checks(key.parameters)
     superseded = [
@@ -117,7 +118,7 @@ def _without_checks(parameters: dict[str, Any]) -> dict[str, Any]:
 def take_over(tx: Tx, id: str, *, lease_id: str, lease_s: float) -> bool:
     """Take a run whose holder is gone."""
     lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
-    return _take(tx, and_(report_runs.c.id == id, report_runs.c.state == "running"), lease)
+    return _take(tx, and_(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING), lease)
 
 
 def renew(tx: Tx, held: Mapping[str, tuple[str, float]], *, lease_s: float) -> set[str]:
@@ -144,7 +145,7 @@ def finish(
 ) -> bool:
     """Store how a run ended: done with its result, else failed; False where it is held no more."""
     values = {
-        "state": "failed" if result is None else "done",
+        "state": RunState.FAILED if result is None else RunState.DONE,
         "progress": 1.0,
         "result": result,
         "problem": problem,
@@ -164,8 +165,8 @@ def cancel(tx: Tx, id: str) -> bool:
     """End a run that is still under way; False where it is not."""
     statement = (
         update(report_runs)
-        .where(report_runs.c.id == id, report_runs.c.state == "running")
-        .values(state="cancelled", lease_id=None, lease_expires_at=None, finished_at=datetime.now(UTC))
+        .where(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING)
+        .values(state=RunState.CANCELLED, lease_id=None, lease_expires_at=None, finished_at=datetime.now(UTC))
     )
     return bool(tx.execute(statement).rowcount)
 
@@ -177,16 +178,18 @@ def remove(tx: Tx, id: str) -> None:
 
 def _take(tx: Tx, which: ColumnElement[bool], lease: dict[str, Any]) -> bool:
     free = or_(
-        report_runs.c.state == "cancelled",
-        and_(report_runs.c.state == "failed", report_runs.c.problem.is_(None)),
-        and_(report_runs.c.state == "running", report_runs.c.lease_expires_at < unix_now()),
+        report_runs.c.state == RunState.CANCELLED,
+        and_(report_runs.c.state == RunState.FAILED, report_runs.c.problem.is_(None)),
+        and_(report_runs.c.state == RunState.RUNNING, report_runs.c.lease_expires_at < unix_now()),
     )
-    fresh = {"state": "running", "progress": 0.0, "problem": None, "finished_at": None}
+    fresh = {"state": RunState.RUNNING, "progress": 0.0, "problem": None, "finished_at": None}
     return bool(tx.execute(update(report_runs).where(which, free).values(**fresh, **lease)).rowcount)
 
 
 def _held(id: str, lease_id: str) -> ColumnElement[bool]:
-    return and_(report_runs.c.id == id, report_runs.c.lease_id == lease_id, report_runs.c.state == "running")
+    return and_(
+        report_runs.c.id == id, report_runs.c.lease_id == lease_id, report_runs.c.state == RunState.RUNNING
+    )
 
 
 def _same(key: RunKey) -> ColumnElement[bool]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from sqlalchemy import and_, insert, select, update
 
+from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, unix_now
 from graspdb_service.storage.simulation.jobs import JobRow
 from graspdb_service.storage.tables import jobs, objects
@@ -42,7 +43,7 @@ def ask(tx: Tx, object_id: int, job_id: str) -> None:
     """Queue the object's decomposition, anew where it failed or was cancelled; an open one is left alone."""
     found = find(tx, object_id)
     fresh = {
-        "state": "queued",
+        "state": JobState.QUEUED,
         "attempts": 0,
         "lease_id": None,
         "lease_expires_at": None,
@@ -54,28 +55,32 @@ def ask(tx: Tx, object_id: int, job_id: str) -> None:
     if found is None:
         fixed = {"kind": "decompose", "capability": "decompose", "number": 0, "start": 0, "stop": 0}
         tx.execute(insert(jobs).values(id=job_id, object_id=object_id, **fixed, **fresh))
-    elif found.state in ("failed", "cancelled"):
+    elif found.state in (JobState.FAILED, JobState.CANCELLED):
         tx.execute(update(jobs).where(jobs.c.id == found.id).values(**fresh))
 
 
 def waiting_sweeps(tx: Tx, object_id: int) -> list[str]:
     """Sweeps with chunks that wait for the object's parts."""
-    query = select(jobs.c.sweep_id).where(jobs.c.object_id == object_id, jobs.c.state == "waiting").distinct()
+    query = (
+        select(jobs.c.sweep_id)
+        .where(jobs.c.object_id == object_id, jobs.c.state == JobState.WAITING)
+        .distinct()
+    )
     return sorted(tx.scalars(query))
 
 
 def release(tx: Tx, object_id: int) -> None:
     """Let workers claim the chunks that have waited."""
-    tx.execute(_waiting(object_id).values(state="queued"))
+    tx.execute(_waiting(object_id).values(state=JobState.QUEUED))
 
 
 def fail_waiting(tx: Tx, object_id: int, error: str) -> None:
     """Fail the chunks that have waited."""
-    tx.execute(_waiting(object_id).values(state="failed", error=error, completed_at=unix_now()))
+    tx.execute(_waiting(object_id).values(state=JobState.FAILED, error=error, completed_at=unix_now()))
 
 
 def _waiting(object_id: int) -> Any:
-    return update(jobs).where(and_(jobs.c.object_id == object_id, jobs.c.state == "waiting"))
+    return update(jobs).where(and_(jobs.c.object_id == object_id, jobs.c.state == JobState.WAITING))
 
 
 def cancel(tx: Tx, object_id: int) -> None:
@@ -86,7 +91,7 @@ def cancel(tx: Tx, object_id: int) -> None:
         .where(
             jobs.c.object_id == object_id,
             jobs.c.kind == "decompose",
-            jobs.c.state.in_(("queued", "leased")),
+            jobs.c.state.in_((JobState.QUEUED, JobState.LEASED)),
         )
-        .values(state="cancelled", completed_at=unix_now())
+        .values(state=JobState.CANCELLED, completed_at=unix_now())
     )

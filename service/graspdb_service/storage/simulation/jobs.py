@@ -19,6 +19,7 @@ from sqlalchemy import ColumnElement, Select, String, and_, exists, func, or_, s
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
 
+from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, insert_or, unix_now
 from graspdb_service.storage.tables import jobs, workers
 
@@ -56,7 +57,7 @@ class JobRow:
     number: int
     start: int
     stop: int
-    state: str
+    state: JobState
     attempts: int
     lease_id: str | None
     lease_expires_at: float | None
@@ -108,12 +109,12 @@ def find(tx: Tx, job_id: str) -> JobRow | None:
 def _claimable(capabilities: Sequence[str], max_attempts: int) -> ColumnElement[bool]:
     # The states are named once more so that both databases search the index on (state, capability).
     ran_out = and_(
-        jobs.c.state == "leased", jobs.c.lease_expires_at < unix_now(), jobs.c.attempts < max_attempts
+        jobs.c.state == JobState.LEASED, jobs.c.lease_expires_at < unix_now(), jobs.c.attempts < max_attempts
     )
     return and_(
-        jobs.c.state.in_(["queued", "leased"]),
+        jobs.c.state.in_([JobState.QUEUED, JobState.LEASED]),
         jobs.c.capability.in_(capabilities),
-        or_(jobs.c.state == "queued", ran_out),
+        or_(jobs.c.state == JobState.QUEUED, ran_out),
     )
 
 
@@ -143,7 +144,7 @@ def claim(
         update(jobs)
         .where(jobs.c.id.in_(select(chosen.cte("chosen").c.id)))
         .values(
-            state="leased",
+            state=JobState.LEASED,
             attempts=jobs.c.attempts + 1,
             lease_id=fresh_id(),
             lease_expires_at=unix_now() + lease_s,
@@ -160,7 +161,7 @@ def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str |
     news = {} if progress is None else {"progress": progress}
     statement = (
         update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == "leased")
+        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
         .values(lease_expires_at=unix_now() + lease_s, **news)
         .returning(jobs.c.lease_expires_at)
     )
@@ -172,9 +173,13 @@ def release(tx: Tx, job_id: str, lease_id: str) -> bool:
     """Give a leased job back; a worker's orderly end is no failed attempt. False if the lease is lost."""
     statement = (
         update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == "leased")
+        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
         .values(
-            state="queued", attempts=jobs.c.attempts - 1, lease_id=None, lease_expires_at=None, worker=None
+            state=JobState.QUEUED,
+            attempts=jobs.c.attempts - 1,
+            lease_id=None,
+            lease_expires_at=None,
+            worker=None,
         )
     )
     return tx.execute(statement).rowcount == 1
@@ -186,9 +191,9 @@ def complete(
     """Mark a job done if the lease is still its own, run out or not. False if it is lost."""
     statement = (
         update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == "leased")
+        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
         .values(
-            state="done",
+            state=JobState.DONE,
             result_sha256=sha256,
             answer=dict(answer),
             counts=dict(counts),
@@ -208,22 +213,24 @@ def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -
     -------
     The job's new state, None if the lease is lost.
     """
-    held = and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == "leased")
+    held = and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
     ended = tx.execute(
         update(jobs)
         .where(held, jobs.c.attempts >= max_attempts)
-        .values(state="failed", error=error, completed_at=unix_now())
+        .values(state=JobState.FAILED, error=error, completed_at=unix_now())
     )
     if ended.rowcount == 1:
-        return "failed"
-    again = tx.execute(update(jobs).where(held).values(state="queued", error=error, lease_expires_at=None))
-    return "queued" if again.rowcount == 1 else None
+        return JobState.FAILED
+    again = tx.execute(
+        update(jobs).where(held).values(state=JobState.QUEUED, error=error, lease_expires_at=None)
+    )
+    return JobState.QUEUED if again.rowcount == 1 else None
 
 
 def exhausted(tx: Tx, max_attempts: int) -> list[JobRow]:
     """Jobs whose last allowed lease has run out."""
     query = select(*_COLUMNS).where(
-        jobs.c.state == "leased", jobs.c.lease_expires_at < unix_now(), jobs.c.attempts >= max_attempts
+        jobs.c.state == JobState.LEASED, jobs.c.lease_expires_at < unix_now(), jobs.c.attempts >= max_attempts
     )
     return [_job(row) for row in tx.execute(query)]
 
@@ -235,11 +242,11 @@ def end_exhausted(tx: Tx, job: JobRow) -> bool:
         .where(
             jobs.c.id == job.id,
             jobs.c.lease_id == job.lease_id,
-            jobs.c.state == "leased",
+            jobs.c.state == JobState.LEASED,
             jobs.c.lease_expires_at < unix_now(),
         )
         .values(
-            state="failed",
+            state=JobState.FAILED,
             error=job.error or STALE_LEASE_ERROR.format(attempts=job.attempts),
             completed_at=unix_now(),
         )
@@ -279,7 +286,7 @@ def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerRow]:
     leased = (
         select(func.count())
         .select_from(jobs)
-        .where(jobs.c.state == "leased", jobs.c.worker == workers.c.name)
+        .where(jobs.c.state == JobState.LEASED, jobs.c.worker == workers.c.name)
         .scalar_subquery()
     )
     query = (

@@ -13,6 +13,7 @@ from typing import Any
 
 from sqlalchemy import Select, func, insert, select, update
 
+from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
 
@@ -136,7 +137,7 @@ def done_chunks(tx: Tx, sweep_ids: Collection[str]) -> list[DoneChunk]:
     query = (
         select(jobs.c.id, jobs.c.sweep_id, jobs.c.start, jobs.c.stop, packed_outcomes.c.revision)
         .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
-        .where(jobs.c.sweep_id.in_(sorted(sweep_ids)), jobs.c.state == "done")
+        .where(jobs.c.sweep_id.in_(sorted(sweep_ids)), jobs.c.state == JobState.DONE)
         .order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
     )
     return [DoneChunk(i, s, int(a), int(b), int(r)) for i, s, a, b, r in tx.execute(query)]
@@ -152,7 +153,7 @@ def done_ranges(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, list[tuple[int, i
     """Places (start, stop) in their plans of the finished chunks of these sweeps."""
     query = (
         select(jobs.c.sweep_id, jobs.c.start, jobs.c.stop)
-        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
+        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == JobState.DONE)
         .order_by(jobs.c.sweep_id, jobs.c.start)
     )
     found: dict[str, list[tuple[int, int]]] = {sweep_id: [] for sweep_id in sweep_ids}
@@ -167,7 +168,7 @@ def count_done(tx: Tx, sweep_ids: Sequence[str]) -> int:
         select(func.count())
         .select_from(jobs)
         .join(batches, batches.c.sweep_id == jobs.c.sweep_id)
-        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == "done")
+        .where(jobs.c.sweep_id.in_(sweep_ids), jobs.c.state == JobState.DONE)
     )
     return int(tx.scalar(query) or 0)
 
@@ -191,7 +192,7 @@ def packed_counts(tx: Tx, sweep_id: str) -> tuple[int, dict[int, int]]:
     if provenance_id is None:
         raise LookupError(sweep_id)
     counts: dict[int, int] = {}
-    query = select(jobs.c.counts).where(jobs.c.sweep_id == sweep_id, jobs.c.state == "done")
+    query = select(jobs.c.counts).where(jobs.c.sweep_id == sweep_id, jobs.c.state == JobState.DONE)
     for (stored,) in tx.execute(query):
         for code, count in stored["packed"].items():
             counts[int(code)] = counts.get(int(code), 0) + count

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
 
+from graspdb.wire.states import JobState, SweepState
 from graspdb_service.storage.database import Tx, unix_now
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.storage.tables import batches, jobs, objects, sweeps
@@ -19,7 +20,7 @@ from graspdb_service.storage.tables import batches, jobs, objects, sweeps
 POSE_COLUMNS = 8
 _POSE_BYTES = 8 * POSE_COLUMNS
 _JOBS_PER_INSERT = 10_000
-_OPEN = ("waiting", "queued", "leased")
+_OPEN = (JobState.WAITING, JobState.QUEUED, JobState.LEASED)
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def create(
                     "number": number,
                     "start": number * chunk_poses,
                     "stop": min((number + 1) * chunk_poses, pose_count),
-                    "state": "waiting" if waiting else "queued",
+                    "state": JobState.WAITING if waiting else JobState.QUEUED,
                     "attempts": 0,
                 }
                 for number, job_id in enumerate(job_ids[first : first + _JOBS_PER_INSERT], first)
@@ -187,25 +188,25 @@ def find_many(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, SweepRow]:
     return {row.id: SweepRow(**row._mapping) for row in rows}
 
 
-def state_of(sweep: SweepRow, failed_chunks: int) -> str:
-    """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``."""
+def state_of(sweep: SweepRow, failed_chunks: int) -> SweepState:
+    """What its own row and its failed chunks make of it."""
     if sweep.cancelled:
-        return "cancelled"
+        return SweepState.CANCELLED
     if sweep.finished_at is not None:
-        return "failed" if failed_chunks else "done"
-    return "queued" if sweep.started_at is None else "running"
+        return SweepState.FAILED if failed_chunks else SweepState.DONE
+    return SweepState.QUEUED if sweep.started_at is None else SweepState.RUNNING
 
 
-def _in_state(state: str) -> ColumnElement[bool]:
+def _in_state(state: SweepState) -> ColumnElement[bool]:
     ended = and_(not_(sweeps.c.cancelled), sweeps.c.finished_at.is_not(None))
     going = and_(not_(sweeps.c.cancelled), sweeps.c.finished_at.is_(None))
-    any_failed = exists().where(jobs.c.sweep_id == sweeps.c.id, jobs.c.state == "failed")
+    any_failed = exists().where(jobs.c.sweep_id == sweeps.c.id, jobs.c.state == JobState.FAILED)
     return {
-        "cancelled": sweeps.c.cancelled,
-        "failed": and_(ended, any_failed),
-        "done": and_(ended, not_(any_failed)),
-        "queued": and_(going, sweeps.c.started_at.is_(None)),
-        "running": and_(going, sweeps.c.started_at.is_not(None)),
+        SweepState.CANCELLED: sweeps.c.cancelled,
+        SweepState.FAILED: and_(ended, any_failed),
+        SweepState.DONE: and_(ended, not_(any_failed)),
+        SweepState.QUEUED: and_(going, sweeps.c.started_at.is_(None)),
+        SweepState.RUNNING: and_(going, sweeps.c.started_at.is_not(None)),
     }[state]
 
 
@@ -217,7 +218,7 @@ def listing(
     if object_id is not None:
         query = query.where(sweeps.c.object_id == object_id)
     if state is not None:
-        query = query.where(_in_state(state))
+        query = query.where(_in_state(SweepState(state)))
     if before is not None:
         query = query.where(sweeps.c.id < before)
     return [SweepRow(**row._mapping) for row in tx.execute(query)]
@@ -234,24 +235,26 @@ def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
     )
     for state, count, poses in tx.execute(totals):
         states[state] = int(count)
-        if state == "done":
+        if state == JobState.DONE:
             poses_done = int(poses)
     counts: dict[str, int] = {}
-    done = select(jobs.c.counts).where(jobs.c.sweep_id == sweep.id, jobs.c.state == "done")
+    done = select(jobs.c.counts).where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.DONE)
     for (stored,) in tx.execute(done):
         for code, count in stored["all"].items():
             counts[code] = counts.get(code, 0) + count
     failed: list[tuple[int, int, str]] = []
-    if states.get("failed"):
+    if states.get(JobState.FAILED):
         ended = (
             select(jobs.c.number, jobs.c.attempts, jobs.c.error)
-            .where(jobs.c.sweep_id == sweep.id, jobs.c.state == "failed")
+            .where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.FAILED)
             .order_by(jobs.c.number)
             .limit(100)
         )
         failed = [(int(number), int(attempts), error or "") for number, attempts, error in tx.execute(ended)]
     recent = select(func.sum(jobs.c.stop - jobs.c.start), unix_now()).where(
-        jobs.c.sweep_id == sweep.id, jobs.c.state == "done", jobs.c.completed_at > unix_now() - window_s
+        jobs.c.sweep_id == sweep.id,
+        jobs.c.state == JobState.DONE,
+        jobs.c.completed_at > unix_now() - window_s,
     )
     recent_poses, now = tx.execute(recent).one()
     if sweep.started_at is not None:
@@ -306,7 +309,7 @@ def cancel(tx: Tx, sweep_id: str) -> bool:
     stopped = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(_OPEN))
-        .values(state="cancelled", completed_at=unix_now())
+        .values(state=JobState.CANCELLED, completed_at=unix_now())
     )
     if stopped.rowcount == 0:
         return False
@@ -320,9 +323,9 @@ def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
     """Queue failed and cancelled chunks again, with all their attempts; under the object's lock."""
     again = tx.execute(
         update(jobs)
-        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(["failed", "cancelled"]))
+        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]))
         .values(
-            state="waiting" if waiting else "queued",
+            state=JobState.WAITING if waiting else JobState.QUEUED,
             attempts=0,
             lease_id=None,
             lease_expires_at=None,

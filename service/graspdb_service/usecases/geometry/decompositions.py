@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from graspdb.wire import DecomposePayload, GridPlan, MeshInfo
+from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import WaitingFor
 from graspdb_geometry import meshes
 from graspdb_service.problems import ProblemError, conflict
@@ -49,7 +50,7 @@ def check(tx: Tx, row: ObjectRow) -> None:
             errors=[("mesh", "flat")],
         )
     job = decompositions.find(tx, row.id)
-    if job is not None and job.state == "failed":
+    if job is not None and job.state == JobState.FAILED:
         raise conflict(
             "convex-parts-missing",
             f"The mesh of {row.slug!r} is not convex, and its decomposition into convex parts failed:"
@@ -129,7 +130,7 @@ def fail_waiting(tx: Tx, job: JobRow, reason: str) -> None:
 def drop_unwanted(tx: Tx, object_id: int) -> None:
     """Stop a decomposition that no sweep waits for any more."""
     job = decompositions.find(tx, object_id)
-    is_open = job is not None and job.state in ("queued", "leased")
+    is_open = job is not None and job.state in (JobState.QUEUED, JobState.LEASED)
     if is_open and not decompositions.waiting_sweeps(tx, object_id):
         decompositions.cancel(tx, object_id)
 
@@ -145,7 +146,7 @@ def waiting_for(tx: Tx, sweep: SweepRow) -> WaitingFor | None:
         {
             "kind": "decompose",
             "job": job.id,
-            "state": "running" if job.state == "leased" else job.state,
+            "state": SweepState.RUNNING if job.state == JobState.LEASED else job.state,
             "attempts": job.attempts,
             "worker": job.worker,
             "progress": job.progress,

@@ -19,6 +19,7 @@ from graspdb.wire.kernels import (
     KernelWidths,
     StoredKernel,
 )
+from graspdb.wire.states import RunState
 from graspdb_density import AnisotropicKernel
 from graspdb_service.problems import invalid, not_found
 from graspdb_service.storage import grippers, kernels
@@ -232,7 +233,7 @@ def _started(
     made = replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
     # The same request may have come before, even while this one did.
     run = runs.follow(made.body["id"], lease if made.body["id"] == id else None)
-    if run.state == "running":
+    if run.state == RunState.RUNNING:
         return replace(made, body=model(run).model_dump(mode="json"))
     assert run.result is not None
     return Created(json.loads(run.result), location=f"/kernels/{run.id}")

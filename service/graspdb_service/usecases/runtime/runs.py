@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from graspdb.wire.reports import ReportRun
+from graspdb.wire.states import RunState
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.storage import report_runs
@@ -121,14 +122,14 @@ class Runs:
 
     def _answered(self, run: RunRow) -> RunRow:
         """The run once it has ended well, or as it is when the wait is over."""
-        if run.state == "running":
+        if run.state == RunState.RUNNING:
             run = self._waited(run)
         what = self._kinds[run.report].noun
-        if run.state == "cancelled":
+        if run.state == RunState.CANCELLED:
             raise conflict("report-cancelled", f"The {what} was cancelled: ask again to compute it anew")
         if run.problem is not None:
             raise _problem(run.problem)
-        if run.state == "failed":
+        if run.state == RunState.FAILED:
             raise ProblemError(
                 500, "internal-error", f"The {what} failed; the service's log says more: ask again to retry"
             )
@@ -137,7 +138,7 @@ class Runs:
     def get(self, id: str) -> RunRow:
         """A run as it is; one whose holder is gone is taken over."""
         run = self._row(id)
-        if run.state == "running" and not run.live:
+        if run.state == RunState.RUNNING and not run.live:
             lease = str(uuid.uuid4())
             with self._database.write() as tx:
                 taken = report_runs.take_over(tx, id, lease_id=lease, lease_s=_LEASE_S)
@@ -151,7 +152,7 @@ class Runs:
         with self._database.write() as tx:
             report_runs.cancel(tx, id)
         run = self._row(id)
-        if run.state == "cancelled":
+        if run.state == RunState.CANCELLED:
             with self._lock:
                 held = self._held.get(id)
                 if held is not None:
@@ -218,7 +219,7 @@ class Runs:
             return run
         try:
             deadline = time.monotonic() + self._wait_s
-            while run.state == "running" and time.monotonic() < deadline and not self._closed.is_set():
+            while run.state == RunState.RUNNING and time.monotonic() < deadline and not self._closed.is_set():
                 with self._changed:
                     if run.id in self._held:
                         self._changed.wait(min(1.0, max(0.0, deadline - time.monotonic())))
@@ -315,9 +316,9 @@ class Runs:
 
 def _settled(run: RunRow) -> bool:
     """Whether a run needs nobody to start it."""
-    if run.state == "running":
+    if run.state == RunState.RUNNING:
         return run.live
-    return run.state == "done" or run.problem is not None
+    return run.state == RunState.DONE or run.problem is not None
 
 
 def _problem(document: dict[str, Any]) -> ProblemError:

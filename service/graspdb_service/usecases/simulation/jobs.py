@@ -26,6 +26,7 @@ from graspdb.wire import (
     WorkerInfo,
 )
 from graspdb.wire.jobs import FailureNoted
+from graspdb.wire.states import JobState
 from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Tx
@@ -176,7 +177,7 @@ def renew(ctx: Runtime, job_id: str, lease_id: str, progress: str | None = None)
     if ends is not None:
         return LeaseRenewed(lease_expires_at=_time(ends), lease_s=ctx.settings.lease_s)
     job = _found(job, job_id)
-    if job.state == "cancelled" and job.lease_id == lease_id:
+    if job.state == JobState.CANCELLED and job.lease_id == lease_id:
         return LeaseRenewed(lease_expires_at=_time(job.lease_expires_at), lease_s=0.0, cancel=True)
     raise _lost(job)
 
@@ -199,10 +200,10 @@ def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> Fai
         attempts = 0 if report.permanent else ctx.settings.max_attempts
         state = jobs.fail(tx, job_id, lease_id, error=report.error, max_attempts=attempts)
         job = _found(jobs.find(tx, job_id), job_id)
-        if state == "failed":
+        if state == JobState.FAILED:
             _failed(tx, job)
     # The same report once more, its answer having been lost.
-    repeated = state is None and job.lease_id == lease_id and job.state in ("queued", "failed")
+    repeated = state is None and job.lease_id == lease_id and job.state in (JobState.QUEUED, JobState.FAILED)
     if state is None and not repeated:
         raise _lost(job)
     return FailureNoted(job=job_id, state=job.state, attempts=job.attempts)
@@ -227,7 +228,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             job = _found(jobs.find(tx, job_id), job_id)
             if (earlier := _replay(job, lease_id, sha256)) is not None:
                 return earlier
-            if job.state != "leased" or job.lease_id != lease_id:
+            if job.state != JobState.LEASED or job.lease_id != lease_id:
                 raise _lost(job)
             if job.kind != "simulate":
                 raise WrongResult(job.kind)
@@ -282,7 +283,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
             return earlier
         if job.kind != "decompose":
             raise WrongResult(job.kind)
-        if job.state != "leased" or job.lease_id != lease_id:
+        if job.state != JobState.LEASED or job.lease_id != lease_id:
             raise _lost(job)
         source = decompositions.source(tx, job)
         row = None if source is None else require(tx, source)
@@ -463,19 +464,19 @@ def _found(job: JobRow | None, job_id: str) -> JobRow:
 
 
 def _replay(job: JobRow, lease_id: str, sha256: str) -> ResultAccepted | None:
-    if job.state == "done" and job.lease_id == lease_id and job.result_sha256 == sha256:
+    if job.state == JobState.DONE and job.lease_id == lease_id and job.result_sha256 == sha256:
         return ResultAccepted.model_validate(job.answer)
     return None
 
 
 def _lost(job: JobRow) -> ProblemError:
     reason = {
-        "done": "it is done",
-        "cancelled": "its sweep was cancelled",
-        "failed": "it has failed for good",
-        "waiting": "it waits for convex parts",
-        "queued": "it was given back or failed, and waits for another claim",
-        "leased": "another claim has it",
+        JobState.DONE: "it is done",
+        JobState.CANCELLED: "its sweep was cancelled",
+        JobState.FAILED: "it has failed for good",
+        JobState.WAITING: "it waits for convex parts",
+        JobState.QUEUED: "it was given back or failed, and waits for another claim",
+        JobState.LEASED: "another claim has it",
     }[job.state]
     return conflict("lease-lost", f"This lease is no longer the job's: {reason}. Drop it and claim again")
 

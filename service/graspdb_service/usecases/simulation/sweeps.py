@@ -24,6 +24,7 @@ from graspdb.wire import (
     SweepCreate,
     SweepInfo,
 )
+from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import FailedChunk
 from graspdb_service.formats import arrow
 from graspdb_service.problems import conflict, invalid, not_found
@@ -345,7 +346,7 @@ def retry(ctx: Estimators, sweep_id: str) -> SweepInfo:
 
 def _info(tx: Tx, row: SweepRow) -> SweepInfo:
     done = sweeps.progress(tx, row)
-    state = sweeps.state_of(row, done.states.get("failed", 0))
+    state = sweeps.state_of(row, done.states.get(JobState.FAILED, 0))
     rate = _rate(row, done)
     left = row.pose_count - done.poses_done
     grid = row.request.get("grid")
@@ -363,15 +364,15 @@ def _info(tx: Tx, row: SweepRow) -> SweepInfo:
         seed=(grid or sample or {}).get("seed"),
         state=state,
         chunks=row.chunks,
-        chunks_done=done.states.get("done", 0),
-        chunks_failed=done.states.get("failed", 0),
+        chunks_done=done.states.get(JobState.DONE, 0),
+        chunks_failed=done.states.get(JobState.FAILED, 0),
         poses=row.pose_count,
         poses_done=done.poses_done,
         full_grid_poses=row.snapshot.get("full_count"),
         waiting_for=decompositions.waiting_for(tx, row),
         outcomes={name: done.counts[name] for name in OUTCOMES if name in done.counts},
         rate_poses_s=rate,
-        time_left_s=left / rate if rate and state == "running" else None,
+        time_left_s=left / rate if rate and state == SweepState.RUNNING else None,
         failed_chunks=[
             FailedChunk(chunk=number, attempts=attempts, error=error)
             for number, attempts, error in done.failed
