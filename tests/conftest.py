@@ -18,7 +18,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -269,16 +269,15 @@ Serve = Callable[..., str]
 @pytest.fixture
 def serve() -> Iterator[Serve]:
     """Start the service: ``serve(database_url, **settings)`` returns its address; several may run."""
-    running = []
+    with ExitStack() as running:
+        yield lambda url, **options: running.enter_context(serving(Settings(database_url=url, **options)))
 
-    def start(database_url: str, **options: object) -> str:
-        manager = serving(Settings(database_url=database_url, **options))  # type: ignore[arg-type]
-        running.append(manager)
-        return manager.__enter__()
 
-    yield start
-    for manager in reversed(running):
-        manager.__exit__(None, None, None)
+@pytest.fixture(scope="module")
+def serve_module() -> Iterator[Serve]:
+    """As ``serve``, for all tests of a module."""
+    with ExitStack() as running:
+        yield lambda url, **options: running.enter_context(serving(Settings(database_url=url, **options)))
 
 
 @pytest.fixture

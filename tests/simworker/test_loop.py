@@ -17,6 +17,7 @@ import pytest
 
 from graspdb.errors import Unreachable
 from graspdb.examples import example
+from graspdb.processes import ChildProcess
 from graspdb.transport import Transport
 from graspdb.wire import OUTCOMES, ClaimedJob, ClaimRequest, SimulatePayload
 from graspdb_simworker import loop
@@ -28,9 +29,22 @@ from graspdb_simworker.simulation import chunks
 Plan = Callable[..., dict[str, Any]]
 
 
-@pytest.fixture
-def url(serve: Callable[..., str], sqlite_url: str) -> str:
-    return serve(sqlite_url, retry_after_s=0.2, lease_s=6.0)
+@pytest.fixture(scope="module")
+def url(serve_module: Callable[..., str], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A service that knows the mug."""
+    database = tmp_path_factory.mktemp("service") / "graspdb.sqlite"
+    url = serve_module(f"sqlite:///{database}", retry_after_s=0.2, lease_s=6.0)
+    mug = example("mug")
+    with httpx.Client(base_url=url, timeout=60.0) as http:
+        created = http.post("/objects", json={"id": "mug", "mass_kg": mug.mass_kg, "friction": mug.friction})
+        assert created.status_code == 201, created.text
+        for path, body, media in (
+            ("mesh", mug.stl(), "model/stl"),
+            ("convex-parts", mug.parts_glb(), "model/gltf-binary"),
+        ):
+            stored = http.put(f"/objects/mug/{path}", content=body, headers={"Content-Type": media})
+            assert stored.is_success, stored.text
+    return url
 
 
 @pytest.fixture
@@ -46,17 +60,9 @@ def transport(url: str) -> Iterator[Transport]:
 
 
 @pytest.fixture
-def plan(http: httpx.Client) -> Plan:
-    """Register the mug and plan a sweep on it: ``plan(max_poses, chunk_poses, ...)``."""
-    mug = example("mug")
-    created = http.post("/objects", json={"id": "mug", "mass_kg": mug.mass_kg, "friction": mug.friction})
-    assert created.status_code == 201, created.text
-    for path, body, media in (
-        ("mesh", mug.stl(), "model/stl"),
-        ("convex-parts", mug.parts_glb(), "model/gltf-binary"),
-    ):
-        stored = http.put(f"/objects/mug/{path}", content=body, headers={"Content-Type": media})
-        assert stored.is_success, stored.text
+def plan(http: httpx.Client) -> Iterator[Plan]:
+    """Plan a sweep on the mug: ``plan(max_poses, chunk_poses, ...)``; the next test finds none of it."""
+    made: list[str] = []
 
     def make(max_poses: int, chunk_poses: int, **more: Any) -> dict[str, Any]:
         answer = http.post(
@@ -71,17 +77,18 @@ def plan(http: httpx.Client) -> Plan:
         )
         assert answer.status_code == 202, answer.text
         sweep: dict[str, Any] = answer.json()
+        made.append(sweep["id"])
         return sweep
 
-    return make
+    yield make
+    for sweep in made:
+        http.post(f"/sweeps/{sweep}/cancel")
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "it never happened"
-        time.sleep(0.02)
-    return value
+@pytest.fixture
+def until_leased(http: httpx.Client, eventually: Callable[..., Any]) -> Callable[[], Any]:
+    """Waits until a worker has a job."""
+    return lambda: eventually(lambda: any(w["jobs_leased"] for w in http.get("/workers").json()["items"]))
 
 
 class Running:
@@ -145,10 +152,12 @@ def test_a_sweep_is_done_whole_with_the_outcomes_of_its_poses(
     assert {"collision", "missed", "slipped", "success"} <= set(stored.values())
 
 
-def test_a_stopped_worker_gives_its_lease_back(http: httpx.Client, transport: Transport, plan: Plan) -> None:
+def test_a_stopped_worker_gives_its_lease_back(
+    http: httpx.Client, transport: Transport, plan: Plan, until_leased: Callable[[], Any]
+) -> None:
     plan(100_000, 100_000)
     running = Running(Worker(transport, name="stopped"))
-    wait_for(lambda: [w for w in http.get("/workers").json()["items"] if w["jobs_leased"]])
+    until_leased()
     running.stop()
     assert running.error is None
     # At once another may have it; without the release it would wait for the lease to run out.
@@ -156,11 +165,13 @@ def test_a_stopped_worker_gives_its_lease_back(http: httpx.Client, transport: Tr
     assert len(claim["jobs"]) == 1
 
 
-def test_a_cancelled_sweep_stops_the_child(http: httpx.Client, transport: Transport, plan: Plan) -> None:
+def test_a_cancelled_sweep_stops_the_child(
+    http: httpx.Client, transport: Transport, plan: Plan, until_leased: Callable[[], Any]
+) -> None:
     sweep = plan(100_000, 100_000)
     worker = Worker(transport, name="cancelled", exit_when_idle=True)
     running = Running(worker)
-    wait_for(lambda: [w for w in http.get("/workers").json()["items"] if w["jobs_leased"]])
+    until_leased()
     assert http.post(f"/sweeps/{sweep['id']}/cancel").is_success
     running.join()
     assert (worker.tally.jobs, worker.tally.lost) == (0, 1)
@@ -278,17 +289,14 @@ def test_a_worker_waits_for_a_service_that_is_not_there() -> None:
     assert running.error is None
 
 
-def cli(*arguments: str, **options: Any) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "graspdb_simworker.cli", *arguments],
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,
+def cli(*arguments: str) -> ChildProcess:
+    return ChildProcess(
+        [sys.executable, "-m", "graspdb_simworker.cli", *arguments], stderr=subprocess.PIPE, text=True
     )
 
 
 def test_the_command_works_until_idle_and_ends_well_on_a_signal(
-    http: httpx.Client, url: str, plan: Plan
+    http: httpx.Client, url: str, plan: Plan, until_leased: Callable[[], Any]
 ) -> None:
     sweep = plan(400, 200)
     with cli("run", "--url", url, "--exit-when-idle") as process:
@@ -299,7 +307,7 @@ def test_the_command_works_until_idle_and_ends_well_on_a_signal(
 
     plan(100_000, 100_000)
     with cli("run", "--url", url, "--name", "signalled") as process:
-        wait_for(lambda: [w for w in http.get("/workers").json()["items"] if w["jobs_leased"]])
+        until_leased()
         os.kill(process.pid, signal.SIGTERM)
         _, said = process.communicate(timeout=30)
     assert process.returncode == 0, said

@@ -6,7 +6,6 @@ import contextlib
 import importlib.util
 import json
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -65,20 +64,10 @@ def decompose(
     progress: Callable[[str], None] = lambda note: None,
     command: Sequence[str] = COMMAND,
 ) -> bytes:
-    """The mesh's convex parts as GLB.
+    """The mesh's convex parts as GLB, from the mesh as it was uploaded.
 
-    Parameters
-    ----------
-    payload : DecomposePayload
-    mesh : bytes
-        As it was uploaded.
-    limits : Limits
-    wanted
-        Asked several times a second; the child is killed as soon as it says no.
-    progress
-        Told in words how far it is.
-    command
-        Starts the process that speaks as :mod:`graspdb_simworker.decomposition.child` does.
+    ``wanted`` is asked several times a second, ``progress`` told in words how far it is; ``command`` starts
+    what answers as :mod:`.child` does.
 
     Raises
     ------
@@ -124,13 +113,8 @@ def decompose(
         if best is None:
             raise _too_long(limits) from None
     except channel.Closed:
-        if best is None and process.wait() == -signal.SIGXCPU:
-            raise _too_long(limits) from None
         if best is None:
-            raise DecompositionFailed(
-                f"{_cause(process)}: perhaps it needs more than {limits.memory_bytes / 2**20:.0f} MiB"
-                f" (the worker's --decompose-memory-mib). {_WAY_OUT}"
-            ) from None
+            raise _death(process.wait(), limits) from None
     finally:
         channel.end(process)
     return best
@@ -142,6 +126,11 @@ def _too_long(limits: Limits) -> DecompositionFailed:
     )
 
 
-def _cause(process: subprocess.Popen[bytes]) -> str:
-    code = process.wait()
-    return f"CoACD died of {signal.Signals(-code).name}" if code < 0 else f"CoACD ended with code {code}"
+def _death(code: int, limits: Limits) -> DecompositionFailed:
+    if code == -signal.SIGXCPU:
+        return _too_long(limits)
+    cause = f"CoACD died of {signal.Signals(-code).name}" if code < 0 else f"CoACD ended with code {code}"
+    return DecompositionFailed(
+        f"{cause}: perhaps it needs more than {limits.memory_bytes / 2**20:.0f} MiB"
+        f" (the worker's --decompose-memory-mib). {_WAY_OUT}"
+    )

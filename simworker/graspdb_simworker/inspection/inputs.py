@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, cast, get_args
+from typing import cast, get_args
 
 import numpy as np
 
 from graspdb.examples import example
 from graspdb.transport import Transport
 from graspdb.wire import Finger, GridPlan, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
+from graspdb.wire.sweeps import Protocol
 from graspdb_geometry import meshes
 from graspdb_geometry.grippers import GRIPPER_SHAPES
 from graspdb_simworker.simulation.bodies import Part
-
-Protocol = Literal["wrench", "lift"]
 
 _DRIVES: dict[str, dict[str, float]] = {
     "pg70": {"finger_mass_kg": 0.1, "max_speed_m_s": 0.06, "force_n": 40.0, "friction": 0.4},
@@ -47,22 +46,7 @@ def load(
     parts: Sequence[Part]
     if url is None:
         thing = example(name)
-        shape = GRIPPER_SHAPES.get(gripper)
-        if shape is None:
-            raise ValueError(
-                f"no gripper {gripper!r} without a service; there are {', '.join(GRIPPER_SHAPES)}"
-            )
-        profile = GripperProfile(
-            max_opening_m=shape.max_opening_m,
-            finger=Finger(
-                width_m=shape.finger_width_m,
-                thickness_m=shape.finger_thickness_m,
-                length_m=shape.finger_length_m,
-            ),
-            tip_offset_m=shape.tip_offset_m,
-            palm_size_m=shape.palm_size_m,
-            **_DRIVES[gripper],
-        )
+        profile = _built_in(gripper)
         parts, mass, friction = thing.parts, thing.mass_kg, thing.friction
     else:
         with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
@@ -100,3 +84,20 @@ def load(
         stop=0,
     )
     return payload, parts
+
+
+def _built_in(gripper: str) -> GripperProfile:
+    shape = GRIPPER_SHAPES.get(gripper)
+    if shape is None:
+        raise ValueError(f"no gripper {gripper!r} without a service; there are {', '.join(GRIPPER_SHAPES)}")
+    return GripperProfile(
+        max_opening_m=shape.max_opening_m,
+        finger=Finger(
+            width_m=shape.finger_width_m,
+            thickness_m=shape.finger_thickness_m,
+            length_m=shape.finger_length_m,
+        ),
+        tip_offset_m=shape.tip_offset_m,
+        palm_size_m=shape.palm_size_m,
+        **_DRIVES[gripper],
+    )

@@ -172,6 +172,7 @@ def _on_circle(normals, forces, count, friction, contact, best, where):  # type:
 
 
 @njit(cache=True)
+# long: four kinds of minima of one function, searched one after the other
 def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
     """Global minimum of h over the sphere.
 

@@ -191,6 +191,7 @@ class GraspWorld(BulletWorld):
             self._filmed_s = 0.0
             self.pictures.append(self._render())
 
+    # long: one step after the other, with every name looked up once: it runs ten thousand times a second
     def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
         client, jaw, body = self._client, self._jaw, self._object
         gripper, stepping = self.gripper, self.stepping
