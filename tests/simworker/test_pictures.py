@@ -63,7 +63,7 @@ def test_show_names_what_is_wrong() -> None:
 
 
 def test_a_film_shows_the_object_swing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "FRAME_S", 0.8)  # a frame takes a second to draw
+    monkeypatch.setattr(pictures, "FRAME_S", 0.2)  # a frame takes a second to draw
     film = tmp_path / "cone.gif"
     arguments = ["--quaternion", "0,0.70710678,0,0.70710678", "--protocol", "lift", "--out", str(film)]
     done = CliRunner().invoke(cli.app, ["show", "cone", *arguments])
