@@ -20,21 +20,9 @@ from graspdb.transport import Transport
 class Client:
     """A connection to a GraspDB service; safe to share between threads.
 
-    Parameters
-    ----------
-    url
-        Base address; by default ``$GRASPDB_URL``, else ``http://127.0.0.1:8000``.
-    api_key
-        By default ``$GRASPDB_API_KEY``.
-    timeout_s
-        Per attempt; a request that computes much may take as long.
-    retries
-        Attempts after the first, on connection errors, timeouts and 429, 502, 503, 504.
-
-    Attributes
-    ----------
-    objects, grippers, kernels, sweeps
-        The collections on the service.
+    ``url`` is by default ``$GRASPDB_URL``, else ``http://127.0.0.1:8000``; ``api_key`` ``$GRASPDB_API_KEY``.
+    ``timeout_s`` is per attempt; a request that computes much may take as long. ``retries`` are attempts
+    after the first, on connection errors, timeouts and 429, 502, 503, 504.
     """
 
     def __init__(
@@ -79,13 +67,6 @@ class Client:
         """Create one of the paper's objects: ``cone``, ``elongated-d``, ``screwdriver`` or ``mug``.
 
         With its mesh, its convex parts, mass and friction. Needs trimesh (extra ``examples``).
-
-        Raises
-        ------
-        ValueError
-            Listing the names, for any other.
-        Conflict
-            If it exists already.
         """
         model = example(name)
         try:

@@ -31,19 +31,11 @@ FRICTION = 0.4
 
 @dataclass(frozen=True)
 class ExampleObject:
-    """An object of the paper.
+    """An object of the paper; ``name`` is a slug, for example ``elongated-d``.
 
-    Attributes
-    ----------
-    name : str
-        Slug, for example ``elongated-d``.
-    parts : tuple of (vertices (V, 3), faces (F, 3))
-        Convex polyhedra in the object frame, metres, whose union is the object.
-    surface : tuple of (vertices, faces)
-        Closed surfaces with the same union; where the object needs two of them (the mug's handle in its wall)
-        they overlap a little, so an enclosed volume counts the overlap twice.
-    density_kg_m3, friction : float
-        Of the material.
+    ``parts`` are convex polyhedra, vertices (V, 3) in the object frame, metres, and faces (F, 3), whose union
+    is the object; ``surface`` closed surfaces with the same union. Where the object needs two of them (the
+    mug's handle in its wall) they overlap a little, so an enclosed volume counts the overlap twice.
     """
 
     name: str
@@ -275,18 +267,7 @@ EXAMPLES: tuple[str, ...] = tuple(_BUILDERS)
 
 
 def example(name: str) -> ExampleObject:
-    """Build one of the paper's objects.
-
-    Parameters
-    ----------
-    name : str
-        One of :data:`EXAMPLES`; ``elongated_d`` is accepted for ``elongated-d``.
-
-    Raises
-    ------
-    ValueError
-        Listing the names, for any other.
-    """
+    """Build one of the paper's objects, :data:`EXAMPLES`; ``elongated_d`` is accepted for ``elongated-d``."""
     builder = _BUILDERS.get(name.replace("_", "-"))
     if builder is None:
         raise ValueError(f"no example named {name!r}; there are {', '.join(EXAMPLES)}")

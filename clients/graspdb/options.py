@@ -48,13 +48,7 @@ class PoseFile(Option):
 
 
 def known_keywords(model: type[Any], given: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """Keywords that a method was given, all of which ``model``, a TypedDict, must name.
-
-    Raises
-    ------
-    TypeError
-        Naming the first that it does not.
-    """
+    """Keywords that a method was given, all of which ``model``, a TypedDict, must name (TypeError)."""
     known: frozenset[str] = model.__optional_keys__
     for name in given:
         if name not in known:

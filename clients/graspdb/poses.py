@@ -46,17 +46,9 @@ class Poses(NamedTuple):
 def as_poses(poses: ArrayLike | Any) -> Poses:
     """One or many poses, checked, their quaternions normalised.
 
-    Parameters
-    ----------
-    poses
-        (N, 4, 4) or (4, 4) homogeneous matrices, or (N, 7) or (7,) rows ``x y z qx qy qz qw``; anything
-        with ``position`` and ``quaternion_xyzw`` (a grasp, samples) is taken too, and a list of such.
-
-    Raises
-    ------
-    ValueError
-        If the shape is none of these, a number is not finite, a position lies beyond 1 km or a rotation
-        is farther than 1e-3 from exact; the message names the first bad pose.
+    (N, 4, 4) or (4, 4) homogeneous matrices, or (N, 7) or (7,) rows ``x y z qx qy qz qw``; anything with
+    ``position`` and ``quaternion_xyzw`` (a grasp, samples) is taken too, and a list of such. A ValueError
+    names the first pose that is not finite, beyond 1 km, or whose rotation is farther than 1e-3 from exact.
     """
     if hasattr(poses, "position") and hasattr(poses, "quaternion_xyzw"):
         given = Poses(*(np.atleast_2d(np.asarray(x, float)) for x in (poses.position, poses.quaternion_xyzw)))
@@ -104,13 +96,7 @@ def _refuse(bad: ArrayLike, what: str) -> None:
 
 
 def as_vector7(pose: ArrayLike | Any) -> tuple[float, ...]:
-    """One pose as ``(x, y, z, qx, qy, qz, qw)``; see :func:`as_poses` for what is accepted.
-
-    Raises
-    ------
-    ValueError
-        If it is no single valid pose.
-    """
+    """One pose as ``(x, y, z, qx, qy, qz, qw)``; see :func:`as_poses` for what is accepted."""
     rows = as_poses(pose).rows
     if len(rows) != 1:
         raise ValueError(f"expected one pose, got {len(rows)}")
@@ -118,13 +104,7 @@ def as_vector7(pose: ArrayLike | Any) -> tuple[float, ...]:
 
 
 def vector(name: str, values: ArrayLike, of: str) -> list[float]:
-    """A vector as JSON, its numbers named by ``of``.
-
-    Raises
-    ------
-    ValueError
-        For another shape.
-    """
+    """A vector as JSON, its numbers named by ``of``; ValueError for another shape."""
     array, count = np.asarray(values, dtype=np.float64), of.count(",") + 1
     if array.shape != (count,):
         raise ValueError(f"{name} has shape {array.shape}; expected {count} numbers: {of}")
@@ -135,10 +115,7 @@ def vector(name: str, values: ArrayLike, of: str) -> list[float]:
 def quaternions_of(rotations: Floats) -> Floats:
     """Unit quaternions xyzw (N, 4) of rotation matrices (N, 3, 3): Shepperd's method (1978), vectorised.
 
-    Raises
-    ------
-    ValueError
-        If a matrix is no rotation within 1e-3; the message names the first such pose.
+    ValueError names the first matrix that is no rotation within 1e-3.
     """
     gram = np.einsum("nki,nkj->nij", rotations, rotations)
     _refuse(

@@ -27,11 +27,6 @@ def new_figure(width: float | None = None, height: float | None = None) -> Figur
     """A figure of this size in inches, laid out by itself; without a size, whoever draws places its axes.
 
     Made without pyplot, so that a server may draw from its threads.
-
-    Raises
-    ------
-    ImportError
-        Without matplotlib; the message says how to install it.
     """
     try:
         from matplotlib.figure import Figure

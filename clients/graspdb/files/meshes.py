@@ -20,15 +20,7 @@ GLB = "model/gltf-binary"
 
 
 def read_mesh(mesh: MeshLike, media_type: str | None, *, prefer: str = "ply") -> tuple[bytes, str]:
-    """The bytes and media type of a file, of bytes or of a trimesh object.
-
-    Raises
-    ------
-    ValueError
-        If the format is not told by name, content or ``media_type``.
-    OSError
-        If the file cannot be read.
-    """
+    """The bytes and media type of a file, bytes or a trimesh object; ValueError for an unknown format."""
     if isinstance(mesh, (str, PathLike)):
         path = Path(mesh)
         kind = media_type or _MEDIA_TYPES.get(path.suffix.lower())

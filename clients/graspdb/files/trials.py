@@ -30,15 +30,7 @@ class FileProblem(ValueError):
 
 
 def read_trials(path: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Trials as mappings, and the values shared by all; ``-`` reads NDJSON or JSON from standard input.
-
-    Raises
-    ------
-    FileProblem
-        Naming file and line.
-    OSError
-        If the file cannot be read.
-    """
+    """Trials as mappings, and the values shared by all; ``-`` reads NDJSON or JSON from standard input."""
     if path.lower().endswith(".csv"):
         return _csv(path, trials=True), {}
     data = _json_or_ndjson(path)
@@ -60,15 +52,7 @@ def read_trials(path: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 
 def read_poses(path: str) -> NDArray[np.float64]:
-    """Poses as rows x y z qx qy qz qw (N, 7), from .csv, .npy, .json or NDJSON.
-
-    Raises
-    ------
-    FileProblem
-        Naming file and line.
-    ValueError
-        If a pose is wrong.
-    """
+    """Poses as rows x y z qx qy qz qw (N, 7), from .csv, .npy, .json or NDJSON; FileProblem says where."""
     if path.lower().endswith(".npy"):
         return as_poses(np.load(path, allow_pickle=False)).rows
     if path.lower().endswith(".csv"):

@@ -30,11 +30,9 @@ QUERY_POSES = 100_000
 
 
 class GraspQueries:
-    """The questions about one object.
+    """The questions about one object; all take the trials and kernel of a density, see :class:`Selection`.
 
-    They take the selection of trials that a density is built from, and the kernel: see
-    :class:`Selection`. All poses are of the tool frame in the object frame, in metres,
-    quaternions xyzw.
+    All poses are of the tool frame in the object frame, in metres, quaternions xyzw.
     """
 
     def __init__(self, transport: Transport, object_id: str) -> None:
@@ -43,10 +41,7 @@ class GraspQueries:
         self._path = f"/objects/{segment(object_id)}"
 
     def density(self, **selection: Unpack[Selection]) -> wire.DensityInfo:
-        """The grasp density: kernel, widths and how they were chosen, counts, effective sample size.
-
-        Takes the :class:`Selection`.
-        """
+        """The grasp density: kernel, widths and how they were chosen, counts, effective sample size."""
         params = query(known_keywords(Selection, selection, "density"))
         return self._transport.model(wire.DensityInfo, "GET", f"{self._path}/density", params=params)
 
@@ -60,17 +55,9 @@ class GraspQueries:
     ) -> LikelihoodArrays:
         """How likely these grasps are, as NumPy arrays in the poses' order.
 
-        Parameters
-        ----------
-        poses
-            (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples.
-        include
-            Columns to compute: ``density``, ``log_density``, ``relative``, ``success_probability``,
-            ``interval``, ``effective_trials``, ``collision_free``; by default all.
-        chunk
-            Poses a request.
-        **selection
-            :class:`Selection`.
+        ``poses`` are (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples, sent ``chunk`` a
+        request. ``include`` are the columns to compute: ``density``, ``log_density``, ``relative``,
+        ``success_probability``, ``interval``, ``effective_trials``, ``collision_free``; by default all.
         """
         options = known_keywords(Selection, selection, "likelihood")
         given = as_poses(poses)
@@ -99,10 +86,7 @@ class GraspQueries:
     ) -> Grasp:
         """The best grasp within constraints; takes what :meth:`best_grasps` does, without ``count``.
 
-        Raises
-        ------
-        Infeasible
-            If no admissible grasp lies within reach of what was tried, or nothing has succeeded yet.
+        Infeasible if nothing admissible lies within reach of what was tried, or nothing has succeeded yet.
         """
         if "count" in constraints:
             raise TypeError("best_grasp() gives one grasp; use best_grasps(count=...)")
@@ -117,26 +101,13 @@ class GraspQueries:
         verify_timeout_s: float = 300.0,
         **constraints: Unpack[Constraints],
     ) -> Grasps:
-        """At most ``count`` distinct grasps, best first.
+        """At most ``count`` distinct grasps within :class:`Constraints`, best first; Infeasible if there is
+        none.
 
-        Parameters
-        ----------
-        verify
-            Have a worker simulate the grasps at the fine step before they are answered: ``grasp.simulated``
-            is what became of each, and those that held come first. The outcomes are stored as a check. With
-            the gripper and protocol of the trials, where they say; else ``pg70`` and ``wrench``.
-        verify_timeout_s
-            How long to wait for that.
-        **constraints
-            :class:`Constraints`: workspace, directions, collisions, objective; and the
-            :class:`Selection` of trials.
-
-        Raises
-        ------
-        Infeasible
-            If there is none; ``nearest`` is the closest grasp outside the constraints, where there is one.
-        TimeoutError
-            If the simulation has not finished in time; it says so where no worker has come.
+        ``verify`` has a worker simulate the grasps at the fine step before they are answered:
+        ``grasp.simulated`` is what became of each, and those that held come first. The outcomes are stored as
+        a check. With the gripper and protocol of the trials, where they say; else ``pg70`` and ``wrench``.
+        TimeoutError if that takes longer than ``verify_timeout_s``; it says so where no worker has come.
         """
         given = known_keywords(Constraints, constraints, "best_grasps")
         return self._best_grasps(count, given, verify, verify_timeout_s)
@@ -184,10 +155,7 @@ class GraspQueries:
     def samples(
         self, count: int = 100, *, seed: int | None = None, **selection: Unpack[Selection]
     ) -> SampledPoses:
-        """Poses drawn from the density; the same seed and revision give the same poses.
-
-        Takes the :class:`Selection`.
-        """
+        """Poses drawn from the density; the same seed and revision give the same poses."""
         fields = {**known_keywords(Selection, selection, "samples"), "count": count, "seed": seed}
         request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
@@ -203,14 +171,9 @@ class GraspQueries:
     ) -> SampledPoses:
         """Grasps to try next; send ``proposal_density`` back with their trials.
 
-        Parameters
-        ----------
-        strategy
-            ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most.
-            ``edges`` needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on
-            opposed surfaces, edges or points. Some of what it draws collides.
-        **selection
-            :class:`Selection`.
+        ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges``
+        needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on opposed surfaces,
+        edges or points; some of what it draws collides.
         """
         fields = known_keywords(Selection, selection, "proposals")
         fields |= {"count": count, "seed": seed, "strategy": strategy}

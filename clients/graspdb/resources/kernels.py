@@ -46,15 +46,12 @@ class Kernels:
         timeout_s: float | None = None,
         **options: Unpack[KernelOptions],
     ) -> wire.StoredKernel:
-        """Fit a kernel on an object's successes, or with ``kind="probability"`` on all its attempts.
+        """Fit a kernel on an object's successes, or with ``kind="probability"`` on all its attempts, and wait
+        for it.
 
-        Waits until it is fitted. ``components="auto"`` may take a while: ``progress`` is called with its run
-        meanwhile, and ``timeout_s`` ends the wait, not the fit: the kernel is in the list once it is done.
-
-        Raises
-        ------
-        Conflict
-            For too few trials, saying how many are needed.
+        ``components="auto"`` may take a while: ``progress`` is called with its run meanwhile, and
+        ``timeout_s`` ends the wait, not the fit. Conflict says how many trials are needed where they are too
+        few.
         """
         return self._create({"object": object, **options}, progress, timeout_s)
 

@@ -31,14 +31,10 @@ class ObjectProperties(TypedDict, total=False):
 
 
 class GraspObject(GraspQueries):
-    """An object on the service.
+    """An object on the service; ``info`` is what the service said last, :meth:`refresh` asks again.
 
-    ``info`` is what the service said last; :meth:`refresh` asks again. ``trials`` and ``batches`` hold what
-    has been tried, the questions ask what follows from it, and ``reports`` whether that was enough. All poses
-    are of the tool frame in the object frame, in metres, quaternions xyzw.
-
-    GraspQueries and reports take the *selection* of trials that a density is built from: ``gripper``,
-    ``protocol``, ``source``, and the ``kernel`` (:class:`Selection`).
+    ``trials`` and ``batches`` hold what has been tried, the questions ask what follows from it, and
+    ``reports`` whether that was enough; both take the trials and kernel of a density (:class:`Selection`).
     """
 
     def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:
@@ -74,16 +70,10 @@ class GraspObject(GraspQueries):
     # Mesh and convex parts
 
     def upload_mesh(self, mesh: MeshLike, *, unit: str = "m", media_type: str | None = None) -> wire.MeshInfo:
-        """Store the object's mesh.
+        """Store the object's mesh: a file (.stl, .obj, .ply, .glb), its bytes, or a trimesh object.
 
-        Parameters
-        ----------
-        mesh
-            A file (.stl, .obj, .ply, .glb), its bytes, or a trimesh object.
-        unit
-            Of its coordinates: ``m``, ``mm``, ``cm`` or ``in``.
-        media_type
-            Needed for bytes whose format they do not tell themselves.
+        Its coordinates are in ``unit``: ``m``, ``mm``, ``cm`` or ``in``. ``media_type`` is needed for bytes
+        whose format they do not tell themselves.
         """
         content, kind = read_mesh(mesh, media_type)
         return self._upload(wire.MeshInfo, "mesh", content, kind, params={"unit": unit})
@@ -95,10 +85,7 @@ class GraspObject(GraspQueries):
     def upload_convex_parts(self, parts: MeshLike | Sequence[Any]) -> wire.PartsInfo:
         """Store the convex parts the object is made of, in metres.
 
-        Parameters
-        ----------
-        parts
-            A GLB file or its bytes with one geometry a part, a trimesh scene, or a sequence of meshes.
+        A GLB file or its bytes with one geometry a part, a trimesh scene, or a sequence of meshes.
         """
         if isinstance(parts, Sequence) and not isinstance(parts, (str, bytes)):
             parts = scene_of(parts)
@@ -187,13 +174,6 @@ class Objects:
 
         ``id`` is a slug; ``mesh``, ``unit`` and ``media_type`` as in :meth:`GraspObject.upload_mesh`,
         ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`, the rest :class:`ObjectProperties`.
-
-        Raises
-        ------
-        Conflict
-            If an object has this id already.
-        InvalidInput
-            If a property or the mesh is refused.
         """
         fields = known_keywords(ObjectProperties, properties, "create")
         request = validate(wire.ObjectCreate, {"id": id, **fields})

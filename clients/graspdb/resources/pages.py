@@ -26,13 +26,7 @@ def segment(identifier: str) -> str:
 
 
 def validate(model: type[Model], fields: Mapping[str, Any]) -> Model:
-    """Build a request from what was given (None means not given).
-
-    Raises
-    ------
-    InvalidInput
-        Naming every wrong field, before anything is sent.
-    """
+    """Build a request from what was given (None means not given); InvalidInput names every wrong field."""
     try:
         return model.model_validate({key: value for key, value in fields.items() if value is not None})
     except ValidationError as error:

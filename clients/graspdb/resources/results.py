@@ -19,13 +19,7 @@ Floats = NDArray[np.float64]
 
 
 def to_pandas(columns: Mapping[str, Any]) -> Any:
-    """A DataFrame of equally long columns.
-
-    Raises
-    ------
-    ImportError
-        If pandas is not installed; the message says how to install it.
-    """
+    """A DataFrame of equally long columns."""
     try:
         pandas = importlib.import_module("pandas")
     except ImportError as error:
@@ -55,38 +49,22 @@ def _vector(values: Any, digits: int = 4) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Grasp:
-    """A grasp: the pose of the tool frame in the object frame, and what is known about it.
+    """A grasp: the pose of the tool frame in the object frame, metres and unit xyzw, and what is known about
+    it.
 
-    Attributes
-    ----------
-    position
-        (3,) metres, object frame.
-    quaternion_xyzw
-        (4,) unit quaternion, object frame.
-    world
-        The same grasp in the world frame, (4, 4); None unless the query gave the object's pose.
-    score
-        What it was ranked by; ``Grasps.ranking`` says what that is.
-    density, log_density
-        Grasp density in 1/(m^3 rad^3), and its natural logarithm.
-    relative
-        Density over the density's global maximum: 1 at the best grasp there is.
-    success_probability, interval, effective_trials
-        Estimate, its interval and the trials it rests on; None where the service gives none.
-    collision_free
-        None until mesh and gripper are known.
-    prior
-        Chosen by the object's edges before any success; its density is that of the edges.
-    candidate
-        Its place among the candidates that were given.
-    simulated
-        Outcome of the grasp simulated anew at the fine step, where that was asked for.
-    width_m
-        Opening of the jaw once both fingers touch the object, metres.
-    nearest_trials
-        ``seq`` of the trials nearest to it.
-    active_constraints
-        The constraints that hold it where it is.
+    - ``world``: the same grasp in the world frame, (4, 4); None unless the query gave the object's pose.
+    - ``score``: what it was ranked by; ``Grasps.ranking`` says what that is.
+    - ``density``, ``log_density``: in 1/(m^3 rad^3), and its natural logarithm.
+    - ``relative``: density over the density's global maximum: 1 at the best grasp there is.
+    - ``success_probability``, ``interval``, ``effective_trials``: the estimate, its interval and the trials
+      it rests on; None where the service gives none.
+    - ``collision_free``: None until mesh and gripper are known.
+    - ``prior``: chosen by the object's edges before any success; its density is that of the edges.
+    - ``candidate``: its place among the candidates that were given.
+    - ``simulated``: outcome of the grasp simulated anew at the fine step, where that was asked for.
+    - ``width_m``: opening of the jaw once both fingers touch the object, metres.
+    - ``nearest_trials``: ``seq`` of the trials nearest to it.
+    - ``active_constraints``: those that hold it where it is.
     """
 
     position: Floats

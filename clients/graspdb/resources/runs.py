@@ -20,14 +20,9 @@ _POLL_S = 0.5
 def wait_for_run(
     transport: Transport, location: str, what: str, progress: RunProgress | None, timeout_s: float | None
 ) -> dict[str, Any]:
-    """The result of the run at ``location``; ``what`` it is, for whoever reads an error.
+    """The result of the run at ``location``, or the typed error it ended with; ``what`` it is, for messages.
 
-    Raises
-    ------
-    GraspDBError
-        The typed error of the problem it ended with, or that it was cancelled.
-    TimeoutError
-        After ``timeout_s``, which does not end the run.
+    TimeoutError after ``timeout_s``, which does not end the run.
     """
     began = time.monotonic()
     while True:

@@ -17,13 +17,10 @@ Kernel = wire.KernelSpec | Mapping[str, Any] | str
 
 
 class TrialSelection(TypedDict, total=False):
-    """Which trials a question is about.
+    """Which trials a question is about: only those of a ``gripper``, ``protocol`` or ``source``.
 
-    Parameters
-    ----------
-    gripper, protocol, source
-        Only trials of these; the first two are needed where an object's trials have several. A trial that
-        names no gripper or protocol fits every selection.
+    The first two are needed where an object's trials have several. A trial that names no gripper or protocol
+    fits every selection.
     """
 
     gripper: Annotated[str | None, Option("Only trials with this gripper.")]
@@ -34,13 +31,10 @@ class TrialSelection(TypedDict, total=False):
 class Selection(TrialSelection, total=False):
     """Which trials a density is built from (:class:`TrialSelection`), and with which kernel.
 
-    Parameters
-    ----------
-    kernel
-        ``isotropic`` (the default), ``anisotropic`` (the newest one fitted for this object and gripper), a
-        stored kernel's id, or a mapping ``{"kind": "isotropic", "sigma_position_m": ..., "cutoff": ...}``.
-    sigma_position_m, sigma_rotation_deg
-        Widths of the isotropic kernel, standard deviations per axis; by default chosen from the trials.
+    ``kernel`` is ``isotropic`` (the default), ``anisotropic`` (the newest one fitted for this object and
+    gripper), a stored kernel's id, or ``{"kind": "isotropic", "sigma_position_m": ..., "cutoff": ...}``.
+    ``sigma_position_m`` and ``sigma_rotation_deg`` are the isotropic kernel's standard deviations per axis;
+    by default chosen from the trials.
     """
 
     kernel: Annotated[Kernel | None, Option("isotropic, anisotropic, or a stored kernel's id.")]
@@ -53,50 +47,29 @@ class Constraints(Selection, total=False):
 
     All constraints are in ``frame``: the world's if ``object_pose`` is given, else the object's.
 
-    Parameters
-    ----------
-    objective
-        ``density`` (the default), ``success_probability`` (ranks by the lower end of its interval), or
-        ``robust``: the mean success probability, or density (``robust_of``), under noise.
-    pose_noise_m, pose_noise_deg, tool_noise_m, tool_noise_deg
-        That noise, deviations per axis: of the object's pose about its bounding box's centre (acts on the
-        left), and of the tool's (acts on the right).
-    box
-        Lower and upper corner (3,) of where the tool's origin may be, metres.
-    sphere
-        ``x, y, z, r``: the tool's origin is within ``r`` metres of the centre.
-    above_plane
-        ``nx, ny, nz, d``: n.x >= d at the tool's origin.
-    half_spaces
-        More such rows (K, 4).
-    approach, approach_cone_deg
-        Direction (3,) of the tool's z axis, and the half angle of the cone about it.
-    closing, closing_cone_deg
-        The same for the tool's y axis, in which the fingers close.
-    collision_free
-        That the gripper does not touch the object before it closes; true where it can be known.
-    obstacles
-        ``boxes`` (each ``size_m`` and a pose), ``points`` (K, 3) and their ``point_radius_m``: what the open
-        gripper must not touch either.
-    pregrasp_distance_m
-        The straight approach is free from this far back.
-    max_width_m
-        How far apart the fingers are at most, once both touch the object.
-    candidates
-        Rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is the place in them.
-    exclude
-        Poses to stay away from, by the separation.
-    object_pose
-        The object in the world: (4, 4) or ``x y z qx qy qz qw``.
-    min_separation_m, min_separation_deg
-        How far apart two grasps are, in either, to count as distinct.
-    include
-        Scores to compute, as in `GraspObject.likelihood`. By default the success
-        probability comes along where the objective needs it or there are at most 500,000 attempts.
-    prior
-        Whether an object with geometry and no success yet may answer from its edges; such grasps have
-        ``grasp.prior``. By default it does where a gripper is known; True says what is missing where it
-        can't.
+    - ``objective``: ``density`` (the default), ``success_probability`` (ranks by the lower end of its
+      interval), or ``robust``: the mean success probability, or density (``robust_of``), under noise.
+    - ``pose_noise_m``, ``pose_noise_deg``, ``tool_noise_m``, ``tool_noise_deg``: that noise, deviations per
+      axis: of the object's pose about its bounding box's centre (on the left), of the tool's (on the right).
+    - ``box``: lower and upper corner (3,) of where the tool's origin may be, metres.
+    - ``sphere``: ``x, y, z, r``: the tool's origin is within ``r`` metres of the centre.
+    - ``above_plane``: ``nx, ny, nz, d``: n.x >= d at the tool's origin; ``half_spaces``: more such, (K, 4).
+    - ``approach``, ``approach_cone_deg``: direction (3,) of the tool's z axis, its cone's half angle.
+    - ``closing``, ``closing_cone_deg``: the same for the tool's y axis, in which the fingers close.
+    - ``collision_free``: the gripper does not touch the object before it closes; true where it can be known.
+    - ``obstacles``: ``boxes`` (each ``size_m`` and a pose), ``points`` (K, 3) and their ``point_radius_m``:
+      what the open gripper must not touch either.
+    - ``pregrasp_distance_m``: the straight approach is free from this far back.
+    - ``max_width_m``: how far apart the fingers are at most, once both touch the object.
+    - ``candidates``: rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is its place.
+    - ``exclude``: poses to stay away from, by the separation.
+    - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``.
+    - ``min_separation_m``, ``min_separation_deg``: how far apart, in either, two grasps count as distinct.
+    - ``include``: scores to compute, as in `GraspObject.likelihood`. By default the success probability comes
+      along where the objective needs it or there are at most 500,000 attempts.
+    - ``prior``: whether an object with geometry and no success yet may answer from its edges; such grasps
+      have ``grasp.prior``. By default it does where a gripper is known; True says what is missing where it
+      can't.
     """
 
     objective: Annotated[
@@ -139,12 +112,7 @@ class Constraints(Selection, total=False):
 def query(selection: Mapping[str, Any]) -> dict[str, Any]:
     """A selection as a query string takes it: the kernel a name, its widths beside it.
 
-    Raises
-    ------
-    InvalidInput
-        For a kernel that is none.
-    ValueError
-        For widths given twice, or a cut-off, which only questions about poses take.
+    ValueError for widths given twice, or a cut-off, which only questions about poses take.
     """
     fields = dict(selection)
     if fields.get("kernel") is None or isinstance(fields["kernel"], str):
@@ -162,13 +130,7 @@ def query(selection: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRequest:
-    """The request for ``count`` grasps within :class:`Constraints`.
-
-    Raises
-    ------
-    InvalidInput, ValueError
-        Naming every wrong field.
-    """
+    """The request for ``count`` grasps within :class:`Constraints`; an error names every wrong field."""
     fields = {name: value for name, value in given.items() if value is not None} | {"count": count}
     box = fields.pop("box", None)
     if box is not None:

@@ -51,26 +51,13 @@ class OutcomeArrays(TriedPoses):
 
 
 class SweepOptions(TypedDict, total=False):
-    """What a sweep simulates: a grid (the default), given ``poses``, or ``sample`` draws.
+    """What a sweep simulates: a grid (the default), given ``poses``, or ``sample`` draws from the density.
 
-    Parameters
-    ----------
-    max_poses
-        A random part of the grid, by ``seed``; without it the whole grid.
-    position_step_m, rotation_step_deg, margin_m, region
-        The grid: its steps, its margin about the bounding box, and the box (lower, upper) it is cut to.
-    poses
-        Exactly these.
-    sample
-        So many draws from the density.
-    gripper
-        Its profile's id, by default ``pg70``.
-    protocol
-        ``wrench`` (the contact forces can counter gravity in every direction) or ``lift``.
-    fidelity
-        ``standard`` or ``fine`` (smaller time step).
-    purpose
-        ``collect``, or ``check``: outcomes are stored but enter no density.
+    The grid has ``position_step_m``, ``rotation_step_deg``, a ``margin_m`` about the bounding box, and a
+    ``region``, the box (lower, upper) it is cut to; ``max_poses`` takes a random part of it, by ``seed``.
+    ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
+    counter gravity in every direction) or ``lift``; ``fidelity`` ``standard`` or ``fine`` (smaller time
+    step); ``purpose`` ``collect``, or ``check``: outcomes are stored but enter no density.
     """
 
     max_poses: Annotated[int | None, Option("A random part of the grid.", min=1)]
@@ -133,22 +120,10 @@ class Sweep:
         return self
 
     def wait(self, *, progress: bool | ProgressCallback = False, timeout: float | None = None) -> Sweep:
-        """Wait until the sweep has finished.
+        """Wait until the sweep has finished, ``timeout`` seconds at most; it goes on all the same.
 
-        Parameters
-        ----------
-        progress
-            True shows a bar with rate and time left; a function is called with each
-            :class:`graspdb.wire.SweepInfo`.
-        timeout
-            Seconds to wait at most; None waits for ever.
-
-        Raises
-        ------
-        SweepFailed
-            If chunks failed for good; ``sweep.retry()`` queues them again.
-        TimeoutError
-            If it has not finished in time; it goes on all the same.
+        ``progress=True`` shows a bar with rate and time left; a function is called with each
+        :class:`graspdb.wire.SweepInfo`. SweepFailed if chunks failed for good: ``retry()`` queues them again.
         """
         for pause in self.pauses(progress=progress, timeout=timeout):
             time.sleep(pause)

@@ -47,16 +47,11 @@ class Receipt:
 
 
 class Upload(TypedDict, total=False):
-    """How trials are sent.
+    """How trials are sent, ``chunk`` a request; each request is stored wholly or not at all, as its own
+    batch.
 
-    Parameters
-    ----------
-    chunk
-        Trials a request. Each request is stored wholly or not at all and is its own batch.
-    idempotency_key
-        Repeat a failed upload with the same key, data and ``chunk``, and nothing is stored twice.
-    progress
-        True shows a bar; a function is called with trials stored and total.
+    Repeat a failed upload with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice.
+    ``progress=True`` shows a bar; a function is called with trials stored and total.
     """
 
     idempotency_key: Annotated[
@@ -110,32 +105,17 @@ class Trials:
         metadata: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
         **upload: Unpack[Upload],
     ) -> Receipt:
-        """Store grasp trials; how they are sent: :class:`Upload`.
+        """Store grasp trials; how they are sent: :class:`Upload`. ValueError if shapes or poses are wrong.
 
-        Parameters
-        ----------
-        poses
-            Tool frames in the object frame: (N, 4, 4) matrices or (N, 7) rows x y z qx qy qz qw, or one
-            pose; a :class:`~graspdb.resources.results.Grasp` or samples are taken too.
-        outcomes
-            (N,) booleans or outcome names; a single one goes for all poses.
-        gripper, source, protocol
-            Of the whole upload.
-        proposal_density
-            1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
-        quality, width_m
-            (N,) or one number; NaN where unknown. Width is the jaw's opening in metres.
-        pose_covariance
-            (6, 6) or (N, 6, 6), translation first, tool frame.
-        measured_at, metadata
-            One for all, or a sequence with one a trial.
-
-        Raises
-        ------
-        ValueError
-            If shapes or poses are wrong: nothing was sent.
-        InvalidInput
-            If the service refuses the trials; the message names the trial and field.
+        - ``poses``: tool frames in the object frame: (N, 4, 4) matrices or (N, 7) rows x y z qx qy qz qw, or
+          one pose; a :class:`~graspdb.resources.results.Grasp` or samples are taken too.
+        - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
+        - ``gripper``, ``source``, ``protocol``: of the whole upload.
+        - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
+        - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width is the jaw's opening in
+          metres.
+        - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, tool frame.
+        - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial.
         """
         given = as_poses(poses)
         count = len(given.position)
