@@ -72,53 +72,43 @@ def position_excess(limits, p):
 
 
 @exact
-def _axis(q, which, out):
-    """Tool axis y (which = 1) or z (2) in the object frame."""
+def _excess(q, which, cone, signed, normal):
+    """Angle by which the tool's axis y (``which`` = 1) or z (2), its nearer end unless ``signed``, leaves a
+    cone (axis, angle); ``normal`` gets the unit turn that brings it back, object frame.
+    """
     x, y, z, w = q[0], q[1], q[2], q[3]
     if which == 2:
-        out[0], out[1], out[2] = 2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)
+        a0, a1, a2 = 2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)
     else:
-        out[0], out[1], out[2] = 2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)
-
-
-@exact
-def _towards(axis, goal, signed, normal):
-    """Angle from an axis (its nearer end unless ``signed``) to a goal; ``normal`` gets the unit turn that
-    closes it.
-    """
-    dot = axis[0] * goal[0] + axis[1] * goal[1] + axis[2] * goal[2]
+        a0, a1, a2 = 2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)
+    dot = a0 * cone[0] + a1 * cone[1] + a2 * cone[2]
     flip = -1.0 if (dot < 0.0 and not signed) else 1.0
-    a0, a1, a2 = flip * axis[0], flip * axis[1], flip * axis[2]
-    normal[0] = a1 * goal[2] - a2 * goal[1]
-    normal[1] = a2 * goal[0] - a0 * goal[2]
-    normal[2] = a0 * goal[1] - a1 * goal[0]
-    sine = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    if sine > 1e-12:
-        for i in range(3):
-            normal[i] /= sine
-    else:
+    a0, a1, a2 = flip * a0, flip * a1, flip * a2
+    normal[0] = a1 * cone[2] - a2 * cone[1]
+    normal[1] = a2 * cone[0] - a0 * cone[2]
+    normal[2] = a0 * cone[1] - a1 * cone[0]
+    sine = length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    if sine <= 1e-12:
         # Parallel or opposite: any normal will do.
         if abs(a0) < 0.6:
             normal[0], normal[1], normal[2] = 0.0, -a2, a1
         else:
             normal[0], normal[1], normal[2] = a2, 0.0, -a0
         length = math.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-        for i in range(3):
-            normal[i] /= length
-    return math.atan2(sine, flip * dot)
+    for i in range(3):
+        normal[i] /= length
+    return math.atan2(sine, flip * dot) - cone[3]
 
 
 @exact
 def cone_excess(cones, q):
     """Angle by which the worse of the two axes leaves its cone, radians; at most 0 inside."""
-    axis, normal = np.empty(3), np.empty(3)
+    normal = np.empty(3)
     worst = -1e300
     if cones[3] >= 0.0:
-        _axis(q, 2, axis)
-        worst = max(worst, _towards(axis, cones[0:3], True, normal) - cones[3])
+        worst = max(worst, _excess(q, 2, cones[0:4], True, normal))
     if cones[7] >= 0.0:
-        _axis(q, 1, axis)
-        worst = max(worst, _towards(axis, cones[4:7], cones[8] > 0.5, normal) - cones[7])
+        worst = max(worst, _excess(q, 1, cones[4:8], cones[8] > 0.5, normal))
     return worst
 
 
@@ -175,70 +165,88 @@ def _least(g1, r1, g2, r2, v):
 
 
 @exact
+def _into_both(cones, q):
+    """Turn q to nearly the nearest rotation inside both cones."""
+    signed, origin = cones[8] > 0.5, q.copy()
+    n1, n2, v, g1, g2 = np.empty(3), np.empty(3), np.zeros(3), np.empty(3), np.empty(3)
+    damping, last = 1.0, 1e300
+    for _ in range(60):
+        r1 = _excess(q, 2, cones[0:4], True, n1) + MARGIN
+        r2 = _excess(q, 1, cones[4:8], signed, n2) + MARGIN
+        _pull_back(v, n1, g1)
+        _pull_back(v, n2, g2)
+        for i in range(3):
+            r1 += g1[i] * v[i]
+            r2 += g2[i] * v[i]
+        moved = v.copy()
+        _least(g1, r1, g2, r2, v)
+        change = abs(v[0] - moved[0]) + abs(v[1] - moved[1]) + abs(v[2] - moved[2])
+        if change > 0.6 * last:
+            # Narrow cones curve more than the subproblem knows: full steps overshoot from side to side.
+            damping = max(0.6 * damping, 0.1)
+        last = change
+        for i in range(3):
+            v[i] = moved[i] + damping * (v[i] - moved[i])
+        length = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+        if length > 3.0:
+            for i in range(3):
+                v[i] *= 3.0 / length
+        q[:] = origin
+        _turn(q, v)
+        if change < 1e-8:
+            break
+
+
+@exact
 def _project_rotation(cones, q):
     """Turn q (4,) in place to the nearest rotation inside the cones; whether it got there."""
     first, second = cones[3] >= 0.0, cones[7] >= 0.0
     if not (first or second):
         return True
-    signed = cones[8] > 0.5
-    axis, n1, n2 = np.empty(3), np.empty(3), np.empty(3)
     if first and second:
-        origin = q.copy()
-        v, g1, g2 = np.zeros(3), np.empty(3), np.empty(3)
-        damping, last = 1.0, 1e300
-        for _ in range(60):
-            _axis(q, 2, axis)
-            e1 = _towards(axis, cones[0:3], True, n1) - cones[3] + MARGIN
-            _axis(q, 1, axis)
-            e2 = _towards(axis, cones[4:7], signed, n2) - cones[7] + MARGIN
-            _pull_back(v, n1, g1)
-            _pull_back(v, n2, g2)
-            r1, r2 = e1, e2
-            for i in range(3):
-                r1 += g1[i] * v[i]
-                r2 += g2[i] * v[i]
-            moved = v.copy()
-            _least(g1, r1, g2, r2, v)
-            change = abs(v[0] - moved[0]) + abs(v[1] - moved[1]) + abs(v[2] - moved[2])
-            if change > 0.6 * last:
-                # Narrow cones curve more than the subproblem knows: full steps overshoot from side to side.
-                damping = max(0.6 * damping, 0.1)
-            last = change
-            for i in range(3):
-                v[i] = moved[i] + damping * (v[i] - moved[i])
-            length = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
-            if length > 3.0:
-                for i in range(3):
-                    v[i] *= 3.0 / length
-            q[:] = origin
-            _turn(q, v)
-            if change < 1e-8:
-                break
+        _into_both(cones, q)
+    normal = np.empty(3)
     # Closed form for one cone; for two, this mends what curvature left over.
     for _ in range(200):
         worst = 0.0
-        if first:
-            _axis(q, 2, axis)
-            excess = _towards(axis, cones[0:3], True, n1) - cones[3]
+        for which, cone, given in ((2, cones[0:4], first), (1, cones[4:8], second)):
+            if not given:
+                continue
+            excess = _excess(q, which, cone, which == 2 or cones[8] > 0.5, normal)
             if excess > 0.0:
                 worst = max(worst, excess)
                 # A cone of angle zero can't be entered with a margin.
-                step = excess + min(MARGIN, 0.5 * cones[3])
+                step = excess + min(MARGIN, 0.5 * cone[3])
                 for i in range(3):
-                    n1[i] *= step
-                _turn(q, n1)
-        if second:
-            _axis(q, 1, axis)
-            excess = _towards(axis, cones[4:7], signed, n2) - cones[7]
-            if excess > 0.0:
-                worst = max(worst, excess)
-                step = excess + min(MARGIN, 0.5 * cones[7])
-                for i in range(3):
-                    n2[i] *= step
-                _turn(q, n2)
+                    normal[i] *= step
+                _turn(q, normal)
         if worst <= MARGIN:
             return True
     return False
+
+
+@exact
+def _shares(planes, active, count, normal, share, way):
+    """A normal as a sum of those of active planes (``share``) and what is square to them (``way``); False
+    where these depend on each other.
+    """
+    way[:] = normal[:3]
+    share[:] = 0.0
+    if count == 0:
+        return True
+    gram, right = np.zeros((count, count)), np.zeros(count)
+    for a in range(count):
+        for i in range(3):
+            right[a] += planes[active[a], i] * normal[i]
+            for b in range(count):
+                gram[a, b] += planes[active[a], i] * planes[active[b], i]
+    if not _solved(gram, right):
+        return False
+    for a in range(count):
+        share[a] = right[a]
+        for i in range(3):
+            way[i] -= right[a] * planes[active[a], i]
+    return True
 
 
 @exact
@@ -255,9 +263,7 @@ def _nearest_in_polyhedron(planes, goal, p):
     for _ in range(8 * planes.shape[0] + 8):
         worst, chosen = 0.0, -1
         for k in range(planes.shape[0]):
-            miss = planes[k, 3] + MARGIN_M
-            for i in range(3):
-                miss -= planes[k, i] * x[i]
+            miss = _miss(planes[k], x)
             if miss > worst:
                 worst, chosen = miss, k
         if worst <= 0.5 * MARGIN_M:
@@ -266,22 +272,8 @@ def _nearest_in_polyhedron(planes, goal, p):
         force[3] = 0.0
         while True:
             normal = planes[chosen]
-            # The chosen normal as a sum of active ones (share) and what is square to them (way).
-            way[:] = normal[:3]
-            share[:] = 0.0
-            if count > 0:
-                gram, right = np.zeros((count, count)), np.zeros(count)
-                for a in range(count):
-                    for i in range(3):
-                        right[a] += planes[active[a], i] * normal[i]
-                        for b in range(count):
-                            gram[a, b] += planes[active[a], i] * planes[active[b], i]
-                if not _solved(gram, right):
-                    return False
-                for a in range(count):
-                    share[a] = right[a]
-                    for i in range(3):
-                        way[i] -= right[a] * planes[active[a], i]
+            if not _shares(planes, active, count, normal, share, way):
+                return False
             square = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
             free = square > 1e-12 and count < 3
             step, dropped = 1e300, -1
@@ -289,15 +281,13 @@ def _nearest_in_polyhedron(planes, goal, p):
                 if share[a] > 1e-12 and force[a] / share[a] < step:
                     step, dropped = force[a] / share[a], a
             if free:
-                miss = normal[3] + MARGIN_M - normal[0] * x[0] - normal[1] * x[1] - normal[2] * x[2]
-                full = miss / square
+                full = _miss(normal, x) / square
                 if full <= step:
                     step, dropped = full, -1
-            elif dropped < 0:
-                return False
-            if free:
                 for i in range(3):
                     x[i] += step * way[i]
+            elif dropped < 0:
+                return False
             for a in range(count):
                 force[a] -= step * share[a]
             force[3] += step
@@ -309,6 +299,15 @@ def _nearest_in_polyhedron(planes, goal, p):
                 active[a], force[a] = active[a + 1], force[a + 1]
             count -= 1
     return False
+
+
+@exact
+def _miss(plane, x):
+    """Distance that a point is short of where projections aim, inside a plane."""
+    miss = plane[3] + MARGIN_M
+    for i in range(3):
+        miss -= plane[i] * x[i]
+    return miss
 
 
 @exact
@@ -348,10 +347,7 @@ def project_position(limits, p):
             for i in range(3):
                 p[i] += memory[k, i]
             if k < planes.shape[0]:
-                miss = planes[k, 3] + MARGIN_M
-                for i in range(3):
-                    miss -= planes[k, i] * p[i]
-                shift = max(miss, 0.0)
+                shift = max(_miss(planes[k], p), 0.0)
                 for i in range(3):
                     memory[k, i] = -shift * planes[k, i]
                     p[i] += shift * planes[k, i]
