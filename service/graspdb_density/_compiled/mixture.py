@@ -176,8 +176,8 @@ def mixture_log_sums(
         done = False
         for t in range(stages.shape[0]):
             total, spread, visited = mixture_sums_at(
-                cells, frames, exact_rows.turning, p, quaternions[j], 1.0 / cells.scale, mixture, stages[t, 0],
-                runs, xi,
+                cells, frames, exact_rows.turning, p, quaternions[j], 1.0 / cells.scale, mixture,
+                stages[t, 0], runs, xi,
             )  # fmt: skip
             if total > 0.0 and spread <= stages[t, 1] * total and total >= stages[t, 2] * visited:
                 out[j] = math.log(total) - unit
