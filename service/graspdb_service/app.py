@@ -77,14 +77,7 @@ ROUTERS = [
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The application over the database that the settings (by default the environment) name.
 
-    SQLite is created and migrated here; a PostgreSQL schema that is not current is refused.
-
-    Raises
-    ------
-    StaleSchema
-        If the PostgreSQL schema is not the one this version needs.
-    RuntimeError
-        If a route declares no scope.
+    SQLite is created and migrated here; a PostgreSQL schema that is not current is refused (StaleSchema).
     """
     settings = settings or Settings()
     database = Database(settings.database_url)

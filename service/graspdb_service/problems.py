@@ -14,16 +14,8 @@ TYPE_PREFIX = "urn:graspdb:problem:"
 class ProblemError(Exception):
     """Raise it anywhere below a route; it becomes ``application/problem+json``.
 
-    Parameters
-    ----------
-    status
-        The HTTP status.
-    kind
-        A stable slug, e.g. ``ambiguous-selection``.
-    title
-        What is wrong and the way out, for a person.
-    errors
-        ``(field, message)`` pairs; a field is a path such as ``trials.3.position``.
+    ``kind`` is a stable slug, ``title`` what is wrong and the way out, for a person; ``errors`` are
+    ``(field, message)`` pairs, a field a path such as ``trials.3.position``.
     """
 
     def __init__(

@@ -26,22 +26,12 @@ def _ints() -> Ints:
 class TrialColumns:
     """Trials (n,). A column that no trial has, or that was not read, is empty.
 
-    Attributes
-    ----------
-    position, quaternion_xyzw : (n, 3) m, (n, 4)
-        The tool in the object frame; the quaternion is unit.
-    outcome : (n,) uint8
-        Codes, see :data:`graspdb.wire.OUTCOME_CODES`.
-    provenance
-        Which :class:`Provenance`: its place in a list that comes with the columns, once stored its id.
-    proposal_density, quality, width_m
-        1/(m^3 rad^3), no unit, m; NaN where a trial has none.
-    pose_index
-        Which pose of its sweep's plan a trial is of; -1 where it is of no sweep.
-    measured_at, pose_covariance, metadata
-        A value or None a trial: aware times, 6x6 nested lists, documents.
-    seq, revision, batch
-        As stored, ascending ``seq``; ``batch`` is internal.
+    ``position`` (n, 3) m and unit ``quaternion_xyzw`` (n, 4) are the tool in the object frame; ``outcome``
+    codes as :data:`graspdb.wire.OUTCOME_CODES`. ``provenance`` is which :class:`Provenance`: its place in a
+    list that comes with the columns, once stored its id. ``proposal_density`` 1/(m^3 rad^3), ``quality`` and
+    ``width_m`` are NaN where a trial has none, ``pose_index`` -1 where it is of no sweep. ``measured_at``
+    (aware), ``pose_covariance`` (6x6 nested lists) and ``metadata`` are a value or None a trial. ``seq`` is
+    ascending, ``batch`` internal.
     """
 
     position: Floats

@@ -27,13 +27,7 @@ _INSTALL = "pip install 'graspdb[service,arrow]' where the service runs"
 
 
 def library() -> Any:
-    """The pyarrow package, which is an extra.
-
-    Raises
-    ------
-    ProblemError
-        406 where it is not installed.
-    """
+    """The pyarrow package, which is an extra: 406 where it is not installed."""
     try:
         return importlib.import_module("pyarrow")
     except ImportError:
@@ -48,21 +42,9 @@ def library() -> Any:
 
 
 class Table:
-    """The columns of a stream from a request.
+    """The columns of a stream from a request, called ``prefix`` and their name in errors.
 
-    Parameters
-    ----------
-    body
-        The stream.
-    columns
-        Those that it may have.
-    prefix
-        How the columns are called in errors.
-
-    Raises
-    ------
-    ProblemError
-        415 without pyarrow; 422 for what is no stream, or for other columns.
+    415 without pyarrow; 422 for what is no stream, or for other than these columns.
     """
 
     def __init__(self, body: bytes, columns: Iterable[str], *, prefix: str = "columns") -> None:
@@ -126,13 +108,7 @@ class Table:
         return self._pa.concat_arrays(column.unify_dictionaries().chunks)
 
     def required(self, name: str) -> Any:
-        """As :meth:`column`, without nulls.
-
-        Raises
-        ------
-        ProblemError
-            422 where the column is missing, or naming the first null.
-        """
+        """As :meth:`column`, without nulls; 422 where it is missing, or naming the first null."""
         column = self.column(name)
         if column is None:
             raise invalid(f"{self._prefix}.{name}", "required")
@@ -143,13 +119,7 @@ class Table:
         return column
 
     def vectors(self, name: str, width: int) -> Floats:
-        """(n, width) finite numbers of a column of lists.
-
-        Raises
-        ------
-        ProblemError
-            422 naming the first row that is none.
-        """
+        """(n, width) finite numbers of a column of lists; 422 naming the first row that is none."""
         pa, column = self._pa, self.required(name)
         kind = column.type
         fixed = pa.types.is_fixed_size_list(kind)
@@ -174,13 +144,7 @@ class Table:
         return np.asarray(values)
 
     def scalars(self, name: str) -> Floats | None:
-        """(n,) numbers, NaN for null; None where the column is absent.
-
-        Raises
-        ------
-        ProblemError
-            422 for a column of another kind, or naming the first value that is not finite.
-        """
+        """(n,) finite numbers, NaN for null, else 422; None where the column is absent."""
         pa, column = self._pa, self.column(name)
         if column is None:
             return None
@@ -209,10 +173,7 @@ class Table:
     def objects(self, name: str) -> list[Any] | None:
         """A column as Python objects, None for null; None where it is absent.
 
-        Raises
-        ------
-        ProblemError
-            422 for a type of which a few bytes may stand for much: dictionaries, views, runs.
+        422 for a type of which a few bytes may stand for much: dictionaries, views, runs.
         """
         pa, column = self._pa, self.column(name)
         if column is None:
@@ -259,13 +220,7 @@ def _plain(pa: Any, kind: Any) -> bool:
 
 
 def _check_messages(pa: Any, body: bytes) -> None:
-    """Refuse a stream with compressed buffers.
-
-    Raises
-    ------
-    ValueError
-        For those; whatever pyarrow or struct say of what is no stream.
-    """
+    """Refuse a stream with compressed buffers (ValueError; for no stream, what pyarrow or struct say)."""
     messages = pa.ipc.MessageReader.open_stream(pa.py_buffer(body))
     while True:
         try:

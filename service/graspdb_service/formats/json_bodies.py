@@ -17,15 +17,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_model(request: Request, body: bytes, model: type[Model]) -> Model:
-    """A body as its model, as FastAPI would read and refuse it.
-
-    Raises
-    ------
-    ProblemError
-        415 for another media type than JSON.
-    RequestValidationError
-        For a body that does not fit.
-    """
+    """A body as its model, as FastAPI would read and refuse it; 415 for another media type than JSON."""
     require_json(request)
     try:
         return model.model_validate_json(body)
@@ -36,10 +28,7 @@ def read_model(request: Request, body: bytes, model: type[Model]) -> Model:
 def read_object(request: Request, body: bytes) -> dict[str, Any]:
     """A JSON object, its long arrays as :class:`LongArray`; NaN and Infinity are refused here.
 
-    Raises
-    ------
-    ProblemError
-        415 for another media type, 400 where the body is no JSON, 422 where it is no object.
+    415 for another media type, 400 where the body is no JSON, 422 where it is no object.
     """
     require_json(request)
     try:
@@ -52,13 +41,7 @@ def read_object(request: Request, body: bytes) -> dict[str, Any]:
 
 
 def validated(content: Any, model: type[Model], *, most: int = 0) -> Model:
-    """What :func:`read_object` read as a model; long arrays are cut where no model takes more than ``most``.
-
-    Raises
-    ------
-    RequestValidationError
-        For content that does not fit.
-    """
+    """What :func:`read_object` read as a model; long arrays are cut where no model takes over ``most``."""
     try:
         return model.model_validate(_as_lists(content, most))
     except ValidationError as error:

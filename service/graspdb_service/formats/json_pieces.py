@@ -48,10 +48,7 @@ class LongArray:
 def loads(body: bytes, *, long: int = LONG, piece: int = PIECE) -> Any:
     """As ``orjson.loads``, but for :class:`LongArray` where an object of depth 1 or 2 holds a long array.
 
-    Raises
-    ------
-    orjson.JSONDecodeError
-        For what is no JSON (in a long array not before it is iterated).
+    What is wrong within a long array is raised when it is iterated.
     """
     if len(body) < long or body.lstrip()[:1] != b"{":
         return orjson.loads(body)

@@ -28,13 +28,7 @@ def unsupported(title: str, media: str | None = None) -> ProblemError:
 
 
 def one_of(request: Request, *kinds: str) -> str:
-    """The body's media type, which must be one of these.
-
-    Raises
-    ------
-    ProblemError
-        415 for another one.
-    """
+    """The body's media type, which must be one of these, else 415."""
     media = media_type(request)
     if media not in kinds:
         raise unsupported(f"Send {' or '.join(kinds)} and say which by Content-Type", media)
@@ -49,12 +43,8 @@ def require_json(request: Request) -> None:
 
 
 def accepted(request: Request, *kinds: str) -> str:
-    """Which of the media types the client prefers: by weight, then as named and not by ``*``, then as listed.
-
-    Raises
-    ------
-    ProblemError
-        406 where it accepts none.
+    """Which media type the client prefers: by weight, then as named and not by ``*``, then as listed; else
+    406.
     """
     ranks: dict[str, tuple[float, int, int]] = {}
     for place, item in enumerate((request.headers.get("accept") or "*/*").split(",")):

@@ -40,13 +40,7 @@ def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:
 
 
 def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Floats, Floats]:
-    """What a request says beside its poses, positions (n, 3) and unit quaternions (n, 4) of an Arrow stream.
-
-    Raises
-    ------
-    ProblemError
-        415 without pyarrow; 422 naming what is wrong.
-    """
+    """What an Arrow stream says beside its poses, their positions (n, 3) and unit quaternions (n, 4)."""
     table = arrow.Table(body, ("position", "quaternion_xyzw"), prefix="poses")
     if not table.count:
         raise invalid("poses", "at least one pose")
@@ -58,10 +52,7 @@ def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Floats, Floats]:
 def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
     """Positions (n, 3) and unit quaternions (n, 4) of a list of poses or of pose columns.
 
-    Raises
-    ------
-    ProblemError
-        422 naming the first bad field, as the wire's models would.
+    422 names the first bad field, as the wire's models would.
     """
     if isinstance(value, dict):
         _check_keys(value, {"position", "quaternion_xyzw"}, field)

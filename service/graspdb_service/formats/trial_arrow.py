@@ -21,17 +21,13 @@ _TEXTS = ("gripper", "source", "protocol")
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
-    """Check a stream of trials.
+    """Check a stream of trials; refused as :func:`graspdb_service.formats.trial_json.parse`, 415 without
+    pyarrow.
 
     Columns have the names of a trial's fields; ``outcome`` is text (or a dictionary of it) or boolean,
     ``measured_at`` a timestamp (UTC where it names no zone) or text, ``metadata`` a struct or JSON text,
     ``pose_covariance`` lists of lists or of 36 numbers. What holds for the whole batch stands as JSON in the
     schema's metadata, key ``graspdb``.
-
-    Raises
-    ------
-    ProblemError
-        As :func:`graspdb_service.formats.trial_json.parse`, 415 without pyarrow.
     """
     table = arrow.Table(body, NAMES)
     if not table.count:
@@ -96,13 +92,7 @@ def _document(value: Any) -> Any:
 
 
 def stream(pages: Iterable[TrialPage], told: dict[str, Any] | None = None) -> Iterator[bytes]:
-    """Stored trials as an Arrow IPC stream; what else is ``told`` stands in its schema's metadata.
-
-    Raises
-    ------
-    ProblemError
-        406 without pyarrow.
-    """
+    """Stored trials as an Arrow IPC stream; what else is ``told`` stands in its schema's metadata."""
     return arrow.stream(_schema(told), (_record_batch(page) for page in pages if len(page.columns)))
 
 

@@ -89,13 +89,7 @@ def defaults_of(beside: Mapping[str, Any], faults: Faults, form: str) -> TrialDe
 
 
 def check(fields: Fields, defaults: TrialDefaults, faults: Faults) -> TrialBatch:
-    """Checked trials.
-
-    Raises
-    ------
-    ProblemError
-        422 naming the fields that are wrong, those in ``faults`` included.
-    """
+    """Checked trials, or 422 naming the fields that are wrong, those in ``faults`` included."""
     position = _positions(fields, faults)
     quaternion = _quaternions(fields, faults)
     outcome = _outcomes(fields, faults)

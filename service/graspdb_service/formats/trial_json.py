@@ -25,13 +25,7 @@ from graspdb_service.trial_columns import Floats, TrialBatch, TrialPage
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
-    """Check a JSON body of ``POST /objects/{id}/trials``.
-
-    Raises
-    ------
-    ProblemError
-        413 for more than ``limit`` trials, 422 naming the fields that are wrong.
-    """
+    """Check a JSON body of trials: 413 for more than ``limit``, 422 naming the fields that are wrong."""
     document, flaw = _loads(body)
     if not isinstance(document, dict):
         raise _body_problem(flaw or "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}")

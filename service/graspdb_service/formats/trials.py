@@ -14,13 +14,7 @@ from graspdb_service.trial_columns import TrialBatch, TrialPage
 
 
 def parse(body: bytes, media: str, *, limit: int) -> TrialBatch:
-    """Check a body of ``POST /objects/{id}/trials``.
-
-    Raises
-    ------
-    ProblemError
-        415 for another media type, 413 for more than ``limit`` trials, 422 naming the fields that are wrong.
-    """
+    """Check a body of trials: 415 for another media type, 413 for more than ``limit``, 422 naming fields."""
     if media in ("", JSON):
         return trial_json.parse(body, limit=limit)
     if media in (NDJSON, "application/ndjson", "application/jsonl"):

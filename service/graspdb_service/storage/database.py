@@ -49,21 +49,11 @@ class UnsupportedDatabase(ValueError):
 
 
 class Database:
-    """Connections to one database.
+    """Connections to one database, ``sqlite:///file`` or ``postgresql://...``; else UnsupportedDatabase.
 
     Writers on SQLite take ``BEGIN IMMEDIATE``, so that a read-modify-write can't lose another's update
     nor fail halfway with "database is locked"; readers have an engine of their own and never take a write
     lock. On PostgreSQL a reader sees one snapshot (REPEATABLE READ, read only).
-
-    Parameters
-    ----------
-    url
-        ``sqlite:///file`` or ``postgresql://...``.
-
-    Raises
-    ------
-    UnsupportedDatabase
-        If the URL is neither, or SQLite without a file.
     """
 
     def __init__(self, url: str, *, pool_size: int = 40) -> None:

@@ -62,25 +62,11 @@ def page(tx: Tx, *, after: str, limit: int) -> list[ObjectRow]:
 
 
 def advance(tx: Tx, object_id: int, *, rows: int = 0, append: bool) -> tuple[int, int]:
-    """Lock the object, give it a new revision and reserve sequence numbers.
+    """Lock the object, give it a new revision and reserve ``rows`` sequence numbers: the revision, their
+    first.
 
-    Parameters
-    ----------
-    rows
-        How many sequence numbers to reserve.
-    append
-        True where trials are only added; anything else starts a new epoch, for what was derived from the
-        object can't be extended then.
-
-    Returns
-    -------
-    revision, first_seq : int
-        The new revision and the first of the reserved numbers.
-
-    Raises
-    ------
-    ObjectGone
-        If the object no longer exists.
+    ``append`` where trials are only added; anything else starts a new epoch, for what was derived from the
+    object can't be extended then. ObjectGone without the object.
     """
     revision = objects.c.revision + 1
     statement = (

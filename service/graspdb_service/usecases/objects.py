@@ -28,13 +28,8 @@ def create(database: Database, request: ObjectCreate, *, key: str | None, body: 
 
 
 def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:
-    """The object with this slug, and with this internal id where one is given; ``lock`` holds it until the
-    transaction ends.
-
-    Raises
-    ------
-    ProblemError
-        404 without such an object, 409 where it is another one by now.
+    """The object with this slug (404), and with this internal id where one is given (409); ``lock`` holds it
+    until the transaction ends.
     """
     row = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
     if row is None:

@@ -72,25 +72,12 @@ class KernelChoice:
 class Built:
     """A density and what it was built of, immutable.
 
-    Attributes
-    ----------
-    density
-        None where no trial of the selection succeeded. With a stored kernel the density under the isotropic
-        one of equal determinants.
-    shaped, sampled
-        The density under the stored kernel, where one was asked for: of Gaussians, or of sampled components.
-    search
-        Beside the density under the kernel that was asked for.
-    seq
-        (N,) sequence numbers of its rows, ascending.
-    proposal_density
-        (N,) as they came with the trials, NaN where unknown.
-    swept
-        (N,) whether a grid tried it.
-    chosen_from
-        How many of the first rows the widths were chosen from.
-    success_kernel
-        What success probabilities are estimated with, where a kernel for those was asked for.
+    ``density`` is None where no trial of the selection succeeded. With a stored kernel it is under the
+    isotropic one of equal determinants, and ``shaped`` (of Gaussians) or ``sampled`` (of sampled components)
+    under the stored one; ``search`` is beside the one asked for. Rows (N,): ``seq`` ascending;
+    ``proposal_density`` as it came, NaN where unknown; ``swept``: a grid tried it. The first ``chosen_from``
+    of them chose the widths. ``success_kernel`` estimates success probabilities, where a kernel for those was
+    asked for.
     """
 
     revision: int
@@ -167,10 +154,7 @@ def build(
 ) -> Built:
     """The density of the rows there were and those that came since; ``axes`` are those of a stored kernel.
 
-    Raises
-    ------
-    ProblemError
-        413 for more components than a density may have.
+    413 for more components than a density may have.
     """
     symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
     fresh = rows.position, rows.quaternion_xyzw, symmetric

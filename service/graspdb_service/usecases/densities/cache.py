@@ -33,12 +33,8 @@ _RESOLVED = 4_096
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
-    """The kernel and the cut-off (None: exact) that a request asks for.
-
-    Raises
-    ------
-    ProblemError
-        422 for widths given twice, or beside a stored kernel.
+    """The kernel and the cut-off (None: exact) that a request asks for; 422 for widths beside a stored
+    kernel.
     """
     choice, cutoff = _choice(request)
     for name, value, (low, high) in (
@@ -112,13 +108,7 @@ class Densities:
         self._lock = threading.Lock()
 
     def current(self, slug: str, filters: Filters) -> tuple[ObjectRow, Selected]:
-        """The object as it is now, and which of its trials the filters select.
-
-        Raises
-        ------
-        ProblemError
-            404 for the object or gripper, 409 for an ambiguous selection.
-        """
+        """The object as it is now, and which of its trials the filters select (404, 409 where ambiguous)."""
         with self._database.read() as tx:
             row = require(tx, slug)
             with self._lock:
@@ -134,13 +124,7 @@ class Densities:
         return row, selected
 
     def get(self, slug: str, filters: Filters, kernel: KernelChoice) -> Built:
-        """The density at least as new as the object is now.
-
-        Raises
-        ------
-        ProblemError
-            As :meth:`current`.
-        """
+        """The density at least as new as the object is now; refused as :meth:`current`."""
         row, selected = self.current(slug, filters)
         stored = None
         if kernel.stored is not None:
@@ -154,12 +138,8 @@ class Densities:
         )
 
     def stored(self, row: ObjectRow, selected: Selected, name: str) -> KernelRow:
-        """The stored kernel with this id, or the newest of the object and gripper for ``anisotropic``.
-
-        Raises
-        ------
-        ProblemError
-            404 without such a kernel; 409 where none was fitted, or for another gripper's.
+        """The stored kernel with this id (404), or the newest of object and gripper for ``anisotropic``
+        (409).
         """
         with self._database.read() as tx:
             if name == "anisotropic":

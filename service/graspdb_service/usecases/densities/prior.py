@@ -76,19 +76,10 @@ class Priors:
         self._cache: SingleFlightCache[_Key, _Made] = SingleFlightCache(_MAX_BYTES, lambda m: m.nbytes)
 
     def get(self, row: ObjectRow, selected: Selected, choice: KernelChoice) -> Prior:
-        """The prior of an object for a gripper.
+        """The prior of an object for a gripper; ``choice`` may name other widths than 10 mm and 15 degrees.
 
-        Parameters
-        ----------
-        choice
-            Widths, where they are not to be 10 mm and 15 degrees; the isotropic kernel's only.
-
-        Raises
-        ------
-        ProblemError
-            409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no gripper is named,
-            ``no-surface-pairs`` where the jaw finds nothing to close on, ``edges-unreachable`` where it can't
-            come near.
+        409 ``mesh-missing`` without geometry, ``gripper-unknown`` where none is named, ``no-surface-pairs``
+        where the jaw finds nothing to close on, ``edges-unreachable`` where it can't come near.
         """
         metres = _POSITION_M if choice.sigma_position_m is None else choice.sigma_position_m
         degrees = _ROTATION_DEG if choice.sigma_rotation_deg is None else choice.sigma_rotation_deg

@@ -64,12 +64,8 @@ class _Lattice:
 class Exposure:
     """The grids of a selection, as far as they are done; equal where they weigh alike.
 
-    Attributes
-    ----------
-    batches
-        Internal ids of the batches that they write.
-    tried
-        Distinct poses, collisions included.
+    ``batches`` are internal ids of those that they write; ``tried`` counts distinct poses, collided ones,
+    too.
     """
 
     lattices: tuple[_Lattice, ...] = ()

@@ -46,13 +46,7 @@ def _component(row: KernelRow) -> IsotropicKernel:
 
 
 def axes(alignment: str, row: ObjectRow, selected: Selected, features: Features) -> Axes:
-    """The axes that translations are along on an object.
-
-    Raises
-    ------
-    ProblemError
-        409 where the object's geometry does not tell them, or has none to tell.
-    """
+    """The axes that translations are along on an object; 409 where its geometry has none to tell."""
     if alignment == "gripper":
         return None
     if alignment == "object":
@@ -93,10 +87,7 @@ def load_success_kernel(row: KernelRow, along: Axes) -> DiagonalKernel:
 def info_of(row: KernelRow, plain: KernelInfo | None = None) -> KernelInfo:
     """What a query says of the kernel it used.
 
-    Parameters
-    ----------
-    plain
-        The isotropic kernel that the density has where the stored one is for success probabilities only.
+    ``plain`` is the isotropic one that the density has where the stored one is for probabilities only.
     """
     covariance = covariance_of(row)
     widths = np.sqrt(np.diag(covariance))
@@ -127,12 +118,8 @@ def info_of(row: KernelRow, plain: KernelInfo | None = None) -> KernelInfo:
 def principal_axes(row: ObjectRow) -> Floats:
     """The object's principal axes as columns (3, 3), right-handed, the longest way first.
 
-    An axis has no sign of its own: the largest component of the first two is made positive.
-
-    Raises
-    ------
-    ProblemError
-        409 ``mesh-missing`` without a closed mesh to take them from.
+    An axis has no sign of its own: the largest component of the first two is made positive. 409
+    ``mesh-missing`` without a closed mesh.
     """
     inertia = None if row.mesh_info is None else row.mesh_info.get("inertia_m5")
     if inertia is None:

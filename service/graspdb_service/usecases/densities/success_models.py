@@ -94,10 +94,7 @@ class Successes:
     def model(self, slug: str, built: Built, *, collisions_known: bool) -> Model | None:
         """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
 
-        Parameters
-        ----------
-        collisions_known
-            Whether geometry and gripper are known: then attempts that collided are left out.
+        With ``collisions_known``, by geometry and gripper, attempts that collided are left out.
         """
         key = _Key(
             built.object_row.id,
@@ -124,10 +121,7 @@ class Successes:
     ) -> Estimates:
         """Success probability of poses (n, 3), (n, 4) under the kernel of a density.
 
-        Parameters
-        ----------
-        free : (n,) bool or None
-            Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
+        ``free`` (n,) is whether the open gripper is free of the object; None where either is unknown.
         """
         model = self.model(slug, built, collisions_known=free is not None)
         return self.under(model, positions, quaternions, free)

@@ -85,13 +85,7 @@ class Scenes:
         return None if solid is None else CollisionTest(solid, shape_of(selected.profile))
 
     def require(self, row: ObjectRow, selected: Selected) -> CollisionTest:
-        """As :meth:`test`.
-
-        Raises
-        ------
-        ProblemError
-            409 saying what is missing and how to give it.
-        """
+        """As :meth:`test`, or 409 saying what is missing and how to give it."""
         test = self.test(row, selected)
         if test is not None:
             return test

@@ -32,12 +32,8 @@ _WAYS_OUT = (
 
 
 def check(tx: Tx, row: ObjectRow) -> None:
-    """Refuse a sweep whose object no worker will find parts for.
-
-    Raises
-    ------
-    ProblemError
-        422 for a flat mesh; 409 where the decomposition has failed before.
+    """Refuse a sweep whose object no worker will find parts for: 422 for a flat mesh, 409 where it failed
+    before.
     """
     box = (row.mesh_info or {})["bounding_box"]
     sides = [high - low for low, high in zip(box["lower"], box["upper"], strict=True)]
@@ -66,12 +62,8 @@ def ask(tx: Tx, row: ObjectRow, created_ms: int) -> None:
 
 
 def settle(tx: Tx, row: ObjectRow) -> None:
-    """The object has parts: complete the snapshots of sweeps that waited, and let workers have their chunks.
-
-    Parameters
-    ----------
-    row
-        The object with its new parts, under its lock.
+    """The object, under its lock, has parts: complete the snapshots of sweeps that waited, and release their
+    chunks.
     """
     for sweep_id in decompositions.waiting_sweeps(tx, row.id):
         sweep = sweeps.find(tx, sweep_id)
@@ -100,12 +92,7 @@ def lacks_parts(sweep: SweepRow) -> bool:
 
 
 def again(tx: Tx, row: ObjectRow, sweep: SweepRow, created_ms: int) -> bool:
-    """Before a sweep without parts is retried: give it those that exist now, or have them made.
-
-    Returns
-    -------
-    Whether its chunks have to wait.
-    """
+    """Before a sweep without parts is retried: give it those there are, or have them made (True: wait)."""
     if row.parts_sha256 is not None:
         take_parts(tx, row, sweep)
         return False

@@ -55,13 +55,7 @@ class Features:
         self._cache: SingleFlightCache[_Key, _Prepared] = SingleFlightCache(_MAX_BYTES, lambda p: p.nbytes)
 
     def ridges(self, row: ObjectRow) -> Ridges:
-        """An object's ridges.
-
-        Raises
-        ------
-        ProblemError
-            409 ``mesh-missing`` without geometry, ``no-edges`` where nothing on it bends.
-        """
+        """An object's ridges; 409 ``mesh-missing`` without geometry, ``no-edges`` where nothing bends."""
         found = self._prepared(row, 0.0).ridges
         if not len(found):
             raise conflict(
@@ -74,11 +68,8 @@ class Features:
     def pairs(self, row: ObjectRow, selected: Selected) -> JawPairs:
         """The pairs of surfaces and edges that the selection's gripper can close on.
 
-        Raises
-        ------
-        ProblemError
-            409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no opening is known,
-            ``no-surface-pairs`` where there are none.
+        409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no opening is known,
+        ``no-surface-pairs``.
         """
         opening = _opening(selected)
         found = self._prepared(row, opening).pairs
@@ -92,12 +83,7 @@ class Features:
 
     def opposed(self, row: ObjectRow, selected: Selected) -> list[JawPairs]:
         """What the selection's gripper can close on: pairs of surfaces and edges, and opposed points of the
-        surface, which tell of curved objects, too; none that is empty.
-
-        Raises
-        ------
-        ProblemError
-            409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no opening is known.
+        surface, which tell of curved objects, too; none that is empty. 409 as :meth:`pairs`.
         """
         found = self._prepared(row, _opening(selected), points=True)
         return [pairs for pairs in (found.pairs, found.points) if pairs is not None and len(pairs)]
@@ -110,13 +96,7 @@ class Features:
             return None
 
     def frames(self, alignment: str, row: ObjectRow, selected: Selected) -> FramesOf:
-        """The axes of grasps by ``edge`` or ``surface-pair``.
-
-        Raises
-        ------
-        ProblemError
-            409 as :meth:`ridges` and :meth:`pairs`.
-        """
+        """The axes of grasps by ``edge`` or ``surface-pair``; 409 as :meth:`ridges` and :meth:`pairs`."""
         if alignment == "edge":
             ridges = self.ridges(row)
             return lambda positions, _: ridges.frames(positions)
@@ -178,13 +158,7 @@ class Features:
 
 
 def _opening(selected: Selected) -> float:
-    """How wide the jaw opens, metres.
-
-    Raises
-    ------
-    ProblemError
-        409 ``gripper-unknown``.
-    """
+    """How wide the jaw opens, metres; 409 ``gripper-unknown``."""
     if selected.profile is None:
         raise conflict(
             "gripper-unknown",

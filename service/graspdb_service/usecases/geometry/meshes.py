@@ -34,10 +34,7 @@ _NEAR_SHARE = 0.01
 def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
     """Check and store an object's mesh; a convex one becomes its own convex part.
 
-    Raises
-    ------
-    ProblemError
-        413 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
+    413 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
     """
     sha256 = hashlib.sha256(content).hexdigest()
     with ctx.database.read() as tx:
@@ -72,10 +69,7 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
 def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
     """Check and store an object's convex parts, a GLB in metres with one geometry a part.
 
-    Raises
-    ------
-    ProblemError
-        413 and 422 for what can't be used; 409 for other parts once a sweep exists.
+    413 and 422 for what can't be used; 409 for other parts once a sweep exists.
     """
     sha256 = hashlib.sha256(content).hexdigest()
     with ctx.database.read() as tx:
@@ -100,13 +94,7 @@ def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
 
 
 def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
-    """Check convex parts, wherever they come from, and measure them against their object's mesh.
-
-    Raises
-    ------
-    ProblemError
-        413 and 422 for what can't be used.
-    """
+    """Check convex parts, wherever they come from, and measure them against their object's mesh."""
     # The child's limits first: what passed them is safe to read here.
     _inspect(ctx, content, GLB, "m", field="parts")
     try:

@@ -24,11 +24,7 @@ def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
     """Widths chosen by held-out log loss, as :func:`graspdb_service.storage.kernels.create` takes them.
 
     Attempts that collided are left out where collisions are tested, as they are when success is predicted.
-
-    Raises
-    ------
-    ProblemError
-        404 for the object, 409 for too few successes or failures, or attempts all in one place.
+    409 for too few successes or failures, or attempts all in one place.
     """
     assert request.object is not None
     filters = Filters(request.gripper, request.protocol, request.source)
@@ -82,13 +78,7 @@ def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
 
 
 def checked(request: KernelCreate) -> list[dict[str, Any]]:
-    """The one component of a kernel that is given.
-
-    Raises
-    ------
-    ProblemError
-        422 for more than one, one off the centre, or correlations.
-    """
+    """The one component of a kernel that is given; 422 for more, one off the centre, or correlations."""
     assert isinstance(request.components, list)
     if len(request.components) != 1:
         raise invalid("components", "a kernel that predicts success has one component")

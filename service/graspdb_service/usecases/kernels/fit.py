@@ -78,13 +78,7 @@ def fitted(
     progress: Progress,
 ) -> dict[str, Any]:
     """A kernel learned from an object's successes, as :func:`graspdb_service.storage.kernels.create` takes
-    it; ``computed`` is where numbers are.
-
-    Raises
-    ------
-    ProblemError
-        404 for the object, 409 where the trials don't suffice or the object's geometry does not have what the
-        kernel is to be aligned with.
+    it; ``computed`` is where numbers are. 404 for the object, 409 where its trials or geometry don't suffice.
     """
     assert request.object is not None
     window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()

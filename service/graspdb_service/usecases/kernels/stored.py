@@ -43,14 +43,9 @@ _SAME = 1e-9
 
 
 def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
-    """Store a kernel, or with ``components=auto`` start the run that fits it (status 202) unless it is done
-    at once.
+    """Store a kernel, or with ``components=auto`` start the run that fits it (202) unless it is done at once.
 
-    Raises
-    ------
-    ProblemError
-        404 for the object, 422 for components that make no kernel, 409 where the trials don't suffice to fit
-        one or the object's geometry does not have what it is to be aligned with.
+    404 for the object, 422 for components that make no kernel, 409 where trials or geometry don't suffice.
     """
     if request.alignment not in _ALIGNED.get(request.kind, (request.alignment,)):
         ways = " or ".join(f"alignment={name}" for name in _ALIGNED[request.kind])

@@ -20,14 +20,10 @@ class _Slot(Generic[V]):
 
 
 class SingleFlightCache(Generic[K, V]):
-    """Values by key, the least recently used dropped first.
+    """Values by key, the least recently used dropped first where all take more than ``max_bytes``.
 
-    Parameters
-    ----------
-    max_bytes
-        What all values together may take. A single larger one is answered but not kept.
-    size
-        Bytes of a value; asked again before each eviction, for values may grow as they are used.
+    A single larger one is answered but not kept. ``size`` is asked again before each eviction, for values may
+    grow as they are used.
     """
 
     def __init__(self, max_bytes: int, size: Callable[[V], int]) -> None:

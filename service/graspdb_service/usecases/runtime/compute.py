@@ -17,13 +17,7 @@ MAX_QUERIES = 28
 
 
 class Compute:
-    """Runs computations on a bounded number of threads and refuses more queries than it can hold.
-
-    Parameters
-    ----------
-    threads
-        Computations at a time.
-    """
+    """Runs computations on a bounded number of threads and refuses more queries than it can hold."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
@@ -32,13 +26,7 @@ class Compute:
 
     @contextmanager
     def admitted(self) -> Iterator[None]:
-        """A query's place, from its first computation to its last.
-
-        Raises
-        ------
-        ProblemError
-            429 where all places are taken.
-        """
+        """A query's place, from its first computation to its last; 429 where all are taken."""
         if not self._room.acquire(blocking=False):
             raise ProblemError(
                 429,

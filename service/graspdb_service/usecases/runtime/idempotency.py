@@ -36,21 +36,9 @@ def replay_or(
 ) -> Created:
     """Create in one transaction with the key, or answer what the same request was answered before.
 
-    Parameters
-    ----------
-    scope
-        Method and path, e.g. ``POST /objects/mug/trials``.
-    key
-        The Idempotency-Key header; None creates anyway.
-    request
-        What the request asked for: its body, and whatever else changes its meaning.
-    create
-        Does the work inside the transaction; parse and compute before.
-
-    Raises
-    ------
-    ProblemError
-        422 where the key was used with another body, 409 where what it made has since been deleted.
+    ``scope`` is method and path; ``request`` the body and whatever else changes its meaning. Without a key
+    ``create`` runs anyway, inside the transaction: parse and compute before. 422 where the key was used with
+    another body, 409 where what it made has since been deleted.
     """
     with database.write() as tx:
         if key is None:
@@ -73,15 +61,9 @@ def replay_or(
 
 
 def replayed(database: Database, *, scope: str, key: str | None, request: bytes) -> Created | None:
-    """What the same request was answered before, or None.
+    """What the same request was answered before, or None; refused as :func:`replay_or`, which takes the key.
 
-    For requests whose checks may turn out otherwise the second time, or whose work is long: looked up before
-    both. Only :func:`replay_or` takes the key.
-
-    Raises
-    ------
-    ProblemError
-        As :func:`replay_or`.
+    For requests whose checks may turn out otherwise the second time, or whose work is long: looked up first.
     """
     if key is None:
         return None

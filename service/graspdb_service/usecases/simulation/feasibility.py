@@ -28,13 +28,7 @@ MIN_MASS_KG = 1e-3
 
 
 def check_gripper(profile: GripperProfile) -> None:
-    """Refuse a gripper that no physics can be done with.
-
-    Raises
-    ------
-    ProblemError
-        422 naming what is wrong.
-    """
+    """Refuse a gripper that no physics can be done with (422)."""
     reason = None
     try:
         shape_of(profile)
@@ -75,20 +69,10 @@ def _troubles(profile: GripperProfile) -> Iterator[str]:
 
 
 def check_mass(row: ObjectRow, mass_kg: float | None, sides_m: Sequence[float]) -> None:
-    """Refuse an object too light to be simulated.
+    """Refuse an object too light to be simulated (422).
 
-    Parameters
-    ----------
-    row
-    mass_kg
-        None where it follows from the density once the volume is known; the box bounds that volume.
-    sides_m
-        Of the mesh's bounding box.
-
-    Raises
-    ------
-    ProblemError
-        422 naming the mass, or the density that it comes from.
+    The mass is None where it follows from the density once the volume is known; the mesh's bounding box, of
+    these sides, bounds that volume.
     """
     by_density = row.mass_kg is None and row.density_kg_m3 is not None
     most = mass_kg
@@ -107,13 +91,7 @@ def check_mass(row: ObjectRow, mass_kg: float | None, sides_m: Sequence[float]) 
 
 
 def check_size(row: ObjectRow, longest_m: float, profile: GripperProfile) -> None:
-    """Refuse an object far larger or smaller than the gripper, and say in which unit it would fit.
-
-    Raises
-    ------
-    ProblemError
-        422 ``mesh-size``.
-    """
+    """Refuse an object far larger or smaller than the gripper (422), and say in which unit it would fit."""
     opening = profile.max_opening_m
     if MIN_SIZE_IN_OPENINGS * opening <= longest_m <= MAX_SIZE_IN_OPENINGS * opening:
         return

@@ -69,13 +69,7 @@ class _Overtaken(Exception):
 
 
 def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
-    """Lease jobs to a worker and register it.
-
-    Raises
-    ------
-    ProblemError
-        422 if the worker names no capability.
-    """
+    """Lease jobs to a worker and register it; 422 if it names no capability."""
     settings = ctx.settings
     capabilities = sorted(set(request.capabilities))
     if not capabilities:
@@ -212,15 +206,8 @@ def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> Fai
 def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: SimulateResult) -> ResultAccepted:
     """Store a chunk's result in the transaction that completes its job.
 
-    Parameters
-    ----------
-    body
-        The request as it came: the same bytes under the same lease are answered the same again.
-
-    Raises
-    ------
-    ProblemError
-        409 ``lease-lost``; 422 if the result does not fit the chunk. Nothing is stored then.
+    The same ``body`` under the same lease is answered the same again. 409 ``lease-lost``; 422 if the result
+    does not fit the chunk: nothing is stored then.
     """
     sha256 = hashlib.sha256(body).hexdigest()
     for _ in range(_MAX_LOOKS):
@@ -271,10 +258,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
 def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
     """Store the convex parts that a worker made, in the transaction that completes its job.
 
-    Raises
-    ------
-    ProblemError
-        409 ``lease-lost``; 413 and 422 as for parts that a user sends. Nothing is stored then.
+    409 ``lease-lost``; 413 and 422 as for parts that a user sends: nothing is stored then.
     """
     sha256 = hashlib.sha256(body).hexdigest()
     with ctx.database.read() as tx:

@@ -83,18 +83,7 @@ class _Plan:
 
 
 def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
-    """Check and queue a sweep.
-
-    Parameters
-    ----------
-    key, request
-        The Idempotency-Key and the body it belongs to.
-
-    Raises
-    ------
-    ProblemError
-        404 without the object, 409 while it lacks its mesh, 422 for what can't be simulated.
-    """
+    """Check and queue a sweep: 404 for the object, 409 without a mesh, 422 for what can't be simulated."""
     scope = f"POST /objects/{slug}/sweeps"
     earlier = replayed(ctx.database, scope=scope, key=key, request=request)
     if earlier is not None:
@@ -325,10 +314,7 @@ def cancel(ctx: Estimators, sweep_id: str) -> SweepInfo:
 def retry(ctx: Estimators, sweep_id: str) -> SweepInfo:
     """Queue failed and cancelled chunks again; without any it changes nothing.
 
-    Raises
-    ------
-    ProblemError
-        409 if the batch was deleted: what the sweep had found is gone, so the rest would mislead.
+    409 if the batch was deleted: what the sweep had found is gone, so the rest would mislead.
     """
     with ctx.database.read() as tx:
         row = _require(tx, sweep_id)
@@ -456,13 +442,7 @@ def outcomes(ctx: Estimators, sweep_id: str, *, limit: int, cursor: str | None) 
 
 
 def stream_outcomes(ctx: Estimators, sweep_id: str, *, cursor: str | None) -> Iterator[bytes]:
-    """All poses of finished chunks from a cursor on, as an Arrow IPC stream.
-
-    Raises
-    ------
-    ProblemError
-        404 without the sweep, 406 without pyarrow.
-    """
+    """All poses of finished chunks from a cursor on, as an Arrow IPC stream."""
     page = outcomes(ctx, sweep_id, limit=STREAM_POSES, cursor=cursor)
 
     def batches(page: OutcomePage) -> Iterator[Any]:

@@ -34,14 +34,9 @@ _SUCCESS = OUTCOME_CODES["success"]
 class AllTrials:
     """Attempts (n,): the rows posted first, then those of sweeps; each pose of a grid once.
 
-    Attributes
-    ----------
-    proposal : 1/(m^3 rad^3), NaN where not known
-    keys : (rotation, position) or None
-        Equal where two poses of the one grid share them; None unless all attempts are of one grid.
-    left_out : int
-        Attempts that collided and are not here, where fewer of them were asked for: those that are stand for
-        all, each as much as the other.
+    ``proposal`` is in 1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal where two
+    poses of the one grid share them; None unless all are of one grid. ``left_out`` attempts that collided are
+    not here, where fewer were asked for: those that are stand for all, each as much as the other.
     """
 
     position: Floats
@@ -104,11 +99,8 @@ def read(
 ) -> AllTrials:
     """Every attempt of a selection, packed outcomes included, of sources that post failures, too.
 
-    Parameters
-    ----------
-    most_collided
-        About so many of the attempts that collided, drawn at random; None: all. Nearly all poses of a large
-        grid collide, and arrays of them would fill the memory.
+    ``most_collided`` of those that collided are drawn at random, about: nearly all poses of a large grid
+    collide, and arrays of them would fill the memory.
     """
     with database.read() as tx:
         stored = fetch(tx, row.id, selected)

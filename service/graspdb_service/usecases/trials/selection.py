@@ -29,18 +29,10 @@ class Filters:
 class Selected:
     """What the filters mean for an object as it was when they were resolved.
 
-    Attributes
-    ----------
-    gripper, protocol
-        The one named, else the only one among the trials, else None.
-    profile
-        The gripper's profile, where there is a gripper.
-    provenances
-        Internal ids of the selected trials' provenances, each with whether its jaw is mirror-symmetric.
-    outcomes
-        Selected trials by outcome, packed ones included.
-    tried
-        The provenances of sources that post failures, too: only they tell how likely a success is.
+    ``gripper`` and ``protocol`` are the one named, else the only one among the trials, else None.
+    ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw is
+    mirror-symmetric; ``tried`` those of sources that post failures, too: only they tell how likely a success
+    is. ``outcomes`` counts selected trials by outcome, packed ones included.
     """
 
     gripper: str | None
@@ -68,13 +60,8 @@ class Selected:
 def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
     """Find the provenances that pass the filters.
 
-    A trial without gripper or protocol fits every selection and makes none ambiguous.
-
-    Raises
-    ------
-    ProblemError
-        404 for a gripper that does not exist; 409 ``ambiguous-selection`` where several grippers or
-        protocols are left and none is named.
+    A trial without gripper or protocol fits every selection and makes none ambiguous. 404 for an unknown
+    gripper; 409 ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
     profiles: dict[str, GripperProfile] = {}
     if filters.gripper is not None:

@@ -31,16 +31,10 @@ ROTATION_VOLUME = 8.0 * np.pi**2
 
 @dataclass(frozen=True)
 class ChunkPoses:
-    """The poses of a chunk, in the order of its outcomes.
+    """The poses of a chunk (n,), in the order of its outcomes, ascending ``pose_index``.
 
-    Attributes
-    ----------
-    pose_index : (n,) int64
-        Ascending.
-    position, quaternion_xyzw : (n, 3), (n, 4) float64
-        The tool frame in the object frame, metres.
-    proposal_density : (n,) float64
-        What each pose was drawn with, 1/(m^3 rad^3); NaN where it was chosen by hand.
+    The tool in the object frame, metres; ``proposal_density`` is what each was drawn with, 1/(m^3 rad^3), NaN
+    where it was chosen by hand.
     """
 
     pose_index: IntArray
@@ -55,13 +49,7 @@ def grid_of(sweep: SweepRow) -> PoseGrid:
 
 
 def pose_grid(plan: GridPlan) -> PoseGrid:
-    """The grid as the worker makes it from the same plan.
-
-    Raises
-    ------
-    ValueError
-        Naming the field that is out of range.
-    """
+    """The grid as the worker makes it from the same plan; ValueError names the field that is out of range."""
     return PoseGrid(**{name: getattr(plan, name) for name in GridPlan.model_fields})
 
 
@@ -100,18 +88,11 @@ def not_stored_yet(
     pose_index: IntArray,
     others: Sequence[tuple[PoseGrid, Sequence[tuple[int, int]]]],
 ) -> npt.NDArray[np.bool_]:
-    """Which poses of a chunk no other sweep with the same repeat key has finished: each counts once.
+    """Which poses of a chunk no other sweep with the same repeat key has finished, (stop - start,): each
+    counts once.
 
-    Parameters
-    ----------
-    grid, start, stop, pose_index
-        The chunk, and its indices as ``grid.pose_indices(start, stop)``.
-    others
-        The other sweeps' grids, and the places of their finished chunks.
-
-    Returns
-    -------
-    (stop - start,) bool
+    ``pose_index`` is ``grid.pose_indices(start, stop)``; ``others`` the other sweeps' grids, and the places
+    of their finished chunks.
     """
     fresh = np.ones(len(pose_index), dtype=np.bool_)
     for other, ranges in others:
