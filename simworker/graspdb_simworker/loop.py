@@ -91,22 +91,11 @@ class Tally:
 
 
 class Worker:
-    """Pulls jobs from one service.
+    """Pulls jobs from one service and runs up to ``processes`` chunks at once, a thread and a runner each.
 
-    Parameters
-    ----------
-    transport : Transport
-        Shared by all threads. Give it few retries: this loop has its own.
-    name : str
-        As the service lists it.
-    processes : int
-        Chunks simulated at once, a thread and a runner each.
-    exit_when_idle, once : bool
-        Return when there is nothing left to claim, or after one job for each process.
-    make_runner
-        What simulates one thread's chunks.
-    decompositions : Limits, optional
-        What the decomposition of one mesh may take; None leaves them to other workers.
+    Give ``transport``, which all threads share, few retries: this loop has its own. ``exit_when_idle``
+    returns when there is nothing left to claim, ``once`` after one job for each process. ``decompositions``
+    are the limits of one mesh's; None leaves them to other workers.
     """
 
     def __init__(
@@ -144,10 +133,7 @@ class Worker:
     def run(self) -> None:
         """Work until stopped, or idle if so asked.
 
-        Raises
-        ------
-        WorkerFailed
-            If the service refuses this worker, pybullet is missing or the heartbeat died.
+        WorkerFailed if the service refuses this worker, pybullet is missing or the heartbeat died.
         """
         heartbeat = threading.Thread(
             target=self._guard, args=(self._heartbeat,), name="heartbeat", daemon=True
@@ -337,12 +323,8 @@ class Worker:
     def _parts_of(self, payload: SimulatePayload, lease: Lease) -> bytes:
         """The object's convex parts as GLB, fetched once for each hash.
 
-        Raises
-        ------
-        Cancelled
-            If the job is not wanted any more before they came.
-        ChunkFailed
-            If the service does not have the parts that the sweep was planned with.
+        Cancelled if the job is not wanted any more before they came; ChunkFailed if the service does not have
+        those that the sweep was planned with.
         """
         digest = payload.parts_sha256
         with self._lock:

@@ -47,8 +47,7 @@ class Receipt:
 
 
 class Upload(TypedDict, total=False):
-    """How trials are sent, ``chunk`` a request; each request is stored wholly or not at all, as its own
-    batch.
+    """How trials are sent, ``chunk`` a request; each is stored wholly or not at all, as its own batch.
 
     Repeat a failed upload with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice.
     ``progress=True`` shows a bar; a function is called with trials stored and total.
@@ -112,8 +111,7 @@ class Trials:
         - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
         - ``gripper``, ``source``, ``protocol``: of the whole upload.
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
-        - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width is the jaw's opening in
-          metres.
+        - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
         - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, tool frame.
         - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial.
         """

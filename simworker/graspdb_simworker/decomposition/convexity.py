@@ -45,12 +45,7 @@ class Candidate:
 
 
 def read(content: bytes, media_type: str, unit: str) -> Mesh:
-    """The mesh as the service reads it, repaired as there.
-
-    Raises
-    ------
-    Undecomposable
-    """
+    """The mesh as the service reads it, repaired as there, or Undecomposable."""
     try:
         return meshes.load(content, media_type, unit)
     except MeshError as error:
@@ -66,11 +61,7 @@ def decompose(mesh: Mesh, threshold: float, *, max_parts: int, seed: int) -> Can
     """Split a mesh into convex parts; the same input gives the same bytes.
 
     A mesh that is no closed manifold is first remeshed by CoACD, which takes longer and rounds edges.
-
-    Raises
-    ------
-    Undecomposable
-        If CoACD finds no solid in the mesh.
+    Undecomposable if CoACD finds no solid in it.
     """
     coacd.set_log_level("off")
     # Near the origin and of size one: the library's tolerances are absolute.

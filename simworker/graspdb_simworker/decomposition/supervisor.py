@@ -26,16 +26,12 @@ _WAY_OUT = "Simplify the mesh, or give its convex parts"
 
 @dataclass(frozen=True)
 class Limits:
-    """What one decomposition may take.
+    """What one decomposition may take: processor time, and address space of the child, libraries (1 GB)
+    included.
 
-    Attributes
-    ----------
-    seconds
-        Processor time after which the best candidate so far is taken, or without one the job fails; by the
-        clock :data:`PATIENCE` times as long. On a busy machine the clock says little about the work, and the
-        parts should not depend on what else ran.
-    memory_bytes
-        Address space of the child, libraries (about 1 GB) included.
+    After ``seconds`` the best candidate so far is taken, or without one the job fails; by the clock
+    :data:`PATIENCE` times as long. On a busy machine the clock says little about the work, and the parts
+    should not depend on what else ran.
     """
 
     seconds: float = 900.0
@@ -64,17 +60,11 @@ def decompose(
     progress: Callable[[str], None] = lambda note: None,
     command: Sequence[str] = COMMAND,
 ) -> bytes:
-    """The mesh's convex parts as GLB, from the mesh as it was uploaded.
+    """The convex parts, as GLB, of a mesh as it was uploaded; DecompositionFailed with the reason.
 
-    ``wanted`` is asked several times a second, ``progress`` told in words how far it is; ``command`` starts
-    what answers as :mod:`.child` does.
-
-    Raises
-    ------
-    Cancelled
-        If it was not wanted any more.
-    DecompositionFailed
-        With the reason.
+    ``wanted`` is asked several times a second; the child is killed as soon as it says no (Cancelled).
+    ``progress`` is told in words how far it is. ``command`` starts what speaks as
+    :mod:`graspdb_simworker.decomposition.child` does.
     """
     deadline = time.monotonic() + PATIENCE * limits.seconds
 

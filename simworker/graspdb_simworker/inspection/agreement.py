@@ -98,12 +98,7 @@ def verify(
 ) -> Agreement:
     """Simulate a chunk, then a stratified sample of ``count`` of its physics poses, or all, at fine fidelity.
 
-    ``progress`` is told how many of how many closings are done.
-
-    Raises
-    ------
-    ValueError
-        If no pose of the chunk meets physics.
+    ``progress`` is told how many of how many closings are done. ValueError if no pose meets physics.
     """
     _, positions, quaternions = chunks.poses_of(payload)
     rng = np.random.default_rng(seed)
@@ -136,12 +131,7 @@ def verify_stored(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Agreement:
     """Simulate stored outcomes of the payload's object, gripper and protocol again at fine fidelity: a
-    stratified sample of ``count``, or all, of those that met physics.
-
-    Raises
-    ------
-    ValueError
-        If no pose of the sample meets physics.
+    stratified sample of ``count``, or all, of those that met physics (ValueError if none did).
     """
     rng = np.random.default_rng(seed)
     with closing(_fine(payload, parts)) as fine:

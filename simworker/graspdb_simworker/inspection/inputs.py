@@ -34,12 +34,7 @@ def load(
 ) -> tuple[SimulatePayload, Sequence[Part]]:
     """Payload of an object's default grid (10 mm, 15 degrees, 20 mm margin), and its convex parts.
 
-    Raises
-    ------
-    ValueError
-        For an unknown example, gripper or protocol, or an object that can't be simulated yet.
-    GraspDBError
-        As the service answers.
+    ValueError for an unknown example, gripper or protocol, or an object that can't be simulated yet.
     """
     if protocol not in get_args(Protocol):
         raise ValueError(f"no protocol {protocol!r}; there are {', '.join(get_args(Protocol))}")

@@ -37,14 +37,7 @@ def sample_of(
 ) -> tuple[SweepInfo, StoredOutcomes]:
     """A sweep, and of each of its outcomes but collisions a random sample of ``per_outcome``, or all.
 
-    ``progress`` is told how many of how many poses have been read.
-
-    Raises
-    ------
-    ValueError
-        If nothing of the sweep is simulated yet.
-    GraspDBError
-        As the service answers.
+    ``progress`` is told how many of how many poses have been read. ValueError if nothing is simulated yet.
     """
     rng = np.random.default_rng(seed)
     # For each outcome the poses with the smallest of random keys, one drawn for each pose.

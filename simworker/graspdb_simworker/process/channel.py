@@ -69,13 +69,7 @@ def take_streams() -> tuple[int, int]:
 
 
 def send(fd: int, kind: bytes, body: bytes = b"") -> None:
-    """Write one message whole.
-
-    Raises
-    ------
-    Closed
-        If nobody reads any more.
-    """
+    """Write one message whole; Closed if nobody reads any more."""
     view = memoryview(_HEADER.pack(kind, len(body)) + body)
     try:
         while view:
@@ -89,14 +83,8 @@ def receive(
 ) -> tuple[bytes, bytes]:
     """Read one message whole: kind and body.
 
-    ``check`` is called about every ``poll_s`` while waiting; what it raises ends the wait.
-
-    Raises
-    ------
-    Closed
-        If nobody writes any more.
-    Silent
-        If nothing came for ``silence_s``.
+    ``check`` is called about every ``poll_s`` while waiting; what it raises ends the wait. Closed if nobody
+    writes any more, Silent if nothing came for ``silence_s``.
     """
     kind, length = _HEADER.unpack(_exactly(fd, _HEADER.size, silence_s, poll_s, check))
     if length > MAX_BYTES:

@@ -26,10 +26,6 @@ def simulate(payload_json: str, parts_glb: bytes) -> str:
 
     The child stays for the next chunk and ends with the thread or the process. Takes and gives the JSON of
     :class:`~graspdb.wire.SimulatePayload` and :class:`~graspdb.wire.SimulateResult`.
-
-    Raises
-    ------
-    ChunkFailed, PybulletMissing
     """
     runner: LocalRunner | None = getattr(_local, "runner", None)
     if runner is None:

@@ -33,17 +33,10 @@ def unpack_label(body: bytes) -> tuple[int, Label]:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Body of a ``CHUNK``.
+    """Body of a ``CHUNK``: a simulate job's payload and the object's convex parts.
 
-    Attributes
-    ----------
-    payload_json : str
-        A simulate job's payload.
-    known : mapping
-        Labels, by row of the chunk, that an earlier child found or died of.
-    pose_s : float
-        After this many seconds in one closing the child ends itself.
-    parts_glb : bytes
+    ``known`` are labels, by row of the chunk, that an earlier child found or died of; after ``pose_s``
+    seconds in one closing the child ends itself.
     """
 
     payload_json: str

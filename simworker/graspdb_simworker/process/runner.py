@@ -29,11 +29,6 @@ class ChunkRunner(AbstractContextManager[Any], Protocol):
     ) -> SimulateResult:
         """Simulate a chunk of an object with these convex parts; ``wanted`` is asked several times a second.
 
-        Raises
-        ------
-        Cancelled
-            If it was not wanted any more.
-        ChunkFailed
-            With the reason, if the chunk as a whole can't be simulated.
-        PybulletMissing
+        Cancelled if it was not wanted any more; ChunkFailed, with the reason, if the chunk as a whole can't
+        be simulated; PybulletMissing.
         """

@@ -31,24 +31,11 @@ of 100 g the same third. Once a jaw has stalled, its fingers' inertia has no par
 
 @dataclass(frozen=True)
 class Gripper:
-    """A parallel jaw in its tool frame: x finger width, y closing, z approach, origin midway between
-    the fingers.
+    """A parallel jaw in its tool frame: x finger width, y closing, z approach, origin midway between fingers.
 
-    Attributes
-    ----------
-    max_opening_m, finger_width_m, finger_thickness_m, finger_length_m : float
-        Largest distance between the fingers and the fingers' sizes along x, y and z.
-    tip_offset_m : float
-        From the tool's origin to the fingertips along z.
-    palm_size_m : tuple
-        Box behind the fingers along x, y, z.
-    finger_mass_kg : float
-        As simulated, see :data:`MIN_FINGER_SHARE`.
-    max_speed_m_s : float
-    force_n : float
-        The gripper's closing force, to which contact forces are scaled.
-    closing_force_n : float
-        The force simulated, at most ``force_n``.
+    The fingers' width, thickness and length are along x, y and z, their tips ``tip_offset_m`` from the origin
+    along z; the palm is a box behind them. ``finger_mass_kg`` is as simulated, see :data:`MIN_FINGER_SHARE`,
+    and so is ``closing_force_n``, at most the gripper's own ``force_n``, to which contact forces are scaled.
     """
 
     max_opening_m: float
@@ -84,17 +71,9 @@ def closing_force(force_n: float, mass_kg: float) -> float:
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass, centre and principal inertia of a solid of uniform density, in the object frame.
+    """Mass, centre (m) and principal inertia (kg m^2) of a solid of uniform density, in the object frame.
 
-    Attributes
-    ----------
-    mass_kg : float
-    centre : tuple
-        Centre of mass in the object frame, metres.
-    principal_xyzw : tuple
-        Rotation from the principal frame to the object frame.
-    inertia : tuple
-        Moments about the principal axes, kg m^2.
+    ``principal_xyzw`` rotates from the principal frame to the object frame.
     """
 
     mass_kg: float
@@ -119,16 +98,12 @@ class MassProperties:
 
 
 def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
-    """Mass properties of a union of convex parts; where parts overlap, their common volume counts once
-    for each.
+    """Mass properties of a union of convex parts; where parts overlap, their common volume counts once for
+    each.
 
     Signed tetrahedra from the origin to every face: volume det/6, first moment det/24 (a + b + c),
-    second moment det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c.
-
-    Raises
-    ------
-    ValueError
-        For a mass that is not positive, or parts that enclose no volume.
+    second moment det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c. ValueError for a mass that is
+    not positive, or parts that enclose no volume.
     """
     if not (np.isfinite(mass_kg) and mass_kg > 0.0):
         raise ValueError(f"mass must be positive and finite, got {mass_kg}")
@@ -226,14 +201,8 @@ class End(Enum):
 class Contacts:
     """What presses on the object at one instant.
 
-    Attributes
-    ----------
-    normals : (K, 3) float64
-        Contact normals in the tool frame, pointing into the object.
-    forces : (K,) float64
-        Normal contact forces in newtons, as exerted with ``Gripper.closing_force_n``.
-    fingers : (K,) int64
-        Which body presses: 0 and 1 the fingers, -1 the palm.
+    ``normals`` (K, 3) are in the tool frame, into the object; ``forces`` (K,) newtons, as exerted with
+    ``Gripper.closing_force_n``; ``fingers`` (K,) which body presses: 0 and 1 the fingers, -1 the palm.
     """
 
     normals: NDArray[np.float64]
@@ -243,16 +212,10 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Carried:
-    """How the object came through lift and shake.
+    """How the object came through lift and shake: whether both fingers still press on it at the end.
 
-    Attributes
-    ----------
-    held : bool
-        Both fingers still press on it at the end.
-    translation_m : float
-        Farthest that the point of the object at the tool's origin moved from there.
-    rotation_rad : float
-        Farthest that the object turned in the jaw.
+    ``translation_m`` is the farthest that the point of the object at the tool's origin moved from there,
+    ``rotation_rad`` the farthest that the object turned in the jaw.
     """
 
     held: bool
@@ -262,25 +225,12 @@ class Carried:
 
 @dataclass(frozen=True)
 class Closing:
-    """The jaw after a closing.
+    """The jaw after a closing, and the object's pose in the tool frame.
 
-    Attributes
-    ----------
-    end : End
-    touched : bool
-        Both fingers had touched the object at the same time.
-    opening_m : float
-        Distance between the fingers; of a stalled jaw, what it holds is this wide.
-    contacts : tuple of Contacts
-        Several instants of a stalled jaw; none of any other.
-    position, quaternion_xyzw
-        The object's pose in the tool frame.
-    steps : int
-        Simulation steps spent.
-    ratings : tuple of float
-        Weights held at the same instants, over the object's, where they were rated.
-    carried : Carried, optional
-        How the object came through lift and shake, where that was asked for and the jaw had stalled.
+    ``touched``: both fingers had touched the object at the same time. ``opening_m`` is between the fingers;
+    of a stalled jaw, what it holds is this wide. ``contacts`` are several instants of a stalled jaw, none of
+    any other; ``ratings`` weights held at these, over the object's, where they were rated; ``carried`` what
+    came of lift and shake, where that was asked for and the jaw had stalled.
     """
 
     end: End

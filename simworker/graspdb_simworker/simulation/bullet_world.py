@@ -39,17 +39,8 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 class BulletWorld:
     """A jaw at the origin, its tool frame the world's, and an object.
 
-    Parameters
-    ----------
-    parts : sequence of (vertices (V, 3), faces (F, 3))
-        Convex parts of the object in its own frame, metres.
-    mass_kg, friction : float
-    gripper : Gripper
-    solver_iterations : int
-    by_faces : bool
-        Faces can touch in whole polygons, see :mod:`.urdf`, once they are told to.
-    visible : bool
-        Build what can be seen.
+    ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3). ``by_faces``: faces
+    can touch in whole polygons, see :mod:`.urdf`, once they are told to. ``visible``: build what can be seen.
     """
 
     def __init__(

@@ -70,11 +70,7 @@ def best(
 ) -> View:
     """The view that shows most of both fingers and something of the object, and best how they close.
 
-    Parameters
-    ----------
-    views
-    first, second, thing : (n,)
-        For each, how many pixels show the first finger, the second and the object.
+    ``first``, ``second`` and ``thing`` are for each how many pixels show the fingers and the object.
     """
     sideways = np.abs([view.towards[0] for view in views])
     scores = (np.minimum(first, second) + 0.25 * (first + second) + 0.02 * thing) * (0.4 + 0.6 * sideways)
@@ -86,13 +82,7 @@ def finished(
 ) -> NDArray[np.uint8]:
     """Half of what was drawn in width and height: outlined where one surface ends, and smooth.
 
-    Parameters
-    ----------
-    pixels : (2 h, 2 w, 3) uint8
-    bodies : (2 h, 2 w)
-        What each pixel shows.
-    distances : (2 h, 2 w)
-        How far it is, metres.
+    ``pixels`` (2 h, 2 w, 3) are uint8; ``bodies`` (2 h, 2 w) what each shows, ``distances`` how far, metres.
     """
     edge = np.zeros(bodies.shape, dtype=bool)
     for axis in (0, 1):

@@ -78,11 +78,7 @@ def prepare(
 ) -> Workpiece:
     """Build what the payload's chunks are simulated with; visible for pictures of the end, or at intervals.
 
-    Raises
-    ------
-    UnsupportedProtocol
-    ValueError
-        For parts or a gripper that no physics can be done with.
+    UnsupportedProtocol, or ValueError for parts or a gripper that no physics can be done with.
     """
     if payload.protocol not in PROTOCOLS:
         raise UnsupportedProtocol(
@@ -164,10 +160,7 @@ def poses_of(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """The chunk's pose indices (n,), positions (n, 3) and quaternions xyzw (n, 4), tool in the object frame.
 
-    Raises
-    ------
-    ValueError
-        If the payload has neither grid nor poses, or as many poses as it does not say.
+    ValueError without grid and poses, or for as many poses as the payload does not say.
     """
     if payload.grid is not None:
         grid = grid_of(payload.grid)
@@ -194,16 +187,8 @@ def simulate_chunk(
 ) -> SimulateResult:
     """Simulate a chunk: an outcome for every pose, and rows for those that met physics.
 
-    Parameters
-    ----------
-    payload : SimulatePayload
-    workpiece : Workpiece
-        From :func:`prepare`, for a payload with the same parts, mass, friction, gripper and fidelity.
-    known : mapping of row to Label
-        Rows of the chunk that need no physics any more, because an earlier process simulated them or
-        died of them.
-    before, after
-        Called around each closing with the row within the chunk.
+    ``known`` rows of the chunk need no physics any more: an earlier process simulated them or died of them.
+    ``before`` and ``after`` are called around each closing with the row within the chunk.
     """
     known = known or {}
     indices, positions, quaternions = poses_of(payload)

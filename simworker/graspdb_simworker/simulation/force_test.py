@@ -247,23 +247,11 @@ def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
 def weakest_force(
     normals: NDArray[np.float64], forces: NDArray[np.float64], friction: float
 ) -> tuple[float, NDArray[np.float64]]:
-    """Largest force the contacts can resist in every direction, and the direction in which they resist
-    no more.
+    """Largest force the contacts can resist in every direction, and the direction in which they resist no
+    more.
 
-    Parameters
-    ----------
-    normals : (K, 3)
-        Unit contact normals into the object.
-    forces : (K,)
-        Normal forces, newtons.
-    friction : float
-
-    Returns
-    -------
-    force : float
-        min over unit d of h(d), newtons; 0 without contacts.
-    direction : (3,)
-        A d that attains it.
+    That is the minimum over unit d of h(d), newtons, 0 without contacts, and a d (3,) that attains it. Unit
+    ``normals`` (K, 3) point into the object; ``forces`` (K,) are newtons along them.
     """
     if len(forces) == 0:
         return 0.0, np.array([0.0, 0.0, 1.0])

@@ -101,21 +101,10 @@ def stepping_for(fidelity: Fidelity, mass_kg: float, *, lifts: bool = False) -> 
 class GraspWorld(BulletWorld):
     """One object and one gripper in a headless Bullet world.
 
-    Parameters
-    ----------
-    parts : sequence of (vertices (V, 3), faces (F, 3))
-        Convex parts of the object in its own frame, metres.
-    mass_kg : float
-    friction : float
-        Coulomb friction coefficient between object and gripper.
-    gripper : Gripper
-    fidelity : {'standard', 'fine'}
-    lifts : bool
-        Lift and shake what is held after every closing, see :mod:`graspdb_simworker.simulation.lifting`.
-    visible : bool
-        Build what can be seen, for :attr:`pictures`.
-    film_every_s : float
-        Take a picture at such intervals, not only at the end.
+    ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3); ``friction`` is
+    Coulomb's coefficient between object and gripper; ``fidelity`` is ``standard`` or ``fine``. ``lifts``:
+    lift and shake what is held after every closing, see :mod:`graspdb_simworker.simulation.lifting`.
+    ``visible``: build what can be seen, for :attr:`pictures`, one at the end and one every ``film_every_s``.
     """
 
     def __init__(
@@ -163,16 +152,10 @@ class GraspWorld(BulletWorld):
     # -- one grasp -----------------------------------------------------------------------------------------
 
     def close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float = 0.0) -> Closing:
-        """Close the jaw at a pose of the tool frame in the object frame, until it stalls, is empty or
-        times out.
+        """Close the jaw at a pose of the tool frame in the object frame, until it stalls, is empty or times
+        out.
 
-        Parameters
-        ----------
-        position, quaternion_xyzw
-            The grasp: pose of the tool frame in the object frame.
-        travel_m : float
-            How far each finger can close before the first of the two touches the object, from the exact
-            geometry.
+        Each finger can close by ``travel_m`` before the first of the two touches, by the exact geometry.
         """
         try:
             self.pictures.clear()

@@ -43,18 +43,12 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True)
 class Label:
-    """What a grasp came to.
+    """What a grasp came to; ``width_m`` is between the fingers at the end.
 
-    Attributes
-    ----------
-    outcome : Outcome
-    width_m : float
-        Distance between the fingers at the end.
-    quality : float
-        ``wrench``: largest weight the contacts hold in the worst direction, over the object's weight;
-        success from 1 on. ``lift``: 1 minus the farthest displacement in the jaw, in units of what is
-        allowed (the larger of translation / 10 mm and rotation / 15 degrees); 1 did not move at all,
-        success down to 0. NaN where nothing was measured.
+    ``quality`` of ``wrench`` is the largest weight the contacts hold in the worst direction, over the
+    object's weight; success from 1 on. Of ``lift``: 1 minus the farthest displacement in the jaw, in units of
+    what is allowed (the larger of translation / 10 mm and rotation / 15 degrees); 1 did not move at all,
+    success down to 0. NaN where nothing was measured.
     """
 
     outcome: Outcome

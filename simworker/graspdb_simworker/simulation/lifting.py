@@ -46,12 +46,8 @@ DURATION_S = _TURNS_FROM_S + 3.0 * TURN_S + REST_S
 class Frame:
     """The jaw's motion at one instant, in its own axes.
 
-    Attributes
-    ----------
-    push : tuple
-        R^T (g - p''): what a particle at rest at the origin feels, m/s^2.
-    spin, spin_rate : tuple
-        Angular velocity, rad/s, and its rate, rad/s^2.
+    ``push`` is R^T (g - p''), what a particle at rest at the origin feels, m/s^2; ``spin`` and ``spin_rate``
+    are the angular velocity, rad/s, and its rate, rad/s^2.
     """
 
     push: Vector
@@ -98,16 +94,8 @@ def load(
 ) -> tuple[Vector, Vector]:
     """Force (newtons, at the centre of mass) and torque (newton metres) on a carried body.
 
-    Compiled: this is done at every step.
-
-    Parameters
-    ----------
-    frame : Frame
-    mass : MassProperties
-    position, orientation
-        Pose of the body's principal frame in the jaw's frame.
-    velocity, spin
-        Relative to the jaw, in its axes.
+    The pose is of the body's principal frame in the jaw's; ``velocity`` and ``spin`` are relative to the jaw,
+    in its axes. Compiled: this is done at every step.
     """
     found: tuple[Vector, Vector] = _load(
         frame.push,
