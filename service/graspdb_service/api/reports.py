@@ -103,13 +103,7 @@ def _tagged(
 
 
 def _media(request: Request) -> str:
-    """The media type to answer in.
-
-    Raises
-    ------
-    ProblemError
-        406 where none of ours is accepted, or a figure where nothing can draw it.
-    """
+    """The media type to answer in; 406 where none of ours is accepted, or nothing can draw a figure."""
     media = accepted(request, JSON, *_FIGURES)
     if media != JSON and importlib.util.find_spec("matplotlib") is None:
         raise ProblemError(

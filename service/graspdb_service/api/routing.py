@@ -50,12 +50,9 @@ def _schema(given: Any) -> dict[str, Any]:
 
 
 def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
-    """The query parameters of every operation, by method and path, of an OpenAPI document.
+    """The query parameters of every operation of an OpenAPI document, by method and path.
 
-    Raises
-    ------
-    RuntimeError
-        If an operation declares no scope: none may be open by oversight.
+    RuntimeError if an operation declares no scope: none may be open by oversight.
     """
     found = {}
     for path, operations in document["paths"].items():

@@ -28,14 +28,9 @@ _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 class Constraints:
     """What bounds a grasp, in the object frame, and what its parts were called in the request.
 
-    Attributes
-    ----------
-    object_pose
-        The object frame in the world frame (position, quaternion), where it was given.
-    obstacles
-        What the gripper must not touch besides the object.
-    candidates, exclude
-        Poses (n, 3), (n, 4): the only ones to rank, and those to stay away from.
+    ``object_pose`` is the object frame in the world frame, where it was given; ``obstacles`` what the gripper
+    must not touch besides the object; ``candidates`` the only poses to rank, ``exclude`` those to stay away
+    from.
     """
 
     region: Region
@@ -65,19 +60,10 @@ class Constraints:
 
 
 def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Constraints:
-    """Check a request's constraints and bring them to the object frame.
+    """Check a request's constraints and bring them to the object frame; 422 names fields that contradict.
 
-    Boxes become half spaces, for in the object frame they may stand askew.
-
-    Parameters
-    ----------
-    jaw_symmetric
-        Whether the tool's y and its opposite close alike.
-
-    Raises
-    ------
-    ProblemError
-        422 naming the fields that contradict each other.
+    Boxes become half spaces, for in the object frame they may stand askew. ``jaw_symmetric``: the tool's y
+    and its opposite close alike.
     """
     _check(request)
     pose = None

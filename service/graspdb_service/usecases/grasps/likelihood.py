@@ -203,15 +203,7 @@ class Draw:
 def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
     """Draw grasps; the same revision, selection, kernel, count and seed give the same ones.
 
-    Parameters
-    ----------
-    seed
-        None: one is made up, and answered.
-
-    Raises
-    ------
-    ProblemError
-        413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
+    Without a seed one is made up, and answered. 413 over the limit; 409 ``no-successes`` without any.
     """
     check_count(ctx, count)
     chosen = secrets.randbits(63) if seed is None else seed

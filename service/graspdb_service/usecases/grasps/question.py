@@ -45,11 +45,7 @@ _CHANCES = frozenset({"success_probability", "interval", "effective_trials"})
 def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
     """The best distinct grasps under the request's constraints, and the object's internal id.
 
-    Raises
-    ------
-    ProblemError
-        422 naming fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that
-        are not there, and as the selection.
+    422 names fields that contradict each other; 409 what needs a mesh, a gripper or attempts.
     """
     choice, _ = kernel_of(request)
     constraints(request)

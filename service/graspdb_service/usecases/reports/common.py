@@ -51,12 +51,7 @@ class KeptCurves:
 
     What a kept curve was made of it tells itself (see `incremental_bootstrap`): after a deletion, other
     weights or another process's commits it is extended or computed anew as its grasps demand, and reports of
-    several processes agree.
-
-    Parameters
-    ----------
-    max_bytes
-        What all of them together may take; a curve of 20,000 points takes about 10 MB.
+    several processes agree. A curve of 20,000 points takes about 10 MB.
     """
 
     def __init__(self, max_bytes: int) -> None:

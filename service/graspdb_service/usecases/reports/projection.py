@@ -31,13 +31,7 @@ _FEW = 50
 def projection_report(
     inputs: ReportInputs, built: Built, options: ProjectionOptions, progress: Progress
 ) -> ProjectionReport:
-    """The density on a plane.
-
-    Raises
-    ------
-    ProblemError
-        409 without a success, or where none points the way asked for.
-    """
+    """The density on a plane; 409 without a success, or where none points the way asked for."""
     density = built.asked
     if density is None or built.density is None:
         raise conflict(

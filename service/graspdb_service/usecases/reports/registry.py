@@ -52,13 +52,7 @@ class Reports:
         self._inputs = ReportInputs(database, densities, scenes, settings.threads, curves)
 
     def key(self, slug: str, report: str, options: ReportOptions) -> RunKey:
-        """The run of a report, everything resolved: the same parameters give the same report of a revision.
-
-        Raises
-        ------
-        ProblemError
-            404 and 409 as the selection.
-        """
+        """The run of a report, everything resolved: the same parameters give the same report of a revision."""
         selection = Selection(**{name: getattr(options, name, None) for name in Selection.model_fields})
         choice, _ = kernel_of(selection)
         densities = self._inputs.densities
@@ -80,13 +74,7 @@ class Reports:
         return RunKey(row.id, row.revision, report, digest, parameters)
 
     def compute(self, slug: str, parameters: Mapping[str, Any], progress: Progress) -> AnyReport:
-        """The report by the parameters of a run.
-
-        Raises
-        ------
-        ProblemError
-            409 where the trials don't suffice, saying what is missing and how much of it.
-        """
+        """The report by the parameters of a run; 409 says what is missing where the trials don't suffice."""
         report = parameters["report"]
         own = {name: value for name, value in parameters["options"].items() if name != report_runs.CHECKS}
         options = REPORTS[report].options.model_validate(own)

@@ -89,12 +89,8 @@ def sources_report(
 
 
 def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str, Selected]:
-    """The trials to compare with, by source.
-
-    Raises
-    ------
-    ProblemError
-        409 where simulation has too few attempts, or no other source has any trial, saying what is needed.
+    """The trials to compare with, by source; 409 says what is needed where these or simulated ones are too
+    few.
     """
     slug = built.object_row.slug
     if len(simulated) < LEAST_SIMULATED or built.density is None:

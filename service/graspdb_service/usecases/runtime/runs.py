@@ -66,12 +66,7 @@ class _Held:
 class Runs:
     """The runs of one service process, over a database that others may share.
 
-    Parameters
-    ----------
-    wait_s
-        How long a request waits for a result.
-    kinds
-        By what a run's row names as its report.
+    A request waits ``wait_s`` for a result; ``kinds`` go by what a run's row names as its report.
     """
 
     def __init__(self, database: Database, *, wait_s: float, kinds: Mapping[str, RunKind]) -> None:
@@ -91,11 +86,8 @@ class Runs:
     def ask(self, key: RunKey) -> RunRow:
         """The run of a key: done, or under way after the wait.
 
-        Raises
-        ------
-        ProblemError
-            What the computation itself was refused for; 409 where it was cancelled; 429 where too many are
-            under way.
+        What the computation itself was refused for; 409 where it was cancelled, 429 where too many are under
+        way.
         """
         with self._database.read() as tx:
             run = report_runs.find(tx, key)
@@ -108,13 +100,7 @@ class Runs:
         report_runs.ask(tx, key, id=id, lease_id=lease_id, lease_s=_LEASE_S)
 
     def follow(self, id: str, lease_id: str | None) -> RunRow:
-        """A run done, or under way after the wait; computed here where this process holds its lease.
-
-        Raises
-        ------
-        ProblemError
-            As :meth:`ask`.
-        """
+        """A run done, or under way after the wait; computed here where this process holds its lease."""
         run = self._row(id)
         if lease_id is not None:
             self._start(run, lease_id)
@@ -183,13 +169,7 @@ class Runs:
         return run
 
     def place(self) -> str:
-        """A lease for a run that this process is to compute.
-
-        Raises
-        ------
-        ProblemError
-            429 where it has too many.
-        """
+        """A lease for a run that this process is to compute; 429 where it has too many."""
         with self._lock:
             if len(self._held) >= MAX_HELD:
                 raise ProblemError(
