@@ -52,7 +52,7 @@ class Reports:
         self._inputs = ReportInputs(database, densities, scenes, settings.threads, curves)
 
     def key(self, slug: str, report: str, options: ReportOptions) -> RunKey:
-        """The run of a report, everything resolved: the same parameters give the same report of a revision."""
+        """The run of a report, all of it resolved: the same parameters give the same report of a revision."""
         selection = Selection(**{name: getattr(options, name, None) for name in Selection.model_fields})
         choice, _ = kernel_of(selection)
         densities = self._inputs.densities
