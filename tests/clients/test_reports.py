@@ -6,15 +6,17 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 
-from graspdb import Client, cli
+from graspdb import Client, cli, figures
+from graspdb.asynchronous import AsyncReports
 from graspdb.errors import ChecksNeeded, Conflict, NotFound
-from graspdb.reports import Report
+from graspdb.reports import Report, Reports, Waiting
 from graspdb.resources.objects import GraspObject
+from graspdb.wire.reports import REPORT_NAMES, REPORTS
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -51,6 +53,20 @@ def run(service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytes
         return (code if isinstance(code, int) else 0 if code is None else 1), captured.out, captured.err
 
     return invoke
+
+
+def test_a_report_is_declared_once() -> None:
+    """The SDK takes the options of the wire, and waits; every answer is named and drawn."""
+    assert set(REPORTS) == set(REPORT_NAMES)
+    for name, declared in REPORTS.items():
+        method = getattr(Reports, name.replace("-", "_"))
+        (keywords,) = get_args(get_type_hints(method)["options"])
+        assert set(keywords.__optional_keys__ - Waiting.__optional_keys__) == set(
+            declared.options.model_fields
+        )
+        assert declared.result.model_fields["report"].default == name
+        assert declared.result in figures._DRAW
+        assert hasattr(AsyncReports, name.replace("-", "_"))
 
 
 def test_reports_have_words_arrays_and_figures(thing: GraspObject, tmp_path: Path) -> None:
