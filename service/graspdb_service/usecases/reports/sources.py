@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import (
     CalibrationBin,
     ReportRange,
@@ -39,7 +38,7 @@ from graspdb_service.usecases.reports.common import (
 )
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-from graspdb_service.usecases.trials.selection import Selected
+from graspdb_service.usecases.trials.selection import Selected, outcome_counts, total
 
 Floats = NDArray[np.float64]
 
@@ -155,10 +154,7 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
     """
     chosen = built.selected
     with inputs.database.read() as tx:
-        counts: dict[int, dict[str, int]] = {}
-        for provenance, code, rows, packed in provenances.tallies(tx, built.object_row.id):
-            if rows + packed:
-                counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
+        counts = outcome_counts(tx, built.object_row.id)
         own = [
             item
             for item in provenances.of_object(tx, built.object_row.id)
@@ -168,10 +164,7 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
         own = [item for item in own if item.protocol in (None, chosen.protocol)]
     if not own:
         return None
-    outcomes: dict[str, int] = {}
-    for item in own:
-        for name, count in counts[item.id].items():
-            outcomes[name] = outcomes.get(name, 0) + count
+    outcomes = total([counts[item.id] for item in own])
     tells = bool(outcomes.keys() - {"success", "simulation_error"})
     return Selected(
         gripper=chosen.gripper,
@@ -179,7 +172,7 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
         source=source,
         profile=chosen.profile,
         provenances={item.id: item.gripper is None or chosen.jaw_symmetric for item in own},
-        outcomes={name: outcomes[name] for name in OUTCOMES if name in outcomes},
+        outcomes=outcomes,
         tried=frozenset(item.id for item in own) if tells else frozenset(),
     )
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import SummaryRate, SummaryReport, SummaryRow
 from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.reports.common import LEVEL, share
+from graspdb_service.usecases.trials.selection import outcome_counts, total
 
 #: What each way of counting leaves out, by its name.
 _LEFT_OUT: dict[str, tuple[str, ...]] = {
@@ -47,10 +47,7 @@ def summary(database: Database) -> SummaryReport:
 
 
 def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
-    counts: dict[int, dict[str, int]] = {}
-    for provenance, code, stored, packed in provenances.tallies(tx, item.id):
-        if stored + packed:
-            counts.setdefault(provenance, {})[OUTCOMES[code]] = stored + packed
+    counts = outcome_counts(tx, item.id)
     symmetric: dict[str | None, bool] = {None: True}
     rows = []
     for origin in provenances.of_object(tx, item.id):
@@ -60,8 +57,7 @@ def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
             assert origin.gripper is not None
             gripper = grippers.find(tx, origin.gripper)
             symmetric[origin.gripper] = gripper is None or bool(gripper.profile.get("symmetric", True))
-        own = counts[origin.id]
-        outcomes: dict[str, int] = {name: own[name] for name in OUTCOMES if name in own}
+        outcomes = total([counts[origin.id]])
         tried = sum(outcomes.values()) - outcomes.get(_NO_ATTEMPT, 0)
         won = outcomes.get("success", 0)
         twins = 2 if symmetric[origin.gripper] else 1

@@ -37,6 +37,7 @@ _TICK_S = 2.0
 _POLL_S = 0.1
 #: What the request is to blame for, and would be again: kept as the run's answer.
 _KEPT_STATUSES = (404, 409, 413, 422)
+_KEPT_MEMBERS = ("status", "kind", "title", "errors", "extra")
 
 Result = Callable[[Tx], str]
 """A run's result as JSON, made in the transaction that ends the run."""
@@ -242,13 +243,7 @@ class Runs:
             return
         except ProblemError as error:
             if error.status in _KEPT_STATUSES:
-                problem = {
-                    "status": error.status,
-                    "kind": error.kind,
-                    "title": error.title,
-                    "errors": error.errors,
-                    "extra": error.extra,
-                }
+                problem = {name: getattr(error, name) for name in _KEPT_MEMBERS}
             else:
                 log.warning("report run %s: %s", run.id, error.title)
         except Exception:
@@ -314,18 +309,8 @@ def _problem(document: dict[str, Any]) -> ProblemError:
 def model(run: RunRow) -> ReportRun:
     """As the wire has it, the result included."""
     problem = None if run.problem is None else _problem(run.problem)
+    result = None if run.result is None else json.loads(run.result)
+    fields = {name: getattr(run, name) for name in ReportRun.model_fields}
     return ReportRun.model_validate(
-        {
-            "id": run.id,
-            "object": run.object,
-            "report": run.report,
-            "revision": run.revision,
-            "parameters": run.parameters,
-            "state": run.state,
-            "progress": run.progress,
-            "result": None if run.result is None else json.loads(run.result),
-            "problem": None if problem is None else problem.document(""),
-            "created_at": run.created_at,
-            "finished_at": run.finished_at,
-        }
+        {**fields, "result": result, "problem": None if problem is None else problem.document("")}
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from graspdb.wire import OUTCOMES, GripperProfile, Selection
@@ -66,10 +66,7 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
     profiles: dict[str, GripperProfile] = {}
     if filters.gripper is not None:
         profiles[filters.gripper] = _profile(tx, filters.gripper)
-    counts: dict[int, dict[str, int]] = {}
-    for provenance, code, rows, packed in provenances.tallies(tx, object_id):
-        if rows + packed:
-            counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
+    counts = outcome_counts(tx, object_id)
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = [
         item
@@ -94,10 +91,6 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
     }
     for name in _distinct([chosen["gripper"], *(item.gripper for item in candidates)]):
         profiles.setdefault(name, _profile(tx, name))
-    outcomes: dict[str, int] = {}
-    for item in candidates:
-        for outcome, number in counts[item.id].items():
-            outcomes[outcome] = outcomes.get(outcome, 0) + number
     failing = {item.source for item in candidates if counts[item.id].keys() - {"success", "simulation_error"}}
     return Selected(
         gripper=chosen["gripper"],
@@ -107,9 +100,24 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
         provenances={
             item.id: item.gripper is None or profiles[item.gripper].symmetric for item in candidates
         },
-        outcomes={name: outcomes[name] for name in OUTCOMES if name in outcomes},
+        outcomes=total([counts[item.id] for item in candidates]),
         tried=frozenset(item.id for item in candidates if item.source in failing),
     )
+
+
+def outcome_counts(tx: Tx, object_id: int) -> dict[int, dict[str, int]]:
+    """Trials by provenance and outcome, packed ones included; none of a provenance without any."""
+    counts: dict[int, dict[str, int]] = {}
+    for provenance, code, rows, packed in provenances.tallies(tx, object_id):
+        if rows + packed:
+            counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
+    return counts
+
+
+def total(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
+    """Counts by outcome together, in the order of outcomes."""
+    sums = {name: sum(item.get(name, 0) for item in counts) for name in OUTCOMES}
+    return {name: number for name, number in sums.items() if number}
 
 
 def _profile(tx: Tx, name: str) -> GripperProfile:
