@@ -31,7 +31,7 @@ def test_every_pose_gets_an_outcome_and_physics_a_row(
     found = codes(result)
     indices, positions, quaternions = chunks.poses_of(payload)
     assert len(found) == len(indices) == 5_000
-    geometry, _ = workpiece.scene.classify(ToolPoses(positions, quaternions), workpiece.shape)
+    geometry, _ = workpiece.scene.classify(ToolPoses(positions, quaternions), workpiece.gripper)
     np.testing.assert_array_equal(found == Outcome.COLLISION, geometry == collision.COLLIDES)
     assert (found[geometry == collision.EMPTY] == Outcome.MISSED).all()
     assert result.rows.pose_index == indices[geometry == collision.CONTACT].tolist()

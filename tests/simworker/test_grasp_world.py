@@ -23,9 +23,9 @@ FindPoses = Callable[[str, int], list[tuple[Any, Any]]]
 
 def travels(workpiece: Workpiece, poses: list[tuple[Any, Any]]) -> list[float]:
     positions, quaternions = (np.array([pose[k] for pose in poses]) for k in (0, 1))
-    codes, first = workpiece.scene.classify(ToolPoses(positions, quaternions), workpiece.shape)
+    codes, first = workpiece.scene.classify(ToolPoses(positions, quaternions), workpiece.gripper)
     assert (codes == collision.CONTACT).all()
-    return [float(t) for t in np.minimum(first.min(axis=1), 0.5 * workpiece.shape.max_opening_m)]
+    return [float(t) for t in np.minimum(first.min(axis=1), 0.5 * workpiece.gripper.max_opening_m)]
 
 
 def close_all(world: GraspWorld, poses: list[tuple[Any, Any]], travel: list[float]) -> list[Closing]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -46,18 +47,10 @@ def title(figure: Figure, report: Any, kind: str) -> int:
 
 def heading(figure: Figure, first: str, text: str) -> int:
     """A title line and words below it, wrapped to the figure's width; the number of lines."""
-    words = f"{first}\n{_wrapped(text, round(11 * figure.get_figwidth()))}"
+    width = round(11 * figure.get_figwidth())
+    words = f"{first}\n{textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)}"
     figure.suptitle(words, fontsize=10)
     return 1 + words.count("\n")
-
-
-def _wrapped(text: str, width: int) -> str:
-    lines = [""]
-    for word in text.split():
-        if len(lines[-1]) + len(word) + 1 > width and lines[-1]:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines)
 
 
 def show_grid(axes: Axes) -> None:

@@ -38,7 +38,7 @@ def simulate_one(
         position, quaternion = np.array([pose.position]), np.array([pose.quaternion_xyzw])
         codes, travel = workpiece.classify(position, quaternion)
         if codes[0] == collision.COLLIDES:
-            return SeenGrasp(Label(Outcome.COLLISION, workpiece.shape.max_opening_m, 0.0), [])
+            return SeenGrasp(Label(Outcome.COLLISION, workpiece.gripper.max_opening_m, 0.0), [])
         if codes[0] == collision.EMPTY:
             return SeenGrasp(Label(Outcome.MISSED, 0.0, 0.0), [])
         label = workpiece.simulate(position[0], quaternion[0], float(travel[0]))

@@ -9,6 +9,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb_geometry.grippers import GripperShape
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Part = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -30,20 +32,13 @@ of 100 g the same third. Once a jaw has stalled, its fingers' inertia has no par
 
 
 @dataclass(frozen=True)
-class Gripper:
-    """A parallel jaw in its tool frame: x finger width, y closing, z approach, origin midway between fingers.
+class Gripper(GripperShape):
+    """A parallel jaw as the physics sees it.
 
-    The fingers' width, thickness and length are along x, y and z, their tips ``tip_offset_m`` from the origin
-    along z; the palm is a box behind them. ``finger_mass_kg`` is as simulated, see :data:`MIN_FINGER_SHARE`,
-    and so is ``closing_force_n``, at most the gripper's own ``force_n``, to which contact forces are scaled.
+    ``finger_mass_kg`` is as simulated, see :data:`MIN_FINGER_SHARE`, and so is ``closing_force_n``, at most
+    the gripper's own ``force_n``, to which contact forces are scaled.
     """
 
-    max_opening_m: float
-    finger_width_m: float
-    finger_thickness_m: float
-    finger_length_m: float
-    tip_offset_m: float
-    palm_size_m: tuple[float, float, float]
     finger_mass_kg: float
     max_speed_m_s: float
     force_n: float

@@ -44,7 +44,6 @@ class Workpiece:
     scene: collision.Scene
     world: GraspWorld
     gripper: Gripper
-    shape: GripperShape
     mass_kg: float
     friction: float
 
@@ -53,8 +52,8 @@ class Workpiece:
     ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """What geometry says of tool poses (n, 3), (n, 4): its code (n,), and how far each finger can close
         before the first touches (n,), metres."""
-        codes, first_contact = self.scene.classify(ToolPoses(positions, quaternions), self.shape)
-        return codes, np.minimum(first_contact.min(axis=1), 0.5 * self.shape.max_opening_m)
+        codes, first_contact = self.scene.classify(ToolPoses(positions, quaternions), self.gripper)
+        return codes, np.minimum(first_contact.min(axis=1), 0.5 * self.gripper.max_opening_m)
 
     def simulate(
         self, position: NDArray[np.float64], quaternion: NDArray[np.float64], travel_m: float
@@ -100,7 +99,6 @@ def prepare(
             film_every_s=film_every_s,
         ),
         gripper=gripper,
-        shape=shape_of(payload.gripper),
         mass_kg=payload.mass_kg,
         friction=payload.friction,
     )
@@ -127,12 +125,7 @@ def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:
     what floats between the fingers. Once they touch, force and friction decide and not the drive's ramp.
     """
     return Gripper(
-        max_opening_m=profile.max_opening_m,
-        finger_width_m=profile.finger.width_m,
-        finger_thickness_m=profile.finger.thickness_m,
-        finger_length_m=profile.finger.length_m,
-        tip_offset_m=profile.tip_offset_m,
-        palm_size_m=profile.palm_size_m,
+        **vars(shape_of(profile)),
         finger_mass_kg=max(profile.finger_mass_kg, MIN_FINGER_SHARE * mass_kg),
         max_speed_m_s=profile.max_speed_m_s,
         force_n=profile.force_n,
@@ -142,17 +135,7 @@ def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:
 
 def grid_of(plan: GridPlan) -> PoseGrid:
     """The grid that a payload describes."""
-    return PoseGrid(
-        lower=plan.lower,
-        upper=plan.upper,
-        position_step_m=plan.position_step_m,
-        rotation_step_deg=plan.rotation_step_deg,
-        margin_m=plan.margin_m,
-        symmetric=plan.symmetric,
-        max_poses=plan.max_poses,
-        seed=plan.seed,
-        region=plan.region,
-    )
+    return PoseGrid(**{name: getattr(plan, name) for name in GridPlan.model_fields})
 
 
 def poses_of(
