@@ -2,12 +2,17 @@
 
 A rotation is a unit quaternion ``(x, y, z, w)``; ``q`` and ``-q`` are the same rotation. Every function takes
 arrays of shape (..., 4), (..., 3) or (..., 3, 3), broadcasts over the leading axes and computes in float64.
-Angles are radians. `Poses` holds many rigid motions as one value.
+Angles are radians.
+
+`Poses` is what functions of this package that ask about grasps take, and what they draw: many motions as
+one value. ``Poses.of(positions, quaternions_xyzw)`` checks what comes from outside; ``poses[rows]``,
+``len(poses)``, ``Poses.concatenate`` and ``positions, quaternions = poses`` do what they say; `compose` and
+`inverse` are those of rigid motions, ``poses.turned()`` the jaw's twins.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +24,6 @@ __all__ = [
     "Floats",
     "Poses",
     "angle_between",
-    "as_poses",
     "canonical",
     "compose",
     "conjugate",
@@ -71,7 +75,22 @@ class Poses:
             For shapes other than (N, 3) and (N, 4), values that are not finite, or quaternions further than
             ``UNIT_TOLERANCE`` from unit length.
         """
-        return cls(*as_poses(positions, quaternions_xyzw))
+        p = np.array(positions, dtype=np.float64, order="C")
+        q = np.array(quaternions_xyzw, dtype=np.float64, order="C")
+        if p.ndim != 2 or p.shape[1] != 3:
+            raise ValueError(f"positions have shape (N, 3), not {p.shape}")
+        if q.shape != (len(p), 4):
+            raise ValueError(f"quaternions_xyzw have shape ({len(p)}, 4), not {q.shape}")
+        if not (np.isfinite(p).all() and np.isfinite(q).all()):
+            raise ValueError("positions and quaternions must be finite")
+        length = np.linalg.norm(q, axis=1)
+        wrong = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
+        if wrong.size:
+            raise ValueError(
+                f"quaternion {wrong[0]} has length {length[wrong[0]]:.6g}; "
+                f"it must be 1 within {UNIT_TOLERANCE}"
+            )
+        return cls(p, q / length[:, None])
 
     @classmethod
     def concatenate(cls, parts: Sequence[Poses]) -> Poses:
@@ -81,11 +100,15 @@ class Poses:
             np.concatenate([part.quaternions_xyzw for part in parts]),
         )
 
+    def __iter__(self) -> Iterator[Floats]:
+        """The two arrays, to unpack."""
+        return iter((self.positions, self.quaternions_xyzw))
+
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __getitem__(self, rows: slice | NDArray[np.integer] | NDArray[np.bool_]) -> Poses:
-        """Some of the poses."""
+    def __getitem__(self, rows: int | slice | NDArray[np.integer] | NDArray[np.bool_]) -> Poses:
+        """Some of the poses; with a number one alone, (3,) and (4,)."""
         return Poses(self.positions[rows], self.quaternions_xyzw[rows])
 
     def turned(self, where: NDArray[np.bool_] | bool = True) -> Poses:
@@ -228,20 +251,16 @@ def jaw_twin(q: ArrayLike) -> Floats:
     return multiply(q, JAW_TURN)
 
 
-def compose(
-    position: ArrayLike, quaternion: ArrayLike, inner_position: ArrayLike, inner_quaternion: ArrayLike
-) -> tuple[Floats, Floats]:
-    """Rigid motion (position, quaternion) after the inner one: the inner pose seen from the outer's parent
-    frame.
-    """
-    turned = rotate(quaternion, inner_position)
-    return np.asarray(position, dtype=np.float64) + turned, multiply(quaternion, inner_quaternion)
+def compose(outer: Poses, inner: Poses) -> Poses:
+    """The inner poses seen from the outer's parent frame; arrays broadcast."""
+    turned = rotate(outer.quaternions_xyzw, inner.positions)
+    return Poses(outer.positions + turned, multiply(outer.quaternions_xyzw, inner.quaternions_xyzw))
 
 
-def inverse(position: ArrayLike, quaternion: ArrayLike) -> tuple[Floats, Floats]:
-    """The inverse rigid motion."""
-    back = conjugate(quaternion)
-    return -rotate(back, position), back
+def inverse(poses: Poses) -> Poses:
+    """The inverse rigid motions."""
+    back = conjugate(poses.quaternions_xyzw)
+    return Poses(-rotate(back, poses.positions), back)
 
 
 def random_quaternions(count: int, rng: np.random.Generator) -> Floats:
@@ -249,30 +268,3 @@ def random_quaternions(count: int, rng: np.random.Generator) -> Floats:
     # A normalised Gaussian; its length is below 1e-3 with probability 1e-13, so a retry loop is not worth its
     # code.
     return normalise(rng.standard_normal((count, 4)))
-
-
-def as_poses(positions: ArrayLike, quaternions_xyzw: ArrayLike) -> tuple[Floats, Floats]:
-    """Check poses and return contiguous float64 copies, quaternions normalised.
-
-    Raises
-    ------
-    ValueError
-        For shapes other than (N, 3) and (N, 4), values that are not finite, or quaternions further than
-        ``UNIT_TOLERANCE`` from unit length.
-    """
-    p = np.array(positions, dtype=np.float64, order="C")
-    q = np.array(quaternions_xyzw, dtype=np.float64, order="C")
-    if p.ndim != 2 or p.shape[1] != 3:
-        raise ValueError(f"positions have shape (N, 3), not {p.shape}")
-    if q.shape != (len(p), 4):
-        raise ValueError(f"quaternions_xyzw have shape ({len(p)}, 4), not {q.shape}")
-    if not (np.isfinite(p).all() and np.isfinite(q).all()):
-        raise ValueError("positions and quaternions must be finite")
-    length = np.linalg.norm(q, axis=1)
-    wrong = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
-    if wrong.size:
-        raise ValueError(
-            f"quaternion {wrong[0]} has length {length[wrong[0]]:.6g}; it must be 1 within {UNIT_TOLERANCE}"
-        )
-    q /= length[:, None]
-    return p, q

@@ -122,25 +122,30 @@ def against_peers(rng: np.random.Generator) -> None:
     ):
         kernel = IsotropicKernel(metres, math.radians(degrees))
         rows = shell(count, rng)
-        density = GraspDensity.build(*rows, kernel=kernel)
+        density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel)
         poses = queries(rows, asked, kernel, rng)
         few = poses[0][:peers], poses[1][:peers]
         learn, tree = scikit_learn(kernel, rows), scipy_and_numpy(kernel, rows)
         seconds = interleaved(
             ROUNDS,
-            lambda d=density, q=poses: d.log_density(*q),
+            lambda d=density, q=poses: d.log_density(se3.Poses.of(*q)),
             lambda f=learn, q=few: f(q),
             lambda f=tree, q=few: f(q),
         )
         alone, both = interleaved(
             ROUNDS,
-            lambda d=density, q=poses: d.log_density(*q),
-            lambda d=density, q=poses: d.log_density(*q, threads=2),
+            lambda d=density, q=poses: d.log_density(se3.Poses.of(*q)),
+            lambda d=density, q=poses: d.log_density(se3.Poses.of(*q), threads=2),
             clock=time.perf_counter,
         )
         one, theirs, scipys = (n / s for n, s in zip((asked, peers, peers), seconds, strict=True))
         part = poses[0][:300], poses[1][:300]
-        error = np.abs(np.expm1(density.log_density(*part) - reference.log_density(kernel, *rows, *part)))
+        error = np.abs(
+            np.expm1(
+                density.log_density(se3.Poses.of(*part))
+                - reference.log_density(kernel, se3.Poses.of(*rows), se3.Poses.of(*part))
+            )
+        )
         print(
             f"{count:7d}   {1e3 * metres:.0f} mm, {degrees:.0f} deg {one:9.0f}  {alone / both:13.2f}"
             f"  {theirs:12.0f} {one / theirs:5.0f}  {scipys:11.0f} {one / scipys:5.0f}"
@@ -214,9 +219,9 @@ def brute_force(rng: np.random.Generator) -> None:
     """Kernels a second without any cut-off, beside bare loops and NumPy's exponential."""
     kernel = IsotropicKernel(0.015, math.radians(20.0))
     rows = shell(20_000, rng)
-    density = GraspDensity.build(*rows, kernel=kernel)
+    density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel)
     # So wide that a cut-off leaves out nothing: what a query costs then, the test of its error included.
-    reached = GraspDensity.build(*rows, kernel=IsotropicKernel(0.15, kernel.sigma_rotation))
+    reached = GraspDensity.build(se3.Poses.of(*rows), kernel=IsotropicKernel(0.15, kernel.sigma_rotation))
     cells = density.cells
     p, q = queries(rows, 500, kernel, rng)
     poses = np.hstack([(p - cells.centre) * cells.scale, kernel.kappa * q]).astype(np.float32)
@@ -234,7 +239,7 @@ def brute_force(rng: np.random.Generator) -> None:
         lambda: isotropic.all_sums(
             cells.data, cells.table, cells.centre, cells.scale, p, q, kernel.kappa, density.wide, out
         ),
-        lambda: reached.log_density(p, q),
+        lambda: reached.log_density(se3.Poses.of(p, q)),
         lambda: _bare_kernels(cells.data, poses, kappa, out),
         lambda: _bare_exponentials(x, y, 500),
         lambda: _bare_sums(x, 500, out),
@@ -262,14 +267,14 @@ def maxima(rng: np.random.Generator) -> None:
     for count in (20_000, 160_000):
         kernel = IsotropicKernel(0.015, math.radians(15.0))
         rows, more = shell(count, rng), shell(1_000, rng)
-        density = GraspDensity.build(*rows, kernel=kernel)
+        density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel)
         started = time.thread_time()
         known = centre_sums(density, None, 1)
         centres = time.thread_time() - started
         search = ModeSearch(density)
         build, extend, best, ten = interleaved(
             ROUNDS,
-            lambda r=rows, k=kernel: GraspDensity.build(*r, kernel=k),
+            lambda r=rows, k=kernel: GraspDensity.build(se3.Poses.of(*r), kernel=k),
             lambda d=density, r=more, k=known: centre_sums(d.extend(*r), k, 1),
             lambda s=search: s.maxima(region),
             lambda s=search: s.maxima(region, count=10),
@@ -289,11 +294,14 @@ def anisotropic(rng: np.random.Generator) -> None:
         rows = shell(count, rng)
         poses = queries(rows, 5_000, plain, rng)
         six = AnisotropicKernel.diagonal([0.015] * 3 + [math.radians(15.0)] * 3)
-        iso, full = GraspDensity.build(*rows, kernel=plain), MixtureDensity(*rows, kernel=six)
+        iso, full = (
+            GraspDensity.build(se3.Poses.of(*rows), kernel=plain),
+            MixtureDensity(se3.Poses.of(*rows), kernel=six),
+        )
         one, other = interleaved(
             3 * ROUNDS,
-            lambda d=iso, q=poses: d.log_density(*q),
-            lambda d=full, q=poses: d.log_density(*q),
+            lambda d=iso, q=poses: d.log_density(se3.Poses.of(*q)),
+            lambda d=full, q=poses: d.log_density(se3.Poses.of(*q)),
         )
         print(f"{count:7d}  {200 * one:9.1f}  {200 * other:20.1f}  {other / one:6.1f}")
     replaced(rng)
@@ -309,18 +317,18 @@ def replaced(rng: np.random.Generator) -> None:
     turns = se3.from_rotation_vector(xi[:, 3:])
     own = np.diag([component.sigma_position_m**2] * 3 + [component.sigma_rotation**2] * 3)
     pair = mixture_fit._fitted(xi, np.ones(900), 2, own, False)
-    whole = sampled_kernel_rows(xi[:, :3], turns, component)
-    one = MixtureDensity(np.zeros((1, 3)), se3.IDENTITY[None], kernel=pair, symmetric=False)
+    whole = sampled_kernel_rows(se3.Poses.of(xi[:, :3], turns), component)
+    one = MixtureDensity(se3.Poses.of(np.zeros((1, 3)), se3.IDENTITY[None]), kernel=pair, symmetric=False)
     found = bhattacharyya(one, whole, rng, points=20_000)
     rows = shell(1_000, rng)
-    sampled = SampledKernel(xi[:, :3], turns, component).placed(*rows)
-    fitted = MixtureDensity(*rows, kernel=pair)
+    sampled = SampledKernel(xi[:, :3], turns, component).placed(se3.Poses.of(*rows))
+    fitted = MixtureDensity(se3.Poses.of(*rows), kernel=pair)
     many, few = queries(rows, 5_000, component, rng), queries(rows, 100, component, rng)
     quick, cut, slow = interleaved(
         ROUNDS,
-        lambda: fitted.log_density(*many),
-        lambda: sampled.log_density(*few),
-        lambda: sampled.log_density(*few, cutoff=None),
+        lambda: fitted.log_density(se3.Poses.of(*many)),
+        lambda: sampled.log_density(se3.Poses.of(*few)),
+        lambda: sampled.log_density(se3.Poses.of(*few), cutoff=None),
     )
     here, cut_off, over_all = 1e6 * quick / 5_000, 1e6 * cut / 100, 1e6 * slow / 100
     print("\n1,000 rows, microseconds a pose on one core")
@@ -343,7 +351,7 @@ def growth(rng: np.random.Generator, plot: str | None) -> None:
         for count in counts:
             scale = math.sqrt(count / 20_000) if scaled else 1.0
             rows = shell(count, rng, semi_axes_m=scale * np.array(SEMI_AXES_M))
-            density = GraspDensity.build(*rows, kernel=kernel)
+            density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel)
             cells = density.cells
             poses = queries(rows, 10_000, kernel, rng)
             within = cKDTree(rows[0]).query_ball_point(
@@ -352,7 +360,7 @@ def growth(rng: np.random.Generator, plot: str | None) -> None:
             reaches.append(float(within.mean()))
             # The cells' own reach is rounded outwards; their share of that is in the time, not in the count.
             assert scaled_radius(CUTOFF) / cells.scale >= CUTOFF * kernel.sigma_position_m * (1.0 - 1e-9)
-            tasks: list[Callable[[], object]] = [lambda d=density, q=poses: d.log_density(*q)]
+            tasks: list[Callable[[], object]] = [lambda d=density, q=poses: d.log_density(se3.Poses.of(*q))]
             peers = max(40, 2_000_000 // count)
             few = poses[0][:peers], poses[1][:peers]
             if not scaled:

@@ -13,6 +13,7 @@ import time
 import numpy as np
 
 from graspdb_density import GraspDensity, IsotropicKernel, se3
+from graspdb_density.se3 import Poses
 from graspdb_density.vicinity import anisotropy
 
 ROUNDS = 5
@@ -58,7 +59,7 @@ def main() -> None:
         )
     kernel = IsotropicKernel(0.015, math.radians(15.0))
     chosen = np.flatnonzero(success)[:20_000]
-    density = GraspDensity.build(p[chosen], q[chosen], kernel=kernel)
+    density = GraspDensity.build(Poses.of(p[chosen], q[chosen]), kernel=kernel)
     volume = len(np.unique(position)) * 1e-6
     anisotropy.smoothed(density, len(p) / (8.0 * math.pi**2 * volume), max_grasps=2)
     started = time.perf_counter()

@@ -46,13 +46,13 @@ class Gaussian:
 def peer_similarity(rows: KernelRows, points: int, rng: np.random.Generator) -> float:
     """Eq 9 with SciPy and NumPy."""
     p, q = rows.sample(points, rng)
-    tree = cKDTree(rows.positions)
+    tree = cKDTree(rows.poses.positions)
     found = tree.query_ball_point(p, 5.0 * KERNEL.sigma_position_m)
     lengths = np.array([len(f) for f in found])
     columns = np.concatenate([np.asarray(f, dtype=np.int64) for f in found])
     at = np.repeat(np.arange(points), lengths)
-    square = np.sum((p[at] - rows.positions[columns]) ** 2, axis=1) / (2.0 * KERNEL.sigma_position_m**2)
-    own = rows.quaternions_xyzw
+    square = np.sum((p[at] - rows.poses.positions[columns]) ** 2, axis=1) / (2.0 * KERNEL.sigma_position_m**2)
+    own = rows.poses.quaternions_xyzw
     cosine = np.maximum(
         np.abs(np.sum(q[at] * own[columns], axis=1)),
         np.abs(np.sum(q[at] * se3.jaw_twin(own)[columns], axis=1)),
@@ -78,7 +78,7 @@ def timed(work: Callable[[], object], rounds: int) -> tuple[float, float]:
 
 def _peak(count: int, points: int) -> float:
     """MB of this process at its peak."""
-    rows = KernelRows(*shell(count, np.random.default_rng(0)), KERNEL)
+    rows = KernelRows(se3.Poses.of(*shell(count, np.random.default_rng(0))), KERNEL)
     bootstrap_similarity(rows, np.random.default_rng(1), replicates=REPLICATES, points=points)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
@@ -126,7 +126,7 @@ def main() -> None:
         for name, kernel in (("isotropic", KERNEL), ("anisotropic", Gaussian())):
             if name == "anisotropic" and points > 20_000:
                 continue
-            rows = KernelRows(*poses, kernel)
+            rows = KernelRows(se3.Poses.of(*poses), kernel)
             bootstrap_similarity(rows, np.random.default_rng(1), points=200)  # compiles
 
             def measure(threads: int = 1, rows: KernelRows = rows, points: int = points) -> float:
@@ -143,7 +143,7 @@ def main() -> None:
                 f"{one:>8.2f} {cpu:>7.2f} {both:>10.2f} {memory:>6}",
                 flush=True,
             )
-    rows = KernelRows(*shell(20_000, rng), KERNEL)
+    rows = KernelRows(se3.Poses.of(*shell(20_000, rng)), KERNEL)
     _, ours = timed(lambda: bootstrap_similarity(rows, np.random.default_rng(1), points=2_000), 3)
     _, peer = timed(lambda: peer_similarity(rows, 2_000, np.random.default_rng(1)), 3)
     print(

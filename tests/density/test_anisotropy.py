@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_density._compiled.pairs import composition_angles
 from graspdb_density.kde import brute_force
-from graspdb_density.se3 import Floats
+from graspdb_density.se3 import Floats, Poses
 from graspdb_density.vicinity import anisotropy as an
 from graspdb_density.vicinity import pair_candidates
 from graspdb_density.vicinity.half_width import tolerances
@@ -346,8 +346,8 @@ def densities(box: Trials) -> tuple[GraspDensity, GraspDensity]:
     near = np.max(np.abs(p) - HALF_M, axis=1) < 0.05
     kernel = IsotropicKernel(0.006, math.radians(8.0))
     return (
-        GraspDensity.build(p[success], q[success], kernel=kernel),
-        GraspDensity.build(p[near], q[near], kernel=kernel),
+        GraspDensity.build(Poses.of(p[success], q[success]), kernel=kernel),
+        GraspDensity.build(Poses.of(p[near], q[near]), kernel=kernel),
     )
 
 
@@ -388,7 +388,10 @@ def test_smoothed_is_the_mean_of_the_definition(densities: tuple[GraspDensity, G
     for row in range(0, n, 7):
         rest = np.delete(np.arange(n), row)
         log = brute_force.log_density(
-            successes.kernel, p[rest], q[rest], p[row : row + 1], q[row : row + 1], weights=np.ones(n - 1)
+            successes.kernel,
+            Poses.of(p[rest], q[rest]),
+            Poses.of(p[row : row + 1], q[row : row + 1]),
+            weights=np.ones(n - 1),
         )
         share.append(min(1.0, (n - 1) * float(np.exp(log[0])) / rho))
     error = np.std(share) / math.sqrt(len(share))
@@ -400,7 +403,9 @@ def test_smoothed_leaves_the_grasp_itself_out() -> None:
     """Successes alone in the world: without its own kernel nothing is left at a grasp."""
     rng = np.random.default_rng(0)
     p = np.arange(30)[:, None] * np.array([1.0, 0.0, 0.0])
-    density = GraspDensity.build(p, se3.random_quaternions(30, rng), kernel=IsotropicKernel(0.01, 0.2))
+    density = GraspDensity.build(
+        Poses.of(p, se3.random_quaternions(30, rng)), kernel=IsotropicKernel(0.01, 0.2)
+    )
     got = an.smoothed(density, 1.0, max_grasps=30)
     peak = float(np.exp(density.kernel.log_peak))
     assert peak > 100.0
@@ -443,7 +448,7 @@ def test_too_little_is_refused_with_what_is_needed(box: Trials) -> None:
     far = np.arange(60)[:, None] * np.array([1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="no trial lies within reach"):
         an.empirical(far, se3.random_quaternions(60, np.random.default_rng(0)), np.arange(60) < 30)
-    density = GraspDensity.build(p[:30], q[:30], kernel=IsotropicKernel(0.01, 0.2))
+    density = GraspDensity.build(Poses.of(p[:30], q[:30]), kernel=IsotropicKernel(0.01, 0.2))
     with pytest.raises(ValueError, match="density of attempts"):
         an.smoothed(density, 0.0)
 

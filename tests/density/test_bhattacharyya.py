@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_density.kde import bhattacharyya as sm
 from graspdb_density.kde.weighted_sums import KernelRows
+from graspdb_density.se3 import Poses
 
 TURN = math.radians(20.0)
 
 
 def _one(x: float, sigma: float = 0.02) -> GraspDensity:
     kernel = IsotropicKernel(sigma, TURN)
-    return GraspDensity.build([[x, 0.0, 0.0]], [se3.IDENTITY], kernel=kernel, symmetric=False)
+    return GraspDensity.build(Poses.of([[x, 0.0, 0.0]], [se3.IDENTITY]), kernel=kernel, symmetric=False)
 
 
 @given(st.floats(0.0, 4.0), st.floats(0.4, 2.5))
@@ -89,9 +90,9 @@ def test_mirrored_displacements_are_those_of_the_turned_jaw() -> None:
     rng = np.random.default_rng(4)
     base_p, base_q = rng.standard_normal((20, 3)), se3.random_quaternions(20, rng)
     t, r = rng.standard_normal((20, 3)), se3.random_quaternions(20, rng)
-    moved_p, moved_q = se3.compose(base_p, base_q, t, r)
-    mt, mr = sm.mirrored_displacements(t, r)
-    other_p, other_q = se3.compose(base_p, se3.jaw_twin(base_q), mt, mr)
+    moved_p, moved_q = se3.compose(Poses(base_p, base_q), Poses(t, r))
+    mt, mr = sm.mirrored_displacements(Poses.of(t, r))
+    other_p, other_q = se3.compose(Poses(base_p, se3.jaw_twin(base_q)), Poses(mt, mr))
     np.testing.assert_allclose(other_p, moved_p, atol=1e-12)
     assert np.max(se3.angle_between(other_q, se3.jaw_twin(moved_q))) < 1e-6
 
@@ -101,8 +102,7 @@ def test_sampled_kernel_curve_rises_towards_one() -> None:
     t = rng.standard_normal((6_000, 3)) * [0.02, 0.006, 0.02]
     r = se3.from_rotation_vector(rng.standard_normal((6_000, 3)) * [0.2, 0.6, 0.2])
     curve = sm.sampled_kernel_curve(
-        t,
-        r,
+        Poses.of(t, r),
         components=IsotropicKernel(0.01, math.radians(10.0)),
         window=sm.DisplacementWindow(),
         rng=rng,
@@ -115,20 +115,23 @@ def test_sampled_kernel_curve_rises_towards_one() -> None:
     assert values[-1] > 0.97
     with pytest.raises(ValueError, match="at least 100 are needed"):
         sm.sampled_kernel_curve(
-            t + 1.0, r, components=IsotropicKernel(0.01, 0.2), window=sm.DisplacementWindow(), rng=rng
+            Poses.of(t + 1.0, r),
+            components=IsotropicKernel(0.01, 0.2),
+            window=sm.DisplacementWindow(),
+            rng=rng,
         )
 
 
 def test_sampled_kernel_is_mirror_symmetric() -> None:
     rng = np.random.default_rng(6)
     t, r = rng.standard_normal((50, 3)) * 0.02, se3.from_rotation_vector(rng.standard_normal((50, 3)) * 0.4)
-    kernel = sm.sampled_kernel_rows(t, r, IsotropicKernel(0.01, 0.2))
+    kernel = sm.sampled_kernel_rows(Poses.of(t, r), IsotropicKernel(0.01, 0.2))
     assert isinstance(kernel, KernelRows)
     assert kernel.size == 100
     at_t, at_r = rng.standard_normal((30, 3)) * 0.02, se3.random_quaternions(30, rng)
     np.testing.assert_allclose(
-        kernel.log_density(at_t, at_r),
-        kernel.log_density(*sm.mirrored_displacements(at_t, at_r)),
+        kernel.log_density(Poses.of(at_t, at_r)),
+        kernel.log_density(Poses.of(*sm.mirrored_displacements(Poses.of(at_t, at_r)))),
         atol=1e-3,
     )
 

@@ -82,13 +82,15 @@ def test_isotropic_sums_equal_the_reference_under_every_weighting(shell: Shell, 
     p, q = shell(400, rng)
     kernel = IsotropicKernel(0.03, math.radians(degrees))
     symmetric = rng.random(400) < 0.7
-    rows = KernelRows(p, q, kernel, symmetric=symmetric)
-    at = rows.sample(60, rng)
+    rows = KernelRows(se3.Poses.of(p, q), kernel, symmetric=symmetric)
+    at = tuple(rows.sample(60, rng))
     weightings = rng.random((400, 37))
-    sums = rows.sums(*at, weightings, least=0.0)
+    sums = rows.sums(se3.Poses.of(*at), weightings, least=0.0)
     for column in (0, 31, 36):
         w = weightings[:, column]
-        expected = brute_force.log_density(kernel, p, q, *at, weights=w, symmetric=symmetric)
+        expected = brute_force.log_density(
+            kernel, se3.Poses.of(p, q), se3.Poses.of(*at), weights=w, symmetric=symmetric
+        )
         got = np.log(sums[:, column] / w.sum()) + rows.log_unit
         assert np.max(np.abs(got - expected)) < 2e-3
         assert np.median(np.abs(got - expected)) < 1e-4
@@ -100,11 +102,11 @@ def test_mixture_density_equals_brute_force(shell: Shell, framed: bool) -> None:
     rows = shell(150, rng)
     frames = se3.to_matrix(se3.random_quaternions(150, rng)) if framed else None
     kernel = _random_mixture(rng)
-    density = KernelRows(*rows, kernel, frames=frames)
-    near = density.sample(80, rng)
+    density = KernelRows(se3.Poses.of(*rows), kernel, frames=frames)
+    near = tuple(density.sample(80, rng))
     far = near[0] + rng.standard_normal((80, 3)) * 0.3, se3.random_quaternions(80, rng)
     for at in (near, far):
-        got = density.log_density(*at)
+        got = density.log_density(se3.Poses.of(*at))
         assert np.max(np.abs(got - _brute_log_density(kernel, rows, frames, at))) < 2e-3
 
 
@@ -113,10 +115,13 @@ def test_a_round_gaussian_agrees_with_the_isotropic_kernel(shell: Shell) -> None
     rng = np.random.default_rng(3)
     p, q = shell(2_000, rng)
     narrow = IsotropicKernel(0.02, math.radians(6.0))
-    density = KernelRows(p, q, narrow)
-    round_one = KernelRows(p, q, _gaussian(*[0.02] * 3, *[math.radians(6.0)] * 3))
-    at = density.sample(500, rng)
-    assert np.max(np.abs(density.log_density(*at) - round_one.log_density(*at))) < 0.05
+    density = KernelRows(se3.Poses.of(p, q), narrow)
+    round_one = KernelRows(se3.Poses.of(p, q), _gaussian(*[0.02] * 3, *[math.radians(6.0)] * 3))
+    at = tuple(density.sample(500, rng))
+    assert (
+        np.max(np.abs(density.log_density(se3.Poses.of(*at)) - round_one.log_density(se3.Poses.of(*at))))
+        < 0.05
+    )
 
 
 @given(st.lists(st.floats(2.0, 40.0), min_size=3, max_size=3))
@@ -135,7 +140,7 @@ def test_rotation_normaliser_agrees_with_its_series(degrees: list[float]) -> Non
 def test_draws_follow_the_density(kernel: IsotropicKernel | Mixture) -> None:
     """Importance sampling: uniform poses weighted by the density have the moments of the draws."""
     rng = np.random.default_rng(4)
-    rows = KernelRows(np.zeros((1, 3)), se3.random_quaternions(1, rng), kernel)
+    rows = KernelRows(se3.Poses.of(np.zeros((1, 3)), se3.random_quaternions(1, rng)), kernel)
     p, q = rows.sample(40_000, rng)
     if isinstance(kernel, IsotropicKernel):
         spread = np.full(3, kernel.sigma_position_m)
@@ -146,7 +151,7 @@ def test_draws_follow_the_density(kernel: IsotropicKernel | Mixture) -> None:
     log_proposal = -0.5 * np.sum((wide_p / (1.3 * spread.max())) ** 2, axis=1)
     log_proposal -= 1.5 * math.log(2.0 * math.pi) + 3.0 * math.log(1.3 * spread.max())
     log_proposal -= math.log(8.0 * math.pi**2)
-    ratio = np.exp(rows.log_density(wide_p, wide_q) - log_proposal)
+    ratio = np.exp(rows.log_density(se3.Poses.of(wide_p, wide_q)) - log_proposal)
     # The density integrates to one over positions and rotations.
     assert ratio.mean() == pytest.approx(1.0, abs=6.0 * ratio.std() / math.sqrt(len(ratio)))
     for axis in range(3):
@@ -154,8 +159,8 @@ def test_draws_follow_the_density(kernel: IsotropicKernel | Mixture) -> None:
         expected = np.average(square, weights=ratio)
         error = math.sqrt(np.sum((ratio * (square - expected)) ** 2)) / ratio.sum()
         assert np.mean(p[:, axis] ** 2) == pytest.approx(expected, abs=5.0 * error + 0.02 * expected)
-    turn = np.abs(np.sum(q * rows.quaternions_xyzw[0], axis=1))
-    other = np.abs(np.sum(wide_q * rows.quaternions_xyzw[0], axis=1))
+    turn = np.abs(np.sum(q * rows.poses.quaternions_xyzw[0], axis=1))
+    other = np.abs(np.sum(wide_q * rows.poses.quaternions_xyzw[0], axis=1))
     expected = np.average(other, weights=ratio)
     error = math.sqrt(np.sum((ratio * (other - expected)) ** 2)) / ratio.sum()
     assert turn.mean() == pytest.approx(expected, abs=5.0 * error)
@@ -164,13 +169,13 @@ def test_draws_follow_the_density(kernel: IsotropicKernel | Mixture) -> None:
 def test_a_mixture_is_checked(shell: Shell) -> None:
     p, q = shell(10, np.random.default_rng(0))
     with pytest.raises(ValueError, match="positive definite"):
-        KernelRows(p, q, Mixture(np.ones(1), np.zeros((1, 6)), -np.eye(6)[None]))
+        KernelRows(se3.Poses.of(p, q), Mixture(np.ones(1), np.zeros((1, 6)), -np.eye(6)[None]))
     with pytest.raises(ValueError, match="weights"):
-        KernelRows(p, q, Mixture(np.ones(2), np.zeros((1, 6)), np.eye(6)[None]))
+        KernelRows(se3.Poses.of(p, q), Mixture(np.ones(2), np.zeros((1, 6)), np.eye(6)[None]))
     with pytest.raises(ValueError, match="orthonormal"):
-        KernelRows(p, q, _gaussian(*[0.1] * 6), frames=2.0 * np.eye(3))
+        KernelRows(se3.Poses.of(p, q), _gaussian(*[0.1] * 6), frames=2.0 * np.eye(3))
     with pytest.raises(ValueError, match="at least one"):
-        KernelRows(p[:0], q[:0], KERNEL)
+        KernelRows(se3.Poses.of(p[:0], q[:0]), KERNEL)
 
 
 # -- similarity
@@ -179,12 +184,15 @@ def test_a_mixture_is_checked(shell: Shell) -> None:
 def _exact_similarity(rows: KernelRows, counts: Floats, points: int, rng: np.random.Generator) -> float:
     """BC(m, d_b) with densities from the float64 reference, no truncation."""
     assert isinstance(rows.kernel, IsotropicKernel)
-    at = rows.sample(points, rng)
-    own = rows.positions, rows.quaternions_xyzw
-    whole = brute_force.log_density(rows.kernel, *own, *at, weights=rows.weights)
+    at = tuple(rows.sample(points, rng))
+    own = tuple(rows.poses)
+    whole = brute_force.log_density(rows.kernel, se3.Poses.of(*own), se3.Poses.of(*at), weights=rows.weights)
     chosen = counts > 0
     again = brute_force.log_density(
-        rows.kernel, own[0][chosen], own[1][chosen], *at, weights=(rows.weights * counts)[chosen]
+        rows.kernel,
+        se3.Poses.of(own[0][chosen], own[1][chosen]),
+        se3.Poses.of(*at),
+        weights=(rows.weights * counts)[chosen],
     )
     return float(np.exp(0.5 * (again - whole)).mean())
 
@@ -192,7 +200,7 @@ def _exact_similarity(rows: KernelRows, counts: Floats, points: int, rng: np.ran
 def test_similarity_equals_the_reference(shell: Shell) -> None:
     rng = np.random.default_rng(5)
     p, q = shell(300, rng)
-    rows = KernelRows(p, q, IsotropicKernel(0.03, 0.4), weights=rng.uniform(0.2, 1.0, 300))
+    rows = KernelRows(se3.Poses.of(p, q), IsotropicKernel(0.03, 0.4), weights=rng.uniform(0.2, 1.0, 300))
     got = cv.bootstrap_similarity(rows, rng, replicates=200, points=4_000)
     exact = [
         _exact_similarity(rows, np.bincount(rng.integers(300, size=300), minlength=300), 2_000, rng)
@@ -209,7 +217,7 @@ def test_far_apart_grasps_follow_the_multinomial() -> None:
     """Kernels that share nothing: BC_b = mean of sqrt(c_i), and E sqrt(Poisson(1)) is .773."""
     rng = np.random.default_rng(6)
     p = np.arange(4_000)[:, None] * np.array([1.0, 0.0, 0.0])
-    rows = KernelRows(p, se3.random_quaternions(4_000, rng), KERNEL)
+    rows = KernelRows(se3.Poses.of(p, se3.random_quaternions(4_000, rng)), KERNEL)
     k = np.arange(60)
     poisson = np.exp(-1.0 - np.cumsum(np.log(np.maximum(k, 1))))
     expected = float(np.sum(np.sqrt(k) * poisson))
@@ -220,7 +228,7 @@ def test_far_apart_grasps_follow_the_multinomial() -> None:
 @pytest.mark.parametrize("points", [1_000, 4_000])
 def test_the_deviation_is_that_of_replicates_not_of_points(shell: Shell, points: int) -> None:
     """Few points tell the mean and the spread of s that many tell."""
-    rows = KernelRows(*shell(200, np.random.default_rng(3)), IsotropicKernel(0.03, 0.4))
+    rows = KernelRows(se3.Poses.of(*shell(200, np.random.default_rng(3))), IsotropicKernel(0.03, 0.4))
     few = cv.bootstrap_similarity(rows, np.random.default_rng(1), replicates=400, points=points)
     many = cv.bootstrap_similarity(rows, np.random.default_rng(2), replicates=400, points=60_000)
     assert few.deviation == pytest.approx(many.deviation, rel=0.15)
@@ -228,7 +236,7 @@ def test_the_deviation_is_that_of_replicates_not_of_points(shell: Shell, points:
 
 
 def test_one_place_has_converged() -> None:
-    rows = KernelRows(np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1)), KERNEL)
+    rows = KernelRows(se3.Poses.of(np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1))), KERNEL)
     got = cv.bootstrap_similarity(rows, np.random.default_rng(0), points=200)
     assert got.value == pytest.approx(1.0, abs=1e-6)
     assert got.deviation < 1e-6
@@ -244,7 +252,7 @@ def test_similarity_is_a_share_and_does_not_know_units_of_weight(
     w = rng.uniform(0.1, 1.0, 60)
     values = []
     for scale in (1.0, 1e6):
-        rows = KernelRows(p, q, IsotropicKernel(sigma, 0.3), weights=w * scale, symmetric=twins)
+        rows = KernelRows(se3.Poses.of(p, q), IsotropicKernel(sigma, 0.3), weights=w * scale, symmetric=twins)
         values.append(
             cv.bootstrap_similarity(rows, np.random.default_rng(seed), points=300, replicates=8).replicates
         )
@@ -255,7 +263,7 @@ def test_similarity_is_a_share_and_does_not_know_units_of_weight(
 
 def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
     rng = np.random.default_rng(7)
-    rows = KernelRows(*shell(3_000, rng), KERNEL)
+    rows = KernelRows(se3.Poses.of(*shell(3_000, rng)), KERNEL)
     one = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10)
     two = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10, threads=2)
     np.testing.assert_array_equal(one.replicates, two.replicates)

@@ -56,8 +56,14 @@ def smoothed(field: Field, rows: Poses, poses: Poses) -> se3.Floats:
     chance, twins = field(*rows), se3.jaw_twin(rows[1])
     out = np.empty(len(poses[0]))
     for j, (p, q) in enumerate(zip(*poses, strict=True)):
-        own = brute_force.kernel_log_density(KERNEL, p, q, rows[0], rows[1]) - KERNEL.log_peak
-        other = brute_force.kernel_log_density(KERNEL, p, q, rows[0], twins) - KERNEL.log_peak
+        own = (
+            brute_force.kernel_log_density(KERNEL, se3.Poses(p, q), se3.Poses(rows[0], rows[1]))
+            - KERNEL.log_peak
+        )
+        other = (
+            brute_force.kernel_log_density(KERNEL, se3.Poses(p, q), se3.Poses(rows[0], twins))
+            - KERNEL.log_peak
+        )
         k = (np.exp(own) + np.exp(other)) * (np.maximum(own, other) >= -0.5 * SUCCESS_CUTOFF**2)
         out[j] = k @ chance / k.sum() if k.any() else np.nan
     return out

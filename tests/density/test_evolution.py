@@ -29,7 +29,7 @@ KERNEL = IsotropicKernel(0.015, math.radians(15.0))
 @pytest.mark.parametrize("seed", range(3))
 def test_the_density_itself_as_a_score_gives_its_maximum(seed: int, shell: Shell) -> None:
     rng = np.random.default_rng(seed)
-    density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(1_500, rng)), kernel=KERNEL)
     region = Region(
         half_spaces=Region.box([-0.15, -0.1, 0.0], [0.15, 0.1, 0.15]), approach=[0, 0, -1], approach_angle=0.8
     )
@@ -41,7 +41,7 @@ def test_the_density_itself_as_a_score_gives_its_maximum(seed: int, shell: Shell
 
 
 def test_as_many_distinct_grasps_as_there_are(shell: Shell) -> None:
-    density = GraspDensity.build(*shell(1_500, np.random.default_rng(0)), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(1_500, np.random.default_rng(0))), kernel=KERNEL)
     found = ModeSearch(density).maxima(score=density.log_density, count=100)
     assert len(found) == 100
     scores = [item.score for item in found]
@@ -64,7 +64,7 @@ def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> Non
     won = np.arange(len(p)) < 301
     won[:60] = False
     model = SuccessModel.build(p, q, won, kernel=KERNEL)
-    density = GraspDensity.build(p[won], q[won], kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=KERNEL)
     found = ModeSearch(density).maxima(score=lambda a, b: model.evaluate(a, b).low, count=2)
     assert found[0].position[0] < -0.05
     assert found[0].score > found[1].score
@@ -77,7 +77,7 @@ def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> Non
 
 def test_refused_poses_are_never_returned(shell: Shell) -> None:
     rng = np.random.default_rng(4)
-    density = GraspDensity.build(*shell(500, rng), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(500, rng)), kernel=KERNEL)
 
     def admissible(p: se3.Floats, q: se3.Floats) -> NDArray[np.bool_]:
         return np.asarray(p[:, 0] > 0.05, dtype=bool)
@@ -90,8 +90,8 @@ def test_refused_poses_are_never_returned(shell: Shell) -> None:
 def test_tool_noise_is_a_wider_kernel(shell: Shell) -> None:
     rng = np.random.default_rng(5)
     rows = shell(300, rng)
-    density = GraspDensity.build(*rows, kernel=KERNEL)
-    wider = GraspDensity.build(*rows, kernel=KERNEL.widened(0.01, math.radians(8.0)))
+    density = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL)
+    wider = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL.widened(0.01, math.radians(8.0)))
     poses = rows[0][:40], rows[1][:40]
     mean = expected(density.density, tool_noise=PoseNoise(0.01, math.radians(8.0)), samples=1024)(*poses)
     np.testing.assert_allclose(mean, wider.density(*poses), rtol=0.08)
@@ -102,13 +102,17 @@ def test_object_noise_grows_with_the_lever() -> None:
     q = se3.IDENTITY[None]
     noise = PoseNoise(0.0, math.radians(5.0))
     for p, least, most in ((near, 0.9, 1.0), (far, 0.0, 0.6)):
-        density = GraspDensity.build(p, q, kernel=IsotropicKernel(0.015, math.radians(60.0)))
-        share = expected(density.density, object_noise=noise, samples=256)(p, q) / density.density(p, q)
+        density = GraspDensity.build(se3.Poses.of(p, q), kernel=IsotropicKernel(0.015, math.radians(60.0)))
+        share = expected(density.density, object_noise=noise, samples=256)(p, q) / density.density(
+            se3.Poses.of(p, q)
+        )
         assert least < share[0] < most
     # About the grasp itself there is no lever.
-    density = GraspDensity.build(far, q, kernel=IsotropicKernel(0.015, math.radians(60.0)))
+    density = GraspDensity.build(se3.Poses.of(far, q), kernel=IsotropicKernel(0.015, math.radians(60.0)))
     about = PoseNoise(0.0, math.radians(5.0), (0.0, 0.0, 0.3))
-    share = expected(density.density, object_noise=about, samples=256)(far, q) / density.density(far, q)
+    share = expected(density.density, object_noise=about, samples=256)(far, q) / density.density(
+        se3.Poses.of(far, q)
+    )
     assert share[0] > 0.97
 
 
@@ -118,7 +122,9 @@ def test_robust_search_prefers_the_broad_peak() -> None:
     sharp = np.array([0.1, 0.0, 0.0]) + rng.normal(size=(60, 3)) * 0.001
     broad = np.array([-0.1, 0.0, 0.0]) + rng.normal(size=(140, 3)) * 0.012
     p = np.concatenate([sharp, broad])
-    density = GraspDensity.build(p, np.tile(se3.IDENTITY, (200, 1)), kernel=IsotropicKernel(0.006, 0.3))
+    density = GraspDensity.build(
+        se3.Poses.of(p, np.tile(se3.IDENTITY, (200, 1))), kernel=IsotropicKernel(0.006, 0.3)
+    )
     assert ModeSearch(density).maxima()[0].position[0] > 0.0
     robust = expected(density.density, object_noise=PoseNoise(0.02, 0.0))
     (best,) = ModeSearch(density).maxima(score=robust)
@@ -126,7 +132,7 @@ def test_robust_search_prefers_the_broad_peak() -> None:
 
 
 def test_bad_arguments_are_refused() -> None:
-    density = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(np.zeros((1, 3)), se3.IDENTITY[None]), kernel=KERNEL)
     with pytest.raises(ValueError, match="noise must be"):
         PoseNoise(-1.0, 0.0)
     with pytest.raises(ValueError, match="samples"):

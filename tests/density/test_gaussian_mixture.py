@@ -44,7 +44,7 @@ def test_kernels_integrate_to_one(kernel: AnisotropicKernel) -> None:
     spread = np.sqrt(np.diag(kernel.overall_covariance))
     cover = IsotropicKernel(1.2 * float(spread[:3].max()), 1.2 * float(spread[3:].max()))
     p, q = cover.sample_displacements(count, rng)
-    log_cover = brute_force.kernel_log_density(cover, p, q, np.zeros(3), se3.IDENTITY)
+    log_cover = brute_force.kernel_log_density(cover, se3.Poses(p, q), se3.Poses(np.zeros(3), se3.IDENTITY))
     ratio = np.exp(kernel.log_kernel(np.hstack([p, se3.to_rotation_vector(q)])) - log_cover)
     error = ratio.std() / math.sqrt(count)
     assert error < 0.015
@@ -74,12 +74,14 @@ def test_the_jaws_turn_changes_nothing(frame: str, shell: Shell, moved: Moved) -
     np.testing.assert_allclose(kernel.log_kernel(xi), kernel.log_kernel(a * xi), atol=1e-9)
     rows = shell(500, rng)
     frames = None if frame == "gripper" else se3.to_matrix(se3.random_quaternions(500, rng))
-    density = MixtureDensity(*rows, kernel=kernel, frames=frames)
+    density = MixtureDensity(se3.Poses.of(*rows), kernel=kernel, frames=frames)
     p, q = moved(rows, 60, 0.01, 0.2, rng)
-    value = density.log_density(p, q)
-    np.testing.assert_allclose(density.log_density(p, se3.jaw_twin(q)), value, atol=2e-3)
-    np.testing.assert_allclose(density.log_density(p, -q), value, atol=1e-4)
-    np.testing.assert_allclose(density.reference(p, se3.jaw_twin(q)), density.reference(p, q), atol=1e-9)
+    value = density.log_density(se3.Poses.of(p, q))
+    np.testing.assert_allclose(density.log_density(se3.Poses.of(p, se3.jaw_twin(q))), value, atol=2e-3)
+    np.testing.assert_allclose(density.log_density(se3.Poses.of(p, -q)), value, atol=1e-4)
+    np.testing.assert_allclose(
+        density.reference(se3.Poses.of(p, se3.jaw_twin(q))), density.reference(se3.Poses.of(p, q)), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("kernel", [ONE, WIDE, PAIR], ids=["one", "wide", "pair"])
@@ -91,21 +93,27 @@ def test_fast_density_equals_float64(
     rows = shell(3_000, rng)
     weights = None if plain else rng.uniform(0.2, 2.0, 3_000)
     flags = True if plain else rng.random(3_000) < 0.6
-    density = MixtureDensity(*rows, kernel=kernel, weights=weights, symmetric=flags)
+    density = MixtureDensity(se3.Poses.of(*rows), kernel=kernel, weights=weights, symmetric=flags)
     poses = moved(rows, 300, 0.012, 0.2, rng)
-    error = np.abs(np.expm1(density.log_density(*poses, threads=2) - density.reference(*poses)))
+    error = np.abs(
+        np.expm1(
+            density.log_density(se3.Poses.of(*poses), threads=2) - density.reference(se3.Poses.of(*poses))
+        )
+    )
     assert error.max() < 2e-3
     assert np.median(error) < 1e-4
     far = poses[0][:10] + 2.0, poses[1][:10]
-    np.testing.assert_allclose(density.log_density(*far), density.reference(*far), rtol=1e-9)
-    assert (density.log_density(*far) < -500.0).all()
+    np.testing.assert_allclose(
+        density.log_density(se3.Poses.of(*far)), density.reference(se3.Poses.of(*far)), rtol=1e-9
+    )
+    assert (density.log_density(se3.Poses.of(*far)) < -500.0).all()
 
 
 def test_reference_sums_kernels_as_defined(shell: Shell, moved: Moved) -> None:
     """The compiled float64 sum against displacements computed with `se3`."""
     rng = np.random.default_rng(3)
     rows = shell(200, rng)
-    density = MixtureDensity(*rows, kernel=PAIR)
+    density = MixtureDensity(se3.Poses.of(*rows), kernel=PAIR)
     poses = moved(rows, 20, 0.01, 0.2, rng)
     expected = np.empty(20)
     for j, (p, q) in enumerate(zip(*poses, strict=True)):
@@ -115,7 +123,7 @@ def test_reference_sums_kernels_as_defined(shell: Shell, moved: Moved) -> None:
             turn = se3.to_rotation_vector(se3.multiply(se3.conjugate(turned), q))
             total += 0.5 * float(np.exp(PAIR.log_kernel(np.hstack([move, turn]))).mean())
         expected[j] = math.log(total)
-    np.testing.assert_allclose(density.reference(*poses), expected, atol=1e-6)
+    np.testing.assert_allclose(density.reference(se3.Poses.of(*poses)), expected, atol=1e-6)
 
 
 def test_equal_widths_are_the_isotropic_kernel(shell: Shell, moved: Moved) -> None:
@@ -125,8 +133,8 @@ def test_equal_widths_are_the_isotropic_kernel(shell: Shell, moved: Moved) -> No
     kernel = AnisotropicKernel.diagonal([0.015] * 3 + [10 * DEG] * 3)
     assert kernel.isotropic.sigma_position_m == pytest.approx(0.015)
     poses = moved(rows, 200, 0.015, 10 * DEG, rng)
-    aniso = MixtureDensity(*rows, kernel=kernel).log_density(*poses)
-    iso = brute_force.log_density(IsotropicKernel(0.015, 10 * DEG), *rows, *poses)
+    aniso = MixtureDensity(se3.Poses.of(*rows), kernel=kernel).log_density(se3.Poses.of(*poses))
+    iso = brute_force.log_density(IsotropicKernel(0.015, 10 * DEG), se3.Poses.of(*rows), se3.Poses.of(*poses))
     assert np.abs(aniso - iso).mean() < 0.01
 
 
@@ -142,34 +150,35 @@ def test_displacements_drawn_have_the_kernels_moments() -> None:
 def test_gradient_against_finite_differences_of_the_fast_density(shell: Shell, moved: Moved) -> None:
     rng = np.random.default_rng(6)
     rows = shell(1_000, rng)
-    density = MixtureDensity(*rows, kernel=ONE)
+    density = MixtureDensity(se3.Poses.of(*rows), kernel=ONE)
     p, q = moved(rows, 10, 0.005, 0.1, rng)
-    along, around = density.gradient(p, q)
+    along, around = density.gradient(se3.Poses.of(p, q))
     step = 2e-3
     for axis in range(3):
         move = np.zeros(3)
         move[axis] = step
-        slope = (density.log_density(p + 0.1 * move, q) - density.log_density(p - 0.1 * move, q)) / (
-            0.2 * step
-        )
+        slope = (
+            density.log_density(se3.Poses.of(p + 0.1 * move, q))
+            - density.log_density(se3.Poses.of(p - 0.1 * move, q))
+        ) / (0.2 * step)
         np.testing.assert_allclose(along[:, axis], slope, atol=0.03 * np.abs(along).max())
         turn = se3.from_rotation_vector(5.0 * move)
-        slope = density.log_density(p, se3.multiply(q, turn)) - density.log_density(
-            p, se3.multiply(q, se3.conjugate(turn))
+        slope = density.log_density(se3.Poses.of(p, se3.multiply(q, turn))) - density.log_density(
+            se3.Poses.of(p, se3.multiply(q, se3.conjugate(turn)))
         )
         np.testing.assert_allclose(around[:, axis], slope / (10.0 * step), atol=0.03 * np.abs(around).max())
 
 
 def test_maximum_is_feasible_and_no_worse_than_rows_and_samples(shell: Shell) -> None:
     rng = np.random.default_rng(7)
-    density = MixtureDensity(*shell(1_000, rng), kernel=ONE)
+    density = MixtureDensity(se3.Poses.of(*shell(1_000, rng)), kernel=ONE)
     region = Region(approach=[0.0, 0.0, -1.0], approach_angle=0.7)
     search = ModeSearch(density)
     (best,) = search.maxima(region)
     assert region.contains(best.position[None], best.quaternion_xyzw[None]).all()
     p, q = density.sample(4_000, rng)
     inside = region.contains(p, q)
-    assert best.score >= density.log_density(p[inside], q[inside]).max() - 1e-3
+    assert best.score >= density.log_density(se3.Poses.of(p[inside], q[inside])).max() - 1e-3
     assert search.global_maximum().score >= best.score - 1e-6
 
 
@@ -199,11 +208,11 @@ def test_bad_kernels_are_refused(make: Callable[[], object], message: str) -> No
 def test_frames_must_fit_the_kernel() -> None:
     p, q = np.zeros((1, 3)), se3.IDENTITY[None]
     with pytest.raises(ValueError, match="takes no frames"):
-        MixtureDensity(p, q, kernel=ONE, frames=np.eye(3))
+        MixtureDensity(se3.Poses.of(p, q), kernel=ONE, frames=np.eye(3))
     fixed = AnisotropicKernel.diagonal([0.01] * 3 + [0.1] * 3, frame="fixed")
     with pytest.raises(ValueError, match="needs frames"):
-        MixtureDensity(p, q, kernel=fixed)
-    assert MixtureDensity(p, q, kernel=fixed, frames=np.eye(3)).size == 1
+        MixtureDensity(se3.Poses.of(p, q), kernel=fixed)
+    assert MixtureDensity(se3.Poses.of(p, q), kernel=fixed, frames=np.eye(3)).size == 1
 
 
 @pytest.mark.parametrize("frame", ["gripper", "fixed"])
@@ -222,18 +231,24 @@ def test_extending_equals_building(frame: str, shell: Shell, moved: Moved) -> No
         }
 
     first, rest = slice(0, 2_500), slice(2_500, 3_000)
-    old = MixtureDensity(p[first], q[first], kernel=kernel, **part(first))  # type: ignore[arg-type]
+    old = MixtureDensity(se3.Poses.of(p[first], q[first]), kernel=kernel, **part(first))  # type: ignore[arg-type]
     search = ModeSearch(old)
     search.global_maximum()
     grown = old.extend(p[rest], q[rest], **part(rest))  # type: ignore[arg-type]
-    built = MixtureDensity(p, q, kernel=kernel, **part(slice(None)))  # type: ignore[arg-type]
+    built = MixtureDensity(se3.Poses.of(p, q), kernel=kernel, **part(slice(None)))  # type: ignore[arg-type]
     poses = moved((p, q), 300, 0.01, 0.2, rng)
-    np.testing.assert_allclose(grown.log_density(*poses), built.log_density(*poses), atol=1e-5)
+    np.testing.assert_allclose(
+        grown.log_density(se3.Poses.of(*poses)), built.log_density(se3.Poses.of(*poses)), atol=1e-5
+    )
     far = poses[0] + 1.0, poses[1]
-    np.testing.assert_allclose(grown.log_density(*far), built.log_density(*far), rtol=1e-6)
+    np.testing.assert_allclose(
+        grown.log_density(se3.Poses.of(*far)), built.log_density(se3.Poses.of(*far)), rtol=1e-6
+    )
     # Two units in the last place of kappa, about 100 here.
     np.testing.assert_allclose(
-        grown.isotropic.log_density(*poses), built.isotropic.log_density(*poses), atol=2e-5
+        grown.isotropic.log_density(se3.Poses.of(*poses)),
+        built.isotropic.log_density(se3.Poses.of(*poses)),
+        atol=2e-5,
     )
     top = search.extended(grown).global_maximum().log_density
     assert math.exp(top - ModeSearch(built).global_maximum().log_density) > 0.999

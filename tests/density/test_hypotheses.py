@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graspdb_density import se3
-from graspdb_density.se3 import Floats
+from graspdb_density.se3 import Floats, Poses
 from graspdb_density.success.block_bootstrap import shares
 from graspdb_density.vicinity import anisotropy as an
 from graspdb_density.vicinity.displacement_bins import Anisotropy
@@ -103,12 +103,14 @@ def test_hypotheses_know_the_smoothed_method_too() -> None:
     rng = np.random.default_rng(0)
     vectors = rng.normal(size=(400, 6)) * [0.03, 0.004, 0.02, 0.05, 0.5, 0.05]
     density = GraspDensity.build(
-        vectors[:, :3],
-        se3.from_rotation_vector(vectors[:, 3:]),
+        Poses.of(vectors[:, :3], se3.from_rotation_vector(vectors[:, 3:])),
         kernel=IsotropicKernel(0.005, math.radians(8.0)),
         symmetric=False,
     )
-    peak = float(np.median(density.density(density.positions, density.quaternions_xyzw))) * density.size
+    peak = (
+        float(np.median(density.density(Poses.of(density.positions, density.quaternions_xyzw))))
+        * density.size
+    )
     found: Anisotropy = an.smoothed(density, 0.6 * peak)
     assert by_name(wide_axes(found))["x-wide"].ratio > 1.0
 

@@ -198,7 +198,7 @@ def test_poisson_counts_and_drawing_with_replacement_agree(shell: Shell, count: 
         None, p, q, ISOTROPIC, weights=weights, replicates=200, points=20_000, threads=2
     )
     last = curve.curve.points[-1]
-    rows = KernelRows(p, q, ISOTROPIC, weights=weights)
+    rows = KernelRows(se3.Poses.of(p, q), ISOTROPIC, weights=weights)
     # As many points as a group has: what they add to the deviation is then alike.
     points = len(curve._groups[0].positions)
     drawn = [
@@ -217,14 +217,14 @@ def test_the_first_points_of_a_group_follow_the_density(shell: Shell) -> None:
     """Draws that grow along are distributed as the density is: the mean log density is its own."""
     p, q = shell(399, np.random.default_rng(3))
     curve = GrowingCurve.grown(None, p, q, ISOTROPIC, points=20_000, replicates=2)
-    rows = KernelRows(p, q, ISOTROPIC)
-    expected = rows.log_density(*rows.sample(20_000, np.random.default_rng(0)))
+    rows = KernelRows(se3.Poses.of(p, q), ISOTROPIC)
+    expected = rows.log_density(se3.Poses.of(*rows.sample(20_000, np.random.default_rng(0))))
     at = (
         np.concatenate([g.positions for g in curve._groups]),
         np.concatenate([g.quaternions for g in curve._groups]),
     )
     assert 10_000 < len(at[0]) <= 20_000
-    got = rows.log_density(*at)
+    got = rows.log_density(se3.Poses.of(*at))
     error = math.hypot(got.std() / math.sqrt(len(got)), expected.std() / math.sqrt(len(expected)))
     assert got.mean() == pytest.approx(expected.mean(), abs=5.0 * error)
 

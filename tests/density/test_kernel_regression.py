@@ -26,8 +26,14 @@ def by_definition(
     probability, trials = np.empty(len(poses[0])), np.empty(len(poses[0]))
     twins = se3.jaw_twin(rows[1])
     for j, (p, q) in enumerate(zip(*poses, strict=True)):
-        own = brute_force.kernel_log_density(kernel, p, q, rows[0], rows[1]) - kernel.log_peak
-        other = brute_force.kernel_log_density(kernel, p, q, rows[0], twins) - kernel.log_peak
+        own = (
+            brute_force.kernel_log_density(kernel, se3.Poses(p, q), se3.Poses(rows[0], rows[1]))
+            - kernel.log_peak
+        )
+        other = (
+            brute_force.kernel_log_density(kernel, se3.Poses(p, q), se3.Poses(rows[0], twins))
+            - kernel.log_peak
+        )
         top = np.where(flags, np.maximum(own, other), own)
         k = np.where(flags, 0.5 * (np.exp(own) + np.exp(other)), np.exp(own)) * (top >= -12.5)
         share = won.mean()

@@ -61,18 +61,20 @@ def exhaustive(density: GraspDensity, region: Region, rng: np.random.Generator) 
     """
     p, q = density.positions, density.quaternions_xyzw
     drawn = density.sample(2_000, rng)
-    p, q, inside = region.project(np.concatenate([p, drawn[0]]), np.concatenate([q, drawn[1]]))
+    p, q, inside = region.project(
+        np.concatenate([p, drawn.positions]), np.concatenate([q, drawn.quaternions_xyzw])
+    )
     p, q = p[inside], q[inside]
     if not len(p):
         return -math.inf
-    values = density.log_density(p, q, cutoff=5.0)
+    values = density.log_density(se3.Poses.of(p, q), cutoff=5.0)
     best = np.argsort(-values)[:300]
     p, q, values = p[best], q[best], values[best]
     for step in np.repeat([1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015], 25):
         moved = p + rng.standard_normal(p.shape) * step * density.kernel.sigma_position_m
         turns = se3.from_rotation_vector(rng.standard_normal(p.shape) * step * density.kernel.sigma_rotation)
         new_p, new_q, inside = region.project(moved, se3.multiply(q, turns))
-        new = np.where(inside, density.log_density(new_p, new_q, cutoff=5.0), -np.inf)
+        new = np.where(inside, density.log_density(se3.Poses.of(new_p, new_q), cutoff=5.0), -np.inf)
         better = new > values
         p[better], q[better], values[better] = new_p[better], new_q[better], new[better]
     return float(values.max())
@@ -81,7 +83,7 @@ def exhaustive(density: GraspDensity, region: Region, rng: np.random.Generator) 
 @pytest.mark.parametrize("seed", range(10))
 def test_against_exhaustive_search(seed: int, shell: Shell) -> None:
     rng = np.random.default_rng(seed)
-    density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(1_500, rng)), kernel=KERNEL)
     region = random_region(rng)
     found = ModeSearch(density).maxima(region)
     best = exhaustive(density, region, rng)
@@ -95,12 +97,12 @@ def test_against_exhaustive_search(seed: int, shell: Shell) -> None:
 
 def test_global_maximum_is_the_highest_point(shell: Shell) -> None:
     rng = np.random.default_rng(20)
-    density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(1_500, rng)), kernel=KERNEL)
     search = ModeSearch(density)
     top = search.global_maximum()
     assert top is search.global_maximum()
     assert math.exp(top.log_density - exhaustive(density, Region(), rng)) >= 0.999
-    assert (density.log_density(*density.sample(5_000, rng)) <= top.log_density + 1e-3).all()
+    assert (density.log_density(se3.Poses.of(*density.sample(5_000, rng))) <= top.log_density + 1e-3).all()
 
 
 @settings(max_examples=40, deadline=None)
@@ -109,7 +111,7 @@ def test_never_infeasible_and_always_distinct(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = rng.uniform([-0.2, -0.1, -0.1], [0.2, 0.1, 0.1], (300, 3)), se3.random_quaternions(300, rng)
     symmetric = bool(rng.random() < 0.5)
-    density = GraspDensity.build(*rows, kernel=KERNEL, symmetric=symmetric)
+    density = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL, symmetric=symmetric)
     region = random_region(rng)
     found = ModeSearch(density).maxima(region, count=4, separation=Separation(0.02, math.radians(30.0)))
     for i, grasp in enumerate(found):
@@ -135,14 +137,14 @@ def test_never_infeasible_and_always_distinct(seed: int) -> None:
 def test_a_single_mode_yields_several_distinct_grasps() -> None:
     rng = np.random.default_rng(21)
     rows = rng.normal(size=(500, 3)) * 0.02, np.tile(se3.IDENTITY, (500, 1))
-    density = GraspDensity.build(*rows, kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL)
     found = ModeSearch(density).maxima(count=5, separation=Separation(0.01, 0.3))
     assert len(found) == 5
 
 
 def test_regions_without_a_feasible_row_are_reached_by_projection() -> None:
     p, q = np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1))
-    density = GraspDensity.build(p, q, kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(p, q), kernel=KERNEL)
     region = Region(
         half_spaces=[[1.0, 0.0, 0.0, 0.03]], approach=[1.0, 0.0, 1.0], approach_angle=math.radians(30.0)
     )
@@ -195,18 +197,20 @@ def test_position_projection_is_the_nearest_point() -> None:
 
 def test_the_closing_axis_has_no_sign_unless_asked() -> None:
     kernel = KERNEL
-    density = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=kernel, symmetric=False)
+    density = GraspDensity.build(
+        se3.Poses.of(np.zeros((1, 3)), se3.IDENTITY[None]), kernel=kernel, symmetric=False
+    )
     back = {"closing": [0.0, -1.0, 0.0], "closing_angle": 0.1}
     assert ModeSearch(density).maxima(Region(**back))
     assert not ModeSearch(density).maxima(Region(**back, closing_signed=True))
-    both = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=kernel)
+    both = GraspDensity.build(se3.Poses.of(np.zeros((1, 3)), se3.IDENTITY[None]), kernel=kernel)
     (twin,) = ModeSearch(both).maxima(Region(**back, closing_signed=True))
     assert float(se3.angle_between(twin.quaternion_xyzw, se3.JAW_TURN)) < 1e-3
 
 
 def test_nothing_is_found_out_of_reach(shell: Shell) -> None:
     rng = np.random.default_rng(24)
-    density = GraspDensity.build(*shell(500, rng), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(500, rng)), kernel=KERNEL)
     region = Region(half_spaces=Region.box([1.0, 1.0, 1.0], [2.0, 2.0, 2.0]))
     assert ModeSearch(density).maxima(region) == []
     assert ModeSearch(density).maxima(admissible=lambda p, q: np.zeros(len(p), dtype=bool)) == []
@@ -219,7 +223,7 @@ def test_nothing_is_found_out_of_reach(shell: Shell) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed: int, shell: Shell) -> None:
     rng = np.random.default_rng(seed)
-    density = GraspDensity.build(*shell(1_500, rng), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(1_500, rng)), kernel=KERNEL)
     top = ModeSearch(density).global_maximum()
 
     def admissible(p: se3.Floats, q: se3.Floats) -> NDArray[np.bool_]:
@@ -233,9 +237,9 @@ def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed:
         assert admissible(grasp.position[None], grasp.quaternion_xyzw[None]).all()
     p, q = density.positions, density.quaternions_xyzw
     free = admissible(p, q)
-    best = density.log_density(p[free], q[free]).max()
+    best = density.log_density(se3.Poses.of(p[free], q[free])).max()
     for step in np.repeat([0.5, 0.2, 0.1, 0.05], 25):
-        start = np.argsort(-density.log_density(p[free], q[free]))[:200]
+        start = np.argsort(-density.log_density(se3.Poses.of(p[free], q[free])))[:200]
         moved = p[free][start] + rng.standard_normal((len(start), 3)) * step * 0.015
         turned = se3.multiply(
             q[free][start], se3.from_rotation_vector(rng.standard_normal((len(start), 3)) * step * 0.26)
@@ -243,7 +247,7 @@ def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed:
         ok = admissible(moved, turned)
         p, q = np.concatenate([p[free], moved[ok]]), np.concatenate([q[free], turned[ok]])
         free = np.ones(len(p), dtype=bool)
-        best = max(best, density.log_density(moved[ok], turned[ok]).max())
+        best = max(best, density.log_density(se3.Poses.of(moved[ok], turned[ok])).max())
     assert math.exp(found[0].log_density - best) > 0.98
 
 
@@ -270,7 +274,7 @@ def test_bad_regions_are_refused(arguments: dict[str, object], message: str) -> 
 
 
 def test_bad_searches_are_refused() -> None:
-    density = GraspDensity.build(np.zeros((1, 3)), se3.IDENTITY[None], kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(np.zeros((1, 3)), se3.IDENTITY[None]), kernel=KERNEL)
     with pytest.raises(ValueError, match="count must be"):
         ModeSearch(density).maxima(count=0)
     with pytest.raises(ValueError, match="negative"):
@@ -301,7 +305,7 @@ def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
     monkeypatch.setattr(start_ranking, "MOST_PAIRS", 3e7)
     rng = np.random.default_rng(100 + seed)
     rows = small_shell(20_000, shell, rng)
-    density = GraspDensity.build(*rows, kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL)
     sample = centre_sums(density, None, 1).sample
     assert sample is not None
     assert 3_000 < sample.data.shape[1] < 8_000
@@ -312,10 +316,10 @@ def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
     )
     found = ModeSearch(density).maxima(region)
     # The same climb from the 400 truly best rows.
-    values = np.where(region.contains(*rows), density.log_density(*rows, threads=2), -np.inf)
+    values = np.where(region.contains(*rows), density.log_density(se3.Poses.of(*rows), threads=2), -np.inf)
     best = np.argsort(-values)[:400]
     ends = climbed_from(density, region, se3.Poses(rows[0][best], rows[1][best]), 200)
-    top = density.log_density(ends.positions, ends.quaternions_xyzw).max()
+    top = density.log_density(se3.Poses.of(ends.positions, ends.quaternions_xyzw)).max()
     assert math.exp(found[0].log_density - top) >= 0.999
 
 
@@ -325,14 +329,14 @@ def test_sampled_centre_sums_are_unbiased_and_extended_alike(
     rng = np.random.default_rng(7)
     p, q = small_shell(9_000, shell, rng)
     weights, symmetric = rng.uniform(0.2, 3.0, 9_000), rng.random(9_000) < 0.7
-    exact = GraspDensity.build(p, q, kernel=KERNEL, weights=weights, symmetric=symmetric)
+    exact = GraspDensity.build(se3.Poses.of(p, q), kernel=KERNEL, weights=weights, symmetric=symmetric)
     every = centre_sums(exact, None, 1)
     truth = every.values
     assert every.sample is None
     monkeypatch.setattr(start_ranking, "MOST_PAIRS", 3e7)
     first = slice(0, 8_500)
     old = GraspDensity.build(
-        p[first], q[first], kernel=KERNEL, weights=weights[first], symmetric=symmetric[first]
+        se3.Poses.of(p[first], q[first]), kernel=KERNEL, weights=weights[first], symmetric=symmetric[first]
     )
     known = centre_sums(old, None, 1)
     grown = old.extend(p[8_500:], q[8_500:], weights=weights[8_500:], symmetric=symmetric[8_500:])
@@ -353,7 +357,7 @@ def test_rows_of_the_sample_do_not_outrank_others(monkeypatch: pytest.MonkeyPatc
     """Far from each other, every row is worth its own kernel, in the sample or not."""
     monkeypatch.setattr(start_ranking, "MOST_PAIRS", 0.0)
     grid = np.stack(np.meshgrid(*[np.arange(18.0)] * 3), axis=-1).reshape(-1, 3)
-    density = GraspDensity.build(grid, np.tile(se3.IDENTITY, (len(grid), 1)), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(grid, np.tile(se3.IDENTITY, (len(grid), 1))), kernel=KERNEL)
     sums = centre_sums(density, None, 1)
     assert sums.sample is not None
     np.testing.assert_allclose(sums.values, 0.5, rtol=1e-5)
@@ -361,7 +365,7 @@ def test_rows_of_the_sample_do_not_outrank_others(monkeypatch: pytest.MonkeyPatc
 
 def test_planes_that_nearly_coincide_hold_no_climb_back(shell: Shell) -> None:
     """A box with a slanted face almost along one of its own."""
-    density = GraspDensity.build(*shell(3_000, np.random.default_rng(5)), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(3_000, np.random.default_rng(5))), kernel=KERNEL)
     slanted = np.array([-0.03, 0.999, -0.02, -0.05])
     region = Region(half_spaces=np.vstack([Region.box([0.1, -0.1, -0.15], [0.22, -0.03, 0.15]), slanted]))
     best = exhaustive(density, region, np.random.default_rng(6))
@@ -374,7 +378,7 @@ def test_runners_up_are_found_however_far_apart_they_must_be() -> None:
     lone = np.array([[0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [-0.3, 0.0, 0.0], [0.0, -0.3, 0.0]])
     p = np.concatenate([0.04 * rng.standard_normal((3_000, 3)), lone])
     q = np.concatenate([se3.random_quaternions(3_000, rng), np.tile(se3.IDENTITY, (4, 1))])
-    density = GraspDensity.build(p, q, kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(p, q), kernel=KERNEL)
     found = ModeSearch(density).maxima(count=5, separation=Separation(0.25, math.pi))
     assert len(found) == 5
     places = np.array([grasp.position for grasp in found[1:]])
@@ -388,23 +392,23 @@ def test_nearest_rows_are_those_of_all(shift: float, shell: Shell) -> None:
     rng = np.random.default_rng(9)
     p, q = shell(2_000, rng)
     symmetric = rng.random(2_000) < 0.5
-    density = GraspDensity.build(p, q, kernel=KERNEL, symmetric=symmetric)
+    density = GraspDensity.build(se3.Poses.of(p, q), kernel=KERNEL, symmetric=symmetric)
     for row in range(0, 2_000, 200):
         at, to = p[row] + shift, se3.normalise(q[row] + 0.05)
         cosine = np.abs(q @ to)
         cosine = np.where(symmetric, np.maximum(cosine, np.abs(q @ se3.jaw_twin(to))), cosine)
         squared = np.sum((p - at) ** 2, axis=1) / KERNEL.sigma_position_m**2
         distance = np.sqrt(squared + 2.0 * KERNEL.kappa * (1.0 - cosine))
-        rows = density.nearest_rows(at, to, 5)
+        rows = density.nearest_rows(se3.Poses(at, to), 5)
         np.testing.assert_allclose(distance[rows], np.sort(distance)[:5], rtol=1e-3)
-        (nearest,), (apart,) = density.nearest_each(at[None], to[None], within=2.0)
+        (nearest,), (apart,) = density.nearest_each(se3.Poses(at[None], to[None]), within=2.0)
         if distance.min() < 2.0:
             assert distance[nearest] == pytest.approx(distance.min(), rel=1e-3)
             assert apart == pytest.approx(distance.min(), rel=1e-3, abs=1e-3)
         else:
             assert nearest == -1 or apart > 2.0
-    few = GraspDensity.build(p[:3], q[:3], kernel=KERNEL)
-    assert sorted(few.nearest_rows(p[0], q[0], 5)) == [0, 1, 2]
+    few = GraspDensity.build(se3.Poses.of(p[:3], q[:3]), kernel=KERNEL)
+    assert sorted(few.nearest_rows(se3.Poses(p[0], q[0]), 5)) == [0, 1, 2]
 
 
 @settings(max_examples=60, deadline=None)
@@ -436,7 +440,7 @@ def test_projection_onto_a_polyhedron_is_exact(seed: int) -> None:
 def test_against_mean_shift_from_everywhere(seed: int, shell: Shell) -> None:
     """The exhaustive maximum at 20,000 kernels: from every feasible centre and 100,000 feasible starts."""
     rng = np.random.default_rng(1_000 + seed)
-    density = GraspDensity.build(*shell(20_000, np.random.default_rng(0)), kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*shell(20_000, np.random.default_rng(0))), kernel=KERNEL)
     region = random_region(rng)
     low, high = density.positions.min(axis=0) - 0.05, density.positions.max(axis=0) + 0.05
     p = np.concatenate([density.positions, rng.uniform(low, high, (100_000, 3))])
@@ -444,13 +448,13 @@ def test_against_mean_shift_from_everywhere(seed: int, shell: Shell) -> None:
     p, q, inside = region.project(p, q)
     p, q = p[inside], q[inside]
     # A start a thousandth as good as the best is left out: hours would go into the tails.
-    value = density.log_density(p, q, threads=2)
+    value = density.log_density(se3.Poses.of(p, q), threads=2)
     kept = value > value.max() - math.log(1e3) if len(value) else np.zeros(0, dtype=bool)
     ends = climbed_from(density, region, se3.Poses(p[kept], q[kept]), 60)
     found = ModeSearch(density).maxima(region)
     if not found:
         assert not len(value) or value.max() < KERNEL.log_peak - 8.0
         return
-    best = density.log_density(ends.positions, ends.quaternions_xyzw, threads=2).max()
+    best = density.log_density(se3.Poses.of(ends.positions, ends.quaternions_xyzw), threads=2).max()
     assert region.contains(found[0].position[None], found[0].quaternion_xyzw[None]).all()
     assert math.exp(found[0].log_density - best) >= 0.999

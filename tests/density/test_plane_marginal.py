@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from graspdb_density import AnisotropicKernel, GraspDensity, IsotropicKernel, MixtureDensity, se3
+from graspdb_density.se3 import Poses
 from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
 
 KERNEL = IsotropicKernel(0.012, math.radians(14.0))
@@ -27,8 +28,7 @@ def density() -> GraspDensity:
     turns = se3.from_rotation_vector(rng.normal(size=(300, 3)) * 0.4)
     down = se3.multiply(np.array([1.0, 0.0, 0.0, 0.0]), turns)
     return GraspDensity.build(
-        rng.uniform(-0.1, 0.1, (300, 3)),
-        se3.normalise(down),
+        Poses.of(rng.uniform(-0.1, 0.1, (300, 3)), se3.normalise(down)),
         kernel=KERNEL,
         weights=rng.uniform(0.5, 2.0, 300),
         symmetric=np.arange(300) % 2 == 0,
@@ -58,7 +58,7 @@ def test_a_plane_has_right_handed_axes_and_z_upwards() -> None:
 
 
 def test_one_grasp_is_a_gaussian_on_the_plane() -> None:
-    one = GraspDensity.build([[0.01, 0.02, 0.03]], [[0, 0, 0, 1]], kernel=KERNEL)
+    one = GraspDensity.build(Poses.of([[0.01, 0.02, 0.03]], [[0, 0, 0, 1]]), kernel=KERNEL)
     found = marginal(one, PLANE, Orientation())
     at = np.array([0.01, 0.02, 0.03])
     u = 0.5 * (found.across_edges[1:] + found.across_edges[:-1]) - at @ PLANE.across
@@ -116,8 +116,7 @@ def test_a_gaussian_alike_in_all_directions_is_the_isotropic_kernel(
 ) -> None:
     covariance = np.diag([KERNEL.sigma_position_m**2] * 3 + [KERNEL.sigma_rotation**2] * 3)
     mixture = MixtureDensity(
-        density.positions,
-        density.quaternions_xyzw,
+        Poses.of(density.positions, density.quaternions_xyzw),
         kernel=AnisotropicKernel.gaussian(covariance),
         weights=density.weights,
         symmetric=density.symmetric,
@@ -131,7 +130,7 @@ def test_a_gaussian_alike_in_all_directions_is_the_isotropic_kernel(
 
 
 def test_fewer_grasps_have_wider_intervals(density: GraspDensity) -> None:
-    few = GraspDensity.build(density.positions[:40], density.quaternions_xyzw[:40], kernel=KERNEL)
+    few = GraspDensity.build(Poses.of(density.positions[:40], density.quaternions_xyzw[:40]), kernel=KERNEL)
     many, one = marginal(density, PLANE, SIDE), marginal(few, PLANE, SIDE)
     assert one.share_high - one.share_low > 1.5 * (many.share_high - many.share_low)
     assert many.share_low < many.share < many.share_high

@@ -29,8 +29,8 @@ def test_integrates_to_one() -> None:
     kernel = template(rng)
     cover = IsotropicKernel(0.025, math.radians(50.0))
     p, q = cover.sample_displacements(400_000, rng)
-    log_cover = brute_force.kernel_log_density(cover, p, q, np.zeros(3), se3.IDENTITY)
-    ratio = np.exp(kernel.log_kernel(p, q) - log_cover)
+    log_cover = brute_force.kernel_log_density(cover, se3.Poses(p, q), se3.Poses(np.zeros(3), se3.IDENTITY))
+    ratio = np.exp(kernel.log_kernel(se3.Poses(p, q)) - log_cover)
     error = ratio.std() / math.sqrt(len(p))
     assert error < 0.02
     assert abs(ratio.mean() - 1.0) < 4.5 * error
@@ -42,7 +42,7 @@ def test_density_is_the_sum_over_rows_turns_and_components(shell: Shell) -> None
     kernel = template(rng, 5)
     rows = shell(30, rng)
     weights, symmetric = rng.uniform(0.5, 2.0, 30), rng.random(30) < 0.6
-    density = kernel.placed(*rows, weights=weights, symmetric=symmetric)
+    density = kernel.placed(se3.Poses.of(*rows), weights=weights, symmetric=symmetric)
     p = rows[0][:20] + rng.normal(size=(20, 3)) * 0.01
     q = se3.multiply(rows[1][:20], se3.from_rotation_vector(rng.normal(size=(20, 3)) * 0.3))
     wanted = np.zeros(20)
@@ -50,12 +50,18 @@ def test_density_is_the_sum_over_rows_turns_and_components(shell: Shell) -> None
         ends = [rows[1][i], se3.jaw_twin(rows[1][i])] if symmetric[i] else [rows[1][i]]
         for end in ends:
             for j in range(5):
-                at, to = se3.compose(rows[0][i], end, kernel.translations[j], kernel.quaternions_xyzw[j])
+                at, to = se3.compose(
+                    se3.Poses(rows[0][i], end), se3.Poses(kernel.translations[j], kernel.quaternions_xyzw[j])
+                )
                 faces = [to, se3.jaw_twin(to)] if symmetric[i] else [to]
                 for face in faces:
                     share = weights[i] * kernel.shares[j] / len(ends) / len(faces)
-                    wanted += share * np.exp(brute_force.kernel_log_density(COMPONENT, p, q, at, face))
-    np.testing.assert_allclose(density.density(p, q, cutoff=None), wanted / weights.sum(), rtol=1e-4)
+                    wanted += share * np.exp(
+                        brute_force.kernel_log_density(COMPONENT, se3.Poses(p, q), se3.Poses(at, face))
+                    )
+    np.testing.assert_allclose(
+        density.density(se3.Poses.of(p, q), cutoff=None), wanted / weights.sum(), rtol=1e-4
+    )
 
 
 def test_the_jaws_turn_changes_nothing(shell: Shell) -> None:
@@ -64,9 +70,13 @@ def test_the_jaws_turn_changes_nothing(shell: Shell) -> None:
     p, q = shell(40, rng)
     turned = np.where(rng.random(40)[:, None] < 0.5, q, se3.jaw_twin(q))
     at, to = p + 0.005, q
-    one = kernel.placed(p, q).log_density(at, to)
-    np.testing.assert_allclose(one, kernel.placed(p, turned).log_density(at, to), atol=1e-4)
-    np.testing.assert_allclose(one, kernel.placed(p, q).log_density(at, se3.jaw_twin(to)), atol=1e-4)
+    one = kernel.placed(se3.Poses.of(p, q)).log_density(se3.Poses.of(at, to))
+    np.testing.assert_allclose(
+        one, kernel.placed(se3.Poses.of(p, turned)).log_density(se3.Poses.of(at, to)), atol=1e-4
+    )
+    np.testing.assert_allclose(
+        one, kernel.placed(se3.Poses.of(p, q)).log_density(se3.Poses.of(at, se3.jaw_twin(to))), atol=1e-4
+    )
 
 
 def test_draws_follow_the_kernel() -> None:
@@ -76,18 +86,20 @@ def test_draws_follow_the_kernel() -> None:
     mean = kernel.shares @ kernel.translations
     np.testing.assert_allclose(move.mean(axis=0), mean, atol=5e-4)
     # Where draws are, a density that is theirs is as high as its own entropy says.
-    drawn = kernel.log_kernel(*kernel.sample_displacements(4_000, rng)).mean()
-    assert kernel.log_kernel(move[:4_000], turn[:4_000]).mean() == pytest.approx(drawn, abs=0.1)
+    drawn = kernel.log_kernel(se3.Poses(*kernel.sample_displacements(4_000, rng))).mean()
+    assert kernel.log_kernel(se3.Poses(move[:4_000], turn[:4_000])).mean() == pytest.approx(drawn, abs=0.1)
 
 
 def test_gradient_is_that_of_the_density(shell: Shell) -> None:
     rng = np.random.default_rng(4)
     p, q = shell(60, rng)
-    density = template(rng).placed(p, q)
+    density = template(rng).placed(se3.Poses.of(p, q))
     at, to = p[:5] + 0.003, q[:5]
-    along, _ = density.gradient(at, to)
+    along, _ = density.gradient(se3.Poses.of(at, to))
     step = 1e-5 * along / np.linalg.norm(along, axis=1, keepdims=True)
-    rise = density.log_density(at + step, to, cutoff=None) - density.log_density(at - step, to, cutoff=None)
+    rise = density.log_density(se3.Poses.of(at + step, to), cutoff=None) - density.log_density(
+        se3.Poses.of(at - step, to), cutoff=None
+    )
     np.testing.assert_allclose(rise / 2e-5, np.linalg.norm(along, axis=1), rtol=0.05)
 
 
@@ -95,7 +107,7 @@ def test_limits_and_bad_values() -> None:
     rng = np.random.default_rng(5)
     kernel = template(rng, 900)
     with pytest.raises(ValueError, match="more than 2000000; fit a mixture"):
-        kernel.placed(np.zeros((1_200, 3)), np.tile(se3.IDENTITY, (1_200, 1)))
+        kernel.placed(se3.Poses.of(np.zeros((1_200, 3)), np.tile(se3.IDENTITY, (1_200, 1))))
     with pytest.raises(ValueError, match="at least one component"):
         SampledKernel(np.empty((0, 3)), np.empty((0, 4)), COMPONENT)
     with pytest.raises(ValueError, match="positive"):

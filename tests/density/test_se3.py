@@ -81,8 +81,8 @@ def test_jaw_twin_keeps_approach_and_swaps_fingers(q: se3.Floats) -> None:
 def test_rigid_motions_compose_and_invert() -> None:
     rng = np.random.default_rng(0)
     p, q = rng.standard_normal((20, 3)), se3.random_quaternions(20, rng)
-    back_p, back_q = se3.inverse(p, q)
-    at, turn = se3.compose(p, q, back_p, back_q)
+    back_p, back_q = se3.inverse(se3.Poses(p, q))
+    at, turn = se3.compose(se3.Poses(p, q), se3.Poses(back_p, back_q))
     np.testing.assert_allclose(at, 0.0, atol=1e-14)
     assert se3.angle_between(turn, se3.IDENTITY).max() < 1e-14
 
@@ -116,9 +116,9 @@ def test_matrices_that_are_no_rotations_are_refused() -> None:
 )
 def test_bad_poses_are_refused(positions: se3.Floats, quaternions: se3.Floats, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        se3.as_poses(positions, quaternions)
+        se3.Poses.of(positions, quaternions)
 
 
 def test_nearly_unit_quaternions_are_normalised() -> None:
-    _, q = se3.as_poses(np.zeros((1, 3)), 1.0005 * se3.IDENTITY[None])
+    _, q = se3.Poses.of(np.zeros((1, 3)), 1.0005 * se3.IDENTITY[None])
     np.testing.assert_allclose(q, se3.IDENTITY[None], atol=1e-15)

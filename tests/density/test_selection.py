@@ -39,17 +39,18 @@ def test_rows_beyond_the_prefix_change_nothing(shell: Shell) -> None:
 def test_more_data_of_finer_structure_gives_narrower_widths() -> None:
     rng = np.random.default_rng(2)
     centres = rng.uniform(-0.1, 0.1, (40, 3)), se3.random_quaternions(40, rng)
-    rows = GraspDensity.build(*centres, kernel=IsotropicKernel(0.02, math.radians(20.0))).sample(3_200, rng)
+    made = GraspDensity.build(se3.Poses.of(*centres), kernel=IsotropicKernel(0.02, math.radians(20.0)))
+    rows = tuple(made.sample(3_200, rng))
     chosen = choose_widths(*rows).kernel
     few = choose_widths(rows[0][:200], rows[1][:200]).kernel
     assert chosen.sigma_position_m <= few.sigma_position_m
     assert chosen.sigma_rotation <= few.sigma_rotation
     assert 0.007 < chosen.sigma_position_m < 0.03
     # The choice generalises: fresh data are likelier under it than under widths far from it.
-    fresh = GraspDensity.build(*centres, kernel=IsotropicKernel(0.02, math.radians(20.0))).sample(500, rng)
+    fresh = made.sample(500, rng)
 
     def likelihood(kernel: IsotropicKernel) -> float:
-        return float(GraspDensity.build(*rows, kernel=kernel).log_density(*fresh).mean())
+        return float(GraspDensity.build(se3.Poses.of(*rows), kernel=kernel).log_density(fresh).mean())
 
     best = likelihood(chosen)
     assert best > likelihood(IsotropicKernel(0.004, math.radians(5.0))) + 0.2

@@ -53,7 +53,7 @@ def fields(answer: httpx.Response, status: int = 422) -> set[str]:
 
 def exact(trials: Poses, grasp: dict[str, Any]) -> float:
     pose = np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]])
-    return float(brute_force.log_density(KERNEL, *trials, *pose)[0])
+    return float(brute_force.log_density(KERNEL, se3.Poses.of(*trials), se3.Poses.of(*pose))[0])
 
 
 @pytest.fixture
@@ -76,8 +76,8 @@ def test_unconstrained_equals_brute_force(thing: httpx.Client, two_clusters: Pos
     rows = rng.integers(0, 500, 20_000)
     positions = two_clusters[0][rows] + rng.normal(size=(20_000, 3)) * 0.005
     turns = se3.from_rotation_vector(rng.normal(size=(20_000, 3)) * 0.1)
-    rivals = GraspDensity.build(*two_clusters, kernel=KERNEL).log_density(
-        positions, se3.multiply(two_clusters[1][rows], turns)
+    rivals = GraspDensity.build(se3.Poses.of(*two_clusters), kernel=KERNEL).log_density(
+        se3.Poses.of(positions, se3.multiply(two_clusters[1][rows], turns))
     )
     assert grasp["log_density"] >= rivals.max() - 1e-3
 
@@ -120,7 +120,7 @@ def test_constraints_hold_and_are_named(thing: httpx.Client, two_clusters: Poses
         inside = region.contains(*two_clusters)
         if inside.any():
             there = two_clusters[0][inside], two_clusters[1][inside]
-            rivals = brute_force.log_density(KERNEL, *two_clusters, *there)
+            rivals = brute_force.log_density(KERNEL, se3.Poses.of(*two_clusters), se3.Poses.of(*there))
             assert grasp["log_density"] >= rivals.max() - 1e-3
 
 
@@ -437,12 +437,12 @@ def test_half_spaces_in_either_frame(thing: httpx.Client) -> None:
 
 
 def test_candidates_are_ranked_as_they_are(thing: httpx.Client, two_clusters: Poses) -> None:
-    density = GraspDensity.build(*two_clusters, kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(*two_clusters), kernel=KERNEL)
     rows = np.arange(0, 500, 7)
     p, q = two_clusters[0][rows], two_clusters[1][rows]
     candidates = {"position": p.tolist(), "quaternion_xyzw": q.tolist()}
     answer = posted(thing, candidates=candidates, count=10)
-    order = np.argsort(-density.log_density(p, q))[:10]
+    order = np.argsort(-density.log_density(se3.Poses.of(p, q)))[:10]
     assert [grasp["candidate"] for grasp in answer["grasps"]] == order.tolist()
     np.testing.assert_allclose(answer["grasps"][0]["position"], p[order[0]], atol=1e-12)
     assert [grasp["score"] for grasp in answer["grasps"]] == [g["density"] for g in answer["grasps"]]
@@ -452,7 +452,7 @@ def test_candidates_are_ranked_as_they_are(thing: httpx.Client, two_clusters: Po
     assert {g["candidate"] for g in answer["grasps"]} == set(np.flatnonzero(p[:, 2] <= 0.03).tolist())
     # In the world, where the object stands elsewhere, they are poses in the world.
     shift, turn = np.array([0.5, -0.3, 0.8]), se3.normalise(np.array([0.3, -0.2, 0.5, 0.7]))
-    there = se3.compose(shift, turn, p, q)
+    there = se3.compose(se3.Poses(shift, turn), se3.Poses(p, q))
     listed = [
         {"position": a, "quaternion_xyzw": b}
         for a, b in zip(there[0].tolist(), there[1].tolist(), strict=True)

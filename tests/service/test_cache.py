@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from graspdb_density import GraspDensity, IsotropicKernel
+from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_density.kde import brute_force
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
@@ -193,12 +193,18 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
         if not np.isnan(known).all():
             weights = np.where(np.isnan(known), np.nanmean(1 / known), 1 / known)
         trials = part(two_clusters, 0, done)
-        fresh = GraspDensity.build(*trials, kernel=KERNEL, weights=weights)
+        fresh = GraspDensity.build(se3.Poses.of(*trials), kernel=KERNEL, weights=weights)
         np.testing.assert_allclose(
-            built.density.log_density(*two_clusters), fresh.log_density(*two_clusters), atol=1e-5
+            built.density.log_density(se3.Poses.of(*two_clusters)),
+            fresh.log_density(se3.Poses.of(*two_clusters)),
+            atol=1e-5,
         )
-        exact = brute_force.log_density(KERNEL, *trials, *two_clusters, weights=weights)
-        np.testing.assert_allclose(built.density.log_density(*two_clusters, cutoff=None), exact, atol=1e-4)
+        exact = brute_force.log_density(
+            KERNEL, se3.Poses.of(*trials), se3.Poses.of(*two_clusters), weights=weights
+        )
+        np.testing.assert_allclose(
+            built.density.log_density(se3.Poses.of(*two_clusters), cutoff=None), exact, atol=1e-4
+        )
         np.testing.assert_allclose(built.density.weights, weights / weights.sum(), rtol=1e-9)
     assert len(reads) == len(steps)
     # Nothing new: not even the tail is read.
@@ -268,7 +274,9 @@ def test_what_one_process_commits_is_in_the_others_next_answer(
         # Deleting a batch through one rebuilds in the other.
         assert one.delete(f"/objects/thing/batches/{batches[1]}").status_code in (200, 204)
         left = np.r_[0:100, 200:500]
-        exact = brute_force.log_density(KERNEL, two_clusters[0][left], two_clusters[1][left], *two_clusters)
+        exact = brute_force.log_density(
+            KERNEL, se3.Poses.of(two_clusters[0][left], two_clusters[1][left]), se3.Poses.of(*two_clusters)
+        )
         for client in (two, one):
             info = client.get("/objects/thing/density").json()
             assert info["size"] == 400

@@ -113,11 +113,11 @@ def test_queries_answer_what_the_maths_does(sqlite_http: httpx.Client, make_obje
     g = np.random.default_rng(5).random(400) + 0.5
     post(http, "thing", poses, proposal_density=g)
     kernel = fit(http, **GIVEN)
-    density = MixtureDensity(*poses, kernel=loaded(kernel), weights=1.0 / g)
+    density = MixtureDensity(se3.Poses.of(*poses), kernel=loaded(kernel), weights=1.0 / g)
     asked = poses[0][:50] + 0.003, poses[1][:50]
     body = {"position": asked[0].tolist(), "quaternion_xyzw": asked[1].tolist()}
     found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": kernel["id"]}).json()
-    np.testing.assert_allclose(found["log_density"], density.log_density(*asked), atol=2e-3)
+    np.testing.assert_allclose(found["log_density"], density.log_density(se3.Poses.of(*asked)), atol=2e-3)
     assert max(found["relative"]) <= 1
     assert found["kernel"]["id"] == kernel["id"]
 
@@ -125,7 +125,7 @@ def test_queries_answer_what_the_maths_does(sqlite_http: httpx.Client, make_obje
     assert best["status"] == "ok"
     top = best["grasps"][0]
     assert top["relative"] == pytest.approx(1, abs=0.02)
-    exact = density.log_density([top["position"]], [top["quaternion_xyzw"]])[0]
+    exact = density.log_density(se3.Poses.of([top["position"]], [top["quaternion_xyzw"]]))[0]
     assert top["log_density"] == pytest.approx(exact, abs=2e-3)
     assert top["log_density"] >= max(found["log_density"]) - 1e-3
     logs = [grasp["log_density"] for grasp in best["grasps"]]
@@ -140,20 +140,22 @@ def test_queries_answer_what_the_maths_does(sqlite_http: httpx.Client, make_obje
         "/objects/thing/samples", json={"count": 2_000, "seed": 3, "kernel": kernel["id"]}
     ).json()
     p, q = np.array(drawn["position"]), np.array(drawn["quaternion_xyzw"])
-    np.testing.assert_allclose(np.log(drawn["proposal_density"]), density.log_density(p, q), atol=2e-3)
+    np.testing.assert_allclose(
+        np.log(drawn["proposal_density"]), density.log_density(se3.Poses.of(p, q)), atol=2e-3
+    )
     # Mean log density of its own draws is minus the entropy: as that of the maths' own draws.
-    own = density.log_density(*density.sample(2_000, np.random.default_rng(8)))
+    own = density.log_density(se3.Poses.of(*density.sample(2_000, np.random.default_rng(8))))
     assert np.log(drawn["proposal_density"]).mean() == pytest.approx(own.mean(), abs=0.25)
 
     # Trials that come later are in the next answer.
     more = ridges(50, seed=9)
     post(http, "thing", more, proposal_density=np.ones(50))
     grown = MixtureDensity(
-        np.concatenate([poses[0], more[0]]), np.concatenate([poses[1], more[1]]), kernel=loaded(kernel),
-        weights=np.concatenate([1.0 / g, np.ones(50)]),
+        se3.Poses.of(np.concatenate([poses[0], more[0]]), np.concatenate([poses[1], more[1]])),
+        kernel=loaded(kernel), weights=np.concatenate([1.0 / g, np.ones(50)]),
     )  # fmt: skip
     found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": kernel["id"]}).json()
-    np.testing.assert_allclose(found["log_density"], grown.log_density(*asked), atol=2e-3)
+    np.testing.assert_allclose(found["log_density"], grown.log_density(se3.Poses.of(*asked)), atol=2e-3)
 
 
 def test_aligned_with_the_object(
@@ -274,11 +276,11 @@ def test_a_sampled_kernel_is_drawn_and_used_in_every_query(
     # It is none of those that the name anisotropic means.
     assert problem(http.get("/objects/thing/density?kernel=anisotropic"), 409)
 
-    density = as_sampled(made).placed(*poses, weights=1.0 / g)
+    density = as_sampled(made).placed(se3.Poses.of(*poses), weights=1.0 / g)
     asked = poses[0][:50] + 0.003, poses[1][:50]
     body = {"position": asked[0].tolist(), "quaternion_xyzw": asked[1].tolist()}
     found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": made["id"]}).json()
-    np.testing.assert_allclose(found["log_density"], density.log_density(*asked), atol=2e-3)
+    np.testing.assert_allclose(found["log_density"], density.log_density(se3.Poses.of(*asked)), atol=2e-3)
     assert max(found["relative"]) <= 1
     info = http.get(f"/objects/thing/density?kernel={made['id']}").json()
     assert (info["size"], info["kernel"]["kind"], info["kernel"]["id"]) == (400, "sampled", made["id"])
@@ -288,20 +290,22 @@ def test_a_sampled_kernel_is_drawn_and_used_in_every_query(
     best = http.get(f"/objects/thing/best-grasp?kernel={made['id']}&count=2").json()
     top = best["grasps"][0]
     assert top["relative"] == pytest.approx(1, abs=0.02)
-    exact = density.log_density([top["position"]], [top["quaternion_xyzw"]])[0]
+    exact = density.log_density(se3.Poses.of([top["position"]], [top["quaternion_xyzw"]]))[0]
     assert top["log_density"] == pytest.approx(exact, abs=2e-3)
     assert top["log_density"] >= max(found["log_density"]) - 1e-3
     drawn = http.post("/objects/thing/samples", json={"count": 500, "seed": 3, "kernel": made["id"]}).json()
     p, q = np.array(drawn["position"]), np.array(drawn["quaternion_xyzw"])
-    np.testing.assert_allclose(np.log(drawn["proposal_density"]), density.log_density(p, q), atol=2e-3)
+    np.testing.assert_allclose(
+        np.log(drawn["proposal_density"]), density.log_density(se3.Poses.of(p, q)), atol=2e-3
+    )
 
     # Trials that come later are in the next answer, extended or weighted anew.
     more = ridges(50, seed=9)
     post(http, "thing", more, gripper="pg70", proposal_density=np.ones(50))
     every = np.concatenate([poses[0], more[0]]), np.concatenate([poses[1], more[1]])
-    grown = as_sampled(made).placed(*every, weights=np.concatenate([1.0 / g, np.ones(50)]))
+    grown = as_sampled(made).placed(se3.Poses.of(*every), weights=np.concatenate([1.0 / g, np.ones(50)]))
     found = http.post("/objects/thing/likelihood", json={"poses": body, "kernel": made["id"]}).json()
-    np.testing.assert_allclose(found["log_density"], grown.log_density(*asked), atol=2e-3)
+    np.testing.assert_allclose(found["log_density"], grown.log_density(se3.Poses.of(*asked)), atol=2e-3)
 
 
 def test_a_sampled_kernel_given_by_its_displacements(
@@ -330,8 +334,8 @@ def test_a_sampled_kernel_given_by_its_displacements(
         for k in (named, spelled)
     ]
     np.testing.assert_allclose(logs[0], logs[1], atol=1e-6)
-    density = as_sampled(named).placed(*poses)
-    np.testing.assert_allclose(logs[0], density.log_density(*poses), atol=2e-3)
+    density = as_sampled(named).placed(se3.Poses.of(*poses))
+    np.testing.assert_allclose(logs[0], density.log_density(se3.Poses.of(*poses)), atol=2e-3)
 
 
 def test_sampled_kernels_are_bounded_and_checked(

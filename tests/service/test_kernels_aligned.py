@@ -82,7 +82,7 @@ def expected(kernel: dict[str, Any], poses: Poses, size: tuple[float, float, flo
     shape = AnisotropicKernel(
         [c["weight"] for c in parts], [c["mean"] for c in parts], [c["covariance"] for c in parts], "fixed"
     )
-    return MixtureDensity(*poses, kernel=shape, frames=frames).density(*at)
+    return MixtureDensity(se3.Poses.of(*poses), kernel=shape, frames=frames).density(*at)
 
 
 @pytest.mark.parametrize("alignment", ["edge", "surface-pair"])

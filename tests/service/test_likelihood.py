@@ -75,7 +75,9 @@ def test_equals_brute_force(
     ):
         answer = ask(http, sent, **({} if kernel is None else {"kernel": kernel}))
         exact = brute_force.log_density(
-            IsotropicKernel(sigma_m, np.deg2rad(sigma_deg)), *two_clusters, *queries
+            IsotropicKernel(sigma_m, np.deg2rad(sigma_deg)),
+            se3.Poses.of(*two_clusters),
+            se3.Poses.of(*queries),
         )
         tolerance = 1e-5 if kernel and "cutoff" in kernel else RELATIVE_ERROR
         np.testing.assert_allclose(answer["log_density"], exact, atol=tolerance)
@@ -94,7 +96,10 @@ def test_weights_of_eq_1(http: httpx.Client, make_object: Make, post: Post, two_
     weights = 1 / proposal
     weights[::7] = np.nanmean(weights)
     exact = brute_force.log_density(
-        IsotropicKernel(0.015, np.deg2rad(15)), *two_clusters, *two_clusters, weights=weights
+        IsotropicKernel(0.015, np.deg2rad(15)),
+        se3.Poses.of(*two_clusters),
+        se3.Poses.of(*two_clusters),
+        weights=weights,
     )
     np.testing.assert_allclose(ask(http, columns(two_clusters))["log_density"], exact, atol=RELATIVE_ERROR)
 
@@ -129,13 +134,15 @@ def test_symmetry_follows_the_gripper(
     assert http.post("/grippers", json={"id": "hook", **profile}).status_code == 201
     post(http, "thing", two_clusters, gripper="hook")
     kernel = IsotropicKernel(0.015, np.deg2rad(15))
-    exact = brute_force.log_density(kernel, *two_clusters, *queries, symmetric=False)
+    exact = brute_force.log_density(
+        kernel, se3.Poses.of(*two_clusters), se3.Poses.of(*queries), symmetric=False
+    )
     np.testing.assert_allclose(ask(http, columns(queries))["log_density"], exact, atol=RELATIVE_ERROR)
     # Trials without a gripper go along, and their jaw counts as symmetric.
     post(http, "thing", queries)
     both = np.concatenate([two_clusters[0], queries[0]]), np.concatenate([two_clusters[1], queries[1]])
     symmetric = np.arange(580) >= 500
-    exact = brute_force.log_density(kernel, *both, *queries, symmetric=symmetric)
+    exact = brute_force.log_density(kernel, se3.Poses.of(*both), se3.Poses.of(*queries), symmetric=symmetric)
     np.testing.assert_allclose(ask(http, columns(queries))["log_density"], exact, atol=RELATIVE_ERROR)
 
 
@@ -146,7 +153,9 @@ def test_far_away_is_tiny_not_null(
     post(sqlite_http, "thing", two_clusters)
     far = (np.array([[3.0, 3, 3], [900, 900, 900]]), np.array([[0, 0, 0, 1.0]] * 2))
     answer = ask(sqlite_http, columns(far))
-    exact = brute_force.log_density(IsotropicKernel(0.015, np.deg2rad(15)), *two_clusters, *far)
+    exact = brute_force.log_density(
+        IsotropicKernel(0.015, np.deg2rad(15)), se3.Poses.of(*two_clusters), se3.Poses.of(*far)
+    )
     np.testing.assert_allclose(answer["log_density"], exact, rtol=1e-5)
     assert answer["density"] == [0, 0]
     assert answer["relative"] == [0, 0]

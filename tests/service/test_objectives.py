@@ -137,7 +137,7 @@ def test_robust_prefers_what_survives_noise(
     narrow = {"sigma_position_m": 0.006, "sigma_rotation_deg": 10}
     assert ask(http, **narrow)["grasps"][0]["position"][0] > 0.05
     kernel = IsotropicKernel(0.006, math.radians(10))
-    density = GraspDensity.build(p[won], q[won], kernel=kernel)
+    density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=kernel)
     model = SuccessModel.build(p, q, won, kernel=kernel)
     middle = (p[won].min(axis=0) + p[won].max(axis=0)) / 2
     at_object = PoseNoise(0.02, math.radians(2), tuple(middle))  # type: ignore[arg-type]
@@ -299,7 +299,7 @@ def exhaustive(
     q = np.concatenate([density.quaternions_xyzw, se3.random_quaternions(starts, rng)])
     p, q, inside = region.project(p, q)
     p, q = p[inside], q[inside]
-    value = density.log_density(p, q, threads=2)
+    value = density.log_density(se3.Poses.of(p, q), threads=2)
     # A start a thousandth as good as the best is left out: hours would go into the tails.
     kept = value > value.max() - math.log(1e3) if len(value) else np.zeros(0, dtype=bool)
     ranking = ModeSearch(density).ranking(2)
@@ -311,7 +311,7 @@ def exhaustive(
     if scene is not None and len(p):
         free = ~scene.collides(ToolPoses(p, q), PG70, threads=2)
         p, q = p[free], q[free]
-    return float(density.log_density(p, q, threads=2).max()) if len(p) else -math.inf
+    return float(density.log_density(se3.Poses.of(p, q), threads=2).max()) if len(p) else -math.inf
 
 
 def compare(
@@ -327,7 +327,7 @@ def compare(
     q = se3.multiply(turns[rows], se3.from_rotation_vector(rng.normal(size=(kernels, 3)) * 0.2))
     for part in np.array_split(np.arange(kernels), max(1, kernels // 10_000)):
         post(http, "thing", (p[part], q[part]), gripper="pg70")
-    density = GraspDensity.build(p, q, kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(p, q), kernel=KERNEL)
     with use_case(url) as ctx:
         for seed in seeds:
             rng = np.random.default_rng(seed)
@@ -373,7 +373,9 @@ class Field:
         self.won = rng.random(len(rows)) < shares[rows]
         self.scene = scene
         self.model = SuccessModel.build(self.positions, self.quaternions, self.won, kernel=KERNEL)
-        self.density = GraspDensity.build(self.positions[self.won], self.quaternions[self.won], kernel=KERNEL)
+        self.density = GraspDensity.build(
+            se3.Poses.of(self.positions[self.won], self.quaternions[self.won]), kernel=KERNEL
+        )
         self.near = search.near_successes(self.density, 2.0, 2)
 
     def chance(self, column: str) -> Callable[[Floats, Floats], Floats]:

@@ -104,7 +104,7 @@ def test_their_density_integrates_to_one(sqlite_http: httpx.Client, box: Scene, 
     assert made.status_code == 201, made.text
     p, q, g = arrays(propose(sqlite_http, gripper="own", count=40_000, seed=5, sigma_rotation_deg=20))
     narrow = IsotropicKernel(0.008, math.radians(14))
-    h = GraspDensity.build(p[:400], q[:400], kernel=narrow, symmetric=symmetric)
+    h = GraspDensity.build(se3.Poses.of(p[:400], q[:400]), kernel=narrow, symmetric=symmetric)
     ratio = h.density(p[400:], q[400:], cutoff=None, threads=2) / g[400:]
     error = ratio.std() / math.sqrt(len(ratio))
     assert error < 0.05

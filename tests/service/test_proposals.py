@@ -102,7 +102,7 @@ def test_proposals_integrate_to_one(
     p, q, g = arrays(propose(http, count=60_000, seed=5, strategy=strategy))
     narrow = IsotropicKernel(0.006, math.radians(6))
     for symmetric in (True, False):
-        h = GraspDensity.build(p[:300], q[:300], kernel=narrow, symmetric=symmetric)
+        h = GraspDensity.build(se3.Poses.of(p[:300], q[:300]), kernel=narrow, symmetric=symmetric)
         ratio = h.density(p[300:], q[300:], cutoff=None, threads=2) / g[300:]
         error = ratio.std() / math.sqrt(len(ratio))
         assert error < 0.05
@@ -118,7 +118,7 @@ def test_any_uncertainty_integrates_to_one(seed: int, symmetric: bool) -> None:
     p, q = rng.normal(size=(60, 3)) * 0.02, se3.random_quaternions(60, rng)
     won = rng.random(60) < 0.4
     won[:2] = True, False
-    density = GraspDensity.build(p[won], q[won], kernel=kernel, symmetric=symmetric)
+    density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=kernel, symmetric=symmetric)
     model = SuccessModel.build(p, q, won, kernel=kernel, symmetric=symmetric)
     proposal = uncertain(density, model, None)
     assert proposal is not None
@@ -138,12 +138,12 @@ def test_trials_of_proposals_are_weighted(
     make_object(http, "other")
     p, q, g = arrays(propose(http, count=50, seed=5, strategy="uncertainty"))
     post(http, "other", (p, q), proposal_density=g)
-    density = GraspDensity.build(p, q, kernel=KERNEL, weights=1 / g)
+    density = GraspDensity.build(se3.Poses.of(p, q), kernel=KERNEL, weights=1 / g)
     answer = http.post(
         "/objects/other/likelihood",
         json={"poses": {"position": p.tolist(), "quaternion_xyzw": q.tolist()}, **WIDTHS},
     ).json()
-    np.testing.assert_allclose(answer["density"], density.density(p, q), rtol=5e-3)
+    np.testing.assert_allclose(answer["density"], density.density(se3.Poses.of(p, q)), rtol=5e-3)
 
 
 def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Poses]) -> None:
@@ -152,7 +152,7 @@ def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Poses]) ->
     free = ~scene.collides(ToolPoses(p, q), PG70)
     p, q = p[free], q[free]
     won = np.arange(len(p)) % 2 == 0
-    density = GraspDensity.build(p[won], q[won], kernel=KERNEL)
+    density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=KERNEL)
     model = SuccessModel.build(p, q, won, kernel=KERNEL)
     blind, seeing = uncertain(density, model, None), uncertain(density, model, CollisionTest(scene, PG70))
     assert blind is not None

@@ -193,8 +193,8 @@ def test_calibration_judges_blocks_left_out(
         train, held = blocks.fold != fold, blocks.fold == fold
         model = SuccessModel.build(p[train], q[train], won[train], kernel=kernel)
         predicted[held] = model.evaluate(p[held], q[held]).probability
-        density = GraspDensity.build(p[train & won], q[train & won], kernel=kernel)
-        ranked[held] = density.log_density(p[held], q[held])
+        density = GraspDensity.build(se3.Poses.of(p[train & won], q[train & won]), kernel=kernel)
+        ranked[held] = density.log_density(se3.Poses.of(p[held], q[held]))
     expected = calibrate(predicted, won, blocks=blocks.block)
     assert body["skill"]["value"] == pytest.approx(expected.skill, abs=1e-3)
     assert body["skill"]["low"] == pytest.approx(expected.skill_low, abs=1e-3)

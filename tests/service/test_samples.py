@@ -45,7 +45,9 @@ def test_repeatable_and_with_their_density(
     position, quaternion = np.array(first["position"]), np.array(first["quaternion_xyzw"])
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1, atol=1e-12)
     exact = brute_force.log_density(
-        IsotropicKernel(0.015, np.deg2rad(15)), *two_clusters, position, quaternion
+        IsotropicKernel(0.015, np.deg2rad(15)),
+        se3.Poses.of(*two_clusters),
+        se3.Poses.of(position, quaternion),
     )
     np.testing.assert_allclose(np.log(first["proposal_density"]), exact, atol=1e-3)
     # 300 of 500 successes are from above: within four standard deviations of the binomial.

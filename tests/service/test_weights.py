@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
+from graspdb_density.se3 import Poses
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
@@ -137,7 +138,7 @@ def test_overlapping_grids_tell_of_the_field_what_one_does(box: httpx.Client, ct
     assert built.density is not None
     rows = built.density.positions, built.density.quaternions_xyzw
     weights = importance_weights(built.proposal_density)
-    naive = GraspDensity.build(*rows, kernel=KERNEL, weights=weights).log_density(*poses)
+    naive = GraspDensity.build(Poses.of(*rows), kernel=KERNEL, weights=weights).log_density(Poses.of(*poses))
     assert np.mean(naive[400:] - naive[:400]) > 0.3
 
 
@@ -179,7 +180,9 @@ def test_weights_are_the_balance_heuristic_while_a_sweep_runs(
         fresh = other.densities.get("thing", *PLAIN)
         other.close()
         np.testing.assert_allclose(
-            built.density.log_density(probe, turns), fresh.density.log_density(probe, turns), atol=1e-5
+            built.density.log_density(Poses.of(probe, turns)),
+            fresh.density.log_density(Poses.of(probe, turns)),
+            atol=1e-5,
         )
         extended.append(built)
         work(box, jobs=1)

@@ -57,14 +57,14 @@ def mixture_curve(
     share = found.weights / found.weights.sum()
     turns = se3.from_rotation_vector(found.vectors[:, 3:])
     whole_rows = rng.choice(len(share), size=min(reference, len(share)), replace=False, p=share)
-    whole = sampled_kernel_rows(found.vectors[whole_rows, :3], turns[whole_rows], components)
+    whole = sampled_kernel_rows(se3.Poses.of(found.vectors[whole_rows, :3], turns[whole_rows]), components)
     chosen = rng.choice(len(share), size=min(fitted, len(share)), replace=False, p=share)
     added = np.diag([components.sigma_position_m**2] * 3 + [components.sigma_rotation**2] * 3)
     result = []
     for number, count in enumerate(counts):
         weights, means, covariances = mixture_parts(found.vectors[chosen], count)
         kernel = AnisotropicKernel.symmetrised(weights, means, _narrowed(covariances + added))
-        alone = KernelRows(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), kernel, symmetric=False)
+        alone = KernelRows(se3.Poses(np.zeros((1, 3)), se3.IDENTITY[None]), kernel, symmetric=False)
         likeness = bhattacharyya(whole, alone, rng, points=points, window=window, threads=threads)
         result.append(SampledKernelPoint(count, likeness.value, likeness.standard_error))
         if progress is not None:

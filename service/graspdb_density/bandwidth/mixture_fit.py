@@ -123,7 +123,7 @@ def displacements(
     per_grasp : int
         At most this many from one success, drawn at random and weighted for the rest.
     """
-    p, q = se3.as_poses(positions, quaternions_xyzw)
+    p, q = se3.Poses.of(positions, quaternions_xyzw)
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p))
     reach = window.position_m * math.sqrt(3.0)
@@ -145,7 +145,7 @@ def displacements(
         other = se3.canonical(se3.multiply(se3.conjugate(q[a]), se3.jaw_twin(q[near])))
         nearer = flags[near] & (other[:, 3] > turn[:, 3])
         turn = np.where(nearer[:, None], other, turn)
-        inside = np.flatnonzero(window.holds(shift, turn))
+        inside = np.flatnonzero(window.holds(se3.Poses(shift, turn)))
         if not inside.size:
             continue
         kept = inside if inside.size <= per_grasp else rng.choice(inside, size=per_grasp, replace=False)
@@ -199,7 +199,7 @@ def fit_kernel(
         For too few successes or displacements (saying how many are needed), a mixture in axes that do not
         turn with the jaw, or a fit whose rotations are wider than a component may be.
     """
-    p, q = se3.as_poses(positions, quaternions_xyzw)
+    p, q = se3.Poses.of(positions, quaternions_xyzw)
     if len(p) < LEAST_SUCCESSES:
         raise ValueError(
             f"a kernel is fitted on at least {LEAST_SUCCESSES} successes; there are {len(p)}, so "
@@ -227,8 +227,8 @@ def fit_kernel(
     )
     turns = se3.from_rotation_vector(found.vectors[:, 3:])
     chosen = rng.choice(len(turns), size=min(_SAMPLES, len(turns)), p=found.weights / found.weights.sum())
-    sampled = sampled_kernel_rows(found.vectors[chosen, :3], turns[chosen], widths)
-    alone = KernelRows(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), shape, symmetric=False,
+    sampled = sampled_kernel_rows(se3.Poses.of(found.vectors[chosen, :3], turns[chosen]), widths)
+    alone = KernelRows(se3.Poses(np.zeros((1, 3)), se3.IDENTITY[None]), shape, symmetric=False,
                        frames=None if frame is None else np.eye(3))  # fmt: skip
     similarity = bhattacharyya(sampled, alone, rng, points=4_000, window=window, threads=threads)
     judge = _Judge(p, q, w, flags, frames, compared, rng, threads)
@@ -298,17 +298,17 @@ class _Judge:
     def anisotropic(self, kernel: AnisotropicKernel) -> float:
         return self._mean(
             lambda train, p, q: MixtureDensity(
-                self._p[train], self._q[train], kernel=kernel, weights=self._w[train],
+                se3.Poses.of(self._p[train], self._q[train]), kernel=kernel, weights=self._w[train],
                 symmetric=self._flags[train], frames=self._frames(train),
-            ).density(p, q, threads=self._threads)
+            ).density(se3.Poses(p, q), threads=self._threads)
         )  # fmt: skip
 
     def isotropic(self, kernel: IsotropicKernel) -> float:
         return self._mean(
             lambda train, p, q: GraspDensity.build(
-                self._p[train], self._q[train], kernel=kernel, weights=self._w[train],
+                se3.Poses.of(self._p[train], self._q[train]), kernel=kernel, weights=self._w[train],
                 symmetric=self._flags[train],
-            ).density(p, q, threads=self._threads)
+            ).density(se3.Poses(p, q), threads=self._threads)
         )  # fmt: skip
 
     def _frames(self, train: NDArray[np.int64]) -> Floats | None:

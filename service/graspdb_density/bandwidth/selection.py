@@ -88,7 +88,7 @@ def choose_widths(
     threads: int = 1,
 ) -> WidthChoice:
     """Choose widths for grasps (N, 3), (N, 4) in commit order."""
-    p, q = se3.as_poses(positions, quaternions_xyzw)
+    p, q = se3.Poses.of(positions, quaternions_xyzw)
     count = widths_prefix(len(p))
     if count == 0:
         return WidthChoice(DEFAULT_KERNEL, "default", 0, math.nan)
@@ -143,7 +143,7 @@ def score_widths(
     ValueError
         For fewer than `LEAST_ROWS` rows, saying how many more are needed.
     """
-    p, q = se3.as_poses(positions, quaternions_xyzw)
+    p, q = se3.Poses.of(positions, quaternions_xyzw)
     if len(p) < LEAST_ROWS:
         raise ValueError(
             f"widths are told apart from {LEAST_ROWS} successes on; there are {len(p)}, so"
@@ -191,7 +191,7 @@ def _tried(
     """Every pair of widths with the rows left out and their log density under it."""
     for step in _STEPS_POSITION:
         sigma = DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * step)
-        cells = Cells.build(p, q, w, flags, sigma)
+        cells = Cells.build(se3.Poses(p, q), w, flags, sigma)
         for turn in _STEPS_ROTATION:
             kernel = IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
             yield kernel, *_held_out(kernel, cells, p, q, w, threads)

@@ -11,19 +11,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from .. import se3
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Poses
+from .density import Density
 from .weighted_sums import KernelRows
 
 __all__ = [
     "Coefficient",
-    "Density",
     "DisplacementWindow",
     "SampledKernelPoint",
     "bhattacharyya",
@@ -31,16 +29,6 @@ __all__ = [
     "sampled_kernel_curve",
     "sampled_kernel_rows",
 ]
-
-
-class Density(Protocol):
-    """What can be evaluated and drawn from: `GraspDensity`, `KernelRows`."""
-
-    def log_density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
-        """(M,) nats of 1/(m^3 rad^3)."""
-
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """(count, 3) metres and (count, 4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +61,9 @@ class DisplacementWindow:
         if not self.position_m > 0.0 or not 0.0 < self.rotation <= math.pi:
             raise ValueError("a window has a positive half edge and an angle in (0, pi]")
 
-    def holds(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> NDArray[np.bool_]:
-        """Whether displacements (M, 3), (M, 4) lie inside."""
-        p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions_xyzw, dtype=np.float64)
+    def holds(self, displacements: Poses) -> NDArray[np.bool_]:
+        """Whether each of M lies inside."""
+        p, q = displacements
         angle = 2.0 * np.arccos(np.minimum(np.abs(q[:, 3]), 1.0))
         near: NDArray[np.bool_] = np.max(np.abs(p), axis=1) <= self.position_m
         return near & (angle <= self.rotation + 1e-9)
@@ -117,16 +105,13 @@ def bhattacharyya(
         raise ValueError("a coefficient needs at least 4 points")
     half = points // 2
     # Draws from each, so the mixture is stratified: exactly half of the points from either.
-    drawn = [density.sample(half, rng) for density in (first, second)]
-    p = np.concatenate([part[0] for part in drawn])
-    q = np.concatenate([part[1] for part in drawn])
-    inside = np.ones(2 * half, dtype=bool) if window is None else window.holds(p, q)
+    drawn = Poses.concatenate([density.sample(half, rng) for density in (first, second)])
+    inside = np.ones(2 * half, dtype=bool) if window is None else window.holds(drawn)
     if not inside[:half].any() or not inside[half:].any():
         raise ValueError("a density has no draw inside the window")
     value = np.zeros(2 * half)
-    difference = first.log_density(p[inside], q[inside], threads=threads) - second.log_density(
-        p[inside], q[inside], threads=threads
-    )
+    within = drawn[inside]
+    difference = first.log_density(within, threads=threads) - second.log_density(within, threads=threads)
     # 2 sqrt(d1 d2) / (d1 + d2) = 1 / cosh((log d1 - log d2) / 2), without overflow.
     decay = np.exp(-0.5 * np.abs(difference))
     value[inside] = 2.0 * decay / (1.0 + decay * decay)
@@ -141,16 +126,18 @@ def bhattacharyya(
     return Coefficient(min(coefficient, 1.0), math.sqrt(variance))
 
 
-def mirrored_displacements(translations: Floats, quaternions_xyzw: Floats) -> tuple[Floats, Floats]:
+def mirrored_displacements(displacements: Poses) -> Poses:
     """Displacements of the same grasps with the jaw mirrored: ``M^-1 xi M``, so x and y change sign in both
     parts.
     """
-    return translations * np.array([-1.0, -1.0, 1.0]), quaternions_xyzw * np.array([-1.0, -1.0, 1.0, 1.0])
+    return Poses(
+        displacements.positions * np.array([-1.0, -1.0, 1.0]),
+        displacements.quaternions_xyzw * np.array([-1.0, -1.0, 1.0, 1.0]),
+    )
 
 
 def sampled_kernel_rows(
-    translations: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    displacements: Poses,
     components: IsotropicKernel,
     *,
     window: DisplacementWindow | None = None,
@@ -163,19 +150,15 @@ def sampled_kernel_rows(
     ValueError
         Where no displacement lies inside the window.
     """
-    t, q = se3.as_poses(translations, quaternions_xyzw)
-    if window is not None:
-        kept = window.holds(t, q)
-        t, q = t[kept], q[kept]
-    if not len(t):
+    held = displacements if window is None else displacements[window.holds(displacements)]
+    if not len(held):
         raise ValueError("no displacement lies inside the window")
-    other_t, other_q = mirrored_displacements(t, q)
-    return KernelRows(np.concatenate([t, other_t]), np.concatenate([q, other_q]), components, symmetric=False)
+    both = Poses.concatenate([held, mirrored_displacements(held)])
+    return KernelRows(both, components, symmetric=False)
 
 
 def sampled_kernel_curve(
-    translations: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    displacements: Poses,
     *,
     components: IsotropicKernel,
     window: DisplacementWindow,
@@ -189,8 +172,8 @@ def sampled_kernel_curve(
 
     Parameters
     ----------
-    translations, quaternions_xyzw : (N, 3) metres, (N, 4)
-        Displacements between successful grasps, in the frame of the first.
+    displacements : (N)
+        Between successful grasps, in the frame of the first.
     components
         Width of every sample's component; like the window, the answer depends on it.
     counts
@@ -203,15 +186,14 @@ def sampled_kernel_curve(
     ValueError
         Where the window holds fewer than 100 displacements.
     """
-    t, q = se3.as_poses(translations, quaternions_xyzw)
-    kept = np.flatnonzero(window.holds(t, q))
+    kept = np.flatnonzero(window.holds(displacements))
     if len(kept) < 100:
         raise ValueError(
             f"the window holds {len(kept)} displacements between successes; at least 100 are needed"
         )
     kept = rng.permutation(kept)
     full = kept[:reference]
-    whole = sampled_kernel_rows(t[full], q[full], components)
+    whole = sampled_kernel_rows(displacements[full], components)
     # Samples are drawn anew from all displacements, as a kernel would be; overlap with the reference is part
     # of comparing a sample with what it was drawn from.
     result = []
@@ -219,7 +201,7 @@ def sampled_kernel_curve(
         if not 1 <= count <= len(full):
             continue
         chosen = rng.choice(full, size=count, replace=False)
-        one = sampled_kernel_rows(t[chosen], q[chosen], components)
+        one = sampled_kernel_rows(displacements[chosen], components)
         found = bhattacharyya(one, whole, rng, points=points, window=window, threads=threads)
         result.append(SampledKernelPoint(count, found.value, found.standard_error))
     return result

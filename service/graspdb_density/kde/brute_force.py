@@ -11,22 +11,20 @@ from scipy.special import logsumexp
 
 from .. import se3
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 
 __all__ = ["gradient", "kernel_log_density", "log_density"]
 
 
 def kernel_log_density(
     kernel: IsotropicKernel,
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
-    centre: ArrayLike,
-    centre_quaternion: ArrayLike,
+    poses: Poses,
+    centres: Poses,
 ) -> Floats:
     """Log of one kernel (eq 2-4) without the jaw's symmetry, arrays broadcast; nats of 1/(m^3 rad^3)."""
-    offset = np.asarray(positions, dtype=np.float64) - np.asarray(centre, dtype=np.float64)
+    offset = np.asarray(poses.positions, dtype=np.float64) - np.asarray(centres.positions, dtype=np.float64)
     squared = np.sum(offset * offset, axis=-1) / kernel.sigma_position_m**2
-    dot = np.abs(np.sum(np.asarray(quaternions_xyzw) * np.asarray(centre_quaternion), axis=-1))
+    dot = np.abs(np.sum(np.asarray(poses.quaternions_xyzw) * np.asarray(centres.quaternions_xyzw), axis=-1))
     kappa = kernel.kappa
     rotation = kappa * (dot - 1.0) + np.log1p(np.exp(-2.0 * kappa * dot))
     return np.asarray(kernel.log_peak - 0.5 * squared + rotation, dtype=np.float64)
@@ -34,10 +32,8 @@ def kernel_log_density(
 
 def log_density(
     kernel: IsotropicKernel,
-    centres: ArrayLike,
-    centre_quaternions: ArrayLike,
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    rows: Poses,
+    poses: Poses,
     *,
     weights: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
@@ -47,8 +43,7 @@ def log_density(
 
     Parameters
     ----------
-    centres, centre_quaternions : (N, 3), (N, 4)
-    positions, quaternions_xyzw : (M, 3), (M, 4)
+    rows : (N), poses : (M)
     weights : (N,) or None
         Positive, normalised here to sum to 1; None means equal.
     symmetric : bool or (N,)
@@ -57,23 +52,22 @@ def log_density(
     -------
     (M,) nats of 1/(m^3 rad^3)
     """
-    centre, turn = np.asarray(centres, dtype=np.float64), np.asarray(centre_quaternions, dtype=np.float64)
-    p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions_xyzw, dtype=np.float64)
-    weight = np.ones(len(centre)) if weights is None else np.asarray(weights, dtype=np.float64)
+    p, q = poses
+    weight = np.ones(len(rows)) if weights is None else np.asarray(weights, dtype=np.float64)
     weight = weight / weight.sum()
-    twin = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(centre),))
-    turned = se3.jaw_twin(turn)
+    twin = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(rows),))
+    turned = rows.turned()
     with np.errstate(divide="ignore"):
         first = np.log(np.where(twin, 0.5 * weight, weight))
         second = np.log(np.where(twin, 0.5 * weight, 0.0))
     result = np.empty(len(p))
     for start in range(0, len(p), chunk):
         part = slice(start, start + chunk)
-        at, to = p[part, None, :], q[part, None, :]
+        at = Poses(p[part, None, :], q[part, None, :])
         terms = np.concatenate(
             [
-                kernel_log_density(kernel, at, to, centre, turn) + first,
-                kernel_log_density(kernel, at, to, centre, turned) + second,
+                kernel_log_density(kernel, at, rows) + first,
+                kernel_log_density(kernel, at, turned) + second,
             ],
             axis=1,
         )
@@ -83,10 +77,8 @@ def log_density(
 
 def gradient(
     kernel: IsotropicKernel,
-    centres: ArrayLike,
-    centre_quaternions: ArrayLike,
-    position: ArrayLike,
-    quaternion_xyzw: ArrayLike,
+    rows: Poses,
+    pose: Poses,
     *,
     weights: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
@@ -98,10 +90,10 @@ def gradient(
     position_gradient : (3,) 1/m
     quaternion_gradient : (4,) tangent to the unit sphere at the pose's quaternion, per unit of quaternion arc
     """
-    centre, turn = np.asarray(centres, dtype=np.float64), np.asarray(centre_quaternions, dtype=np.float64)
-    p, q = np.asarray(position, dtype=np.float64), np.asarray(quaternion_xyzw, dtype=np.float64)
-    weight = np.ones(len(centre)) if weights is None else np.asarray(weights, dtype=np.float64)
-    twin = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(centre),))
+    centre, turn = rows
+    p, q = pose
+    weight = np.ones(len(rows)) if weights is None else np.asarray(weights, dtype=np.float64)
+    twin = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(rows),))
     mu = np.concatenate([turn, se3.jaw_twin(turn[twin])])
     at = np.concatenate([centre, centre[twin]])
     w = np.concatenate([np.where(twin, 0.5, 1.0) * weight, 0.5 * weight[twin]])

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._compiled import isotropic as c
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 
 __all__ = ["Cells"]
 
@@ -70,8 +70,7 @@ class Cells:
     @classmethod
     def build(
         cls,
-        positions: Floats,
-        quaternions: Floats,
+        poses: Poses,
         weights: Floats,
         symmetric: NDArray[np.bool_],
         sigma_position_m: float,
@@ -79,11 +78,11 @@ class Cells:
         """Sort all rows; ``weights`` are raw (of about 1), a symmetric row's is shared by its two twins."""
         scale = 1.0 / (sigma_position_m * math.sqrt(2.0))
         # The median keeps the bulk near the origin, where float32 is finest, whatever the outliers.
-        centre = np.median(positions, axis=0)
-        rows = np.arange(len(positions), dtype=np.int32)
+        centre = np.median(poses.positions, axis=0)
+        rows = np.arange(len(poses), dtype=np.int32)
         segments = tuple(
             _sort(
-                _soa(positions, quaternions, weights, chosen, flag, centre, scale),
+                _soa(poses, weights, chosen, flag, centre, scale),
                 rows[chosen],
                 flag,
                 centre * scale,
@@ -95,21 +94,20 @@ class Cells:
 
     def extend(
         self,
-        positions: Floats,
-        quaternions: Floats,
+        poses: Poses,
         weights: Floats,
         symmetric: NDArray[np.bool_],
     ) -> Cells:
         """Add rows behind the present ones; shares nothing mutable with the old cells."""
         first = self.data.shape[1]
-        rows = np.arange(first, first + len(positions), dtype=np.int32)
+        rows = np.arange(first, first + len(poses), dtype=np.int32)
         segments: list[_Segment] = []
         for flag, chosen in ((True, symmetric), (False, ~symmetric)):
             present = [s for s in self.segments if s.twin == flag]
             if not chosen.any():
                 segments += present
                 continue
-            data = _soa(positions, quaternions, weights, chosen, flag, self.centre, self.scale)
+            data = _soa(poses, weights, chosen, flag, self.centre, self.scale)
             tail = present[1:]
             joined = sum(s.size for s in tail) + data.shape[1]
             if present and joined > max(_TAIL_LEAST, _TAIL_SHARE * present[0].size):
@@ -197,8 +195,7 @@ class Cells:
 
 
 def _soa(
-    positions: Floats,
-    quaternions: Floats,
+    poses: Poses,
     weights: Floats,
     chosen: NDArray[np.bool_],
     twin: bool,
@@ -208,8 +205,8 @@ def _soa(
     """Scaled float32 columns (8, n) of the chosen rows."""
     return np.concatenate(
         [
-            ((positions[chosen] - centre) * scale).T,
-            quaternions[chosen].T,
+            ((poses.positions[chosen] - centre) * scale).T,
+            poses.quaternions_xyzw[chosen].T,
             (weights[chosen] * (0.5 if twin else 1.0))[None, :],
         ]
     ).astype(np.float32)

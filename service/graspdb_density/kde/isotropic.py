@@ -18,7 +18,7 @@ from .. import se3
 from .._compiled import isotropic, nearest
 from .._compiled.threads import for_blocks
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from . import brute_force
 from .cell_list import Cells
 
@@ -44,16 +44,14 @@ class GraspDensity:
     def __init__(
         self,
         kernel: IsotropicKernel,
-        positions: Floats,
-        quaternions: Floats,
+        poses: Poses,
         weights: Floats,
         symmetric: NDArray[np.bool_],
         cells: Cells,
         unit: float,
     ) -> None:
         self._kernel = kernel
-        self._positions = positions
-        self._quaternions = quaternions
+        self.poses = poses
         self._weights = weights
         self._symmetric = symmetric
         self._cells = cells
@@ -66,8 +64,7 @@ class GraspDensity:
     @classmethod
     def build(
         cls,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         kernel: IsotropicKernel,
         weights: ArrayLike | None = None,
@@ -77,8 +74,7 @@ class GraspDensity:
 
         Parameters
         ----------
-        positions : (N, 3) metres, N at least 1
-        quaternions_xyzw : (N, 4) unit within 1e-3
+        poses : (N), at least one
         kernel
             Widths.
         weights : (N,) or None
@@ -91,18 +87,16 @@ class GraspDensity:
         ValueError
             For wrong shapes, values that are not finite, weights that are not positive, or no row.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
-        if not len(p):
+        if not len(poses):
             raise ValueError("a density needs at least one grasp")
-        w, flags = row_values(weights, symmetric, len(p))
+        w, flags = row_values(weights, symmetric, len(poses))
         unit = float(w.mean())
-        cells = Cells.build(p, q, w / unit, flags, kernel.sigma_position_m)
-        return cls(kernel, p, q, w, flags, cells, unit)
+        cells = Cells.build(poses, w / unit, flags, kernel.sigma_position_m)
+        return cls(kernel, poses, w, flags, cells, unit)
 
     def extend(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         weights: ArrayLike | None = None,
         symmetric: ArrayLike | bool = True,
     ) -> GraspDensity:
@@ -111,15 +105,13 @@ class GraspDensity:
         Equal to building from all rows within 1e-5 of the density. The cost is that of the rows added and a
         copy.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
-        if not len(p):
+        if not len(poses):
             return self
-        w, flags = row_values(weights, symmetric, len(p), fill=self._total / self.size)
-        cells = self._cells.extend(p, q, w / self._unit, flags)
+        w, flags = row_values(weights, symmetric, len(poses), fill=self._total / self.size)
+        cells = self._cells.extend(poses, w / self._unit, flags)
         return GraspDensity(
             self._kernel,
-            np.concatenate([self._positions, p]),
-            np.concatenate([self._quaternions, q]),
+            Poses.concatenate([self.poses, poses]),
             np.concatenate([self._weights, w]),
             np.concatenate([self._symmetric, flags]),
             cells,
@@ -141,17 +133,17 @@ class GraspDensity:
     @property
     def size(self) -> int:
         """Rows; the twins of symmetric ones are not counted."""
-        return len(self._positions)
+        return len(self.poses)
 
     @property
     def positions(self) -> Floats:
         """(N, 3) metres, read-only use."""
-        return self._positions
+        return self.poses.positions
 
     @property
     def quaternions_xyzw(self) -> Floats:
         """(N, 4), read-only use."""
-        return self._quaternions
+        return self.poses.quaternions_xyzw
 
     @property
     def weights(self) -> Floats:
@@ -176,8 +168,8 @@ class GraspDensity:
     @property
     def nbytes(self) -> int:
         """Bytes of every array held."""
-        own = (self._positions, self._quaternions, self._weights, self._symmetric)
-        return sum(a.nbytes for a in own) + self._cells.nbytes
+        own = (*self.poses, self._weights, self._symmetric)
+        return int(sum(a.nbytes for a in own)) + self._cells.nbytes
 
     @property
     def cells(self) -> Cells:
@@ -200,8 +192,7 @@ class GraspDensity:
 
     def log_density(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         cutoff: float | None = CUTOFF,
         threads: int = 1,
@@ -210,7 +201,7 @@ class GraspDensity:
 
         Parameters
         ----------
-        positions, quaternions_xyzw : (M, 3), (M, 4)
+        poses : (M)
         cutoff
             Kernels nearer than this many standard deviations of position are summed; those beyond too
             wherever they might matter (`stages`). None: all.
@@ -227,7 +218,7 @@ class GraspDensity:
         cut-off are summed without one, as all are where there is none: there the error is 2e-5, or 1e-6 of
         what the log density lies below the kernel's peak if that is more, from rounding to float32.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = poses
         cells = self._cells
         steps = stages(self._kernel, cutoff)
         terms, least = brute_terms(self._kernel, self._total / self._unit)
@@ -261,18 +252,15 @@ class GraspDensity:
 
     def density(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         cutoff: float | None = CUTOFF,
         threads: int = 1,
     ) -> Floats:
         """Density at poses, 1/(m^3 rad^3); underflows to 0 only below 1e-300."""
-        return np.exp(self.log_density(positions, quaternions_xyzw, cutoff=cutoff, threads=threads))
+        return np.exp(self.log_density(poses, cutoff=cutoff, threads=threads))
 
-    def gradient(
-        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, cutoff: float = 6.0
-    ) -> tuple[Floats, Floats]:
+    def gradient(self, poses: Poses, *, cutoff: float = 6.0) -> tuple[Floats, Floats]:
         """Gradient of the log density.
 
         Returns
@@ -282,8 +270,8 @@ class GraspDensity:
             Tangent to the unit sphere at each quaternion. The rate along a rotation vector r in the tool
             frame (``q <- q exp(r)``) is its product with ``multiply(q, (r, 0)) / 2``.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
-        moments = self.moments(p, q, cutoff=cutoff)
+        q = poses.quaternions_xyzw
+        moments = self.moments(poses, cutoff=cutoff)
         total = moments[:, :1]
         kappa, scale = self._kernel.kappa, self._cells.scale
         near = total[:, 0] > math.exp(-0.5 * cutoff * cutoff)
@@ -293,63 +281,59 @@ class GraspDensity:
         around = pull - np.sum(pull * q, axis=1, keepdims=True) * q
         for i in np.flatnonzero(~near):
             along[i], around[i] = brute_force.gradient(
-                self._kernel, self._positions, self._quaternions, p[i], q[i],
+                self._kernel, self.poses, poses[int(i)],
                 weights=self._weights, symmetric=self._symmetric,
             )  # fmt: skip
         return along, around
 
-    def moments(self, positions: Floats, quaternions: Floats, *, cutoff: float) -> Floats:
-        """Kernel sums, displacements and pulls (M, 9) as `isotropic.moments` lays them out; poses already
-        checked.
-        """
+    def moments(self, poses: Poses, *, cutoff: float) -> Floats:
+        """Kernel sums, displacements and pulls (M, 9) as `isotropic.moments` lays them out."""
         cells = self._cells
-        out = np.empty((len(positions), 9))
+        out = np.empty((len(poses), 9))
         isotropic.moments(
-            cells.arrays, positions, quaternions, self._kernel.kappa, scaled_radius(cutoff), self.wide, out,
+            cells.arrays, *poses, self._kernel.kappa, scaled_radius(cutoff), self.wide, out,
         )  # fmt: skip
         return out
 
-    def kernel_sums(
-        self, positions: Floats, quaternions: Floats, *, cutoff: float, threads: int = 1
-    ) -> Floats:
-        """Kernel sums (M,) within a cut-off, 0 where nothing is in reach; poses already checked."""
+    def kernel_sums(self, poses: Poses, *, cutoff: float, threads: int = 1) -> Floats:
+        """Kernel sums (M,) within a cut-off, 0 where nothing is in reach."""
         cells = self._cells
-        out = np.empty(len(positions))
+        p, q = poses
+        out = np.empty(len(poses))
 
         def work(begin: int, end: int) -> None:
             isotropic.sums(
-                cells.arrays, positions[begin:end], quaternions[begin:end], self._kernel.kappa,
+                cells.arrays, p[begin:end], q[begin:end], self._kernel.kappa,
                 scaled_radius(cutoff), self.wide, out[begin:end],
             )  # fmt: skip
 
-        for_blocks(work, len(positions), block=16, threads=threads)
+        for_blocks(work, len(poses), block=16, threads=threads)
         return out
 
-    def nearest_rows(self, position: Floats, quaternion: Floats, count: int) -> NDArray[np.intp]:
-        """The ``count`` rows, or all if there are fewer, whose kernels are highest at a pose (3,), (4,) with
-        weights left out: the nearest in the kernel's own measure, nearest first.
+    def nearest_rows(self, pose: Poses, count: int) -> NDArray[np.intp]:
+        """The ``count`` rows, or all if there are fewer, whose kernels are highest at one pose with weights
+        left out: the nearest in the kernel's own measure, nearest first.
         """
         cells, kernel = self._cells, self._kernel
         count = min(count, self.size)
         best, places = np.empty(count), np.empty(count, dtype=np.int64)
         radius = scaled_radius(CUTOFF)
-        nearest.nearest_rows(cells.arrays, position, quaternion, kernel.kappa, radius, best, places)
+        nearest.nearest_rows(cells.arrays, *pose, kernel.kappa, radius, best, places)
         # Nothing outside the ball has an exponent above that of its surface.
         if best[-1] > -radius * radius:
             return np.asarray(cells.rows[places], dtype=np.intp)
+        position, quaternion = pose
         twin = se3.jaw_twin(quaternion)
-        cosine = np.abs(np.einsum("ij,j->i", self._quaternions, quaternion))
-        turned = np.abs(np.einsum("ij,j->i", self._quaternions, twin))
+        cosine = np.abs(np.einsum("ij,j->i", self.poses.quaternions_xyzw, quaternion))
+        turned = np.abs(np.einsum("ij,j->i", self.poses.quaternions_xyzw, twin))
         cosine = np.where(self._symmetric, np.maximum(cosine, turned), cosine)
-        squared = np.sum((self._positions - position) ** 2, axis=1) / kernel.sigma_position_m**2
+        squared = np.sum((self.poses.positions - position) ** 2, axis=1) / kernel.sigma_position_m**2
         value = kernel.kappa * cosine - 0.5 * squared
         highest = np.argpartition(-value, count - 1)[:count]
         return np.asarray(highest[np.argsort(-value[highest], kind="stable")])
 
-    def nearest_each(
-        self, positions: Floats, quaternions: Floats, *, within: float
-    ) -> tuple[NDArray[np.intp], Floats]:
-        """The row nearest to every pose (M, 3), (M, 4), in the kernel's own measure.
+    def nearest_each(self, poses: Poses, *, within: float) -> tuple[NDArray[np.intp], Floats]:
+        """The row nearest to every one of M poses, in the kernel's own measure.
 
         Returns
         -------
@@ -360,9 +344,9 @@ class GraspDensity:
             inf where there is no row.
         """
         cells = self._cells
-        best, places = np.empty(len(positions)), np.empty(len(positions), dtype=np.int64)
+        best, places = np.empty(len(poses)), np.empty(len(poses), dtype=np.int64)
         radius = within / math.sqrt(2.0)
-        nearest.nearest_each(cells.arrays, positions, quaternions, self._kernel.kappa, radius, best, places)
+        nearest.nearest_each(cells.arrays, *poses, self._kernel.kappa, radius, best, places)
         found = places >= 0
         rows = np.where(found, cells.rows[places], -1).astype(np.intp)
         return rows, np.where(found, np.sqrt(np.maximum(-2.0 * best, 0.0)), np.inf)
@@ -370,23 +354,15 @@ class GraspDensity:
     # -- sampling
     # ---------------------------------------------------------------------------------------------------
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Draw grasps, both twins of symmetric rows alike.
-
-        Returns
-        -------
-        positions : (count, 3) metres
-        quaternions_xyzw : (count, 4)
-        """
+    def sample(self, count: int, rng: np.random.Generator) -> Poses:
+        """Draw grasps, both twins of symmetric rows alike."""
         if count < 0:
             raise ValueError(f"cannot draw {count} samples")
         edges = np.cumsum(self._weights)
         row = np.minimum(np.searchsorted(edges, rng.random(count) * edges[-1], side="right"), self.size - 1)
-        centre = self._quaternions[row]
-        turned = self._symmetric[row] & (rng.random(count) < 0.5)
-        centre = np.where(turned[:, None], se3.jaw_twin(centre), centre)
+        centres = self.poses[row].turned(self._symmetric[row] & (rng.random(count) < 0.5))
         translations, turns = self._kernel.sample_displacements(count, rng)
-        return self._positions[row] + translations, se3.multiply(centre, turns)
+        return Poses(centres.positions + translations, se3.multiply(centres.quaternions_xyzw, turns))
 
 
 def brute_terms(kernel: IsotropicKernel, total: float) -> tuple[int, float]:

@@ -19,7 +19,7 @@ from .._compiled.threads import for_blocks
 from .._compiled.weighted import mixture_log_sum
 from ..kernels.gaussian_mixture import AnisotropicKernel
 from ..kernels.isotropic import HAAR_VOLUME
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from .cell_list import Cells
 from .isotropic import GraspDensity, row_values
 from .weighted_sums import KernelRows
@@ -38,7 +38,7 @@ class MixtureDensity:
 
     Parameters
     ----------
-    positions, quaternions_xyzw : (N, 3), (N, 4), N at least 1
+    poses : (N), at least one
     kernel
     weights : (N,) positive, normalised here; None: equal
     symmetric : bool or (N,)
@@ -54,8 +54,7 @@ class MixtureDensity:
 
     def __init__(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         kernel: AnisotropicKernel,
         weights: ArrayLike | None = None,
@@ -65,9 +64,7 @@ class MixtureDensity:
         if (frames is None) != (kernel.frame == "gripper"):
             need = "takes no frames" if kernel.frame == "gripper" else "needs frames"
             raise ValueError(f"a kernel in the {kernel.frame} frame {need}")
-        rows = KernelRows(
-            positions, quaternions_xyzw, kernel, weights=weights, symmetric=symmetric, frames=frames
-        )
+        rows = KernelRows(poses, kernel, weights=weights, symmetric=symmetric, frames=frames)
         # Weights are kept in the unit of those given, so that further rows can be added in it.
         self._total = float(rows.size) if weights is None else float(np.sum(weights))
         self._unit = self._total / rows.size
@@ -76,7 +73,7 @@ class MixtureDensity:
         self._offset = float(np.linalg.norm(kernel.means[:, :3], axis=1).max())
         self._spread = spread
         raw = rows.weights * rows.size
-        self._hold(rows, Cells.build(rows.positions, rows.quaternions_xyzw, raw, rows.symmetric, spread))
+        self._hold(rows, Cells.build(rows.poses, raw, rows.symmetric, spread))
         self._log_unit = rows.log_unit
         self._mixture = rows.mixture._replace(wraps=True)
         turn = max(float(np.linalg.eigvalsh(s[3:, 3:])[-1]) for s in kernel.covariances) ** 0.5
@@ -95,8 +92,7 @@ class MixtureDensity:
 
     def extend(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         weights: ArrayLike | None = None,
         symmetric: ArrayLike | bool = True,
         frames: ArrayLike | None = None,
@@ -105,15 +101,13 @@ class MixtureDensity:
 
         Equal to building from all rows within 1e-5 of the density; what is sorted stays sorted.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
-        if not len(p):
+        if not len(poses):
             return self
-        w, flags = row_values(weights, symmetric, len(p), fill=self._unit_mean)
-        more = KernelRows(p, q, self._kernel, weights=w, symmetric=flags, frames=frames)
+        w, flags = row_values(weights, symmetric, len(poses), fill=self._unit_mean)
+        more = KernelRows(poses, self._kernel, weights=w, symmetric=flags, frames=frames)
         old = self._rows
         rows = KernelRows(
-            np.concatenate([old.positions, p]),
-            np.concatenate([old.quaternions_xyzw, q]),
+            Poses.concatenate([old.poses, poses]),
             self._kernel,
             weights=np.concatenate([old.weights * self._total, w]),
             symmetric=np.concatenate([old.symmetric, flags]),
@@ -122,9 +116,9 @@ class MixtureDensity:
         grown = copy.copy(self)
         grown.__dict__.pop("isotropic", None)
         grown._total = self._total + float(w.sum())
-        grown._hold(rows, self._cells.extend(p, q, w / self._unit, flags))
+        grown._hold(rows, self._cells.extend(poses, w / self._unit, flags))
         if "isotropic" in self.__dict__:
-            grown.__dict__["isotropic"] = self.isotropic.extend(p, q, weights=w, symmetric=flags)
+            grown.__dict__["isotropic"] = self.isotropic.extend(poses, weights=w, symmetric=flags)
         return grown
 
     @property
@@ -155,22 +149,21 @@ class MixtureDensity:
     def isotropic(self) -> GraspDensity:
         """The density under the isotropic kernel of equal determinants: where searches start."""
         return GraspDensity.build(
-            self._rows.positions,
-            self._rows.quaternions_xyzw,
+            self._rows.poses,
             kernel=self._kernel.isotropic,
             weights=self._rows.weights * self._total,
             symmetric=self._rows.symmetric,
         )
 
-    def log_density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
+    def log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row.
 
         Within 1e-3 of the float64 sum near data where rotation widths are at most `NARROW`; wider kernels sum
         both twins and both wraps of every rotation.
         """
         if not self._narrow:
-            return self._rows.log_density(positions, quaternions_xyzw, threads=threads)
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+            return self._rows.log_density(poses, threads=threads)
+        p, q = poses
         cells = self._cells
         order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
         p, q = p[order], q[order]
@@ -202,38 +195,38 @@ class MixtureDensity:
             rows.append((radius, max(0.5 * reach * reach - 5.8, 2.2), least))
         return np.array(rows)
 
-    def density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
+    def density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Density at poses, 1/(m^3 rad^3)."""
-        return np.exp(self.log_density(positions, quaternions_xyzw, threads=threads))
+        return np.exp(self.log_density(poses, threads=threads))
 
-    def gradient(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> tuple[Floats, Floats]:
+    def gradient(self, poses: Poses) -> tuple[Floats, Floats]:
         """Gradient of the log density by position (M, 3), 1/m, and by a rotation vector in the tool (M, 3).
 
         Central differences of a thousandth of the kernel's widths in the exact float64 sum: meant for checks
         and for few poses.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = poses
         steps = 1e-3 * np.sqrt(np.diag(self._kernel.overall_covariance))
         out = np.empty((2, len(p), 3))
         for axis in range(3):
             for kind in (0, 1):
                 move, turn = np.zeros(3), np.zeros(3)
                 (move if kind == 0 else turn)[axis] = steps[3 * kind + axis]
-                ahead = self.reference(p + move, se3.multiply(q, se3.from_rotation_vector(turn)))
-                behind = self.reference(p - move, se3.multiply(q, se3.from_rotation_vector(-turn)))
+                ahead = self.reference(Poses(p + move, se3.multiply(q, se3.from_rotation_vector(turn))))
+                behind = self.reference(Poses(p - move, se3.multiply(q, se3.from_rotation_vector(-turn))))
                 out[kind, :, axis] = (ahead - behind) / (2.0 * steps[3 * kind + axis])
         return out[0], out[1]
 
-    def reference(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> Floats:
+    def reference(self, poses: Poses) -> Floats:
         """Log density at poses (M,) in float64 over all rows, twins and wraps; M times N evaluations."""
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = poses
         values = [
             mixture_log_sum(self._rows.exact, self._mixture, at, to) for at, to in zip(p, q, strict=True)
         ]
         return self._log_unit + np.array(values)
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Draw grasps: positions (count, 3) and quaternions (count, 4)."""
+    def sample(self, count: int, rng: np.random.Generator) -> Poses:
+        """Draw grasps."""
         return self._rows.sample(count, rng)
 
     @property

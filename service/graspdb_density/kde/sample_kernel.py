@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from .. import se3
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from .isotropic import GraspDensity, row_values
 
 __all__ = ["MOST_COMPONENTS", "SampledKernel"]
@@ -50,7 +50,7 @@ class SampledKernel:
     weights: Floats | None = None
 
     def __post_init__(self) -> None:
-        t, q = se3.as_poses(self.translations, self.quaternions_xyzw)
+        t, q = Poses.of(self.translations, self.quaternions_xyzw)
         if not len(t):
             raise ValueError("a sampled kernel needs at least one component")
         w, _ = row_values(self.weights, True, len(t))
@@ -69,27 +69,25 @@ class SampledKernel:
         assert self.weights is not None
         return self.weights
 
-    def log_kernel(self, translations: ArrayLike, quaternions_xyzw: ArrayLike) -> Floats:
-        """Log density at displacements (M, 3), (M, 4): eq 5, nats of 1/(m^3 rad^3), integrating to 1."""
+    def log_kernel(self, displacements: Poses) -> Floats:
+        """Log density at displacements (M): eq 5, nats of 1/(m^3 rad^3), integrating to 1."""
         template = GraspDensity.build(
-            self.translations,
-            self.quaternions_xyzw,
+            Poses(self.translations, self.quaternions_xyzw),
             kernel=self.component,
             weights=self.weights,
             symmetric=False,
         )
-        return template.log_density(translations, quaternions_xyzw, cutoff=None)
+        return template.log_density(displacements, cutoff=None)
 
-    def sample_displacements(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Draw displacements: translations (count, 3) and turns (count, 4)."""
+    def sample_displacements(self, count: int, rng: np.random.Generator) -> Poses:
+        """Draw displacements."""
         which = rng.choice(self.size, size=count, p=self.shares)
         move, turn = self.component.sample_displacements(count, rng)
-        return self.translations[which] + move, se3.multiply(self.quaternions_xyzw[which], turn)
+        return Poses(self.translations[which] + move, se3.multiply(self.quaternions_xyzw[which], turn))
 
     def placed(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         weights: ArrayLike | None = None,
         symmetric: ArrayLike | bool = True,
@@ -103,27 +101,25 @@ class SampledKernel:
         ValueError
             As `GraspDensity.build`, and for more than `MOST_COMPONENTS` components.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
-        if not len(p):
+        if not len(poses):
             raise ValueError("a density needs at least one grasp")
-        w, flags = row_values(weights, symmetric, len(p))
-        many = self.size * (len(p) + int(flags.sum()))
+        w, flags = row_values(weights, symmetric, len(poses))
+        many = self.size * (len(poses) + int(flags.sum()))
         if many > MOST_COMPONENTS:
             raise ValueError(
-                f"{len(p)} grasps of {self.size} components each, those of symmetric jaws twice, are {many}: "
-                f"more than {MOST_COMPONENTS}; fit a mixture of a few, or take fewer grasps or components"
+                f"{len(poses)} grasps of {self.size} components each, those of symmetric jaws twice, are "
+                f"{many}: more than {MOST_COMPONENTS}; fit a mixture of a few, or take fewer grasps or "
+                "components"
             )
         # A symmetric row's template stands at the row and at its turn, half of the weight each.
-        at = np.concatenate([p, p[flags]])
-        to = np.concatenate([q, se3.jaw_twin(q[flags])])
+        at, to = Poses.concatenate([poses, poses[flags].turned()])
         share = np.concatenate([np.where(flags, 0.5, 1.0) * w, 0.5 * w[flags]])
         twin = np.concatenate([flags, flags[flags]])
         moved, turned = se3.compose(
-            at[:, None], to[:, None], self.translations[None], self.quaternions_xyzw[None]
+            Poses(at[:, None], to[:, None]), Poses(self.translations, self.quaternions_xyzw)
         )
         return GraspDensity.build(
-            moved.reshape(-1, 3),
-            se3.normalise(turned.reshape(-1, 4)),
+            Poses(moved.reshape(-1, 3), se3.normalise(turned.reshape(-1, 4))),
             kernel=self.component,
             weights=(share[:, None] * self.shares[None]).reshape(-1),
             symmetric=np.repeat(twin, self.size),

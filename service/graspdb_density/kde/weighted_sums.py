@@ -25,7 +25,7 @@ from .. import se3
 from .._compiled import weighted
 from .._compiled.threads import for_blocks
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from .cell_list import Cells
 from .isotropic import GraspDensity
 
@@ -102,8 +102,7 @@ class KernelRows:
 
     Parameters
     ----------
-    positions : (N, 3) metres, N at least 1
-    quaternions_xyzw : (N, 4)
+    poses : (N), at least one
     kernel
         Isotropic, or a mixture over the displacement in each row's frame. A mixture must not change when the
         jaw is mirrored: under ``A = diag(-1, -1, 1, -1, -1, 1)`` in the gripper's frame, under
@@ -123,22 +122,20 @@ class KernelRows:
 
     def __init__(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         kernel: Kernel,
         *,
         weights: ArrayLike | None = None,
         symmetric: ArrayLike | bool = True,
         frames: ArrayLike | None = None,
     ) -> None:
-        p, q = se3.as_poses(positions, quaternions_xyzw)
-        if not len(p):
+        if not len(poses):
             raise ValueError("statistics of a density need at least one grasp")
         self.kernel = kernel
-        self.positions, self.quaternions_xyzw = p, q
-        self.weights = _normalised(weights, len(p))
+        self.poses = poses
+        self.weights = _normalised(weights, len(poses))
         self.symmetric: NDArray[np.bool_] = np.array(
-            np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p))
+            np.broadcast_to(np.asarray(symmetric, dtype=bool), len(poses))
         )
         self._own_frames = frames is None
         self._frames: Floats | None = None
@@ -150,17 +147,17 @@ class KernelRows:
             self.log_unit = kernel.log_peak
         else:
             self._sigma = self._take_mixture(kernel)
-            self._frames = None if frames is None else _frames(frames, len(p))
+            self._frames = None if frames is None else _frames(frames, len(poses))
 
     @cached_property
     def frames(self) -> Floats:
         """(N, 3, 3) axes that translations are measured along."""
-        return se3.to_matrix(self.quaternions_xyzw) if self._frames is None else self._frames
+        return se3.to_matrix(self.poses.quaternions_xyzw) if self._frames is None else self._frames
 
     @cached_property
     def _cells(self) -> Cells:
         ones = np.ones(self.size)
-        return Cells.build(self.positions, self.quaternions_xyzw, ones, self.symmetric, self._sigma)
+        return Cells.build(self.poses, ones, self.symmetric, self._sigma)
 
     @cached_property
     def _sorted_frames(self) -> NDArray[np.float32]:
@@ -170,8 +167,8 @@ class KernelRows:
     def exact(self) -> weighted.MixtureRows:
         """The rows in float64, as the sum without a cut-off takes them."""
         return weighted.MixtureRows(
-            self.positions,
-            self.quaternions_xyzw,
+            self.poses.positions,
+            self.poses.quaternions_xyzw,
             np.ascontiguousarray(self.frames.reshape(-1, 9)),
             self.symmetric,
             np.log(self.weights * np.where(self.symmetric, 0.5, 1.0)),
@@ -181,9 +178,9 @@ class KernelRows:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held, those made on demand included."""
-        held = [self.positions, self.quaternions_xyzw, self.weights, self.symmetric]
+        held = [*self.poses, self.weights, self.symmetric]
         held += [self.__dict__[name] for name in ("frames", "_sorted_frames") if name in self.__dict__]
-        return sum(a.nbytes for a in held) + (self._cells.nbytes if "_cells" in self.__dict__ else 0)
+        return int(sum(a.nbytes for a in held)) + (self._cells.nbytes if "_cells" in self.__dict__ else 0)
 
     def _take_mixture(self, kernel: MixtureKernel) -> float:
         w = np.asarray(kernel.weights, dtype=np.float64)
@@ -221,14 +218,13 @@ class KernelRows:
     @property
     def size(self) -> int:
         """Rows; twins are not counted."""
-        return len(self.positions)
+        return len(self.poses)
 
     def subset(self, rows: NDArray[np.int64]) -> KernelRows:
         """The rows given, weights renormalised."""
         frames = None if self._frames is None or self._own_frames else self._frames[rows]
         return KernelRows(
-            self.positions[rows],
-            self.quaternions_xyzw[rows],
+            self.poses[rows],
             self.kernel,
             weights=self.weights[rows],
             symmetric=self.symmetric[rows],
@@ -239,8 +235,7 @@ class KernelRows:
 
     def sums(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         weightings: NDArray[np.floating],
         *,
         least: float = LEAST,
@@ -251,7 +246,7 @@ class KernelRows:
 
         Parameters
         ----------
-        positions, quaternions_xyzw : (M, 3), (M, 4)
+        poses : (M)
         weightings : (N, B)
             V, one column a weighting of the rows.
         least : float
@@ -264,7 +259,7 @@ class KernelRows:
         (M, B) float32
             In units of ``exp(log_unit)`` 1/(m^3 rad^3).
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = poses
         if weightings.ndim != 2 or len(weightings) != self.size:
             raise ValueError(f"weightings have shape ({self.size}, B), not {weightings.shape}")
         cells = self._cells
@@ -302,38 +297,34 @@ class KernelRows:
         result[order] = out[:, : weightings.shape[1]]
         return result
 
-    def log_density(self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1) -> Floats:
+    def log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row."""
-        p, q = se3.as_poses(positions, quaternions_xyzw)
         if isinstance(self.kernel, IsotropicKernel):
-            return self._isotropic(self.kernel).log_density(p, q, cutoff=CUTOFF, threads=threads)
+            return self._isotropic(self.kernel).log_density(poses, cutoff=CUTOFF, threads=threads)
         raw = (self.weights / self.weights.mean()).astype(np.float32)[:, None]
-        sums = self.sums(p, q, raw, least=0.0, threads=threads)[:, 0].astype(np.float64)
+        sums = self.sums(poses, raw, least=0.0, threads=threads)[:, 0].astype(np.float64)
         # Where little is left, what lies beyond the cut-off may count as much: those poses are taken again.
         near = sums > TRUSTED_SUM * float(raw.min())
-        out = np.empty(len(p))
+        out = np.empty(len(poses))
         out[near] = np.log(sums[near]) - math.log(self.size) + self.log_unit
         if not near.all():
-            out[~near] = self.exact_log_density(p[~near], q[~near], threads=threads)
+            out[~near] = self.exact_log_density(poses[~near], threads=threads)
         return out
 
     def _isotropic(self, kernel: IsotropicKernel) -> GraspDensity:
         """The same rows as a density."""
         return GraspDensity.build(
-            self.positions,
-            self.quaternions_xyzw,
+            self.poses,
             kernel=kernel,
             weights=self.weights,
             symmetric=self.symmetric,
         )
 
-    def exact_log_density(
-        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, *, threads: int = 1
-    ) -> Floats:
+    def exact_log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """As `log_density`, over all rows at every pose: for the few that are far from all of them."""
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = poses
         if isinstance(self.kernel, IsotropicKernel):
-            return self._isotropic(self.kernel).log_density(p, q, cutoff=None, threads=threads)
+            return self._isotropic(self.kernel).log_density(poses, cutoff=None, threads=threads)
         values = [
             weighted.mixture_log_sum(self.exact, self.mixture, at, to) for at, to in zip(p, q, strict=True)
         ]
@@ -341,16 +332,11 @@ class KernelRows:
 
     # -- sampling
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    def sample(self, count: int, rng: np.random.Generator) -> Poses:
         """Draw grasps, systematic over rows and with a random mirror.
 
         One uniform offset places all draws on the cumulated weights, so that every row is drawn its expected
         number of times, rounded up or down: averages over the draws vary less than with independent ones.
-
-        Returns
-        -------
-        positions : (count, 3) metres
-        quaternions_xyzw : (count, 4)
         """
         if count < 0:
             raise ValueError(f"cannot draw {count} samples")
@@ -371,18 +357,17 @@ class KernelRows:
 
     def displaced(
         self, row: NDArray[np.intp], turned: NDArray[np.bool_], moves: Floats, turns: Floats
-    ) -> tuple[Floats, Floats]:
-        """Poses (n, 3), (n, 4) at displacements from rows (n,), or from their twins where they are ``turned``
+    ) -> Poses:
+        """Poses at displacements from rows (n,), or from their twins where they are ``turned``
         and have one.
         """
         turned = turned & self.symmetric[row]
-        centre = self.quaternions_xyzw[row]
-        centre = np.where(turned[:, None], se3.jaw_twin(centre), centre)
+        centre = self.poses[row].turned(turned)
         if not isinstance(self.kernel, IsotropicKernel):
             # The twin's own x and y axes point the other way.
             flip = np.where((turned & self._own_frames)[:, None], np.array([-1.0, -1.0, 1.0]), 1.0)
             moves = np.einsum("nij,nj->ni", self.frames[row], moves * flip)
-        return self.positions[row] + moves, se3.multiply(centre, turns)
+        return Poses(centre.positions + moves, se3.multiply(centre.quaternions_xyzw, turns))
 
     def _draw_vectors(self, count: int, rng: np.random.Generator) -> Floats:
         """Displacements (count, 6) of the mixture kernel by rejection on the rotations' volume element."""

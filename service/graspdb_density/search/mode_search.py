@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import threading
-from functools import partial
 
 import numpy as np
 
@@ -139,7 +138,7 @@ class ModeSearch:
             raise ValueError(f"count must be at least 1, not {count}")
         if not all(apart >= 0.0 for apart in separation):
             raise ValueError("separations must not be negative")
-        log_density: Score = partial(self.density.log_density, threads=threads)
+        log_density = _scored(self.density, threads)
         climbing = score is None and self.density.isotropic is self.density
         start = self if climbing else self._by_values
         common = (
@@ -235,9 +234,7 @@ class MeanShiftSearch(MultiStart):
 
     def scored(self, poses: Poses) -> ScoredPoses:
         """Poses with sums over all kernels."""
-        sums = self.density.kernel_sums(
-            poses.positions, poses.quaternions_xyzw, cutoff=REACH, threads=self.threads
-        )
+        sums = self.density.kernel_sums(poses, cutoff=REACH, threads=self.threads)
         return ScoredPoses(poses, sums)
 
     def thinned(self, poses: ScoredPoses, most: int, apart: float) -> ScoredPoses:
@@ -291,6 +288,10 @@ class MeanShiftSearch(MultiStart):
         for_blocks(work, count, block=8, threads=self.threads)
         ends, moved = self.best_tries(at, values[:, 0], p, q, values[:, 1:])
         return ends, np.where(moved, np.minimum(step, 1.0), 0.6 * step)
+
+
+def _scored(density: GraspDensity | MixtureDensity, threads: int) -> Score:
+    return lambda p, q: density.log_density(Poses(p, q), threads=threads)
 
 
 def _along(rows: Floats) -> ScoredPoses:

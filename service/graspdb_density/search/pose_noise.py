@@ -61,7 +61,7 @@ def expected(
         p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
         seen_p = pivot + se3.rotate(left_q[:, None], p[None] - pivot) + left_p[:, None]
         seen_q = se3.multiply(left_q[:, None], q[None])
-        at, to = se3.compose(seen_p, seen_q, right_p[:, None], right_q[:, None])
+        at, to = se3.compose(se3.Poses(seen_p, seen_q), se3.Poses(right_p[:, None], right_q[:, None]))
         values = value(at.reshape(-1, 3), se3.normalise(to.reshape(-1, 4)))
         return np.asarray(values.reshape(samples, len(p)).mean(axis=0), dtype=np.float64)
 

@@ -92,7 +92,7 @@ class Region:
 
     def contains(self, positions: ArrayLike, quaternions_xyzw: ArrayLike) -> NDArray[np.bool_]:
         """Which poses (M,) lie inside, within 2e-9 m and 1e-7 rad."""
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = se3.Poses.of(positions, quaternions_xyzw)
         inside = np.empty(len(p), dtype=bool)
         feasible_projection.contains_all(self.limits, p, q, TOLERANCE_M, TOLERANCE, inside)
         return inside
@@ -101,7 +101,7 @@ class Region:
         self, positions: ArrayLike, quaternions_xyzw: ArrayLike
     ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Nearest poses inside, position and rotation each by itself, and which (M,) got there."""
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = se3.Poses.of(positions, quaternions_xyzw)
         inside = np.empty(len(p), dtype=bool)
         feasible_projection.project_all(self.limits, p, q, inside)
         return p, q, inside

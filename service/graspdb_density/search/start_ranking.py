@@ -132,9 +132,7 @@ def _completed(density: GraspDensity, known: CentreSums, threads: int) -> Centre
     else:
         drawn, weights = _systematic_sample(density, new, rate)
         if len(drawn):
-            sample = sample.extend(
-                density.positions[drawn], density.quaternions_xyzw[drawn], weights, density.symmetric[drawn]
-            )
+            sample = sample.extend(density.poses[drawn], weights, density.symmetric[drawn])
         within = sample
     values = np.zeros(density.size)
     values[:first] = known.values
@@ -183,8 +181,7 @@ def _systematic_sample(density: GraspDensity, rows: Rows, rate: float) -> tuple[
 def _cells(density: GraspDensity, rows: Rows, weights: Floats) -> Cells:
     """Some rows' kernels, weighted anew."""
     return Cells.build(
-        density.positions[rows],
-        density.quaternions_xyzw[rows],
+        density.poses[rows],
         weights,
         density.symmetric[rows],
         density.kernel.sigma_position_m,

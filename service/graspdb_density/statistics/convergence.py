@@ -173,14 +173,14 @@ def bootstrap_similarity(
     """
     if rows.size < 2 or replicates < 2 or points < 2:
         raise ValueError("a bootstrap needs at least 2 grasps, 2 replicates and 2 points")
-    p, q = rows.sample(points, rng)
+    drawn = rows.sample(points, rng)
     weightings = np.empty((replicates + 1, rows.size), dtype=np.float32)
     weightings[0] = rows.weights * rows.size
     for b in range(1, replicates + 1):
         counts = np.bincount(rng.integers(rows.size, size=rows.size), minlength=rows.size)
         again = rows.weights * counts
         weightings[b] = again * (rows.size / again.sum())
-    sums = rows.sums(p, q, weightings.T, threads=threads, progress=progress)
+    sums = rows.sums(drawn, weightings.T, threads=threads, progress=progress)
     values = coefficients(sums[:, 0], sums[:, 1:], np.ones(replicates))
     return Similarity(float(values.mean()), float(values.std(ddof=1)), values)
 

@@ -223,7 +223,7 @@ class GrowingCurve:
         ValueError
             Where there are too few grasps (saying how many are needed) or an argument is out of range.
         """
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = se3.Poses.of(positions, quaternions_xyzw)
         count = len(p)
         sizes = curve_sizes(count)
         if subsets < 5:
@@ -231,7 +231,7 @@ class GrowingCurve:
         if replicates < 2 or points < 2:
             raise ValueError("a bootstrap needs at least 2 replicates and 2 points")
         plan = _Plan(subsets, replicates, points, seed)
-        rows = KernelRows(p, q, kernel, weights=weights, symmetric=symmetric, frames=frames)
+        rows = KernelRows(se3.Poses.of(p, q), kernel, weights=weights, symmetric=symmetric, frames=frames)
         prefix = curve_prefix(count)
         # In units of the first ones' mean, which stays.
         raw = rows.weights / rows.weights[:prefix].mean()
@@ -389,7 +389,7 @@ class _Work:
         plan, rows = self.plan, self.rows
         is_judged = np.zeros(prefix, dtype=bool)
         is_judged[judged] = True
-        test = rows.positions[judged], rows.quaternions_xyzw[judged]
+        test = rows.poses[judged]
         for index, size in enumerate(sizes):
             values, likelihoods = [], []
             for turn in range(plan.subsets):
@@ -407,7 +407,7 @@ class _Work:
                     ).replicates
                 )
                 training = rows.subset(chosen[~is_judged[chosen]])
-                likelihoods.append(training.log_density(*test, threads=self.threads))
+                likelihoods.append(training.log_density(test, threads=self.threads))
                 self.steps.finish(amount)
             yield _curve_point(size, np.array(values), np.mean(likelihoods, axis=0), self.raw[judged])
 
@@ -417,11 +417,11 @@ class _Work:
         training = np.ones(rows.size, dtype=bool)
         training[held.rows] = False
         fresh = first + np.flatnonzero(training[first:])
-        at = rows.positions[held.rows], rows.quaternions_xyzw[held.rows]
+        at = rows.poses[held.rows]
         sums = held.sums.copy()
         if len(fresh):
             added = rows.subset(fresh).sums(
-                *at, raw[fresh, None], least=0.0, threads=self.threads,
+                at, raw[fresh, None], least=0.0, threads=self.threads,
                 progress=self.steps.part(len(fresh) * _HELD_OUT_MOST),
             )  # fmt: skip
             sums += added[:, 0]
@@ -433,9 +433,9 @@ class _Work:
             which = np.flatnonzero(far & (np.isfinite(log_sums) == known))
             new = fresh if known else np.flatnonzero(training)
             if len(which) and len(new):
-                found = rows.subset(new).exact_log_density(
-                    at[0][which], at[1][which], threads=self.threads
-                ) + math.log(float(raw[new].sum()))
+                found = rows.subset(new).exact_log_density(at[which], threads=self.threads) + math.log(
+                    float(raw[new].sum())
+                )
                 log_sums[which] = np.logaddexp(log_sums[which], found) if known else found
         total = math.log(float(raw[training].sum()))
         with np.errstate(divide="ignore"):
@@ -454,7 +454,7 @@ class _Work:
         if present:
             amount = present * len(fresh)
             sums = sums + rows.subset(fresh).sums(
-                group.positions, group.quaternions, weightings,
+                se3.Poses(group.positions, group.quaternions), weightings,
                 threads=self.threads, progress=self.steps.part(amount),
             )  # fmt: skip
             self.steps.finish(amount)
@@ -470,7 +470,7 @@ class _Work:
         if first:
             weightings, _ = self._weightings(number, 0)
         amount = len(row) * rows.size
-        added = rows.sums(p, q, weightings, threads=self.threads, progress=self.steps.part(amount))
+        added = rows.sums(se3.Poses(p, q), weightings, threads=self.threads, progress=self.steps.part(amount))
         self.steps.finish(amount)
         return _Group(
             np.concatenate([group.positions, p]),

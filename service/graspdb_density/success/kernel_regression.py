@@ -113,7 +113,7 @@ class SuccessModel:
             p, widest = self.kernel.along(p), max(self.kernel.sigmas[:3])
         parts: list[Cells | None] = []
         for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
-            columns = p[chosen], q[chosen], np.ones(int(chosen.sum())), flags[chosen]
+            columns = se3.Poses(p[chosen], q[chosen]), np.ones(int(chosen.sum())), flags[chosen]
             if not len(columns[0]):
                 parts.append(present)
             elif present is None:
@@ -195,7 +195,7 @@ class SuccessModel:
         """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
         if not self.size:
             raise ValueError("a success probability needs at least one attempt")
-        p, q = se3.as_poses(positions, quaternions_xyzw)
+        p, q = se3.Poses.of(positions, quaternions_xyzw)
         won = self._sums(self._succeeded, p, q, cutoff, threads)
         lost = self._sums(self._failed, p, q, cutoff, threads)
         prior = self.prior_share
@@ -276,7 +276,7 @@ def checked_attempts(
     positions: ArrayLike, quaternions_xyzw: ArrayLike, success: ArrayLike, symmetric: ArrayLike | bool
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Attempts as arrays of one length, or a `ValueError` that says what is wrong."""
-    p, q = se3.as_poses(positions, quaternions_xyzw)
+    p, q = se3.Poses.of(positions, quaternions_xyzw)
     won = np.asarray(success)
     if won.shape != (len(p),) or won.dtype != np.bool_:
         raise ValueError(f"success must be bools of shape ({len(p)},), not {won.dtype} of shape {won.shape}")

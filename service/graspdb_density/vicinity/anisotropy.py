@@ -117,7 +117,7 @@ def empirical(
     ValueError
         For fewer than `LEAST_SUCCESSES` successes, no failure, no pair within reach, or wrong arguments.
     """
-    p, q = se3.as_poses(positions, quaternions_xyzw)
+    p, q = se3.Poses.of(positions, quaternions_xyzw)
     won = np.asarray(success)
     if won.shape != (len(p),) or (won.dtype != np.bool_ and not np.all((won == 0) | (won == 1))):
         raise ValueError(f"success has shape ({len(p)},) and is true or false")

@@ -90,7 +90,7 @@ def smoothed(
 
 def attempt_density(attempts: GraspDensity) -> Callable[[Floats, Floats], Floats]:
     """Attempts per m^3 rad^3 around poses, for `smoothed`, from the density of all of them."""
-    return lambda p, q: attempts.size * attempts.density(p, q)
+    return lambda p, q: attempts.size * attempts.density(se3.Poses(p, q))
 
 
 def _bin_moves(layout: Bins) -> list[tuple[Floats, Floats]]:
@@ -166,13 +166,14 @@ def _shares(
         vector = np.zeros((len(moves), 3))
         vector[:, axis] = moves[:, 3 + axis]
         q = se3.multiply(q, se3.from_rotation_vector(vector))
-    density = successes.density(p, q, threads=threads)
+    poses, centre = se3.Poses(p, q), se3.Poses(successes.positions[row], own)
+    density = successes.density(poses, threads=threads)
     weight = successes.weights[row]
-    centre = successes.positions[row]
     kernel = successes.kernel
-    mine = np.exp(brute_force.kernel_log_density(kernel, p, q, centre, own))
+    mine = np.exp(brute_force.kernel_log_density(kernel, poses, centre))
     if twin:
-        mine = 0.5 * (mine + np.exp(brute_force.kernel_log_density(kernel, p, q, centre, se3.jaw_twin(own))))
+        turned_centre = se3.Poses(centre.positions, se3.jaw_twin(own))
+        mine = 0.5 * (mine + np.exp(brute_force.kernel_log_density(kernel, poses, turned_centre)))
     rest = np.maximum(density - weight * mine, 0.0) * successes.size
     rho = attempts(p, q) if callable(attempts) else attempts
     with np.errstate(divide="ignore", invalid="ignore"):

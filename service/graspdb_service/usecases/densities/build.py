@@ -26,6 +26,7 @@ from graspdb_density import (
     SampledKernel,
     choose_widths,
     importance_weights,
+    se3,
     widths_prefix,
 )
 from graspdb_density.bandwidth.selection import FIRST_CHOICE
@@ -201,7 +202,7 @@ def build(
     if before is not None and before.chosen_from == built.chosen_from:
         built = replace(built, kernel=before.kernel)
         if old is not None and added is not None:
-            longer = old.extend(*fresh[:2], weights=added, symmetric=symmetric)
+            longer = old.extend(se3.Poses.of(*fresh[:2]), weights=added, symmetric=symmetric)
             return _searched(replace(built, density=longer), before)
     elif built.chosen_from:
         chosen = _choose(everything(), proposal, built.chosen_from, threads)
@@ -220,8 +221,7 @@ def _searched(built: Built, before: Built | None) -> Built:
 def _isotropic(kernel: KernelInfo, poses: Poses, weights: Floats | None) -> GraspDensity:
     position, quaternion, symmetric = poses
     return GraspDensity.build(
-        position,
-        quaternion,
+        se3.Poses.of(position, quaternion),
         kernel=IsotropicKernel(kernel.sigma_position_m, math.radians(kernel.sigma_rotation_deg)),
         weights=weights,
         symmetric=symmetric,
@@ -245,20 +245,21 @@ def _shaped(
         _check_components(kernel, len(position), len(position) + int(symmetric.sum()))
         old = None if before is None else before.density
         if before is not None and old is not None and before.sampled is not None and added is not None:
-            alike = old.extend(*fresh[:2], weights=added, symmetric=fresh[2])
+            alike = old.extend(se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2])
             sampled = _placed(before.sampled, kernel, fresh, added)
             return _searched(replace(built, density=alike, sampled=sampled), before)
         alike = _isotropic(built.kernel, (position, quaternion, symmetric), weights)
-        sampled = kernel.placed(position, quaternion, weights=weights, symmetric=symmetric)
+        sampled = kernel.placed(se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric)
         return _searched(replace(built, density=alike, sampled=sampled), None)
     if before is not None and before.shaped is not None and added is not None:
         frames = stored_kernel.axes_at(axes, *fresh[:2])
-        shaped = before.shaped.extend(*fresh[:2], weights=added, symmetric=fresh[2], frames=frames)
+        shaped = before.shaped.extend(
+            se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2], frames=frames
+        )
         return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
     position, quaternion, symmetric = everything()
     shaped = MixtureDensity(
-        position,
-        quaternion,
+        se3.Poses.of(position, quaternion),
         kernel=stored_kernel.load(stored),
         weights=weights,
         symmetric=symmetric,
@@ -271,11 +272,9 @@ def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Poses, added: Float
     """The density of a sampled kernel's components with those of further grasps."""
     if not len(added):
         return old
-    more = kernel.placed(*fresh[:2], weights=added, symmetric=fresh[2])
+    more = kernel.placed(se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2])
     total = float(added.sum())
-    return old.extend(
-        more.positions, more.quaternions_xyzw, weights=more.weights * total, symmetric=more.symmetric
-    )
+    return old.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
 
 
 def _check_components(kernel: SampledKernel, rows: int, placed: int) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graspdb.wire import KernelInfo
-from graspdb_density import GraspDensity, IsotropicKernel, ModeSearch
+from graspdb_density import GraspDensity, IsotropicKernel, ModeSearch, se3
 from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.objects import ObjectRow
@@ -155,4 +155,6 @@ def density_on(
         count = _MOST
     if not held.any():
         return None
-    return GraspDensity.build(p[held], q[held], kernel=kernel, weights=weights[held], symmetric=symmetric)
+    return GraspDensity.build(
+        se3.Poses.of(p[held], q[held]), kernel=kernel, weights=weights[held], symmetric=symmetric
+    )

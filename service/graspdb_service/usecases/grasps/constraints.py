@@ -55,7 +55,7 @@ class Constraints:
         """A grasp (object frame) in the world frame, where the object's pose is known."""
         if self.object_pose is None:
             return None
-        p, q = se3.compose(*self.object_pose, position, quaternion)
+        p, q = se3.compose(se3.Poses(*self.object_pose), se3.Poses(position, quaternion))
         return p, se3.canonical(se3.normalise(q))
 
 
@@ -99,7 +99,8 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
         # What is left to contradict after the checks above are the two cones.
         cones = ("approach_cone_deg", "closing_cone_deg")
         raise _contradiction([(name, str(error)) for name in cones]) from None
-    into = se3.inverse(shift, turn)
+    inwards = se3.inverse(se3.Poses(shift, turn))
+    into = inwards.positions, inwards.quaternions_xyzw
     posted = request if isinstance(request, BestGraspRequest) else BestGraspRequest()
     return Constraints(
         region,
@@ -137,7 +138,9 @@ def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud
     if given is not None and given.boxes:
         parts = []
         for box in given.boxes:
-            p, q = se3.compose(*into, np.array(box.position), np.array(box.quaternion_xyzw))
+            p, q = se3.compose(
+                se3.Poses(*into), se3.Poses(np.array(box.position), np.array(box.quaternion_xyzw))
+            )
             parts.append(box_part(np.array(box.size_m) / 2, p, q))
         solids.append(Scene(parts))
     if given is not None and given.points:
@@ -154,7 +157,7 @@ def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | N
     else:
         p = np.array([pose.position for pose in poses]).reshape(-1, 3)
         q = np.array([pose.quaternion_xyzw for pose in poses]).reshape(-1, 4)
-    p, q = se3.compose(*into, p, q)
+    p, q = se3.compose(se3.Poses(*into), se3.Poses(p, q))
     return p, se3.normalise(q)
 
 

@@ -165,10 +165,10 @@ def _log_density(
     def work(part: slice) -> None:
         p, q = positions[part], quaternions[part]
         if isinstance(density, GraspDensity):
-            logs[part] = density.log_density(p, q, cutoff=cutoff, threads=threads)
+            logs[part] = density.log_density(se3.Poses.of(p, q), cutoff=cutoff, threads=threads)
         else:
             # It sums whatever matters, however far.
-            logs[part] = density.log_density(p, q, threads=threads)
+            logs[part] = density.log_density(se3.Poses.of(p, q), threads=threads)
 
     ctx.compute.blocks(len(positions), _BLOCK, work)
     return logs

@@ -151,4 +151,6 @@ def uncertain(
         return None
     narrow = IsotropicKernel(_NARROWER * kernel.sigma_position_m, _NARROWER * kernel.sigma_rotation)
     symmetric = bool(density.symmetric.all())
-    return GraspDensity.build(p[taught], q[taught], kernel=narrow, weights=gain[taught], symmetric=symmetric)
+    return GraspDensity.build(
+        se3.Poses.of(p[taught], q[taught]), kernel=narrow, weights=gain[taught], symmetric=symmetric
+    )

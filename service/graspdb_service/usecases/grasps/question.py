@@ -239,11 +239,10 @@ def _widened(question: Question, noises: dict[str, PoseNoise]) -> tuple[Score, d
     """
     density, at_object, at_tool = question.asked, noises["pose_noise"], noises["tool_noise"]
     if isinstance(density, MixtureDensity):
-        return density.density, noises
+        return lambda p, q: density.density(se3.Poses(p, q)), noises
     shift = math.hypot(at_object.sigma_position_m, at_tool.sigma_position_m)
     wider = GraspDensity.build(
-        density.positions,
-        density.quaternions_xyzw,
+        density.poses,
         kernel=density.kernel.widened(shift, at_tool.sigma_rotation),
         weights=density.weights,
         symmetric=density.symmetric,
@@ -252,7 +251,7 @@ def _widened(question: Question, noises: dict[str, PoseNoise]) -> tuple[Score, d
         "pose_noise": replace(at_object, sigma_position_m=0.0),
         "tool_noise": replace(at_tool, sigma_position_m=0.0, sigma_rotation=0.0),
     }
-    return wider.density, left
+    return lambda p, q: wider.density(se3.Poses(p, q)), left
 
 
 def _pivot(question: Question) -> tuple[tuple[float, float, float], str]:
@@ -365,5 +364,5 @@ def _place(limits: Constraints, item: Maximum) -> int | None:
 
 def _nearest_trials(built: Built, density: GraspDensity, position: Floats, quaternion: Floats) -> list[int]:
     """Sequence numbers of the successes nearest to a pose in the kernel's own measure."""
-    rows = density.nearest_rows(position, quaternion, _NEAREST_TRIALS)
+    rows = density.nearest_rows(se3.Poses(position, quaternion), _NEAREST_TRIALS)
     return [int(seq) for seq in built.seq[rows]]

@@ -117,13 +117,13 @@ class NearSuccesses:
     reach: float = _NEAR
 
     def __call__(self, positions: Floats, quaternions: Floats) -> Bools:
-        _, distance = self.density.nearest_each(positions, quaternions, within=self.reach)
+        _, distance = self.density.nearest_each(se3.Poses(positions, quaternions), within=self.reach)
         return np.asarray(distance <= self.reach)
 
     def pull(self, positions: Floats, quaternions: Floats) -> Poses:
         """Poses a little farther from a success moved straight towards it as far as the reach."""
         density, reach = self.density, self.reach * (1.0 - 1e-4)
-        rows, distance = density.nearest_each(positions, quaternions, within=1.5 * self.reach)
+        rows, distance = density.nearest_each(se3.Poses(positions, quaternions), within=1.5 * self.reach)
         far = np.flatnonzero((distance > reach) & (rows >= 0))
         p, q = positions.copy(), quaternions.copy()
         if not len(far):
@@ -200,7 +200,7 @@ def _ranked(question: Question, poses: Poses) -> list[Maximum]:
         # Only those that may be among the best are worth the score itself.
         best = np.argsort(-question.quick(p, q), kind="stable")[:few]
         p, q = p[best], q[best]
-    logs = question.asked.log_density(p, q, threads=question.threads)
+    logs = question.asked.log_density(se3.Poses.of(p, q), threads=question.threads)
     scores = logs if question.score is None else question.score(p, q)
     chosen: list[int] = []
     separated = request.min_separation_m is not None or request.min_separation_deg is not None
@@ -235,7 +235,7 @@ def closest(question: Question) -> list[Maximum]:
         free = np.arange(len(rows)) if admissible is None else np.flatnonzero(admissible(p, q))
         if free.size:
             at = slice(int(free[0]), int(free[0]) + 1)
-            log = float(question.asked.log_density(p[at], q[at])[0])
+            log = float(question.asked.log_density(se3.Poses.of(p[at], q[at]))[0])
             score = log if question.score is None else float(question.score(p[at], q[at])[0])
             return [Maximum(p[at][0], se3.canonical(q[at][0]), log, (), score)]
     return []

@@ -182,7 +182,9 @@ def _sample(
     chosen = found.vectors[rng.choice(len(share), size=count, p=share)]
     whole = found.vectors[rng.choice(len(share), size=min(_WHOLE, len(share)), p=share)]
     one, every = (
-        sampled_kernel_rows(part[:, :3], se3.from_rotation_vector(part[:, 3:]), _isotropic(widths))
+        sampled_kernel_rows(
+            se3.Poses.of(part[:, :3], se3.from_rotation_vector(part[:, 3:])), _isotropic(widths)
+        )
         for part in (chosen, whole)
     )
     similarity = bhattacharyya(one, every, rng, points=4_000, window=_window(window), threads=threads)

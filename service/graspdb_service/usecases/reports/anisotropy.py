@@ -17,7 +17,7 @@ from graspdb.wire.reports import (
     AnisotropyTolerance,
     Method,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, importance_weights
+from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.vicinity.anisotropy import (
     LEAST_SUCCESSES,
@@ -191,8 +191,7 @@ def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[
     if len(rows) > _LOCAL_ATTEMPTS:
         rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_LOCAL_ATTEMPTS, replace=False))
     density = GraspDensity.build(
-        everything.position[rows],
-        everything.quaternion[rows],
+        se3.Poses.of(everything.position[rows], everything.quaternion[rows]),
         kernel=kernel,
         symmetric=everything.symmetric[rows],
     )

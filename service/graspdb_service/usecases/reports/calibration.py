@@ -14,7 +14,7 @@ from graspdb.wire.reports import (
     CheckedGrasps,
     ReportRange,
 )
-from graspdb_density import GraspDensity, SuccessModel, importance_weights
+from graspdb_density import GraspDensity, SuccessModel, importance_weights, se3
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.success.calibration import (
     Blocks,
@@ -148,13 +148,12 @@ def _predictions(
         kept = train[everything.success[train]]
         if kept.size:
             own = GraspDensity.build(
-                everything.position[kept],
-                everything.quaternion[kept],
+                se3.Poses.of(everything.position[kept], everything.quaternion[kept]),
                 kernel=kernel,
                 weights=importance_weights(everything.proposal[kept]) if proposal_known else None,
                 symmetric=everything.symmetric[kept],
             )
-            ranked[held] = own.log_density(p[held], q[held], threads=inputs.threads)
+            ranked[held] = own.log_density(se3.Poses.of(p[held], q[held]), threads=inputs.threads)
     if free is not None:
         predicted[~free] = 0.0
     return predicted, ranked

@@ -19,7 +19,7 @@ from graspdb.wire.reports import (
     SimulatedDraws,
 )
 from graspdb.wire.reports import Verdict as VerdictModel
-from graspdb_density import GraspDensity, IsotropicKernel, MixtureDensity
+from graspdb_density import GraspDensity, IsotropicKernel, MixtureDensity, se3
 from graspdb_density.bandwidth.matching import (
     Match,
     match_determinants,
@@ -183,10 +183,14 @@ def _matched(
 
     def likelihood(used: Kernel) -> float:
         rows = KernelRows(
-            p[train], q[train], used, weights=w[train], symmetric=density.symmetric[train],
+            se3.Poses.of(p[train], q[train]), used, weights=w[train], symmetric=density.symmetric[train],
             frames=None if isinstance(used, IsotropicKernel) else frames,
         )  # fmt: skip
-        return float(np.average(rows.log_density(p[held], q[held], threads=inputs.threads), weights=w[held]))
+        return float(
+            np.average(
+                rows.log_density(se3.Poses.of(p[held], q[held]), threads=inputs.threads), weights=w[held]
+            )
+        )
 
     return inputs.curves.match(
         grown, rule, lambda: match_likelihood(likelihood(kernel), match.kernel, likelihood)

@@ -37,8 +37,7 @@ def kernel_similarity_report(
     share = found.weights / found.weights.sum()
     kept = rng.choice(len(share), size=min(2 * _REFERENCE, len(share)), replace=False, p=share)
     samples = sampled_kernel_curve(
-        found.vectors[kept, :3],
-        se3.from_rotation_vector(found.vectors[kept, 3:]),
+        se3.Poses.of(found.vectors[kept, :3], se3.from_rotation_vector(found.vectors[kept, 3:])),
         components=widths,
         window=window,
         rng=rng,

@@ -17,7 +17,7 @@ from graspdb.wire.reports import (
     SourcesOptions,
     SourcesReport,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.success.calibration import calibrate
@@ -244,8 +244,7 @@ def _similarity(inputs: ReportInputs, built: Built, everything: AllTrials) -> So
 
     def under(rows: NDArray[np.int64], weights: Floats | None) -> GraspDensity:
         return GraspDensity.build(
-            density.positions[rows],
-            density.quaternions_xyzw[rows],
+            se3.Poses.of(density.positions[rows], density.quaternions_xyzw[rows]),
             kernel=kernel,
             weights=weights,
             symmetric=density.symmetric[rows],
@@ -253,8 +252,7 @@ def _similarity(inputs: ReportInputs, built: Built, everything: AllTrials) -> So
 
     whole = under(np.arange(density.size), density.weights)
     real = GraspDensity.build(
-        everything.position[won],
-        everything.quaternion[won],
+        se3.Poses.of(everything.position[won], everything.quaternion[won]),
         kernel=kernel,
         symmetric=everything.symmetric[won],
     )

@@ -51,10 +51,10 @@ def _exercise() -> None:
     success = rng.random(300) < 0.5
     model = SuccessModel.build(positions, quaternions, success, kernel=kernel)
     model.extend(positions, quaternions, success).evaluate(positions[:5], quaternions[:5])
-    density = GraspDensity.build(positions, quaternions, kernel=kernel)
-    density = density.extend(*density.sample(10, rng))
-    density.log_density(positions, quaternions)
-    density.log_density(positions[:3] + 1.0, quaternions[:3], cutoff=None)
+    density = GraspDensity.build(se3.Poses.of(positions, quaternions), kernel=kernel)
+    density = density.extend(density.sample(10, rng))
+    density.log_density(se3.Poses.of(positions, quaternions))
+    density.log_density(se3.Poses.of(positions[:3] + 1.0, quaternions[:3]), cutoff=None)
     search = ModeSearch(density)
     search.maxima(region, count=2, admissible=free)
     top = search.global_maximum()
@@ -63,6 +63,6 @@ def _exercise() -> None:
         return np.asarray(np.linalg.norm(p - top.position, axis=1) > 0.005)
 
     search.maxima(admissible=elsewhere)
-    density.nearest_rows(positions[0], quaternions[0], 5)
-    density.nearest_each(positions[:5], quaternions[:5], within=2.0)
+    density.nearest_rows(se3.Poses(positions[0], quaternions[0]), 5)
+    density.nearest_each(se3.Poses(positions[:5], quaternions[:5]), within=2.0)
     model.lower_end(positions[:5], quaternions[:5])

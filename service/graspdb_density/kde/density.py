@@ -1,0 +1,34 @@
+"""What every density can do, whatever its kernels."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..se3 import Floats, Poses
+
+__all__ = ["Density"]
+
+
+class Density(Protocol):
+    """A density of grasps, 1/(m^3 rad^3): `GraspDensity`, `MixtureDensity`, `KernelRows`."""
+
+    @property
+    def size(self) -> int:
+        """Rows; twins are not counted."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays held."""
+
+    @property
+    def symmetric(self) -> NDArray[np.bool_]:
+        """(N,) whether a row has its twin under the jaw's turn."""
+
+    def log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
+        """(M,) nats, right however far from every row."""
+
+    def sample(self, count: int, rng: np.random.Generator) -> Poses:
+        """Grasps drawn from it."""
