@@ -101,8 +101,7 @@ class GraspQueries:
         verify_timeout_s: float = 300.0,
         **constraints: Unpack[Constraints],
     ) -> Grasps:
-        """At most ``count`` distinct grasps within :class:`Constraints`, best first; Infeasible if there is
-        none.
+        """At most ``count`` distinct grasps within :class:`Constraints`, best first, or Infeasible.
 
         ``verify`` has a worker simulate the grasps at the fine step before they are answered:
         ``grasp.simulated`` is what became of each, and those that held come first. The outcomes are stored as

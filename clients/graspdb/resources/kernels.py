@@ -46,8 +46,7 @@ class Kernels:
         timeout_s: float | None = None,
         **options: Unpack[KernelOptions],
     ) -> wire.StoredKernel:
-        """Fit a kernel on an object's successes, or with ``kind="probability"`` on all its attempts, and wait
-        for it.
+        """Fit a kernel on an object's successes, with ``kind="probability"`` on all attempts; waits for it.
 
         ``components="auto"`` may take a while: ``progress`` is called with its run meanwhile, and
         ``timeout_s`` ends the wait, not the fit. Conflict says how many trials are needed where they are too

@@ -49,8 +49,7 @@ def _vector(values: Any, digits: int = 4) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Grasp:
-    """A grasp: the pose of the tool frame in the object frame, metres and unit xyzw, and what is known about
-    it.
+    """A grasp: the pose of the tool frame in the object frame, metres and unit xyzw, and what is known of it.
 
     - ``world``: the same grasp in the world frame, (4, 4); None unless the query gave the object's pose.
     - ``score``: what it was ranked by; ``Grasps.ranking`` says what that is.

@@ -43,9 +43,7 @@ def require_json(request: Request) -> None:
 
 
 def accepted(request: Request, *kinds: str) -> str:
-    """Which media type the client prefers: by weight, then as named and not by ``*``, then as listed; else
-    406.
-    """
+    """The media type preferred: by weight, then as named and not by ``*``, then as listed; else 406."""
     ranks: dict[str, tuple[float, int, int]] = {}
     for place, item in enumerate((request.headers.get("accept") or "*/*").split(",")):
         media, *parameters = (part.strip().lower() for part in item.split(";"))

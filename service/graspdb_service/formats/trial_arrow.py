@@ -21,8 +21,7 @@ _TEXTS = ("gripper", "source", "protocol")
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
-    """Check a stream of trials; refused as :func:`graspdb_service.formats.trial_json.parse`, 415 without
-    pyarrow.
+    """Check a stream of trials; refused as in :mod:`graspdb_service.formats.trial_json`, 415 without pyarrow.
 
     Columns have the names of a trial's fields; ``outcome`` is text (or a dictionary of it) or boolean,
     ``measured_at`` a timestamp (UTC where it names no zone) or text, ``metadata`` a struct or JSON text,

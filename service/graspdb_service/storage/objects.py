@@ -62,8 +62,7 @@ def page(tx: Tx, *, after: str, limit: int) -> list[ObjectRow]:
 
 
 def advance(tx: Tx, object_id: int, *, rows: int = 0, append: bool) -> tuple[int, int]:
-    """Lock the object, give it a new revision and reserve ``rows`` sequence numbers: the revision, their
-    first.
+    """Lock the object, give it a new revision, reserve ``rows`` sequence numbers: the revision, their first.
 
     ``append`` where trials are only added; anything else starts a new epoch, for what was derived from the
     object can't be extended then. ObjectGone without the object.

@@ -28,9 +28,7 @@ def create(database: Database, request: ObjectCreate, *, key: str | None, body: 
 
 
 def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:
-    """The object with this slug (404), and with this internal id where one is given (409); ``lock`` holds it
-    until the transaction ends.
-    """
+    """The object of this slug (404), and of this internal id (409); ``lock`` holds it for the transaction."""
     row = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
     if row is None:
         raise not_found("object", slug[:80], "GET /objects lists them, POST /objects makes one")

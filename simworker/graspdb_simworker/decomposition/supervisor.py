@@ -26,8 +26,7 @@ _WAY_OUT = "Simplify the mesh, or give its convex parts"
 
 @dataclass(frozen=True)
 class Limits:
-    """What one decomposition may take: processor time, and address space of the child, libraries (1 GB)
-    included.
+    """What one decomposition may take: processor time, and the child's address space, libraries (1 GB) too.
 
     After ``seconds`` the best candidate so far is taken, or without one the job fails; by the clock
     :data:`PATIENCE` times as long. On a busy machine the clock says little about the work, and the parts

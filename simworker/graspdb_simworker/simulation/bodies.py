@@ -93,8 +93,7 @@ class MassProperties:
 
 
 def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
-    """Mass properties of a union of convex parts; where parts overlap, their common volume counts once for
-    each.
+    """Mass properties of a union of convex parts; where these overlap, the volume counts once for each.
 
     Signed tetrahedra from the origin to every face: volume det/6, first moment det/24 (a + b + c),
     second moment det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c. ValueError for a mass that is

@@ -247,8 +247,7 @@ def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
 def weakest_force(
     normals: NDArray[np.float64], forces: NDArray[np.float64], friction: float
 ) -> tuple[float, NDArray[np.float64]]:
-    """Largest force the contacts can resist in every direction, and the direction in which they resist no
-    more.
+    """Largest force the contacts resist in every direction, and the direction in which they resist no more.
 
     That is the minimum over unit d of h(d), newtons, 0 without contacts, and a d (3,) that attains it. Unit
     ``normals`` (K, 3) point into the object; ``forces`` (K,) are newtons along them.

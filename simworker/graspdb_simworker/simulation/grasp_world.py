@@ -152,8 +152,7 @@ class GraspWorld(BulletWorld):
     # -- one grasp -----------------------------------------------------------------------------------------
 
     def close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float = 0.0) -> Closing:
-        """Close the jaw at a pose of the tool frame in the object frame, until it stalls, is empty or times
-        out.
+        """Close the jaw at a tool pose in the object frame, until it stalls, is empty or times out.
 
         Each finger can close by ``travel_m`` before the first of the two touches, by the exact geometry.
         """

@@ -33,9 +33,7 @@ _RESOLVED = 4_096
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
-    """The kernel and the cut-off (None: exact) that a request asks for; 422 for widths beside a stored
-    kernel.
-    """
+    """The kernel and the cut-off (None: exact) of a request; 422 for widths beside a stored kernel."""
     choice, cutoff = _choice(request)
     for name, value, (low, high) in (
         ("sigma_position_m", choice.sigma_position_m, POSITION_LIMITS_M),
@@ -138,9 +136,7 @@ class Densities:
         )
 
     def stored(self, row: ObjectRow, selected: Selected, name: str) -> KernelRow:
-        """The stored kernel with this id (404), or the newest of object and gripper for ``anisotropic``
-        (409).
-        """
+        """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""
         with self._database.read() as tx:
             if name == "anisotropic":
                 newest = kernels.newest(tx, row.id, selected.gripper)

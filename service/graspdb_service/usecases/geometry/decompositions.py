@@ -32,9 +32,7 @@ _WAYS_OUT = (
 
 
 def check(tx: Tx, row: ObjectRow) -> None:
-    """Refuse a sweep whose object no worker will find parts for: 422 for a flat mesh, 409 where it failed
-    before.
-    """
+    """Refuse a sweep whose object no worker will find parts for: 422 for a flat mesh, 409 after a failure."""
     box = (row.mesh_info or {})["bounding_box"]
     sides = [high - low for low, high in zip(box["lower"], box["upper"], strict=True)]
     if min(sides) < max(MIN_SIDE_M, MIN_FLATNESS * max(sides)):
@@ -62,9 +60,7 @@ def ask(tx: Tx, row: ObjectRow, created_ms: int) -> None:
 
 
 def settle(tx: Tx, row: ObjectRow) -> None:
-    """The object, under its lock, has parts: complete the snapshots of sweeps that waited, and release their
-    chunks.
-    """
+    """The object (locked) has parts: complete the snapshots of sweeps that waited, release their chunks."""
     for sweep_id in decompositions.waiting_sweeps(tx, row.id):
         sweep = sweeps.find(tx, sweep_id)
         if sweep is not None:

@@ -28,8 +28,6 @@ Floats = NDArray[np.float64]
 
 #: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
 _BLOCK = 16_384
-_SEPARATION_M = 0.01
-_SEPARATION_DEG = 20.0
 _NEAREST_TRIALS = 5
 #: Successes shown to the collision test at a time while looking for the nearest admissible one.
 _CANDIDATES = 1_024

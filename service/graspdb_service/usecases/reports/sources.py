@@ -88,9 +88,7 @@ def sources_report(
 
 
 def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str, Selected]:
-    """The trials to compare with, by source; 409 says what is needed where these or simulated ones are too
-    few.
-    """
+    """The trials to compare with, by source; 409 says what is needed where these or simulated are too few."""
     slug = built.object_row.slug
     if len(simulated) < LEAST_SIMULATED or built.density is None:
         raise conflict(

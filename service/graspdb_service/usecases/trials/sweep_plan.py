@@ -88,11 +88,10 @@ def not_stored_yet(
     pose_index: IntArray,
     others: Sequence[tuple[PoseGrid, Sequence[tuple[int, int]]]],
 ) -> npt.NDArray[np.bool_]:
-    """Which poses of a chunk no other sweep with the same repeat key has finished, (stop - start,): each
-    counts once.
+    """Which poses (stop - start,) of a chunk no other sweep of the same repeat key has: each counts once.
 
-    ``pose_index`` is ``grid.pose_indices(start, stop)``; ``others`` the other sweeps' grids, and the places
-    of their finished chunks.
+    ``pose_index`` is ``grid.pose_indices(start, stop)``; ``others`` are their grids and
+    the places of their finished chunks.
     """
     fresh = np.ones(len(pose_index), dtype=np.bool_)
     for other, ranges in others:
