@@ -1,19 +1,13 @@
 """Meshes from users: read, checked, measured, and split into convex parts.
 
-Reading foreign files takes memory and time that only a process of its own can bound, so a service calls
-:func:`inspect_in_child`; :func:`load` is what the child runs.  Lengths are metres in the object frame.
+Reading foreign files takes memory and time that only a process of its own can bound: a service calls
+:func:`inspect` in one. Lengths are metres in the object frame.
 """
 
 from __future__ import annotations
 
-import io
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -290,78 +284,9 @@ def inspect(
     return Inspection(mesh, properties(mesh, unit))
 
 
-def inspect_in_child(
-    data: bytes,
-    media_type: str,
-    unit: str = "m",
-    *,
-    max_triangles: int = MAX_TRIANGLES,
-    memory_bytes: int = 2 * 2**30,
-    seconds: float = 30.0,
-) -> Inspection:
-    """Load and measure in a child process with bounded memory and time.
-
-    Parameters
-    ----------
-    memory_bytes : int
-        Address space of the child, interpreter and libraries (about 0.4 GB) included.
-    seconds : float
-        Of processor time, and of waiting.
-
-    Raises
-    ------
-    MeshError
-        As :func:`load`, and when the child exceeds a limit or dies.
-    """
-    # Cheap refusals need no child.
-    if media_type.split(";", 1)[0].strip().lower() not in READERS or unit not in UNITS or not data:
-        load(data, media_type, unit, max_triangles=max_triangles)
-    order = {
-        "media_type": media_type,
-        "unit": unit,
-        "max_triangles": max_triangles,
-        "memory_bytes": memory_bytes,
-        "seconds": seconds,
-    }
-    # One thread in the numeric libraries: each would reserve address space of its own.
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-m", "graspdb_geometry.mesh_reading.child"],
-            input=json.dumps(order).encode() + b"\n" + data,
-            capture_output=True,
-            timeout=seconds,
-            env=environment,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise MeshError("mesh", f"reading it takes more than {seconds:g} s: simplify it first") from None
-    if done.returncode != 0:
-        raise MeshError(
-            "mesh",
-            f"reading it failed or needs more than {memory_bytes / 2**20:.0f} MiB of memory or {seconds:g} s "
-            "of processor time: check the file, or simplify it",
-        )
-    head, _, rest = done.stdout.partition(b"\n")
-    answer: dict[str, Any] = json.loads(head)
-    if "error" in answer:
-        raise MeshError(answer["error"]["field"], answer["error"]["message"])
-    stream = io.BytesIO(rest)
-    vertices = np.load(stream, allow_pickle=False)
-    faces = np.load(stream, allow_pickle=False)
-    return Inspection(
-        Mesh(vertices, faces, tuple(answer["mesh_warnings"])), MeshProperties(**answer["properties"])
-    )
-
-
-def serialise(inspection: Inspection) -> bytes:
-    """What the child writes and :func:`inspect_in_child` reads: a line of JSON and two arrays."""
-    head = {"properties": asdict(inspection.properties), "mesh_warnings": list(inspection.mesh.warnings)}
-    stream = io.BytesIO()
-    stream.write(json.dumps(head).encode() + b"\n")
-    np.save(stream, inspection.mesh.vertices, allow_pickle=False)
-    np.save(stream, inspection.mesh.faces, allow_pickle=False)
-    return stream.getvalue()
+def readable(media_type: str, unit: str) -> bool:
+    """Whether meshes of this media type and unit are read at all."""
+    return media_type.split(";", 1)[0].strip().lower() in READERS and unit in UNITS
 
 
 # -------------------------------------------------------------------------------------------- checks

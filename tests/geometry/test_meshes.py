@@ -377,38 +377,6 @@ def test_hulls_are_convex_and_pushed_in_vertices_are_not(seed: int) -> None:
         assert not meshes.is_convex(meshes.Mesh(vertices, np.asarray(hull.faces)))
 
 
-# --------------------------------------------------------------------------------------------- child
-
-
-def test_the_child_gives_the_same_answer() -> None:
-    data = example("mug").stl()
-    here, there = meshes.inspect(data, "model/stl"), meshes.inspect_in_child(data, "model/stl")
-    assert here.properties == there.properties
-    np.testing.assert_array_equal(here.mesh.vertices, there.mesh.vertices)
-    np.testing.assert_array_equal(here.mesh.faces, there.mesh.faces)
-
-
-def test_the_child_reports_refusals() -> None:
-    with pytest.raises(MeshError, match="finite") as caught:
-        meshes.inspect_in_child(obj("v nan 0 0", *TRIANGLE, "f 1 2 3"), "model/obj")
-    assert caught.value.field == "mesh"
-    with pytest.raises(MeshError) as caught:
-        meshes.inspect_in_child(b"x", "model/3mf")
-    assert caught.value.field == "content_type"
-
-
-def test_the_childs_memory_is_bounded() -> None:
-    lump = trimesh.creation.icosphere(subdivisions=6, radius=0.1)
-    with pytest.raises(MeshError, match="memory"):
-        meshes.inspect_in_child(export(lump, "stl") * 1, "model/stl", memory_bytes=150 * 2**20)
-
-
-def test_the_childs_time_is_bounded() -> None:
-    lines = obj(*TRIANGLE) + b"\n" + b"f 1 2 3\n" * 900_000
-    with pytest.raises(MeshError, match=r"takes more than 0\.3 s"):
-        meshes.inspect_in_child(lines, "model/obj", seconds=0.3)
-
-
 @settings(max_examples=150, deadline=None)
 @given(data=st.binary(max_size=400), media_type=st.sampled_from(meshes.MEDIA_TYPES))
 def test_noise_is_a_mesh_error(data: bytes, media_type: str) -> None:

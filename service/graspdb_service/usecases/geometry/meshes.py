@@ -19,6 +19,7 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.geometry import decompositions
+from graspdb_service.usecases.geometry.mesh_child import inspect_in_child
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
 
@@ -166,7 +167,7 @@ def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str 
     try:
         # Each child may take the memory limit, so few run at once.
         with ctx.mesh_children:
-            return meshes.inspect_in_child(
+            return inspect_in_child(
                 content,
                 media,
                 unit,

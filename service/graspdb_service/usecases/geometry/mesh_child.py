@@ -1,0 +1,123 @@
+"""Untrusted meshes are read in a child process of bounded memory and time, which ends with the service.
+
+Run as ``python -m graspdb_service.usecases.geometry.mesh_child``: order and content on the standard input,
+result on the standard output.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import resource
+import subprocess
+import sys
+from dataclasses import asdict
+
+import numpy as np
+
+from graspdb.processes import ChildProcess, end_with_parent
+from graspdb_geometry import meshes
+from graspdb_geometry.meshes import Inspection, Mesh, MeshError, MeshProperties
+
+# One thread in the numeric libraries: each would reserve address space of its own.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def inspect_in_child(
+    data: bytes,
+    media_type: str,
+    unit: str = "m",
+    *,
+    max_triangles: int = meshes.MAX_TRIANGLES,
+    memory_bytes: int = 2 * 2**30,
+    seconds: float = 30.0,
+) -> Inspection:
+    """Load and measure a mesh.
+
+    ``memory_bytes`` is the child's address space, interpreter and libraries (about 0.4 GB) included;
+    ``seconds`` are of processor time, and of waiting. Raises MeshError as `meshes.load`, and when the child
+    exceeds a limit or dies.
+    """
+    # Cheap refusals need no child.
+    if not meshes.readable(media_type, unit) or not data:
+        meshes.load(data, media_type, unit, max_triangles=max_triangles)
+    order = {
+        "media_type": media_type,
+        "unit": unit,
+        "max_triangles": max_triangles,
+        "memory_bytes": memory_bytes,
+        "seconds": seconds,
+    }
+    pipe = subprocess.PIPE
+    with ChildProcess(
+        [sys.executable, "-P", "-m", __name__],
+        env=os.environ | _ONE_THREAD,
+        stdin=pipe,
+        stdout=pipe,
+        stderr=subprocess.DEVNULL,
+    ) as child:
+        try:
+            answer, _ = child.communicate(json.dumps(order).encode() + b"\n" + data, timeout=seconds)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            raise MeshError("mesh", f"reading it takes more than {seconds:g} s: simplify it first") from None
+    if child.returncode != 0:
+        raise MeshError(
+            "mesh",
+            f"reading it failed or needs more than {memory_bytes / 2**20:.0f} MiB of memory or {seconds:g} s "
+            "of processor time: check the file, or simplify it",
+        )
+    return _deserialise(answer)
+
+
+def main() -> int:
+    """Limit this process, read one mesh, write the result; 0 also for a mesh that was refused."""
+    end_with_parent()
+    order = json.loads(sys.stdin.buffer.readline())
+    # Both limits count what the libraries have used already.
+    for kind, limit in (
+        (resource.RLIMIT_AS, order["memory_bytes"]),
+        (resource.RLIMIT_CPU, max(1, round(order["seconds"]))),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        with contextlib.suppress(ValueError, OSError):  # an inherited limit may be tighter already
+            resource.setrlimit(kind, (limit, limit))
+    try:
+        inspection = meshes.inspect(
+            sys.stdin.buffer.read(), order["media_type"], order["unit"], max_triangles=order["max_triangles"]
+        )
+        answer = _serialise(inspection)
+    except MeshError as error:
+        answer = json.dumps({"error": {"field": error.field, "message": error.message}}).encode() + b"\n"
+    sys.stdout.buffer.write(answer)
+    sys.stdout.buffer.flush()
+    return 0
+
+
+def _serialise(inspection: Inspection) -> bytes:
+    """A line of JSON and two arrays."""
+    head = {"properties": asdict(inspection.properties), "mesh_warnings": list(inspection.mesh.warnings)}
+    stream = io.BytesIO()
+    stream.write(json.dumps(head).encode() + b"\n")
+    np.save(stream, inspection.mesh.vertices, allow_pickle=False)
+    np.save(stream, inspection.mesh.faces, allow_pickle=False)
+    return stream.getvalue()
+
+
+def _deserialise(data: bytes) -> Inspection:
+    head, _, rest = data.partition(b"\n")
+    answer = json.loads(head)
+    if "error" in answer:
+        raise MeshError(answer["error"]["field"], answer["error"]["message"])
+    stream = io.BytesIO(rest)
+    vertices = np.load(stream, allow_pickle=False)
+    faces = np.load(stream, allow_pickle=False)
+    return Inspection(
+        Mesh(vertices, faces, tuple(answer["mesh_warnings"])), MeshProperties(**answer["properties"])
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
