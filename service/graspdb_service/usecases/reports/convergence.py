@@ -203,10 +203,7 @@ def _by_success(
     """The isotropic kernel whose simulated draws succeed as often as those of the stored one, and the
     narrowest and widest that may, as the draws are few; none where no width tried succeeds as often.
 
-    Raises
-    ------
-    ProblemError
-        409 ``checks-needed`` while draws of either have not been simulated, with the sweeps that do it.
+    409 ``checks-needed`` while draws of either have not been simulated, with the sweeps that do it.
     """
     base = match_determinants(shaped.kernel).kernel
     drawn = simulated_draws(verification.read(inputs.database, built))

@@ -99,8 +99,8 @@ def read(
 ) -> AllTrials:
     """Every attempt of a selection, packed outcomes included, of sources that post failures, too.
 
-    ``most_collided`` of those that collided are drawn at random, about: nearly all poses of a large grid
-    collide, and arrays of them would fill the memory.
+    About ``most_collided`` of those that collided are drawn at random (None: all): nearly all poses of a
+    large grid collide, and arrays of them would fill the memory.
     """
     with database.read() as tx:
         stored = fetch(tx, row.id, selected)
