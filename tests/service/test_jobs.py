@@ -37,7 +37,7 @@ from graspdb_service.storage import assets, objects, schema
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import jobs as job_rows
 from graspdb_service.usecases import grippers
-from graspdb_service.usecases.simulation import jobs, sweeps
+from graspdb_service.usecases.simulation import leases, planning, results, sweeps
 
 BOX = {"lower": [-0.02, -0.02, -0.05], "upper": [0.02, 0.02, 0.05]}
 GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "margin_m": 0.0}
@@ -490,7 +490,7 @@ class LeaseProtocol(RuleBasedStateMachine):
         slug = f"box-{LeaseProtocol.number}-{time.time_ns()}"
         add_box(self.context.database, slug)
         spec = SweepCreate.model_validate({"grid": GRID, "chunk_poses": 500})
-        made = sweeps.create(self.context, slug, spec, key=None, request=b"")
+        made = planning.create(self.context, slug, spec, key=None, request=b"")
         self.slug, self.sweep_id = slug, made.body["id"]
         self.state = dict.fromkeys(range(4), "queued")
         self.attempts: Counter[int] = Counter()
@@ -510,7 +510,7 @@ class LeaseProtocol(RuleBasedStateMachine):
             if state == "queued" or (state == "leased" and self.expired[chunk])
         ]
         request = ClaimRequest(worker="w", limit=limit)
-        answer = jobs.claim(self.context, request)
+        answer = leases.claim(self.context, request)
         claimed = [(job.payload.start // 500, job) for job in answer.jobs]  # type: ignore[union-attr]
         assert [chunk for chunk, _ in claimed] == free[:limit]
         for chunk, job in claimed:
@@ -535,20 +535,20 @@ class LeaseProtocol(RuleBasedStateMachine):
     def renew(self, lease: Any) -> None:
         chunk, job = lease
         if self._holds(chunk, job):
-            assert not jobs.renew(self.context, job.id, job.lease_id).cancel
+            assert not leases.renew(self.context, job.id, job.lease_id).cancel
             self.expired[chunk] = False
         elif self.state[chunk] == "cancelled" and self.holder[chunk] == job.lease_id:
-            assert jobs.renew(self.context, job.id, job.lease_id).cancel
+            assert leases.renew(self.context, job.id, job.lease_id).cancel
         else:
-            self._refused(jobs.renew, job.id, job.lease_id)
+            self._refused(leases.renew, job.id, job.lease_id)
 
     @rule(lease=leases)
     def give_back(self, lease: Any) -> None:
         chunk, job = lease
         if not self._holds(chunk, job):
-            self._refused(jobs.release, job.id, job.lease_id)
+            self._refused(leases.release, job.id, job.lease_id)
             return
-        jobs.release(self.context, job.id, job.lease_id)
+        leases.release(self.context, job.id, job.lease_id)
         self.state[chunk], self.holder[chunk] = "queued", None
         self.attempts[chunk] -= 1
 
@@ -558,13 +558,13 @@ class LeaseProtocol(RuleBasedStateMachine):
         report = FailureReport(error="boom")
         if self._holds(chunk, job):
             last = self.attempts[chunk] >= self.context.settings.max_attempts
-            noted = jobs.fail(self.context, job.id, job.lease_id, report)
+            noted = leases.fail(self.context, job.id, job.lease_id, report)
             self.state[chunk] = "failed" if last else "queued"
             assert noted.state == self.state[chunk]
         elif self.holder[chunk] == job.lease_id and self.state[chunk] in ("queued", "failed"):
-            assert jobs.fail(self.context, job.id, job.lease_id, report).state == self.state[chunk]
+            assert leases.fail(self.context, job.id, job.lease_id, report).state == self.state[chunk]
         else:
-            self._refused(jobs.fail, job.id, job.lease_id, report)
+            self._refused(leases.fail, job.id, job.lease_id, report)
 
     @rule(lease=leases)
     def hand_in(self, lease: Any) -> None:
@@ -573,25 +573,25 @@ class LeaseProtocol(RuleBasedStateMachine):
         model = SimulateResult.model_validate(result)
         arguments = (job.id, job.lease_id, b"the same bytes", model)
         if self._holds(chunk, job):
-            answer = jobs.complete(self.context, *arguments)
+            answer = results.complete(self.context, *arguments)
             assert answer.inserted == len(result["rows"]["pose_index"])
             self.state[chunk] = "done"
             self.reported[chunk] = answer.model_dump_json()
         elif self.state[chunk] == "done" and self.holder[chunk] == job.lease_id:
-            assert jobs.complete(self.context, *arguments).model_dump_json() == self.reported[chunk]
+            assert results.complete(self.context, *arguments).model_dump_json() == self.reported[chunk]
         else:
-            self._refused(jobs.complete, *arguments)
+            self._refused(results.complete, *arguments)
 
     @rule()
     def cancel(self) -> None:
-        sweeps.cancel(self.context, self.sweep_id)
+        sweeps.cancel(self.context.database, self.sweep_id)
         for chunk, state in self.state.items():
             if state in ("queued", "leased"):
                 self.state[chunk] = "cancelled"
 
     @rule()
     def retry(self) -> None:
-        sweeps.retry(self.context, self.sweep_id)
+        sweeps.retry(self.context.database, self.sweep_id)
         for chunk, state in self.state.items():
             if state in ("failed", "cancelled"):
                 self.state[chunk], self.holder[chunk], self.attempts[chunk] = "queued", None, 0
@@ -600,7 +600,7 @@ class LeaseProtocol(RuleBasedStateMachine):
     def done_chunks_are_stored_once(self) -> None:
         if not hasattr(self, "sweep_id"):
             return
-        info = sweeps.get(self.context, self.sweep_id)
+        info = sweeps.get(self.context.database, self.sweep_id)
         states = Counter(self.state.values())
         assert (info.chunks_done, info.chunks_failed) == (states["done"], states["failed"])
         if states["cancelled"]:
@@ -632,7 +632,7 @@ class LeaseProtocol(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         if hasattr(self, "sweep_id"):
-            sweeps.cancel(self.context, self.sweep_id)
+            sweeps.cancel(self.context.database, self.sweep_id)
 
     def _holds(self, chunk: int, job: Any) -> bool:
         return self.state[chunk] == "leased" and self.holder[chunk] == job.lease_id

@@ -28,7 +28,7 @@ from graspdb_service.api.routing import (
 )
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import BINARY, GLB, JSON, media_type, unsupported
-from graspdb_service.usecases.simulation import jobs
+from graspdb_service.usecases.simulation import leases, results
 
 router = APIRouter(tags=["jobs"])
 
@@ -46,19 +46,19 @@ ProgressText = Annotated[
 @router.post("/jobs/claim", **scope("jobs:work"))
 def claim_jobs(ctx: Ctx, request: ClaimRequest) -> ClaimResponse:
     """Lease up to ``limit`` jobs that a worker with these capabilities can do, and register it."""
-    return jobs.claim(ctx, request)
+    return leases.claim(ctx, request)
 
 
 @router.put("/jobs/{id}/lease", **scope("jobs:work"))
 def renew_lease(ctx: Ctx, id: JobId, lease_id: LeaseId, progress: ProgressText = None) -> LeaseRenewed:
     """Keep a job; ``cancel`` says that it is no longer wanted. 409 ``lease-lost`` if another has it."""
-    return jobs.renew(ctx, id, lease_id, progress)
+    return leases.renew(ctx, id, lease_id, progress)
 
 
 @router.delete("/jobs/{id}/lease", status_code=204, **scope("jobs:work"))
 def release_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> None:
     """Give a job back unfinished, as a worker does that is told to stop; it counts as no attempt."""
-    jobs.release(ctx, id, lease_id)
+    leases.release(ctx, id, lease_id)
 
 
 @router.put("/jobs/{id}/result", **scope("jobs:work", body=_RESULTS))
@@ -69,9 +69,9 @@ def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: R
     """
     try:
         if media_type(request) == GLB:
-            return jobs.complete_parts(ctx, id, lease_id, body)
-        return jobs.complete(ctx, id, lease_id, body, read_model(request, body, SimulateResult))
-    except jobs.WrongResult as error:
+            return results.complete_parts(ctx, id, lease_id, body)
+        return results.complete(ctx, id, lease_id, body, read_model(request, body, SimulateResult))
+    except results.WrongResult as error:
         wanted = {"simulate": f"JSON, as {JSON}", "decompose": f"a GLB, as {GLB}"}[error.kind]
         raise unsupported(f"The result of a {error.kind} job is {wanted}") from None
 
@@ -79,11 +79,11 @@ def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: R
 @router.put("/jobs/{id}/failure", **scope("jobs:work"))
 def put_failure(ctx: Ctx, id: JobId, lease_id: LeaseId, report: FailureReport) -> FailureNoted:
     """Report that an attempt failed: the job is queued again, or failed after its last attempt."""
-    return jobs.fail(ctx, id, lease_id, report)
+    return leases.fail(ctx, id, lease_id, report)
 
 
 @router.get("/workers", **scope("read"))
 def list_workers(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[WorkerInfo]:
     """The workers that ever asked for jobs, by name."""
-    items, after = jobs.workers(ctx, skip=number_cursor(cursor), limit=limit)
+    items, after = leases.workers(ctx, skip=number_cursor(cursor), limit=limit)
     return Page(items=items, next=encode_cursor(after))

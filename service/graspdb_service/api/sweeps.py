@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import StreamingResponse
 
-from graspdb.wire import OUTCOMES, Page, SweepCreate, SweepInfo, SweepOutcomes
+from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.states import AnySweepState
 from graspdb_service.api.routing import (
     Ctx,
@@ -20,10 +18,10 @@ from graspdb_service.api.routing import (
     name_cursor,
     scope,
 )
-from graspdb_service.formats.columns import columns_json
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
-from graspdb_service.usecases.simulation import sweeps
+from graspdb_service.formats.sweep_outcomes import page_response, stream_response
+from graspdb_service.usecases.simulation import outcomes, planning, sweeps
 
 router = APIRouter(tags=["sweeps"])
 
@@ -45,7 +43,7 @@ def create_sweep(
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
     draws from its density. Workers take its chunks."""
     spec = read_model(request, body or b"{}", SweepCreate)
-    made = sweeps.create(ctx, id, spec, key=key, request=body)
+    made = planning.create(ctx, id, spec, key=key, request=body)
     response.headers["Location"] = made.location
     return made.body
 
@@ -60,7 +58,7 @@ def list_sweeps(
 ) -> Page[SweepInfo]:
     """The sweeps, the newest first."""
     items, after = sweeps.listing(
-        ctx, slug=object, state=state, cursor=name_cursor(cursor) or None, limit=limit
+        ctx.database, slug=object, state=state, cursor=name_cursor(cursor) or None, limit=limit
     )
     return Page(items=items, next=encode_cursor(after))
 
@@ -68,19 +66,19 @@ def list_sweeps(
 @router.get("/sweeps/{id}", **scope("read"))
 def get_sweep(ctx: Ctx, id: str) -> SweepInfo:
     """How far a sweep has come, what it found, how long it will take, and what failed."""
-    return sweeps.get(ctx, id)
+    return sweeps.get(ctx.database, id)
 
 
 @router.post("/sweeps/{id}/cancel", **scope("admin"))
 def cancel_sweep(ctx: Ctx, id: str) -> SweepInfo:
     """Stop a sweep; what is stored stays. A finished one is left as it is."""
-    return sweeps.cancel(ctx, id)
+    return sweeps.cancel(ctx.database, id)
 
 
 @router.post("/sweeps/{id}/retry", **scope("admin"))
 def retry_sweep(ctx: Ctx, id: str) -> SweepInfo:
     """Queue a sweep's failed and cancelled chunks again. 409 once its batch was deleted."""
-    return sweeps.retry(ctx, id)
+    return sweeps.retry(ctx.database, id)
 
 
 @router.get(
@@ -98,19 +96,7 @@ def get_outcomes(
     As an Arrow stream (`Accept: application/vnd.apache.arrow.stream`) all of them come at once.
     """
     kind, start = accepted(request, JSON, ARROW), name_cursor(cursor) or None
-    headers = {"Vary": "Accept"}
     if kind == ARROW and limit is None:
-        stream = sweeps.stream_outcomes(ctx, id, cursor=start)
-        return StreamingResponse(stream, media_type=ARROW, headers=headers)
-    page = sweeps.outcomes(ctx, id, limit=limit or 10_000, cursor=start)
-    following = encode_cursor(page.next)
-    if kind == ARROW:
-        return Response(b"".join(sweeps.arrow_page(page, following)), media_type=ARROW, headers=headers)
-    names = np.array(OUTCOMES, dtype=object)[page.codes].tolist()
-    columns = {
-        "pose_index": page.pose_index,
-        "position": page.position,
-        "quaternion_xyzw": page.quaternion_xyzw,
-    }
-    head = {"sweep": page.sweep, "outcome": names, "next": following}
-    return columns_json(head, columns, headers)
+        return stream_response(id, outcomes.pages(ctx.database, id, cursor=start))
+    page, following = outcomes.page(ctx.database, id, limit=limit or 10_000, cursor=start)
+    return page_response(id, page, encode_cursor(following), kind)

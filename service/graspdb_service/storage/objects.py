@@ -9,8 +9,8 @@ from typing import Any
 
 from sqlalchemy import Row, and_, delete, exists, or_, select, update
 
-from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, insert_or
+from graspdb_service.storage.simulation.jobs import OPEN
 from graspdb_service.storage.tables import batches, idempotency_keys, jobs, objects, sweeps, trials
 
 
@@ -95,7 +95,7 @@ def has_running_sweep(tx: Tx, object_id: int, *, sweep_id: str | None = None) ->
     """Whether a sweep of the object (or the one named) still has chunks to simulate."""
     open_jobs = and_(
         jobs.c.sweep_id == sweeps.c.id,
-        jobs.c.state.in_((JobState.WAITING, JobState.QUEUED, JobState.LEASED)),
+        jobs.c.state.in_(OPEN),
     )
     query = select(exists().where(sweeps.c.object_id == object_id, sweeps.c.cancelled.is_(False), open_jobs))
     if sweep_id is not None:

@@ -12,10 +12,8 @@ from sqlalchemy import and_, insert, select, update
 
 from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, unix_now
-from graspdb_service.storage.simulation.jobs import JobRow
+from graspdb_service.storage.simulation.jobs import COLUMNS, JobRow, job_row
 from graspdb_service.storage.tables import jobs, objects
-
-_COLUMNS = [jobs.c[name] for name in JobRow.__dataclass_fields__]
 
 
 @dataclass(frozen=True)
@@ -28,9 +26,9 @@ class Source:
 
 def find(tx: Tx, object_id: int) -> JobRow | None:
     """The object's decomposition, whatever became of it."""
-    query = select(*_COLUMNS).where(jobs.c.object_id == object_id, jobs.c.kind == "decompose")
+    query = select(*COLUMNS).where(jobs.c.object_id == object_id, jobs.c.kind == "decompose")
     row = tx.execute(query).first()
-    return None if row is None else JobRow(**row._mapping)
+    return None if row is None else job_row(row)
 
 
 def source_of(tx: Tx, object_id: int) -> Source | None:

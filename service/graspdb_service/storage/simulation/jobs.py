@@ -1,6 +1,6 @@
 """The queue that workers pull from: claiming under a lease, fencing, ending what keeps failing.
 
-A job's lease id is fresh for every attempt and is the only fence: a worker's name proves nothing, for a
+A job's lease id is fresh for every claim and is the only fence: a worker's name proves nothing, for a
 stalled worker comes back under the same one. Whether a lease has run out is judged when somebody claims, by
 the database's clock, so no replica sweeps up after the others.
 
@@ -22,6 +22,9 @@ from sqlalchemy.sql.functions import GenericFunction
 from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, insert_or, unix_now
 from graspdb_service.storage.tables import jobs, workers
+
+OPEN = (JobState.WAITING, JobState.QUEUED, JobState.LEASED)
+"""States of a job that is still to be done."""
 
 STALE_LEASE_ERROR = (
     "the lease ran out {attempts} times: the job stalls or kills its worker"
@@ -48,7 +51,7 @@ def _postgres_fresh_id(element: fresh_id, compiler: Any, **_: Any) -> str:
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job as it is stored; times in seconds since 1970 by the database's clock."""
+    """A job as stored; ``attempts`` counts its leases, times are seconds since 1970 by its clock."""
 
     id: str
     kind: str
@@ -78,11 +81,12 @@ class WorkerRow:
     poses_done: int
 
 
-_COLUMNS = [jobs.c[name] for name in JobRow.__dataclass_fields__]
+COLUMNS = [jobs.c[name] for name in JobRow.__dataclass_fields__]
 
 
-def _job(row: Any) -> JobRow:
-    return JobRow(**row._mapping)
+def job_row(row: Any) -> JobRow:
+    """A row of :data:`COLUMNS`."""
+    return JobRow(**{**row._mapping, "state": JobState(row.state)})
 
 
 def job_ids(created_ms: int, count: int, *, urgent: bool) -> list[str]:
@@ -102,8 +106,8 @@ def job_ids(created_ms: int, count: int, *, urgent: bool) -> list[str]:
 
 def find(tx: Tx, job_id: str) -> JobRow | None:
     """The job with this id."""
-    row = tx.execute(select(*_COLUMNS).where(jobs.c.id == job_id)).first()
-    return None if row is None else _job(row)
+    row = tx.execute(select(*COLUMNS).where(jobs.c.id == job_id)).first()
+    return None if row is None else job_row(row)
 
 
 def _claimable(capabilities: Sequence[str], max_attempts: int) -> ColumnElement[bool]:
@@ -151,9 +155,9 @@ def claim(
             worker=worker,
             progress=None,
         )
-        .returning(*_COLUMNS)
+        .returning(*COLUMNS)
     )
-    return sorted((_job(row) for row in tx.execute(statement)), key=lambda job: job.id)
+    return sorted((job_row(row) for row in tx.execute(statement)), key=lambda job: job.id)
 
 
 def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str | None = None) -> float | None:
@@ -170,7 +174,7 @@ def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str |
 
 
 def release(tx: Tx, job_id: str, lease_id: str) -> bool:
-    """Give a leased job back; a worker's orderly end is no failed attempt. False if the lease is lost."""
+    """Give a leased job back; a worker's orderly end counts as no lease. False if the lease is lost."""
     statement = (
         update(jobs)
         .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
@@ -204,10 +208,14 @@ def complete(
     return tx.execute(statement).rowcount == 1
 
 
-def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -> str | None:
-    """Record a failed attempt: queued again, or failed for good after the last; None if the lease is lost.
+def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -> JobState | None:
+    """Record a failure: queued again, or failed for good after the last lease.
 
     The job keeps the lease id, so that the same report sent again is recognised.
+
+    Returns
+    -------
+    The job's new state, None if the lease is lost.
     """
     held = and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
     ended = tx.execute(
@@ -225,13 +233,13 @@ def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -
 
 def exhausted(tx: Tx, max_attempts: int) -> list[JobRow]:
     """Jobs whose last allowed lease has run out."""
-    query = select(*_COLUMNS).where(
+    query = select(*COLUMNS).where(
         jobs.c.state == JobState.LEASED, jobs.c.lease_expires_at < unix_now(), jobs.c.attempts >= max_attempts
     )
-    return [_job(row) for row in tx.execute(query)]
+    return [job_row(row) for row in tx.execute(query)]
 
 
-def end_exhausted(tx: Tx, job: JobRow) -> bool:
+def expire(tx: Tx, job: JobRow) -> bool:
     """Fail a job found by :func:`exhausted`, unless its worker came back meanwhile."""
     statement = (
         update(jobs)

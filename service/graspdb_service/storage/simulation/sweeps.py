@@ -14,13 +14,13 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, 
 from graspdb.wire.states import JobState, SweepState
 from graspdb_service.storage.database import Tx, unix_now
 from graspdb_service.storage.objects import ObjectGone
+from graspdb_service.storage.simulation.jobs import OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, sweeps
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
 POSE_COLUMNS = 8
 _POSE_BYTES = 8 * POSE_COLUMNS
 _JOBS_PER_INSERT = 10_000
-_OPEN = (JobState.WAITING, JobState.QUEUED, JobState.LEASED)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,13 @@ def lock_object(tx: Tx, object_id: int) -> None:
 
 
 def lock_and_read_revision(tx: Tx, object_id: int) -> int:
-    """Take the object's row lock; its revision, which stays as it is, or ObjectGone."""
+    """Take the object's row lock; its revision, which stays as it is.
+
+    Raises
+    ------
+    ObjectGone
+        If the object was deleted.
+    """
     query = select(objects.c.revision).where(objects.c.id == object_id).with_for_update(key_share=True)
     revision = tx.scalar(query)
     if revision is None:
@@ -97,49 +103,33 @@ def lock_and_read_revision(tx: Tx, object_id: int) -> int:
 
 def create(
     tx: Tx,
+    sweep: Mapping[str, Any],
     *,
-    sweep_id: str,
-    object_id: int,
-    provenance_id: int,
-    gripper: str,
-    protocol: str,
-    fidelity: str,
-    purpose: str,
-    plan: str,
-    request: Mapping[str, Any],
-    snapshot: Mapping[str, Any],
     poses: npt.NDArray[np.float64] | None,
-    pose_count: int,
-    chunk_poses: int,
     capability: str,
     job_ids: Sequence[str],
     waiting: bool = False,
 ) -> None:
     """Store a sweep and queue its jobs, one for every ``chunk_poses`` poses of the plan.
 
-    ``poses`` of a plan that is no grid are rows (pose_count, 8): position, quaternion xyzw and proposal
-    density (NaN: none). ``waiting`` for the object's convex parts, jobs can't be claimed.
+    Parameters
+    ----------
+    sweep
+        What :class:`SweepRow` has but for chunks, times, batch and the object's slug.
+    poses : (pose_count, 8) float64 or None
+        Position, quaternion xyzw and proposal density (NaN: none) of a plan that is no grid.
+    waiting
+        The jobs wait for the object's convex parts before they can be claimed.
     """
-    tx.execute(
-        insert(sweeps).values(
-            id=sweep_id,
-            object_id=object_id,
-            provenance_id=provenance_id,
-            gripper=gripper,
-            protocol=protocol,
-            fidelity=fidelity,
-            purpose=purpose,
-            plan=plan,
-            request=dict(request),
-            snapshot=dict(snapshot),
-            poses=None if poses is None else np.ascontiguousarray(poses, dtype="<f8").tobytes(),
-            pose_count=pose_count,
-            chunk_poses=chunk_poses,
-            chunks=len(job_ids),
-            cancelled=False,
-            created_at=datetime.now(UTC),
-        )
-    )
+    chunk_poses, pose_count = sweep["chunk_poses"], sweep["pose_count"]
+    values = {
+        **sweep,
+        "poses": None if poses is None else np.ascontiguousarray(poses, dtype="<f8").tobytes(),
+        "chunks": len(job_ids),
+        "cancelled": False,
+        "created_at": datetime.now(UTC),
+    }
+    tx.execute(insert(sweeps).values(values))
     for first in range(0, len(job_ids), _JOBS_PER_INSERT):
         tx.execute(
             insert(jobs),
@@ -148,8 +138,8 @@ def create(
                     "id": job_id,
                     "kind": "simulate",
                     "capability": capability,
-                    "object_id": object_id,
-                    "sweep_id": sweep_id,
+                    "object_id": sweep["object_id"],
+                    "sweep_id": sweep["id"],
                     "number": number,
                     "start": number * chunk_poses,
                     "stop": min((number + 1) * chunk_poses, pose_count),
@@ -179,7 +169,7 @@ def find_many(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, SweepRow]:
 
 
 def state_of(sweep: SweepRow, failed_chunks: int) -> SweepState:
-    """What its own row and its failed chunks make of it."""
+    """Where a sweep is."""
     if sweep.cancelled:
         return SweepState.CANCELLED
     if sweep.finished_at is not None:
@@ -187,7 +177,7 @@ def state_of(sweep: SweepRow, failed_chunks: int) -> SweepState:
     return SweepState.QUEUED if sweep.started_at is None else SweepState.RUNNING
 
 
-def _in_state(state: SweepState) -> ColumnElement[bool]:
+def _in_state(state: str) -> ColumnElement[bool]:
     ended = and_(not_(sweeps.c.cancelled), sweeps.c.finished_at.is_not(None))
     going = and_(not_(sweeps.c.cancelled), sweeps.c.finished_at.is_(None))
     any_failed = exists().where(jobs.c.sweep_id == sweeps.c.id, jobs.c.state == JobState.FAILED)
@@ -197,7 +187,7 @@ def _in_state(state: SweepState) -> ColumnElement[bool]:
         SweepState.DONE: and_(ended, not_(any_failed)),
         SweepState.QUEUED: and_(going, sweeps.c.started_at.is_(None)),
         SweepState.RUNNING: and_(going, sweeps.c.started_at.is_not(None)),
-    }[state]
+    }[SweepState(state)]
 
 
 def listing(
@@ -208,7 +198,7 @@ def listing(
     if object_id is not None:
         query = query.where(sweeps.c.object_id == object_id)
     if state is not None:
-        query = query.where(_in_state(SweepState(state)))
+        query = query.where(_in_state(state))
     if before is not None:
         query = query.where(sweeps.c.id < before)
     return [SweepRow(**row._mapping) for row in tx.execute(query)]
@@ -279,7 +269,7 @@ def note_finished(tx: Tx, sweep_id: str) -> bool:
     # From the last chunk backwards: while a sweep runs, that is where the open ones are.
     still_open = (
         select(jobs.c.id)
-        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(_OPEN))
+        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(OPEN))
         .order_by(jobs.c.number.desc())
         .limit(1)
     )
@@ -298,7 +288,7 @@ def cancel(tx: Tx, sweep_id: str) -> bool:
     # The lease stays, so that its holder is told to stop rather than that the lease is lost.
     stopped = tx.execute(
         update(jobs)
-        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(_OPEN))
+        .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(OPEN))
         .values(state=JobState.CANCELLED, completed_at=unix_now())
     )
     if stopped.rowcount == 0:

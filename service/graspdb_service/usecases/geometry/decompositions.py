@@ -17,7 +17,7 @@ from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import decompositions, sweeps
-from graspdb_service.storage.simulation.jobs import JobRow, job_ids
+from graspdb_service.storage.simulation.jobs import OPEN, JobRow, job_ids
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.usecases.trials import sweep_plan
 
@@ -113,7 +113,7 @@ def fail_waiting(tx: Tx, job: JobRow, reason: str) -> None:
 def drop_unwanted(tx: Tx, object_id: int) -> None:
     """Stop a decomposition that no sweep waits for any more."""
     job = decompositions.find(tx, object_id)
-    is_open = job is not None and job.state in (JobState.QUEUED, JobState.LEASED)
+    is_open = job is not None and job.state in OPEN
     if is_open and not decompositions.waiting_sweeps(tx, object_id):
         decompositions.cancel(tx, object_id)
 

@@ -1,33 +1,16 @@
-"""Jobs: hand them out under leases, and take results in, each once."""
+"""Results: what a worker hands in, stored once in the transaction that completes its job."""
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 import numpy as np
 import numpy.typing as npt
 
-from graspdb.wire import (
-    OUTCOME_CODES,
-    OUTCOMES,
-    ClaimedJob,
-    ClaimRequest,
-    ClaimResponse,
-    DecomposePayload,
-    FailureReport,
-    GridPlan,
-    LeaseRenewed,
-    PosePlan,
-    ResultAccepted,
-    SimulatePayload,
-    SimulateResult,
-    WorkerInfo,
-)
-from graspdb.wire.jobs import FailureNoted
+from graspdb.wire import OUTCOME_CODES, OUTCOMES, ResultAccepted, SimulateResult
 from graspdb.wire.states import JobState
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import ProblemError, invalid
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
@@ -40,11 +23,11 @@ from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.geometry import decompositions, meshes
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
+from graspdb_service.usecases.simulation import leases
+from graspdb_service.usecases.simulation.leases import lost_lease
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
 
-#: An idle worker that asks again and again is noted this often, so that asking takes no write lock.
-WORKER_NOTED_EVERY_S = 10.0
 #: Sweeps over the same grid that finish chunks at the same moment make one another look again.
 _MAX_LOOKS = 50
 
@@ -68,160 +51,28 @@ class _Overtaken(Exception):
     """Another sweep over the same grid has finished a chunk since its chunks were read."""
 
 
-def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
-    """Lease jobs to a worker and register it; 422 if it names no capability."""
-    settings = ctx.settings
-    capabilities = sorted(set(request.capabilities))
-    if not capabilities:
-        raise invalid("capabilities", "name at least one, such as simulate")
-    with ctx.database.read() as tx:
-        exhausted = jobs.exhausted(tx, settings.max_attempts)
-        age = jobs.worker_age(tx, request.worker)
-        work = jobs.any_claimable(tx, capabilities, settings.max_attempts)
-    for job in exhausted:
-        _end(ctx, job)
-    if not work and age is not None and age < WORKER_NOTED_EVERY_S:
-        return ClaimResponse(jobs=[], retry_after_s=settings.retry_after_s)
-    with ctx.database.write() as tx:
-        claimed = jobs.claim(
-            tx,
-            worker=request.worker,
-            capabilities=capabilities,
-            limit=request.limit,
-            lease_s=settings.lease_s,
-            max_attempts=settings.max_attempts,
-        )
-        ids = sorted({job.sweep_id for job in claimed if job.sweep_id is not None})
-        if ids:
-            sweeps.note_started(tx, ids)
-        jobs.see_worker(tx, request.worker, capabilities)
-        rows = sweeps.find_many(tx, ids)
-        stored = {
-            job.id: sweep_plan.chunk_poses(tx, rows[job.sweep_id], job.start, job.stop)
-            for job in claimed
-            if job.sweep_id is not None
-        }
-        payloads = {job.id: decompositions.payload(tx, job) for job in claimed if job.kind == "decompose"}
-    answers = []
-    for job in claimed:
-        payload: SimulatePayload | DecomposePayload | None
-        if job.sweep_id is None:
-            payload = payloads[job.id]
-        else:
-            payload = _payload(rows[job.sweep_id], job, stored[job.id])
-        if payload is not None:
-            answer = ClaimedJob(
-                id=job.id,
-                kind="decompose" if job.sweep_id is None else "simulate",
-                lease_id=job.lease_id or "",
-                lease_expires_at=_time(job.lease_expires_at),
-                lease_s=settings.lease_s,
-                payload=payload,
-            )
-            answers.append(answer)
-    return ClaimResponse(jobs=answers, retry_after_s=0.0 if answers else settings.retry_after_s)
-
-
-def _payload(sweep: SweepRow, job: JobRow, stored: ChunkPoses | None) -> SimulatePayload:
-    world = sweep.snapshot["world"]
-    return SimulatePayload(
-        sweep=sweep.id,
-        object=sweep.object,
-        convex_parts=f"/objects/{sweep.object}/convex-parts",
-        parts_sha256=world["parts_sha256"],
-        mass_kg=world["mass_kg"],
-        friction=world["friction"],
-        gripper=world["gripper"],
-        protocol=sweep.protocol,
-        fidelity=sweep.fidelity,
-        grid=None if stored is not None else GridPlan.model_validate(sweep.snapshot["grid"]),
-        poses=None
-        if stored is None
-        else PosePlan(position=stored.position.tolist(), quaternion_xyzw=stored.quaternion_xyzw.tolist()),
-        start=job.start,
-        stop=job.stop,
-    )
-
-
-def _time(seconds: float | None) -> datetime:
-    return datetime.fromtimestamp(seconds or 0.0, UTC)
-
-
-def _end(ctx: Runtime, job: JobRow) -> None:
-    """Fail a job whose last attempt has run out."""
-    with ctx.database.write() as tx:
-        sweeps.lock_object(tx, job.object_id)
-        if jobs.end_exhausted(tx, job):
-            _failed(tx, _found(jobs.find(tx, job.id), job.id))
-
-
-def _failed(tx: Tx, job: JobRow) -> None:
-    """What follows from a job that has failed for good."""
-    if job.sweep_id is not None:
-        sweeps.note_finished(tx, job.sweep_id)
-    else:
-        decompositions.fail_waiting(tx, job, job.error or "no reason given")
-
-
-def renew(ctx: Runtime, job_id: str, lease_id: str, progress: str | None = None) -> LeaseRenewed:
-    """Extend a lease, or tell its holder that the job is no longer wanted."""
-    with ctx.database.write() as tx:
-        ends = jobs.renew(tx, job_id, lease_id, ctx.settings.lease_s, progress=progress)
-        job = None if ends is not None else jobs.find(tx, job_id)
-    if ends is not None:
-        return LeaseRenewed(lease_expires_at=_time(ends), lease_s=ctx.settings.lease_s)
-    job = _found(job, job_id)
-    if job.state == JobState.CANCELLED and job.lease_id == lease_id:
-        return LeaseRenewed(lease_expires_at=_time(job.lease_expires_at), lease_s=0.0, cancel=True)
-    raise _lost(job)
-
-
-def release(ctx: Runtime, job_id: str, lease_id: str) -> None:
-    """Give a job back, unfinished."""
-    with ctx.database.write() as tx:
-        if jobs.release(tx, job_id, lease_id):
-            return
-        job = jobs.find(tx, job_id)
-    raise _lost(_found(job, job_id))
-
-
-def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> FailureNoted:
-    """Record a failed attempt; after the last one the job is failed for good."""
-    with ctx.database.read() as tx:
-        job = _found(jobs.find(tx, job_id), job_id)
-    with ctx.database.write() as tx:
-        sweeps.lock_object(tx, job.object_id)
-        attempts = 0 if report.permanent else ctx.settings.max_attempts
-        state = jobs.fail(tx, job_id, lease_id, error=report.error, max_attempts=attempts)
-        job = _found(jobs.find(tx, job_id), job_id)
-        if state == JobState.FAILED:
-            _failed(tx, job)
-    # The same report once more, its answer having been lost.
-    repeated = state is None and job.lease_id == lease_id and job.state in (JobState.QUEUED, JobState.FAILED)
-    if state is None and not repeated:
-        raise _lost(job)
-    return FailureNoted(job=job_id, state=job.state, attempts=job.attempts)
-
-
 def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: SimulateResult) -> ResultAccepted:
     """Store a chunk's result in the transaction that completes its job.
 
-    The same ``body`` under the same lease is answered the same again. 409 ``lease-lost``; 422 if the result
-    does not fit the chunk: nothing is stored then.
+    Parameters
+    ----------
+    body
+        The request as it came: the same bytes under the same lease are answered the same again.
+
+    Raises
+    ------
+    ProblemError
+        409 ``lease-lost``; 422 if the result does not fit the chunk. Nothing is stored then.
     """
     sha256 = hashlib.sha256(body).hexdigest()
     for _ in range(_MAX_LOOKS):
         with ctx.database.read() as tx:
-            job = _found(jobs.find(tx, job_id), job_id)
-            if (earlier := _replay(job, lease_id, sha256)) is not None:
-                return earlier
-            if job.state != JobState.LEASED or job.lease_id != lease_id:
-                raise _lost(job)
-            if job.kind != "simulate":
-                raise WrongResult(job.kind)
+            job = _held(tx, job_id, lease_id, sha256, "simulate")
+            if isinstance(job, ResultAccepted):
+                return job
             sweep = sweeps.find(tx, job.sweep_id or "")
             if sweep is None:
-                raise _lost(job)
+                raise lost_lease(job)
             stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
             twins = _twins(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
             ranges = packed.done_ranges(tx, list(twins))
@@ -241,12 +92,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
         except _Overtaken:
             continue
         except _LostLease:
-            # By another claim, a cancellation, or this very request sent twice at once.
-            with ctx.database.read() as tx:
-                job = _found(jobs.find(tx, job_id), job_id)
-            if (earlier := _replay(job, lease_id, sha256)) is not None:
-                return earlier
-            raise _lost(job) from None
+            return _replayed(ctx, job_id, lease_id, sha256, "simulate")
     raise ProblemError(
         503,
         "busy",
@@ -258,21 +104,20 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
 def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
     """Store the convex parts that a worker made, in the transaction that completes its job.
 
-    409 ``lease-lost``; 413 and 422 as for parts that a user sends: nothing is stored then.
+    Raises
+    ------
+    ProblemError
+        409 ``lease-lost``; 413 and 422 as for parts that a user sends. Nothing is stored then.
     """
     sha256 = hashlib.sha256(body).hexdigest()
     with ctx.database.read() as tx:
-        job = _found(jobs.find(tx, job_id), job_id)
-        if (earlier := _replay(job, lease_id, sha256)) is not None:
-            return earlier
-        if job.kind != "decompose":
-            raise WrongResult(job.kind)
-        if job.state != JobState.LEASED or job.lease_id != lease_id:
-            raise _lost(job)
+        job = _held(tx, job_id, lease_id, sha256, "decompose")
+        if isinstance(job, ResultAccepted):
+            return job
         source = decompositions.source(tx, job)
         row = None if source is None else require(tx, source)
     if row is None:
-        raise _lost(job)
+        raise lost_lease(job)
     info = meshes.check_parts(ctx, row, body)
     try:
         with ctx.database.write() as tx:
@@ -290,12 +135,37 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
             meshes.store_parts(tx, locked, body, info)
             jobs.credit_worker(tx, job.worker, 0)
     except _LostLease:
-        with ctx.database.read() as tx:
-            job = _found(jobs.find(tx, job_id), job_id)
-        if (earlier := _replay(job, lease_id, sha256)) is not None:
-            return earlier
-        raise _lost(job) from None
+        return _replayed(ctx, job_id, lease_id, sha256, "decompose")
     return accepted
+
+
+def _held(tx: Tx, job_id: str, lease_id: str, sha256: str, kind: str) -> JobRow | ResultAccepted:
+    """The job under this lease, or what the same result was answered before.
+
+    Raises
+    ------
+    ProblemError
+        409 ``lease-lost``.
+    WrongResult
+        If the job is of another kind.
+    """
+    job = leases.require(jobs.find(tx, job_id), job_id)
+    if job.state == JobState.DONE and job.lease_id == lease_id and job.result_sha256 == sha256:
+        return ResultAccepted.model_validate(job.answer)
+    if job.state != JobState.LEASED or job.lease_id != lease_id:
+        raise lost_lease(job)
+    if job.kind != kind:
+        raise WrongResult(job.kind)
+    return job
+
+
+def _replayed(ctx: Runtime, job_id: str, lease_id: str, sha256: str, kind: str) -> ResultAccepted:
+    """For a lease lost meanwhile: to another claim, a cancellation, or this very request sent twice."""
+    with ctx.database.read() as tx:
+        job = _held(tx, job_id, lease_id, sha256, kind)
+    if isinstance(job, ResultAccepted):
+        return job
+    raise lost_lease(job)
 
 
 @dataclass(frozen=True)
@@ -439,45 +309,3 @@ def _store(
         )
         jobs.credit_worker(tx, job.worker, job.stop - job.start)
     return accepted
-
-
-def _found(job: JobRow | None, job_id: str) -> JobRow:
-    if job is None:
-        raise not_found("job", job_id[:80], "its object may have been deleted")
-    return job
-
-
-def _replay(job: JobRow, lease_id: str, sha256: str) -> ResultAccepted | None:
-    if job.state == JobState.DONE and job.lease_id == lease_id and job.result_sha256 == sha256:
-        return ResultAccepted.model_validate(job.answer)
-    return None
-
-
-def _lost(job: JobRow) -> ProblemError:
-    reason = {
-        JobState.DONE: "it is done",
-        JobState.CANCELLED: "its sweep was cancelled",
-        JobState.FAILED: "it has failed for good",
-        JobState.WAITING: "it waits for convex parts",
-        JobState.QUEUED: "it was given back or failed, and waits for another claim",
-        JobState.LEASED: "another claim has it",
-    }[job.state]
-    return conflict("lease-lost", f"This lease is no longer the job's: {reason}. Drop it and claim again")
-
-
-def workers(ctx: Runtime, *, skip: int, limit: int) -> tuple[list[WorkerInfo], int | None]:
-    """Every worker that ever asked for jobs, by name, and where the next page starts."""
-    with ctx.database.read() as tx:
-        rows = jobs.list_workers(tx, skip=skip, limit=limit + 1)
-    items = [
-        WorkerInfo(
-            worker=row.name,
-            capabilities=row.capabilities,
-            last_seen=_time(row.last_seen),
-            jobs_leased=row.jobs_leased,
-            jobs_done=row.jobs_done,
-            poses_done=row.poses_done,
-        )
-        for row in rows[:limit]
-    ]
-    return items, skip + limit if len(rows) > limit else None

@@ -1,0 +1,85 @@
+"""Outcomes: what became of every pose of a sweep."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+from graspdb_service.problems import invalid
+from graspdb_service.storage.database import Database
+from graspdb_service.storage.simulation import outcomes as packed
+from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.usecases.simulation.sweeps import require_sweep
+from graspdb_service.usecases.trials import sweep_plan
+
+#: Poses read at a time where all are asked for.
+STREAM_POSES = 100_000
+
+_CURSOR = re.compile(r"(\d{1,9})\.(\d{1,9})")
+
+
+def page(
+    database: Database, sweep_id: str, *, limit: int, cursor: str | None
+) -> tuple[TrialColumns, str | None]:
+    """Poses of finished chunks with outcome and pose index, in the plan's order; where the next page starts.
+
+    While a sweep runs, a page has the chunks that are finished by then: read it again at the end.
+    """
+    number, skip = 0, 0
+    if cursor is not None:
+        match = _CURSOR.fullmatch(cursor)
+        if match is None:
+            raise invalid("cursor", "take it from `next` of the page before")
+        number, skip = int(match[1]), int(match[2])
+    with database.read() as tx:
+        row = require_sweep(tx, sweep_id)
+        # One pose more than asked for tells whether there is another page.
+        chunks = packed.page(tx, sweep_id, first_number=number, poses=limit + skip + 1)
+        stored = {chunk.number: sweep_plan.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
+    grid = sweep_plan.grid_of(row) if row.plan == "grid" else None
+    index, position = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
+    quaternion, codes = [np.empty((0, 4))], [np.empty(0, dtype=np.uint8)]
+    following = None
+    for chunk in chunks:
+        first = skip if chunk.number == number else 0
+        last = min(chunk.stop - chunk.start, first + limit)
+        if limit == 0:
+            following = f"{chunk.number}.{first}"
+            break
+        if first >= last:
+            continue
+        poses = stored[chunk.number]
+        if poses is None:
+            assert grid is not None
+            poses = sweep_plan.grid_poses(grid, chunk.start, chunk.stop)
+        part = slice(first, last)
+        index.append(poses.pose_index[part])
+        position.append(poses.position[part])
+        quaternion.append(poses.quaternion_xyzw[part])
+        codes.append(np.frombuffer(chunk.outcomes, dtype=np.uint8)[part])
+        limit -= last - first
+        if last < chunk.stop - chunk.start:
+            following = f"{chunk.number}.{last}"
+            break
+    columns = TrialColumns(
+        position=np.concatenate(position),
+        quaternion_xyzw=np.concatenate(quaternion),
+        outcome=np.concatenate(codes),
+        pose_index=np.concatenate(index),
+    )
+    return columns, following
+
+
+def pages(database: Database, sweep_id: str, *, cursor: str | None) -> Iterator[TrialColumns]:
+    """All poses of finished chunks from a cursor on."""
+    columns, following = page(database, sweep_id, limit=STREAM_POSES, cursor=cursor)
+
+    def rest(columns: TrialColumns, following: str | None) -> Iterator[TrialColumns]:
+        yield columns
+        while following is not None:
+            columns, following = page(database, sweep_id, limit=STREAM_POSES, cursor=following)
+            yield columns
+
+    return rest(columns, following)

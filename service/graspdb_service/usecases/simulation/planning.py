@@ -1,0 +1,269 @@
+"""Making a sweep: what it simulates, checked in every way that can be before a worker starts."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from graspdb.wire import (
+    GridPlan,
+    GridSpec,
+    GripperProfile,
+    KernelInfo,
+    PoseColumns,
+    SampleSpec,
+    Selection,
+    SweepCreate,
+)
+from graspdb_service.problems import conflict, invalid
+from graspdb_service.storage import grippers
+from graspdb_service.storage.database import Tx
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.simulation import jobs, sweeps
+from graspdb_service.storage.simulation.sweeps import POSE_COLUMNS
+from graspdb_service.storage.trials import batches, provenances
+from graspdb_service.trial_columns import Provenance
+from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.geometry import decompositions
+from graspdb_service.usecases.grasps import likelihood
+from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
+from graspdb_service.usecases.simulation import feasibility
+from graspdb_service.usecases.simulation.sweeps import require_sweep, sweep_info
+from graspdb_service.usecases.trials import sweep_plan
+
+#: More chunks than this are bookkeeping without a use: no lab has so many workers.
+MAX_CHUNKS = 100_000
+#: A plan is cut into at least about this many chunks, so that several processes share a small one ...
+WANTED_CHUNKS = 16
+#: ... down to these many poses. Given and drawn poses lie at the object, where each needs physics.
+MIN_GRID_CHUNK, MIN_POSES_CHUNK, MAX_POSES_CHUNK = 1_000, 10, 2_000
+
+
+@dataclass(frozen=True)
+class _World:
+    """What a sweep's physics depends on, as it is when the sweep is made."""
+
+    object: ObjectRow
+    snapshot: dict[str, Any]
+    profile: GripperProfile
+
+    def still_holds(self, row: ObjectRow) -> bool:
+        names = ("id", "mesh_sha256", "parts_sha256", "mass_kg", "density_kg_m3", "friction")
+        return all(getattr(row, name) == getattr(self.object, name) for name in names)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What to simulate: a grid, or poses (n, 8) as :func:`sweeps.create` takes them."""
+
+    kind: str
+    count: int
+    grid: GridPlan | None = None
+    full_count: int | None = None
+    poses: npt.NDArray[np.float64] | None = None
+    kernel: KernelInfo | None = None
+
+
+def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
+    """Check and queue a sweep.
+
+    Parameters
+    ----------
+    key, request
+        The Idempotency-Key and the body it belongs to.
+
+    Raises
+    ------
+    ProblemError
+        404 without the object, 409 while it lacks its mesh, 422 for what can't be simulated.
+    """
+    scope = f"POST /objects/{slug}/sweeps"
+    earlier = replayed(ctx.database, scope=scope, key=key, request=request)
+    if earlier is not None:
+        return earlier
+    with ctx.database.read() as tx:
+        row = require(tx, slug)
+        gripper = grippers.find(tx, spec.gripper)
+        if row.mesh_info is not None and row.parts_sha256 is None:
+            decompositions.check(tx, row)
+    if gripper is None:
+        raise invalid("gripper", f"there is no gripper {spec.gripper!r}: GET /grippers lists them")
+    world = _world(row, GripperProfile.model_validate(gripper.profile))
+    plan = _plan(ctx, slug, spec, world)
+    chunk = _chunk_size(ctx, spec, plan)
+    # In memory and in one go, before the transaction, that it may be short.
+    created_ms = time.time_ns() // 1_000_000
+    numbers = jobs.job_ids(created_ms, -(-plan.count // chunk), urgent=spec.purpose == "check")
+    snapshot = _snapshot(world, plan, spec)
+    wish = spec.model_dump(mode="json", exclude={"poses"}, exclude_none=True)
+    if plan.grid is not None:
+        wish["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
+
+    def store(tx: Tx) -> Created:
+        locked = require(tx, slug, lock=True)
+        if not world.still_holds(locked):
+            raise conflict("object-changed", f"Object {slug!r} was changed at the same moment: send it again")
+        waiting = locked.parts_sha256 is None
+        if waiting:
+            decompositions.ask(tx, locked, created_ms)
+        sweep_id = _new_id(created_ms)
+        provenance_id = provenances.ensure(
+            tx, locked.id, Provenance(spec.gripper, "simulation", spec.protocol)
+        )
+        sweep = {
+            "id": sweep_id,
+            "object_id": locked.id,
+            "provenance_id": provenance_id,
+            **spec.model_dump(include={"gripper", "protocol", "fidelity", "purpose"}),
+            "plan": plan.kind,
+            "request": wish,
+            "snapshot": snapshot,
+            "pose_count": plan.count,
+            "chunk_poses": chunk,
+        }
+        capability = "simulate" if spec.protocol == "wrench" else spec.protocol
+        sweeps.create(tx, sweep, poses=plan.poses, job_ids=numbers, capability=capability, waiting=waiting)
+        if waiting:
+            # Until there are parts, it repeats no other's poses.
+            snapshot["repeat_key"] = sweep_id
+        _, batch = batches.create(tx, locked.id, revision=locked.revision, sweep_id=sweep_id)
+        sweeps.keep_snapshot(tx, sweep_id, {**snapshot, "batch": batch})
+        info = sweep_info(tx, require_sweep(tx, sweep_id))
+        return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
+
+    return replay_or(ctx.database, scope=scope, key=key, request=request, create=store)
+
+
+def _snapshot(world: _World, plan: _Plan, spec: SweepCreate) -> dict[str, Any]:
+    """All that a sweep's results depend on, for good."""
+    snapshot: dict[str, Any] = {"world": world.snapshot, "full_count": plan.full_count}
+    if plan.grid is not None:
+        snapshot["grid"] = plan.grid.model_dump(mode="json")
+        snapshot["repeat_key"] = sweep_plan.repeat_key(
+            world.snapshot, spec.protocol, spec.fidelity, plan.grid
+        )
+    if plan.kernel is not None:
+        # A sample may name no widths, and those of a density change as it grows.
+        snapshot["drawn_with"] = plan.kernel.model_dump(mode="json")
+    return snapshot
+
+
+def _new_id(created_ms: int) -> str:
+    """A UUID of version 7 (RFC 9562): sweeps sort by their creation."""
+    random = uuid.uuid4().int
+    return str(
+        uuid.UUID(int=(created_ms << 80) | (7 << 76) | (random & ((1 << 76) - 1) & ~(3 << 62)) | (2 << 62))
+    )
+
+
+def _world(row: ObjectRow, profile: GripperProfile) -> _World:
+    if row.mesh_info is None or row.mesh_sha256 is None:
+        raise conflict("mesh-missing", f"Object {row.slug!r} has no mesh: PUT /objects/{row.slug}/mesh first")
+    feasibility.check_gripper(profile)
+    box = row.mesh_info["bounding_box"]
+    lower, upper = np.array(box["lower"]), np.array(box["upper"])
+    feasibility.check_size(row, float(np.max(upper - lower)), profile)
+    mass_kg = _mass(row)
+    feasibility.check_mass(row, mass_kg, (upper - lower).tolist())
+    snapshot = {
+        "mesh_sha256": row.mesh_sha256,
+        "parts_sha256": row.parts_sha256,
+        "mass_kg": mass_kg,
+        "friction": row.friction if row.friction is not None else profile.friction,
+        "gripper": profile.model_dump(mode="json"),
+        "lower": lower.tolist(),
+        "upper": upper.tolist(),
+    }
+    if snapshot["mass_kg"] is None:
+        snapshot["density_kg_m3"] = row.density_kg_m3
+    return _World(row, snapshot, profile)
+
+
+def _mass(row: ObjectRow) -> float | None:
+    """The mass, by density where it is not given; None where that has to wait for the parts' volume."""
+    if row.mass_kg is not None:
+        return row.mass_kg
+    if row.density_kg_m3 is not None:
+        # The mesh's own volume where it has one: parts may overlap, and differ from decomposer to decomposer.
+        volume = (row.mesh_info or {}).get("volume_m3") or (row.parts_info or {}).get("volume_m3")
+        return row.density_kg_m3 * volume if volume else None
+    raise invalid(
+        "mass_kg",
+        f"unknown: PATCH /objects/{row.slug} with mass_kg, or with density_kg_m3",
+        "The object's mass is needed: a grasp must hold its weight",
+    )
+
+
+def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan:
+    if spec.poses is not None:
+        return _given(ctx, spec.poses)
+    if spec.sample is not None:
+        return _drawn(ctx, slug, spec, spec.sample)
+    wish = spec.grid or GridSpec()
+    region = None if wish.region is None else (wish.region.lower, wish.region.upper)
+    plan = GridPlan(
+        **wish.model_dump(exclude={"region"}),
+        lower=world.snapshot["lower"],
+        upper=world.snapshot["upper"],
+        region=region,
+        symmetric=world.profile.symmetric,
+    )
+    try:
+        grid = sweep_plan.pose_grid(plan)
+        count, full = grid.total, grid.full_total
+    except ValueError as error:
+        text = str(error)
+        fields = ("region", "position_step_m", "rotation_step_deg", "margin_m", "max_poses", "seed")
+        field = next((name for name in fields if name in text), "position_step_m")
+        raise invalid(f"grid.{field}", text) from None
+    if count > ctx.settings.max_sweep_poses:
+        raise feasibility.too_many_poses(world.object, plan, world.profile, ctx.settings.max_sweep_poses)
+    return _Plan("grid", count, grid=plan, full_count=full)
+
+
+def _given(ctx: Estimators, poses: Any) -> _Plan:
+    if isinstance(poses, PoseColumns):
+        position, quaternion = poses.position, poses.quaternion_xyzw
+    else:
+        position = [pose.position for pose in poses]
+        quaternion = [pose.quaternion_xyzw for pose in poses]
+    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
+    if len(position) > limit:
+        raise invalid("poses", f"{len(position)} are more than {limit}: make several sweeps of them")
+    table = np.full((len(position), POSE_COLUMNS), np.nan)
+    table[:, :3] = position
+    table[:, 3:7] = quaternion
+    return _Plan("poses", len(table), poses=table)
+
+
+def _drawn(ctx: Estimators, slug: str, spec: SweepCreate, sample: SampleSpec) -> _Plan:
+    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
+    if sample.count > limit:
+        raise invalid("sample.count", f"at most {limit}")
+    selection = Selection(gripper=spec.gripper, protocol=sample.protocol, kernel=sample.kernel)
+    drawn = likelihood.draw(ctx, slug, selection, sample.count, sample.seed)
+    table = np.column_stack([drawn.position, drawn.quaternion_xyzw, drawn.proposal_density])
+    return _Plan("sample", len(table), poses=table, kernel=drawn.kernel)
+
+
+def _chunk_size(ctx: Estimators, spec: SweepCreate, plan: _Plan) -> int:
+    if spec.chunk_poses is not None:
+        size = spec.chunk_poses
+    else:
+        most, least = ctx.settings.chunk_poses, MIN_GRID_CHUNK
+        if plan.kind != "grid":
+            most, least = min(most, MAX_POSES_CHUNK), MIN_POSES_CHUNK
+        size = min(most, max(least, -(-plan.count // WANTED_CHUNKS)))
+    if plan.count > size * MAX_CHUNKS:
+        raise invalid(
+            "chunk_poses",
+            f"{plan.count} poses in chunks of {size} are more than {MAX_CHUNKS} chunks:"
+            f" take at least {-(-plan.count // MAX_CHUNKS)}",
+        )
+    return size
