@@ -38,8 +38,8 @@ from graspdb_service.api import (
     trials,
 )
 from graspdb_service.api.context import Context
-from graspdb_service.api.document import document
-from graspdb_service.api.routing import declared_parameters, refuse_unknown_parameters
+from graspdb_service.api.routing.document import document
+from graspdb_service.api.routing.scopes import declared_parameters, refuse_unknown_parameters
 from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
 from graspdb_service.settings import Settings

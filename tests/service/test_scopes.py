@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fastapi import FastAPI
 
-from graspdb_service.api.routing import SCOPE_FIELD, declared_parameters, scope
+from graspdb_service.api.routing.scopes import SCOPE_FIELD, declared_parameters, scope
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 

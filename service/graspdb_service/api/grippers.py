@@ -5,17 +5,10 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from graspdb.wire import GripperCreate, GripperInfo, Page
-from graspdb_service.api.routing import (
-    Ctx,
-    Cursor,
-    IdempotencyKey,
-    Limit,
-    RawBody,
-    encode_cursor,
-    name_cursor,
-    scope,
-    tagged_json,
-)
+from graspdb_service.api.routing.caching import tagged_json
+from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
+from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import grippers
 
 router = APIRouter(tags=["grippers"])

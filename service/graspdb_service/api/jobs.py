@@ -17,15 +17,9 @@ from graspdb.wire import (
     WorkerInfo,
 )
 from graspdb.wire.jobs import FailureNoted
-from graspdb_service.api.routing import (
-    Ctx,
-    Cursor,
-    Limit,
-    RawBody,
-    encode_cursor,
-    number_cursor,
-    scope,
-)
+from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
+from graspdb_service.api.routing.parameters import Ctx, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import BINARY, GLB, JSON, media_type, unsupported
 from graspdb_service.usecases.simulation import leases, results

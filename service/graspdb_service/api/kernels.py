@@ -10,17 +10,10 @@ from fastapi.responses import JSONResponse
 from graspdb.wire import Page, Slug
 from graspdb.wire.kernels import KernelCreate, StoredKernel
 from graspdb.wire.reports import ReportRun
-from graspdb_service.api.routing import (
-    Ctx,
-    Cursor,
-    IdempotencyKey,
-    Limit,
-    RawBody,
-    encode_cursor,
-    number_cursor,
-    scope,
-    tagged_json,
-)
+from graspdb_service.api.routing.caching import tagged_json
+from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
+from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases.kernels import stored
 
 router = APIRouter(tags=["kernels"])

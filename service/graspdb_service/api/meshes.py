@@ -7,7 +7,9 @@ from typing import Literal
 from fastapi import APIRouter, Request, Response
 
 from graspdb.wire import MeshInfo, PartsInfo
-from graspdb_service.api.routing import Ctx, RawBody, not_modified, scope
+from graspdb_service.api.routing.caching import not_modified
+from graspdb_service.api.routing.parameters import Ctx, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import BINARY, GLB, one_of
 from graspdb_service.usecases.geometry import meshes
 

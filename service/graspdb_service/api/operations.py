@@ -9,7 +9,8 @@ from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from graspdb_service import __version__
-from graspdb_service.api.routing import Ctx, scope
+from graspdb_service.api.routing.parameters import Ctx
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 

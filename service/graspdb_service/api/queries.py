@@ -26,7 +26,9 @@ from graspdb.wire.base import Position, Quaternion
 from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn, SelectionQuery
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
-from graspdb_service.api.routing import Ctx, RawBody, etag, not_modified, scope
+from graspdb_service.api.routing.caching import etag, not_modified
+from graspdb_service.api.routing.parameters import Ctx, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.columns import columns_arrow, columns_json
 from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted, media_type

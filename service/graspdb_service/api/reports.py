@@ -13,7 +13,9 @@ from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions, ReportRun, R
 from graspdb.wire.states import RunState
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
-from graspdb_service.api.routing import Ctx, etag, not_modified, scope
+from graspdb_service.api.routing.caching import etag, not_modified
+from graspdb_service.api.routing.parameters import Ctx
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import JSON, PNG, SVG, accepted
 from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.reports import summary

@@ -8,16 +8,9 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.states import AnySweepState
-from graspdb_service.api.routing import (
-    Ctx,
-    Cursor,
-    IdempotencyKey,
-    Limit,
-    RawBody,
-    encode_cursor,
-    name_cursor,
-    scope,
-)
+from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
+from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
 from graspdb_service.formats.sweep_outcomes import page_response, stream_response

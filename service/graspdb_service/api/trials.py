@@ -8,19 +8,10 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, TrialIn, TrialOut, TrialsIn
 from graspdb.wire.trials import TrialColumnsIn
-from graspdb_service.api.routing import (
-    Ctx,
-    Cursor,
-    IdempotencyKey,
-    Limit,
-    RawBody,
-    encode_cursor,
-    etag,
-    not_modified,
-    number_cursor,
-    scope,
-    tagged_json,
-)
+from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
+from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
+from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
 from graspdb_service.formats.trials import page_response, stream_response
 from graspdb_service.usecases import objects

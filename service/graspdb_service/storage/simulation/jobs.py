@@ -209,13 +209,9 @@ def complete(
 
 
 def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -> JobState | None:
-    """Record a failure: queued again, or failed for good after the last lease.
+    """Record a failure: queued again, or failed for good after the last lease; None if the lease is lost.
 
     The job keeps the lease id, so that the same report sent again is recognised.
-
-    Returns
-    -------
-    The job's new state, None if the lease is lost.
     """
     held = and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
     ended = tx.execute(

@@ -87,13 +87,7 @@ def lock_object(tx: Tx, object_id: int) -> None:
 
 
 def lock_and_read_revision(tx: Tx, object_id: int) -> int:
-    """Take the object's row lock; its revision, which stays as it is.
-
-    Raises
-    ------
-    ObjectGone
-        If the object was deleted.
-    """
+    """Take the object's row lock; its revision, which stays as it is, or ObjectGone."""
     query = select(objects.c.revision).where(objects.c.id == object_id).with_for_update(key_share=True)
     revision = tx.scalar(query)
     if revision is None:
@@ -112,14 +106,9 @@ def create(
 ) -> None:
     """Store a sweep and queue its jobs, one for every ``chunk_poses`` poses of the plan.
 
-    Parameters
-    ----------
-    sweep
-        What :class:`SweepRow` has but for chunks, times, batch and the object's slug.
-    poses : (pose_count, 8) float64 or None
-        Position, quaternion xyzw and proposal density (NaN: none) of a plan that is no grid.
-    waiting
-        The jobs wait for the object's convex parts before they can be claimed.
+    ``sweep`` is what :class:`SweepRow` has but for chunks, times, batch and the object's slug. ``poses`` of a
+    plan that is no grid are rows (pose_count, 8): position, quaternion xyzw and proposal density (NaN: none).
+    ``waiting`` for the object's convex parts, jobs can't be claimed.
     """
     chunk_poses, pose_count = sweep["chunk_poses"], sweep["pose_count"]
     values = {

@@ -31,13 +31,7 @@ WORKER_NOTED_EVERY_S = 10.0
 
 
 def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
-    """Lease jobs to a worker and register it.
-
-    Raises
-    ------
-    ProblemError
-        422 if the worker names no capability.
-    """
+    """Lease jobs to a worker and register it; 422 if it names no capability."""
     settings = ctx.settings
     capabilities = sorted(set(request.capabilities))
     if not capabilities:

@@ -54,15 +54,8 @@ class _Overtaken(Exception):
 def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: SimulateResult) -> ResultAccepted:
     """Store a chunk's result in the transaction that completes its job.
 
-    Parameters
-    ----------
-    body
-        The request as it came: the same bytes under the same lease are answered the same again.
-
-    Raises
-    ------
-    ProblemError
-        409 ``lease-lost``; 422 if the result does not fit the chunk. Nothing is stored then.
+    The same ``body`` under the same lease is answered the same again. 409 ``lease-lost``; 422 if the result
+    does not fit the chunk: nothing is stored then.
     """
     sha256 = hashlib.sha256(body).hexdigest()
     for _ in range(_MAX_LOOKS):
@@ -104,10 +97,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
 def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
     """Store the convex parts that a worker made, in the transaction that completes its job.
 
-    Raises
-    ------
-    ProblemError
-        409 ``lease-lost``; 413 and 422 as for parts that a user sends. Nothing is stored then.
+    409 ``lease-lost``; 413 and 422 as for parts that a user sends: nothing is stored then.
     """
     sha256 = hashlib.sha256(body).hexdigest()
     with ctx.database.read() as tx:
@@ -140,15 +130,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
 
 
 def _held(tx: Tx, job_id: str, lease_id: str, sha256: str, kind: str) -> JobRow | ResultAccepted:
-    """The job under this lease, or what the same result was answered before.
-
-    Raises
-    ------
-    ProblemError
-        409 ``lease-lost``.
-    WrongResult
-        If the job is of another kind.
-    """
+    """The job under this lease, or what the same result was answered before; 409 ``lease-lost``."""
     job = leases.require(jobs.find(tx, job_id), job_id)
     if job.state == JobState.DONE and job.lease_id == lease_id and job.result_sha256 == sha256:
         return ResultAccepted.model_validate(job.answer)

@@ -55,10 +55,7 @@ def cancel(database: Database, sweep_id: str) -> SweepInfo:
 def retry(database: Database, sweep_id: str) -> SweepInfo:
     """Queue failed and cancelled chunks again; without any it changes nothing.
 
-    Raises
-    ------
-    ProblemError
-        409 if the batch was deleted: what the sweep had found is gone, so the rest would mislead.
+    409 if the batch was deleted: what the sweep had found is gone, so the rest would mislead.
     """
     with database.read() as tx:
         row = require_sweep(tx, sweep_id)

@@ -10,7 +10,7 @@ from pydantic.json_schema import models_json_schema
 from starlette.routing import BaseRoute
 
 from graspdb.wire import Problem
-from graspdb_service.api.routing import BODY_MODELS
+from graspdb_service.api.routing.scopes import BODY_MODELS
 
 PROBLEM = {
     "description": "A problem (RFC 9457): `title` says what to do, `errors` name the fields",

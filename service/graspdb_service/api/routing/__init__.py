@@ -1,0 +1,1 @@
+"""What every route shares: a declared scope, known parameters, cursors and ETags."""

@@ -1,0 +1,34 @@
+"""ETags, and the answers that they spare."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import orjson
+from fastapi import Request, Response
+from pydantic import BaseModel
+
+
+def etag(*parts: object) -> str:
+    """A weak ETag of what an answer depends on."""
+    return 'W/"' + ".".join(str(part) for part in parts) + '"'
+
+
+def not_modified(request: Request, tag: str) -> Response | None:
+    """304 where the client already has this answer, else None."""
+    seen = request.headers.get("if-none-match")
+    if seen is None:
+        return None
+    tags = {item.strip().removeprefix("W/") for item in seen.split(",")}
+    if "*" in tags or tag.removeprefix("W/") in tags:
+        return Response(status_code=304, headers={"ETag": tag})
+    return None
+
+
+def tagged_json(request: Request, content: Any, *, tag: str | None = None) -> Response:
+    """A JSON answer with an ETag (by default of its content), or 304 where the client has it already."""
+    model = isinstance(content, BaseModel)
+    body = content.model_dump_json().encode() if model else orjson.dumps(content)
+    tag = tag or etag(hashlib.sha256(body).hexdigest()[:32])
+    return not_modified(request, tag) or Response(body, media_type="application/json", headers={"ETag": tag})

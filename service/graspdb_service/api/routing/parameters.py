@@ -1,0 +1,37 @@
+"""What routes take beside their own parameters: the context, a body's bytes, the Idempotency-Key."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+
+from fastapi import Depends, Header, Request
+
+from graspdb_service.api.context import Context
+from graspdb_service.problems import invalid
+
+
+def context(request: Request) -> Context:
+    """The service's parts, as :func:`graspdb_service.app.create_app` put them together."""
+    state: Context = request.app.state.context
+    return state
+
+
+Ctx = Annotated[Context, Depends(context)]
+
+
+def _key(idempotency_key: Annotated[str | None, Header()] = None) -> str | None:
+    if idempotency_key is not None and not re.fullmatch(r"[\x21-\x7e]{1,200}", idempotency_key):
+        raise invalid("Idempotency-Key", "1 to 200 printable ASCII characters, best a UUID")
+    return idempotency_key
+
+
+IdempotencyKey = Annotated[str | None, Depends(_key)]
+
+
+async def _raw_body(request: Request) -> bytes:
+    return await request.body()
+
+
+RawBody = Annotated[bytes, Depends(_raw_body)]
+"""The body's bytes. A large body must never be a FastAPI parameter, which would validate it row by row."""

@@ -1,0 +1,74 @@
+"""Declared scopes and parameters: a route without a scope stops the start, an unknown parameter a request."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+from fastapi import Request
+from pydantic import BaseModel
+
+from graspdb_service.problems import ProblemError
+
+Scope = Literal["public", "read", "trials:write", "jobs:work", "admin"]
+SCOPES: tuple[Scope, ...] = get_args(Scope)
+SCOPE_FIELD = "x-required-scope"
+
+
+BODY_MODELS: dict[str, type[BaseModel]] = {}
+"""Models of bodies that a route reads itself, for the OpenAPI document."""
+
+
+def scope(name: Scope, *, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``.
+
+    ``body`` documents a body that the route reads itself (:data:`RawBody`): by media type a model, a tuple
+    of models or a JSON schema.
+    """
+    extra: dict[str, Any] = {SCOPE_FIELD: name}
+    if body is not None:
+        content = {media: {"schema": _schema(given)} for media, given in body.items()}
+        extra["requestBody"] = {"required": True, "content": content}
+    return {"openapi_extra": extra}
+
+
+def _schema(given: Any) -> dict[str, Any]:
+    if isinstance(given, tuple):
+        return {"anyOf": [_schema(item) for item in given]}
+    if isinstance(given, type) and issubclass(given, BaseModel):
+        BODY_MODELS[given.__name__] = given
+        return {"$ref": f"#/components/schemas/{given.__name__}"}
+    schema: dict[str, Any] = given
+    return schema
+
+
+def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
+    """The query parameters of every operation of an OpenAPI document, by method and path.
+
+    RuntimeError if an operation declares no scope: none may be open by oversight.
+    """
+    found = {}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            if operation.get(SCOPE_FIELD) not in SCOPES:
+                raise RuntimeError(f"{method.upper()} {path} declares no scope")
+            names = [item["name"] for item in operation.get("parameters", ()) if item["in"] == "query"]
+            found[method.upper(), path] = frozenset(names)
+    return found
+
+
+def refuse_unknown_parameters(request: Request) -> None:
+    """422 for a query parameter that the route does not know: a typing error must not be ignored."""
+    path = getattr(request.scope.get("route"), "path", None)
+    known = request.app.state.parameters.get((request.method, path))
+    if known is None or not request.query_params:
+        return
+    unknown = sorted(set(request.query_params) - known)
+    if unknown:
+        allowed = ", ".join(sorted(known)) or "none"
+        raise ProblemError(
+            422,
+            "unknown-parameter",
+            f"Unknown query parameter {', '.join(unknown)}; this route takes: {allowed}",
+            errors=[(name, "unknown query parameter") for name in unknown],
+        )
