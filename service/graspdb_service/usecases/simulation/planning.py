@@ -71,18 +71,7 @@ class _Plan:
 
 
 def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
-    """Check and queue a sweep.
-
-    Parameters
-    ----------
-    key, request
-        The Idempotency-Key and the body it belongs to.
-
-    Raises
-    ------
-    ProblemError
-        404 without the object, 409 while it lacks its mesh, 422 for what can't be simulated.
-    """
+    """Check and queue a sweep: 409 while its object lacks its mesh, 422 for what can't be simulated."""
     scope = f"POST /objects/{slug}/sweeps"
     earlier = replayed(ctx.database, scope=scope, key=key, request=request)
     if earlier is not None:
@@ -101,9 +90,6 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, re
     created_ms = time.time_ns() // 1_000_000
     numbers = jobs.job_ids(created_ms, -(-plan.count // chunk), urgent=spec.purpose == "check")
     snapshot = _snapshot(world, plan, spec)
-    wish = spec.model_dump(mode="json", exclude={"poses"}, exclude_none=True)
-    if plan.grid is not None:
-        wish["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
 
     def store(tx: Tx) -> Created:
         locked = require(tx, slug, lock=True)
@@ -122,7 +108,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, re
             "provenance_id": provenance_id,
             **spec.model_dump(include={"gripper", "protocol", "fidelity", "purpose"}),
             "plan": plan.kind,
-            "request": wish,
+            "request": _request(spec, plan),
             "snapshot": snapshot,
             "pose_count": plan.count,
             "chunk_poses": chunk,
@@ -138,6 +124,14 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, re
         return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
 
     return replay_or(ctx.database, scope=scope, key=key, request=request, create=store)
+
+
+def _request(spec: SweepCreate, plan: _Plan) -> dict[str, Any]:
+    """What was asked for, defaults filled in; given poses are stored as the plan's."""
+    asked = spec.model_dump(mode="json", exclude={"poses"}, exclude_none=True)
+    if plan.grid is not None:
+        asked["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
+    return asked
 
 
 def _snapshot(world: _World, plan: _Plan, spec: SweepCreate) -> dict[str, Any]:
