@@ -23,7 +23,8 @@ from scipy.spatial import cKDTree
 
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density._compiled.threads import processors
-from graspdb_density.kde.weighted_sums import LEAST, Kernel, KernelRows
+from graspdb_density.kde.weighted_sums import LEAST, KernelRows
+from graspdb_density.kernels.gaussian_mixture import Kernel
 from graspdb_density.statistics.convergence import bootstrap_similarity
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve, convergence_curve
 

@@ -15,7 +15,8 @@ from scipy.special import logsumexp
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.bandwidth import matching
 from graspdb_density.kde import brute_force
-from graspdb_density.kde.weighted_sums import KernelRows, rotation_normaliser
+from graspdb_density.kde.weighted_sums import KernelRows
+from graspdb_density.kernels.gaussian_mixture import rotation_normaliser
 from graspdb_density.se3 import Floats
 from graspdb_density.statistics import convergence as cv
 from graspdb_density.statistics import incremental_bootstrap

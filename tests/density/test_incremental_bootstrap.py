@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.kde.weighted_sums import Kernel, KernelRows
+from graspdb_density.kde.weighted_sums import KernelRows
+from graspdb_density.kernels.gaussian_mixture import Kernel
 from graspdb_density.se3 import Floats
 from graspdb_density.statistics import convergence as cv
 from graspdb_density.statistics.counter_rng import FixedDraws

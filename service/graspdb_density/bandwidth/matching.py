@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import isotonic_regression
 
-from ..kde.weighted_sums import Kernel
+from ..kernels.gaussian_mixture import Kernel
 from ..kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS, IsotropicKernel
 from ..se3 import Floats
 

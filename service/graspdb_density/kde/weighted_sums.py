@@ -16,7 +16,6 @@ import math
 import threading
 from collections.abc import Callable
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,20 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from .. import se3
 from .._compiled import weighted
 from .._compiled.threads import for_blocks
+from ..kernels.gaussian_mixture import Kernel, MixtureKernel, rotation_normaliser
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
 from .cell_list import Cells
 from .isotropic import GraspDensity
 
-__all__ = [
-    "CUTOFF",
-    "TRUSTED_SUM",
-    "Kernel",
-    "KernelRows",
-    "MixtureKernel",
-    "Progress",
-    "rotation_normaliser",
-]
+__all__ = ["CUTOFF", "TRUSTED_SUM", "KernelRows", "Progress"]
 
 #: Kernels further than this many standard deviations of position are dropped.
 CUTOFF = 5.0
@@ -51,50 +43,6 @@ _WIDE_ROTATION = math.radians(20.0)
 
 #: Called with the share done, in [0, 1]; an exception it raises cancels the work and reaches the caller.
 Progress = Callable[[float], None]
-
-
-@runtime_checkable
-class MixtureKernel(Protocol):
-    """A mixture of Gaussians over displacements (translation in metres first, then rotation vector in
-    radians). It must be invariant under the jaw's mirror, see `KernelRows`.
-    """
-
-    @property
-    def weights(self) -> Floats:
-        """(C,) positive, summing to 1."""
-
-    @property
-    def means(self) -> Floats:
-        """(C, 6)."""
-
-    @property
-    def covariances(self) -> Floats:
-        """(C, 6, 6) positive definite."""
-
-
-Kernel = IsotropicKernel | MixtureKernel
-
-
-def rotation_normaliser(means: ArrayLike, covariances: ArrayLike) -> Floats:
-    """Haar volume under ``exp(-(r - m)^T T^-1 (r - m) / 2)`` over all rotation vectors r, relative to the
-    Gaussian's own, shape (C,).
-
-    The expectation of the volume element ``(2 sin(|r| / 2) / |r|)^2`` by Gauss-Hermite quadrature with 12^3
-    nodes. For zero means it agrees with ``1 - tr T / 12 + (tr^2 + 2 tr T^2) / 360`` within 1e-4 up to 40
-    degrees per axis.
-
-    Parameters
-    ----------
-    means : (C, 3) radians
-    covariances : (C, 3, 3) rad^2
-    """
-    node, weight = np.polynomial.hermite_e.hermegauss(12)
-    grid = np.stack(np.meshgrid(node, node, node, indexing="ij"), axis=-1).reshape(-1, 3)
-    weights = (weight[:, None, None] * weight[:, None] * weight).ravel() / (2.0 * math.pi) ** 1.5
-    mean, cov = np.asarray(means, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
-    vectors = mean[:, None, :] + np.einsum("cij,nj->cni", np.linalg.cholesky(cov), grid)
-    half = 0.5 * np.linalg.norm(vectors, axis=2)
-    return np.asarray(np.sinc(half / np.pi) ** 2 @ weights, dtype=np.float64)
 
 
 class KernelRows:

@@ -14,17 +14,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from ..kde.weighted_sums import rotation_normaliser
 from ..se3 import Floats
 from .isotropic import POSITION_LIMITS_M, IsotropicKernel
 
-__all__ = ["MOST_ROTATION", "AnisotropicKernel", "Frame", "mirror"]
+__all__ = [
+    "MOST_ROTATION",
+    "AnisotropicKernel",
+    "Frame",
+    "Kernel",
+    "MixtureKernel",
+    "mirror",
+    "rotation_normaliser",
+]
 
 #: Axes a row's translations are measured along: the gripper's, which turn with the jaw, or others, which do
 #: not.
@@ -42,6 +49,50 @@ def mirror(frame: Frame) -> Floats:
     if frame == "gripper":
         return np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
     return np.array([1.0, 1.0, 1.0, -1.0, -1.0, 1.0])
+
+
+@runtime_checkable
+class MixtureKernel(Protocol):
+    """A mixture of Gaussians over displacements (translation in metres first, then rotation vector in
+    radians). It must be invariant under the jaw's mirror, see the module.
+    """
+
+    @property
+    def weights(self) -> Floats:
+        """(C,) positive, summing to 1."""
+
+    @property
+    def means(self) -> Floats:
+        """(C, 6)."""
+
+    @property
+    def covariances(self) -> Floats:
+        """(C, 6, 6) positive definite."""
+
+
+Kernel = IsotropicKernel | MixtureKernel
+
+
+def rotation_normaliser(means: ArrayLike, covariances: ArrayLike) -> Floats:
+    """Haar volume under ``exp(-(r - m)^T T^-1 (r - m) / 2)`` over all rotation vectors r, relative to the
+    Gaussian's own, shape (C,).
+
+    The expectation of the volume element ``(2 sin(|r| / 2) / |r|)^2`` by Gauss-Hermite quadrature with 12^3
+    nodes. For zero means it agrees with ``1 - tr T / 12 + (tr^2 + 2 tr T^2) / 360`` within 1e-4 up to 40
+    degrees per axis.
+
+    Parameters
+    ----------
+    means : (C, 3) radians
+    covariances : (C, 3, 3) rad^2
+    """
+    node, weight = np.polynomial.hermite_e.hermegauss(12)
+    grid = np.stack(np.meshgrid(node, node, node, indexing="ij"), axis=-1).reshape(-1, 3)
+    weights = (weight[:, None, None] * weight[:, None] * weight).ravel() / (2.0 * math.pi) ** 1.5
+    mean, cov = np.asarray(means, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
+    vectors = mean[:, None, :] + np.einsum("cij,nj->cni", np.linalg.cholesky(cov), grid)
+    half = 0.5 * np.linalg.norm(vectors, axis=2)
+    return np.asarray(np.sinc(half / np.pi) ** 2 @ weights, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

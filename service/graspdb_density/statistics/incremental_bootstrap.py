@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import se3
-from ..kde.weighted_sums import TRUSTED_SUM, Kernel, KernelRows, Progress
+from ..kde.weighted_sums import TRUSTED_SUM, KernelRows, Progress
+from ..kernels.gaussian_mixture import Kernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats
 from .convergence import (

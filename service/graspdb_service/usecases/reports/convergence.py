@@ -28,7 +28,8 @@ from graspdb_density.bandwidth.matching import (
     scaled,
     success_ends,
 )
-from graspdb_density.kde.weighted_sums import Kernel, KernelRows, Progress
+from graspdb_density.kde.weighted_sums import KernelRows, Progress
+from graspdb_density.kernels.gaussian_mixture import Kernel
 from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
 from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
 from graspdb_service.problems import conflict
