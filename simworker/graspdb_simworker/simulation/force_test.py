@@ -171,8 +171,8 @@ def _on_circle(normals, forces, count, friction, contact, best, where):  # type:
     return best
 
 
-@njit(cache=True)
 # long: four kinds of minima of one function, searched one after the other
+@njit(cache=True)
 def _weakest(normals, forces, friction):  # type: ignore[no-untyped-def]
     """Global minimum of h over the sphere.
 

@@ -231,19 +231,6 @@ def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
     return Progress(states, poses_done, counts, failed, int(recent_poses or 0), window_s)
 
 
-def count_states(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, dict[str, int]]:
-    """Chunks by state, for several sweeps at once."""
-    query = (
-        select(jobs.c.sweep_id, jobs.c.state, func.count())
-        .where(jobs.c.sweep_id.in_(sweep_ids))
-        .group_by(jobs.c.sweep_id, jobs.c.state)
-    )
-    found: dict[str, dict[str, int]] = {sweep_id: {} for sweep_id in sweep_ids}
-    for sweep_id, state, count in tx.execute(query):
-        found[sweep_id][state] = int(count)
-    return found
-
-
 def note_started(tx: Tx, sweep_ids: Sequence[str]) -> None:
     """Set the start of sweeps whose first job was just claimed."""
     tx.execute(
