@@ -36,7 +36,7 @@ from graspdb.wire import BestGraspRequest
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
-from graspdb_service.usecases.grasps import question
+from graspdb_service.usecases.grasps.answer import best_grasps
 
 sys.path.append(str(Path(__file__).parents[1] / "density"))
 import ellipsoid_shell
@@ -171,7 +171,7 @@ class Asked:
         }
         request = BestGraspRequest(**(asked | more))
         started, busy = time.perf_counter(), time.process_time()
-        question.best_grasps(self.context, self.slug, request)
+        best_grasps(self.context, self.slug, request)
         return (time.perf_counter() - started) * 1000, (time.process_time() - busy) * 1000
 
     def likelihoods(self, name: str, body: bytes, times: int) -> None:

@@ -23,7 +23,9 @@ from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.densities import success_models
-from graspdb_service.usecases.grasps import question, search
+from graspdb_service.usecases.grasps import question
+from graspdb_service.usecases.grasps.admissible import NearSuccesses
+from graspdb_service.usecases.grasps.answer import best_grasps
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -334,7 +336,7 @@ def compare(
             query, region = random_request(rng, scene=seed % 3 == 2)
             tested = scene if query["collision_free"] else None
             try:
-                answer, _ = question.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+                answer, _ = best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
             except ProblemError:
                 assert not region.project(np.zeros((1, 3)), se3.IDENTITY[None])[2].any(), seed
                 continue
@@ -376,7 +378,7 @@ class Field:
         self.density = GraspDensity.build(
             se3.Poses.of(self.positions[self.won], self.quaternions[self.won]), kernel=KERNEL
         )
-        self.near = search.near_successes(self.density, 2.0, 2)
+        self.near = NearSuccesses(self.density, 2.0)
 
     def chance(self, column: str) -> Callable[[Floats, Floats], Floats]:
         def score(p: Floats, q: Floats) -> Floats:
@@ -464,7 +466,7 @@ def compare_scores(
                 query["objective"] = "success_probability"
                 rough = score = field.chance("low")
             try:
-                answer, _ = question.best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+                answer, _ = best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
             except ProblemError:
                 assert not region.project(np.zeros((1, 3)), se3.IDENTITY[None])[2].any(), seed
                 continue

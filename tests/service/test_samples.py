@@ -14,7 +14,7 @@ from graspdb_density import IsotropicKernel, se3
 from graspdb_density.kde import brute_force
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
-from graspdb_service.usecases.grasps.likelihood import draw
+from graspdb_service.usecases.grasps.samples import draw
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]

@@ -33,9 +33,10 @@ from graspdb_service.formats.columns import columns_arrow, columns_json
 from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted, media_type
 from graspdb_service.formats.poses import read_arrow_poses, read_poses
+from graspdb_service.usecases.densities.info import density_info
 from graspdb_service.usecases.densities.success_models import LEVEL
-from graspdb_service.usecases.grasps import likelihood, proposals
-from graspdb_service.usecases.grasps import question as bestgrasp
+from graspdb_service.usecases.grasps import likelihood, proposals, samples
+from graspdb_service.usecases.grasps.answer import best_grasps
 from graspdb_service.usecases.trials.selection import Filters
 
 router = APIRouter(tags=["queries"])
@@ -80,7 +81,7 @@ def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQ
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
-    info, object_id = likelihood.density_info(ctx, id, query)
+    info, object_id = density_info(ctx, id, query)
     return _json(info, _tag(object_id, info.revision, query))
 
 
@@ -135,7 +136,7 @@ def get_best_grasp(
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
-    answer, object_id = bestgrasp.best_grasps(ctx, id, query)
+    answer, object_id = best_grasps(ctx, id, query)
     return _json(answer, _tag(object_id, answer.revision, query))
 
 
@@ -147,14 +148,14 @@ def get_best_grasp(
 def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
     """As GET, the constraints as JSON; also half spaces, obstacles, candidates and poses to exclude."""
     query = validated(read_object(request, body), BestGraspRequest, most=MAX_OBSTACLE_POINTS)
-    answer, _ = bestgrasp.best_grasps(ctx, id, query)
+    answer, _ = best_grasps(ctx, id, query)
     return _json(answer)
 
 
 @router.post("/objects/{id}/samples", response_model=Samples, **scope("read"))
 def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
     """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
-    drawn = likelihood.draw(ctx, id, query, query.count, query.seed)
+    drawn = samples.draw(ctx, id, query, query.count, query.seed)
     return _drawn(drawn, {})
 
 
@@ -172,7 +173,7 @@ def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
     return _drawn(drawn, {"strategy": query.strategy, "criterion": criterion})
 
 
-def _drawn(drawn: likelihood.Draw, more: dict[str, Any]) -> Response:
+def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
     return columns_json(
         {"revision": drawn.revision, "kernel": drawn.kernel.model_dump(), "seed": drawn.seed, **more},
         {

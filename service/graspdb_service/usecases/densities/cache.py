@@ -135,6 +135,11 @@ class Densities:
             lambda before: self._refresh(key, slug, before, stored),
         )
 
+    def asked(self, slug: str, request: Selection) -> Built:
+        """The density that a request is about, as :meth:`get`."""
+        choice, _ = kernel_of(request)
+        return self.get(slug, Filters.of(request), choice)
+
     def stored(self, row: ObjectRow, selected: Selected, name: str) -> KernelRow:
         """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""
         with self._database.read() as tx:

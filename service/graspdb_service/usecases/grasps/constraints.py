@@ -12,11 +12,12 @@ from scipy.optimize import nnls
 
 from graspdb.wire import BestGraspRequest, GraspConstraints, Obstacles, Pose, PoseColumns
 from graspdb_density import Region, se3
+from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError
 
 Floats = NDArray[np.float64]
-Poses = tuple[Floats, Floats]
+Frame = tuple[Floats, Floats]
 
 _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.
@@ -28,14 +29,19 @@ _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 class Constraints:
     """What bounds a grasp, in the object frame, and what its parts were called in the request.
 
-    ``object_pose`` is the object frame in the world frame, where it was given; ``obstacles`` what the gripper
-    must not touch besides the object; ``candidates`` the only poses to rank, ``exclude`` those to stay away
-    from.
+    Attributes
+    ----------
+    object_pose
+        The object frame in the world frame (position, quaternion), where it was given.
+    obstacles
+        What the gripper must not touch besides the object.
+    candidates, exclude
+        The only ones to rank, and those to stay away from.
     """
 
     region: Region
     half_space_names: tuple[str, ...]
-    object_pose: Poses | None
+    object_pose: Frame | None
     obstacles: tuple[Scene | PointCloud, ...] = ()
     candidates: Poses | None = None
     exclude: Poses | None = None
@@ -50,13 +56,6 @@ class Constraints:
             else:
                 names.append({"spheres": "sphere"}.get(kind, kind))
         return list(dict.fromkeys(names))
-
-    def to_world(self, position: Floats, quaternion: Floats) -> Poses | None:
-        """A grasp (object frame) in the world frame, where the object's pose is known."""
-        if self.object_pose is None:
-            return None
-        p, q = se3.compose(se3.Poses(*self.object_pose), se3.Poses(position, quaternion))
-        return p, se3.canonical(se3.normalise(q))
 
 
 def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Constraints:
@@ -133,7 +132,7 @@ def _planes(request: GraspConstraints) -> tuple[list[str], list[tuple[Floats, fl
     return names, planes
 
 
-def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud, ...]:
+def _obstacles(given: Obstacles | None, into: Frame) -> tuple[Scene | PointCloud, ...]:
     solids: list[Scene | PointCloud] = []
     if given is not None and given.boxes:
         parts = []
@@ -149,7 +148,7 @@ def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud
     return tuple(solids)
 
 
-def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | None:
+def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Frame) -> Poses | None:
     if poses is None:
         return None
     if isinstance(poses, PoseColumns):
@@ -157,8 +156,8 @@ def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | N
     else:
         p = np.array([pose.position for pose in poses]).reshape(-1, 3)
         q = np.array([pose.quaternion_xyzw for pose in poses]).reshape(-1, 4)
-    p, q = se3.compose(se3.Poses(*into), se3.Poses(p, q))
-    return p, se3.normalise(q)
+    p, q = se3.compose(Poses(*into), Poses(p, q))
+    return Poses(p, se3.normalise(q))
 
 
 def _apart(names: Sequence[str], planes: Floats, sphere: Floats | None) -> list[str]:

@@ -1,8 +1,7 @@
-"""Questions to a density: what it is, how likely poses are, which grasp is best, draws from it."""
+"""How likely poses are: the density there, the success probability, whether the gripper collides."""
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
@@ -10,72 +9,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import (
-    DensityInfo,
-    KernelInfo,
-    Selection,
-)
+from graspdb.wire import KernelInfo, Selection
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density import GraspDensity, MixtureDensity, se3
-from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
-from graspdb_service.problems import ProblemError, conflict
-from graspdb_service.usecases.densities.cache import Built, kernel_of
+from graspdb_service.problems import ProblemError
+from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
-from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 
 #: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
 _BLOCK = 16_384
-_NEAREST_TRIALS = 5
-#: Successes shown to the collision test at a time while looking for the nearest admissible one.
-_CANDIDATES = 1_024
-#: Ratios and draws see more of the kernels' tails than a plain question.
-_PRECISE_CUTOFF = 5.0
-
-
-def built_for(ctx: Estimators, slug: str, request: Selection) -> Built:
-    """The density that a request is about."""
-    choice, _ = kernel_of(request)
-    return ctx.densities.get(slug, Filters.of(request), choice)
-
-
-# -- the density itself ------------------------------------------------------------------------------------
-
-
-def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, int]:
-    """What is known of a density, and the object's internal id."""
-    with ctx.compute.admitted():
-        built = built_for(ctx, slug, request)
-    density, selected = built.density, built.selected
-    size = 0 if density is None else density.size
-    effective = 0.0 if density is None else density.effective_sample_size
-    warnings = []
-    if size and effective < LOW_EFFECTIVE_SHARE * size:
-        warnings.append(
-            f"the weights are very uneven: {size} successes count like {effective:.0f};"
-            " check the proposal densities of the trials"
-        )
-    info = DensityInfo(
-        object=slug,
-        revision=built.revision,
-        epoch=built.epoch,
-        gripper=selected.gripper,
-        protocol=selected.protocol,
-        source=selected.source,
-        kernel=built.kernel,
-        size=size,
-        outcomes=dict(selected.outcomes),
-        effective_sample_size=effective,
-        weights=built.weights_info,
-        bytes=built.nbytes,
-        warnings=warnings,
-    )
-    return info, built.object_row.id
-
-
-# -- likelihood ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,14 +65,14 @@ def likelihood(
         return include is None or any(name in include for name in names)
 
     with ctx.compute.admitted():
-        built = built_for(ctx, slug, request)
+        built = ctx.densities.asked(slug, request)
         logs = relative = free = None
         if asked("density", "log_density", "relative"):
             search = built.search
             if search is None:
                 logs, relative = np.full(count, -np.inf), np.zeros(count)
             else:
-                logs = _log_density(ctx, search.density, positions, quaternions, cutoff)
+                logs = log_density(ctx, search.density, positions, quaternions, cutoff)
                 if asked("relative"):
                     relative = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
         chances = asked("success_probability", "interval", "effective_trials")
@@ -150,13 +95,14 @@ def likelihood(
     )
 
 
-def _log_density(
+def log_density(
     ctx: Estimators,
     density: GraspDensity | MixtureDensity,
     positions: Floats,
     quaternions: Floats,
     cutoff: float | None,
 ) -> Floats:
+    """Log densities (n,) of poses (n, 3), (n, 4), computed in blocks."""
     logs = np.empty(len(positions))
     threads = ctx.compute.threads
 
@@ -180,72 +126,3 @@ def _free(ctx: Estimators, test: CollisionTest, positions: Floats, quaternions: 
 
     ctx.compute.blocks(len(positions), _BLOCK, work)
     return free
-
-
-# -- samples -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Draw:
-    """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with."""
-
-    object_id: int
-    revision: int
-    kernel: KernelInfo
-    seed: int
-    position: Floats
-    quaternion_xyzw: Floats
-    proposal_density: Floats
-
-
-def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
-    """Draw grasps; the same revision, selection, kernel, count and seed give the same ones.
-
-    Without a seed one is made up, and answered. 413 over the limit; 409 ``no-successes`` without any.
-    """
-    check_count(ctx, count)
-    chosen = secrets.randbits(63) if seed is None else seed
-    with ctx.compute.admitted():
-        built = built_for(ctx, slug, selection)
-        density = built.asked
-        if density is None:
-            raise no_successes(slug)
-        position, quaternion = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
-        densities = density_at(ctx, density, position, quaternion)
-    return Draw(
-        object_id=built.object_row.id,
-        revision=built.revision,
-        kernel=built.kernel,
-        seed=chosen,
-        position=position,
-        quaternion_xyzw=se3.canonical(quaternion),
-        proposal_density=densities,
-    )
-
-
-def check_count(ctx: Estimators, count: int) -> None:
-    """413 for more draws than the service allows."""
-    limit = ctx.settings.max_samples
-    if count > limit:
-        raise ProblemError(
-            413,
-            "too-many-samples",
-            f"{count} samples are over the limit of {limit}: draw them in several requests with other seeds",
-            errors=[("count", f"at most {limit}")],
-        )
-
-
-def no_successes(slug: str) -> ProblemError:
-    """409 where there is nothing to draw from."""
-    return conflict(
-        "no-successes",
-        "No trial of this selection succeeded, so there is no density to draw from:"
-        f" post trials (POST /objects/{slug}/trials) or sweep a grid first",
-    )
-
-
-def density_at(
-    ctx: Estimators, density: GraspDensity | MixtureDensity, positions: Floats, quaternions: Floats
-) -> Floats:
-    """The density (n,) at draws from it."""
-    return np.exp(_log_density(ctx, density, positions, quaternions, _PRECISE_CUTOFF))

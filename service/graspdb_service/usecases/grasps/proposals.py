@@ -7,7 +7,6 @@ tells it at each draw: sent back with the trial, it undoes the choice (eq 1).
 from __future__ import annotations
 
 import math
-import secrets
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +19,9 @@ from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
-from graspdb_service.usecases.grasps import likelihood
-from graspdb_service.usecases.grasps.likelihood import Draw
-from graspdb_service.usecases.grasps.search import near_successes
+from graspdb_service.usecases.grasps import samples
+from graspdb_service.usecases.grasps.admissible import NearSuccesses
+from graspdb_service.usecases.grasps.samples import Draw
 from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
@@ -52,18 +51,26 @@ CRITERIA: dict[Strategy, str] = {
 
 
 def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw, str]:
-    """Poses to try next, and how they were chosen; the same revision, request and seed give the same ones."""
+    """Poses to try next, and how they were chosen; the same revision, request and seed give the same ones.
+
+    Raises
+    ------
+    ProblemError
+        409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
+    """
     if request.strategy == "density":
-        return likelihood.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]
-    if request.strategy == "edges":
-        return _from_edges(ctx, slug, request), CRITERIA["edges"]
-    likelihood.check_count(ctx, request.count)
-    seed = secrets.randbits(63) if request.seed is None else request.seed
+        return samples.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]
+    samples.check_count(ctx, request.count)
+    drawn = _uncertain if request.strategy == "uncertainty" else _from_edges
+    return drawn(ctx, slug, request), CRITERIA[request.strategy]
+
+
+def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     with ctx.compute.admitted():
-        built = likelihood.built_for(ctx, slug, request)
+        built = ctx.densities.asked(slug, request)
         density = built.density
         if density is None:
-            raise likelihood.no_successes(slug)
+            raise samples.no_successes(slug)
         test = ctx.scenes.test(built.object_row, built.selected)
         model = ctx.successes.model(slug, built, collisions_known=test is not None)
         if model is None:
@@ -79,46 +86,18 @@ def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw
                 "nothing-uncertain",
                 "Every pose near the successes collides or is known: use strategy=density, or sweep a grid",
             )
-        chosen = proposal
-        position, quaternion = ctx.compute.run(
-            lambda: chosen.sample(request.count, np.random.default_rng(seed))
-        )
-        densities = likelihood.density_at(ctx, proposal, position, quaternion)
-    draw = Draw(
-        object_id=built.object_row.id,
-        revision=built.revision,
-        kernel=built.kernel,
-        seed=seed,
-        position=position,
-        quaternion_xyzw=se3.canonical(quaternion),
-        proposal_density=densities,
-    )
-    return draw, CRITERIA["uncertainty"]
+        return samples.drawn_from(ctx, proposal, built.object_row, built.kernel, request.count, request.seed)
 
 
 def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     """Draws from the prior: no trial is needed, nor does any change it."""
-    likelihood.check_count(ctx, request.count)
     choice, _ = kernel_of(request)
     if choice.stored is not None:
         raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
-    seed = secrets.randbits(63) if request.seed is None else request.seed
     with ctx.compute.admitted():
         row, selected = ctx.densities.current(slug, Filters.of(request))
         prior = ctx.priors.get(row, selected, choice)
-        position, quaternion = ctx.compute.run(
-            lambda: prior.density.sample(request.count, np.random.default_rng(seed))
-        )
-        densities = likelihood.density_at(ctx, prior.density, position, quaternion)
-    return Draw(
-        object_id=row.id,
-        revision=row.revision,
-        kernel=prior.kernel,
-        seed=seed,
-        position=position,
-        quaternion_xyzw=se3.canonical(quaternion),
-        proposal_density=densities,
-    )
+        return samples.drawn_from(ctx, prior.density, row, prior.kernel, request.count, request.seed)
 
 
 def uncertain(
@@ -136,7 +115,7 @@ def uncertain(
     p = p + rng.standard_normal(p.shape) * extra * kernel.sigma_position_m
     turns = se3.from_rotation_vector(rng.standard_normal(p.shape) * extra * kernel.sigma_rotation)
     q = se3.multiply(q, turns)
-    kept = near_successes(density, _REACH, threads)(p, q)
+    kept = NearSuccesses(density, _REACH)(p, q)
     if test is not None:
         kept &= test.free(p, q, threads=threads)
     p, q = p[kept], q[kept]

@@ -30,7 +30,7 @@ from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.trial_columns import Provenance
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
-from graspdb_service.usecases.grasps import likelihood
+from graspdb_service.usecases.grasps import samples
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
 from graspdb_service.usecases.simulation import feasibility
@@ -241,7 +241,7 @@ def _drawn(ctx: Estimators, slug: str, spec: SweepCreate, sample: SampleSpec) ->
     if sample.count > limit:
         raise invalid("sample.count", f"at most {limit}")
     selection = Selection(gripper=spec.gripper, protocol=sample.protocol, kernel=sample.kernel)
-    drawn = likelihood.draw(ctx, slug, selection, sample.count, sample.seed)
+    drawn = samples.draw(ctx, slug, selection, sample.count, sample.seed)
     table = np.column_stack([drawn.position, drawn.quaternion_xyzw, drawn.proposal_density])
     return _Plan("sample", len(table), poses=table, kernel=drawn.kernel)
 

@@ -1,0 +1,38 @@
+"""What is known of a density."""
+
+from __future__ import annotations
+
+from graspdb.wire import DensityInfo, Selection
+from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
+from graspdb_service.usecases.densities.estimators import Estimators
+
+
+def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, int]:
+    """What is known of a density, and the object's internal id."""
+    with ctx.compute.admitted():
+        built = ctx.densities.asked(slug, request)
+    density, selected = built.density, built.selected
+    size = 0 if density is None else density.size
+    effective = 0.0 if density is None else density.effective_sample_size
+    warnings = []
+    if size and effective < LOW_EFFECTIVE_SHARE * size:
+        warnings.append(
+            f"the weights are very uneven: {size} successes count like {effective:.0f};"
+            " check the proposal densities of the trials"
+        )
+    info = DensityInfo(
+        object=slug,
+        revision=built.revision,
+        epoch=built.epoch,
+        gripper=selected.gripper,
+        protocol=selected.protocol,
+        source=selected.source,
+        kernel=built.kernel,
+        size=size,
+        outcomes=dict(selected.outcomes),
+        effective_sample_size=effective,
+        weights=built.weights_info,
+        bytes=built.nbytes,
+        warnings=warnings,
+    )
+    return info, built.object_row.id

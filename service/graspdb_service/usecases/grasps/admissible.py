@@ -1,0 +1,92 @@
+"""Which poses a question admits, beyond what a region says: collisions, widths, what is known nearby."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb_density import GraspDensity, se3
+from graspdb_density.search.scored_poses import Admissible
+from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.poses import ToolPoses
+from graspdb_service.usecases.grasps.constraints import Constraints
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: A chance is told within so many standard deviations of a success, position and rotation together. Farther
+#: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
+_NEAR = 2.0
+
+
+def all_of(checks: Sequence[Admissible]) -> Admissible | None:
+    """Whether poses pass every check, the first ones first: those that fail it see no other."""
+    if not checks:
+        return None
+
+    def admissible(positions: Floats, quaternions: Floats) -> Bools:
+        left = np.arange(len(positions))
+        for check in checks:
+            if len(left):
+                left = left[check(positions[left], quaternions[left])]
+        allowed = np.zeros(len(positions), dtype=np.bool_)
+        allowed[left] = True
+        return allowed
+
+    return admissible
+
+
+def clear_of(limits: Constraints, shape: GripperShape, distance: float, threads: int) -> Admissible:
+    """Whether the gripper touches no obstacle, all along an approach of this length."""
+
+    def clear(positions: Floats, quaternions: Floats) -> Bools:
+        hit = np.zeros(len(positions), dtype=np.bool_)
+        for solid in limits.obstacles:
+            hit |= solid.collides(
+                ToolPoses(positions, quaternions), shape, threads=threads, retreat_m=distance
+            )
+        return ~hit
+
+    return clear
+
+
+@dataclass(frozen=True, eq=False)
+class NearSuccesses:
+    """Whether some success is within so many standard deviations, position and rotation together."""
+
+    density: GraspDensity
+    reach: float = _NEAR
+
+    def __call__(self, positions: Floats, quaternions: Floats) -> Bools:
+        _, distance = self.density.nearest_each(se3.Poses(positions, quaternions), within=self.reach)
+        return np.asarray(distance <= self.reach)
+
+    def pull(self, positions: Floats, quaternions: Floats) -> tuple[Floats, Floats]:
+        """Poses a little farther from a success moved straight towards it as far as the reach."""
+        density, reach = self.density, self.reach * (1.0 - 1e-4)
+        rows, distance = density.nearest_each(se3.Poses(positions, quaternions), within=1.5 * self.reach)
+        far = np.flatnonzero((distance > reach) & (rows >= 0))
+        p, q = positions.copy(), quaternions.copy()
+        if not len(far):
+            return p, q
+        rows = rows[far]
+        centre, to = density.positions[rows], density.quaternions_xyzw[rows]
+        # The end of the success's rotation, of its twin's and of both antipodes that is nearest.
+        twin = se3.jaw_twin(to)
+        own, other = (np.einsum("ij,ij->i", end, q[far]) for end in (to, twin))
+        turned = density.symmetric[rows] & (np.abs(other) > np.abs(own))
+        to = np.where(turned[:, None], twin, to) * np.sign(np.where(turned, other, own))[:, None]
+        kernel = density.kernel
+        share = np.ones(len(far))
+        for _ in range(3):
+            at = centre + share[:, None] * (positions[far] - centre)
+            mixed = se3.normalise(to + share[:, None] * (quaternions[far] - to))
+            squared = np.sum((at - centre) ** 2, axis=1) / kernel.sigma_position_m**2
+            squared += 2.0 * kernel.kappa * (1.0 - np.einsum("ij,ij->i", mixed, to))
+            share *= np.minimum(reach / np.sqrt(np.maximum(squared, 1e-12)), 1.0)
+        p[far] = centre + share[:, None] * (positions[far] - centre)
+        q[far] = se3.normalise(to + share[:, None] * (quaternions[far] - to))
+        return p, q

@@ -1,0 +1,138 @@
+"""The best grasps under constraints: by density, by success probability, or by a mean under noise.
+
+Before any success they are chosen by the prior of the object's edges, where geometry and gripper are known.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from graspdb.wire import BestGrasps, Grasp, GraspConstraints, Interval, WorldPose
+from graspdb_density import Maximum, Separation, se3
+from graspdb_service.usecases.densities.cache import kernel_of
+from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.success_models import LEVEL
+from graspdb_service.usecases.grasps.constraints import Constraints, constraints
+from graspdb_service.usecases.grasps.question import Question, question_of
+from graspdb_service.usecases.grasps.search import closest
+from graspdb_service.usecases.trials.selection import Filters
+
+_NEAREST_TRIALS = 5
+
+
+def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
+    """The best distinct grasps under the request's constraints, and the object's internal id.
+
+    Raises
+    ------
+    ProblemError
+        422 naming fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that
+        are not there, and as the selection.
+    """
+    choice, _ = kernel_of(request)
+    with ctx.compute.admitted():
+        _, selected = ctx.densities.current(slug, Filters.of(request))
+        limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
+        built = ctx.densities.get(slug, Filters.of(request), choice)
+        question = question_of(ctx, request, built, limits)
+        answer: dict[str, Any] = {"status": "no_successes", "grasps": [], "kernel": built.kernel}
+        if question is not None:
+            answer = {"kernel": question.kernel, "ranking": question.ranking, **_answer(ctx, question)}
+    return BestGrasps.model_validate({"revision": built.revision, **answer}), built.object_row.id
+
+
+def _answer(ctx: Estimators, question: Question) -> dict[str, Any]:
+    engine, bounds = question.engine, question.bounds
+    found = ctx.compute.run(lambda: engine.best(bounds))
+    if found:
+        grasps = _described(ctx, question, found)
+        return {"status": "ok" if len(grasps) >= bounds.count else "fewer", "grasps": grasps}
+    centres = question.search.centres
+    poses = question.limits.candidates
+    if poses is None:
+        poses = centres.poses
+    widths = Separation(centres.kernel.sigma_position_m, centres.kernel.sigma_rotation)
+    nearest = _described(ctx, question, ctx.compute.run(lambda: closest(engine, bounds, poses, widths)))
+    return {"status": "infeasible", "grasps": [], "nearest": nearest[0] if nearest else None}
+
+
+def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> list[Grasp]:
+    """What is known of grasps that a search found."""
+    if not found:
+        return []
+    limits, test, built, threads = question.limits, question.test, question.built, ctx.compute.threads
+    positions = np.array([item.position for item in found])
+    quaternions = np.array([item.quaternion_xyzw for item in found])
+    logs = np.array([item.log_density for item in found])
+
+    def known() -> tuple[Any, Any, list[list[int]], Any]:
+        """Whether they are free, how wide the jaw is, the sequence numbers of the nearest successes."""
+        free = None if test is None else test.free(positions, quaternions, threads=threads)
+        widths = None if test is None else test.widths(positions, quaternions, threads=threads)
+        nearest: list[list[int]] = [[] for _ in found]
+        if not question.prior:
+            rows = (
+                question.search.centres.nearest_rows(
+                    se3.Poses(item.position, item.quaternion_xyzw), _NEAREST_TRIALS
+                )
+                for item in found
+            )
+            nearest = [built.seq[row].tolist() for row in rows]
+        return free, widths, nearest, question.search.relative(logs, threads)
+
+    free, widths, nearest, relative = ctx.compute.run(known)
+    estimates = None
+    if question.chances:
+        estimates = ctx.successes.under(question.model, positions, quaternions, free)
+    grasps = []
+    for i, item in enumerate(found):
+        chances: dict[str, object] = {}
+        if estimates is not None:
+            chances["effective_trials"] = float(estimates.effective_trials[i])
+        if estimates is not None and math.isfinite(estimates.probability[i]):
+            low, high = float(estimates.low[i]), float(estimates.high[i])
+            chances["success_probability"] = float(estimates.probability[i])
+            chances["interval"] = Interval(level=LEVEL, low=low, high=high)
+        density = math.exp(item.log_density)
+        grasps.append(
+            Grasp.model_validate(
+                {
+                    "position": tuple(item.position.tolist()),
+                    "quaternion_xyzw": tuple(item.quaternion_xyzw.tolist()),
+                    "world": _world(limits, item),
+                    "score": density if question.ranking.objective == "density" else item.score,
+                    "density": density,
+                    "log_density": item.log_density,
+                    "relative": float(relative[i]),
+                    **chances,
+                    "collision_free": None if free is None else bool(free[i]),
+                    "prior": question.prior,
+                    "candidate": _place(limits, item),
+                    "width_m": None if widths is None or math.isnan(widths[i]) else float(widths[i]),
+                    "nearest_trials": nearest[i],
+                    "active_constraints": limits.named(item.active_constraints),
+                }
+            )
+        )
+    return grasps
+
+
+def _world(limits: Constraints, item: Maximum) -> WorldPose | None:
+    """A grasp in the world frame, where the object's pose is known."""
+    if limits.object_pose is None:
+        return None
+    p, q = se3.compose(se3.Poses(*limits.object_pose), se3.Poses(item.position, item.quaternion_xyzw))
+    q = se3.canonical(se3.normalise(q))
+    return WorldPose(position=tuple(p.tolist()), quaternion_xyzw=tuple(q.tolist()))
+
+
+def _place(limits: Constraints, item: Maximum) -> int | None:
+    """The place of a grasp among the candidates."""
+    if limits.candidates is None:
+        return None
+    apart = np.linalg.norm(limits.candidates.positions - item.position, axis=1)
+    apart += se3.angle_between(limits.candidates.quaternions_xyzw, item.quaternion_xyzw)
+    return int(np.argmin(apart))

@@ -1,0 +1,137 @@
+"""What grasps are ranked by: the density, the success probability, or either's mean under noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspdb.wire import GraspConstraints, Ranking
+from graspdb_density import GraspDensity, ModeSearch, PoseNoise, SuccessModel, expected
+from graspdb_density.se3 import Poses
+from graspdb_density.search.scored_poses import Pull, Score
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.densities.success_models import LEVEL, Model
+from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.grasps.search import DensityModes, ScoreEvolution
+
+Floats = NDArray[np.float64]
+
+#: Draws of the noise that a mean is taken over, and while searching.
+_NOISE_DRAWS, _FEW_DRAWS = 256, 16
+
+
+def by_density(search: ModeSearch, threads: int) -> tuple[DensityModes, Ranking]:
+    """The density itself."""
+    return DensityModes(search, threads), Ranking(objective="density", score="density, 1/(m^3 rad^3)")
+
+
+def by_success(
+    search: ModeSearch, model: Model, test: CollisionTest | None, pull: Pull, threads: int
+) -> tuple[ScoreEvolution, Ranking]:
+    """The lower end of the success probability's interval."""
+    score = success_score(model.whole, "low", test, threads)
+    rough = score if model.quick is model.whole else success_score(model.quick, "low", test, threads)
+    told = f"lower end of the success probability's {LEVEL:.0%} interval"
+    ranking = Ranking(objective="success_probability", score=told)
+    return ScoreEvolution(search, score, rough, pull, threads), ranking
+
+
+def by_mean(
+    request: GraspConstraints,
+    row: ObjectRow,
+    search: ModeSearch,
+    value: Score | None,
+    pull: Pull | None,
+    threads: int,
+) -> tuple[ScoreEvolution, Ranking]:
+    """The mean under noise of a success probability ``value``; None: of the density."""
+    pivot, named = _pivot(row, search.centres)
+    about = {"pose_noise": f"the object about {named}, on the left", "tool_noise": "the tool, on the right"}
+    told: dict[str, str] = {}
+    noises: dict[str, PoseNoise] = {}
+    for name, moved in about.items():
+        metres = getattr(request, f"{name}_m") or 0.0
+        degrees = getattr(request, f"{name}_deg") or 0.0
+        noises[name] = PoseNoise(metres, math.radians(degrees), pivot if name == "pose_noise" else (0.0,) * 3)
+        if metres or degrees:
+            told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {moved}"
+    averaged = "density" if value is None else "success_probability"
+    if value is None:
+        value, noises = _widened(search, noises)
+    score = rough = value
+    if any(noise.sigma_position_m or noise.sigma_rotation for noise in noises.values()):
+        score, rough = (
+            expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
+            for draws in (_NOISE_DRAWS, _FEW_DRAWS)
+        )
+    unit = ", 1/(m^3 rad^3)" if averaged == "density" else ""
+    ranking = Ranking.model_validate(
+        {
+            "objective": "robust",
+            "score": f"mean {averaged.replace('_', ' ')} under the noise{unit}",
+            "robust_of": averaged,
+            **told,
+        }
+    )
+    return ScoreEvolution(search, score, rough, pull, threads), ranking
+
+
+def success_score(
+    model: SuccessModel, column: Literal["low", "probability"], test: CollisionTest | None, threads: int
+) -> Score:
+    """A column of the success probability as a score: 0 where the open gripper collides."""
+
+    def score(positions: Floats, quaternions: Floats) -> Floats:
+        values = np.zeros(len(positions))
+        index = np.arange(len(positions))
+        if test is not None:
+            index = np.flatnonzero(test.free(positions, quaternions, threads=threads))
+        if not len(index):
+            return values
+        p, q = positions[index], quaternions[index]
+        if column == "low":
+            values[index] = model.lower_end(p, q, level=LEVEL, threads=threads)
+        else:
+            values[index] = model.probability(p, q, threads=threads)
+        return values
+
+    return score
+
+
+def _widened(search: ModeSearch, noises: dict[str, PoseNoise]) -> tuple[Score, dict[str, PoseNoise]]:
+    """A density under a kernel that is wider by the noise, and the noise that is left to draw.
+
+    An isotropic kernel takes all noise of the tool and the object's shifts; the object's turns move a grasp
+    the farther the longer its lever, which no one kernel does.
+    """
+    density, at_object, at_tool = search.density.isotropic, noises["pose_noise"], noises["tool_noise"]
+    if density is not search.density:
+        return lambda p, q: search.density.density(Poses(p, q)), noises
+    shift = math.hypot(at_object.sigma_position_m, at_tool.sigma_position_m)
+    wider = GraspDensity.build(
+        density.poses,
+        kernel=density.kernel.widened(shift, at_tool.sigma_rotation),
+        weights=density.weights,
+        symmetric=density.symmetric,
+    )
+    left = {
+        "pose_noise": replace(at_object, sigma_position_m=0.0),
+        "tool_noise": replace(at_tool, sigma_position_m=0.0, sigma_rotation=0.0),
+    }
+    return lambda p, q: wider.density(Poses(p, q)), left
+
+
+def _pivot(row: ObjectRow, density: GraspDensity) -> tuple[tuple[float, float, float], str]:
+    """What the object turns about: its bounding box's centre, object frame."""
+    if row.mesh_info is not None:
+        corners = np.array([row.mesh_info["bounding_box"][end] for end in ("lower", "upper")])
+        named = "its bounding box's centre"
+    else:
+        corners = np.array([density.positions.min(axis=0), density.positions.max(axis=0)])
+        named = "the centre of the successes' bounding box, for there is no mesh"
+    x, y, z = (float(value) for value in corners.mean(axis=0))
+    return (x, y, z), named
