@@ -34,6 +34,10 @@ PLAIN = (Filters(), KernelChoice(0.015, 15.0))
 KERNEL = IsotropicKernel(0.015, np.deg2rad(15))
 
 
+def density_of(ctx: Context, filters: Filters, kernel: KernelChoice) -> Built:
+    return ctx.densities.get(ctx.densities.selections.resolve("thing", filters), kernel)
+
+
 def part(poses: Poses, start: int, stop: int) -> Poses:
     return poses[0][start:stop], poses[1][start:stop]
 
@@ -136,20 +140,20 @@ def test_concurrent_first_requests_build_once(
     make_object(http)
     post(http, "thing", two_clusters)
     builds = []
-    build = densities_module.builds.build
+    build = densities_module.build.build
 
     def counted(*given: Any) -> Built:
         builds.append(1)
         time.sleep(0.05)
         return build(*given)
 
-    monkeypatch.setattr(densities_module.builds, "build", counted)
+    monkeypatch.setattr(densities_module.build, "build", counted)
     with ThreadPoolExecutor(10) as pool:
-        found = list(pool.map(lambda _: ctx.densities.get("thing", *PLAIN), range(10)))
+        found = list(pool.map(lambda _: density_of(ctx, *PLAIN), range(10)))
     assert len(builds) == 1
     assert len({id(built) for built in found}) == 1
     # Named or not, the only gripper there is means the same density.
-    named = ctx.densities.get("thing", Filters(), KernelChoice(0.015, 15.0))
+    named = density_of(ctx, Filters(), KernelChoice(0.015, 15.0))
     assert named is found[0]
 
 
@@ -183,9 +187,9 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
         post(http, "thing", poses, proposal_density=density)
         post(http, "thing", part(two_clusters, 0, 10), "failure")
         done += count
-        built = ctx.densities.get("thing", *PLAIN)
+        built = density_of(ctx, *PLAIN)
         assert reads[-1] == last_seq  # The tail only.
-        last_seq = built.last_seq
+        last_seq = built.object_row.last_seq
         assert built.density is not None
         assert built.density.size == done
         known = np.concatenate(proposals)
@@ -208,7 +212,7 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
         np.testing.assert_allclose(built.density.weights, weights / weights.sum(), rtol=1e-9)
     assert len(reads) == len(steps)
     # Nothing new: not even the tail is read.
-    assert ctx.densities.get("thing", *PLAIN) is built
+    assert density_of(ctx, *PLAIN) is built
     assert len(reads) == len(steps)
 
 
@@ -230,10 +234,10 @@ def test_default_widths_are_chosen_anew_only_when_successes_double(
     seen = {}
     for start, stop in ((0, 150), (150, 199), (199, 260), (260, 399), (399, 401), (401, 700), (700, 1000)):
         post(http, "thing", part(poses, start, stop), proposal_density=rng.uniform(1, 3, stop - start))
-        seen[stop] = ctx.densities.get("thing", Filters(), KernelChoice()).kernel
+        seen[stop] = density_of(ctx, Filters(), KernelChoice()).kernel
         fresh = create_app(Settings(database_url=database_url)).state.context
         try:
-            assert fresh.densities.get("thing", Filters(), KernelChoice()).kernel == seen[stop]
+            assert density_of(fresh, Filters(), KernelChoice()).kernel == seen[stop]
         finally:
             fresh.close()
     assert (seen[150].sigma_position_m, seen[150].sigma_rotation_deg) == (0.015, 15)
@@ -318,13 +322,13 @@ def test_a_new_object_of_the_same_name_has_nothing_of_the_old(
 ) -> None:
     make_object(http)
     post(http, "thing", two_clusters)
-    old = ctx.densities.get("thing", *PLAIN)
+    old = density_of(ctx, *PLAIN)
     assert http.delete("/objects/thing").status_code == 204
     with pytest.raises(ProblemError) as caught:
-        ctx.densities.get("thing", *PLAIN)
+        density_of(ctx, *PLAIN)
     assert caught.value.status == 404
     make_object(http)
-    new = ctx.densities.get("thing", *PLAIN)
+    new = density_of(ctx, *PLAIN)
     assert new.density is None
     assert new.object_row.id != old.object_row.id
 
@@ -339,7 +343,7 @@ def test_readers_never_lose_or_double_a_trial_while_others_write(
     def read() -> None:
         size = 0
         while not stop.is_set():
-            built = ctx.densities.get("thing", *PLAIN)
+            built = density_of(ctx, *PLAIN)
             now = 0 if built.density is None else built.density.size
             if now < size or now != built.selected.successes or len(np.unique(built.seq)) != now:
                 wrong.append(f"{now} after {size}, {built.selected.successes} counted")
@@ -357,7 +361,7 @@ def test_readers_never_lose_or_double_a_trial_while_others_write(
     for reader in readers:
         reader.join()
     assert wrong == []
-    final = ctx.densities.get("thing", *PLAIN)
+    final = density_of(ctx, *PLAIN)
     assert final.density is not None
     assert final.density.size == 500
 
@@ -372,17 +376,17 @@ def test_the_cache_is_bounded_by_bytes(
     try:
         widths = [0.01 + 0.001 * i for i in range(12)]
         for width in widths:
-            built = context.densities.get("thing", Filters(), KernelChoice(width, 15.0))
+            built = density_of(context, Filters(), KernelChoice(width, 15.0))
             assert built.density is not None
             assert context.densities.nbytes <= 2**21
         assert 1 <= len(context.densities) < len(widths)
-        again = context.densities.get("thing", Filters(), KernelChoice(widths[-1], 15.0))
+        again = density_of(context, Filters(), KernelChoice(widths[-1], 15.0))
         assert again is built
         # Models of success have a bound of their own, of the same kind.
         post(http, "thing", clusters([((0, 0, 0), (0, 0, 0, 1.0))], 2000, seed=1), "failure")
         for width in widths[:6]:
-            built = context.densities.get("thing", Filters(), KernelChoice(width, 15.0))
-            assert context.successes.model("thing", built, collisions_known=False) is not None
+            built = density_of(context, Filters(), KernelChoice(width, 15.0))
+            assert context.successes.model(built, collisions_known=False) is not None
             assert context.successes.nbytes <= settings.max_density_cache_bytes
     finally:
         context.close()

@@ -124,7 +124,7 @@ def test_what_cannot_be_fitted_is_said(http: httpx.Client, make_object: Make, po
 
 def test_a_dead_processs_fit_is_taken_over(http: httpx.Client, database_url: str) -> None:
     context = Context.create(Settings(database_url=database_url), Database(database_url))
-    row, _ = context.densities.current("thing", Filters())
+    row = context.densities.selections.resolve("thing", Filters()).row
     request = KernelCreate.model_validate(AUTO)
     with context.database.write() as tx:
         context.runs.enter(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")

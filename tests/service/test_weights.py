@@ -31,6 +31,10 @@ COARSE = {"position_step_m": 0.01, "rotation_step_deg": 60.0, "margin_m": 0.02}
 RIGHT = {"lower": (0.0, -1.0, -1.0), "upper": (1.0, 1.0, 1.0)}
 
 
+def density_of(ctx: Context, filters: Filters, kernel: KernelChoice) -> Built:
+    return ctx.densities.get(ctx.densities.selections.resolve("thing", filters), kernel)
+
+
 def ball(position: Floats) -> NDArray[np.bool_]:
     """Where grasps succeed: within 30 mm of the origin, whatever their rotation."""
     near: NDArray[np.bool_] = np.linalg.norm(position, axis=1) < 0.03
@@ -134,7 +138,7 @@ def test_overlapping_grids_tell_of_the_field_what_one_does(box: httpx.Client, ct
     assert told["poses_tried"] == sum(tried.values())
 
     # What every trial tells of itself alone counts the right side several times.
-    built = ctx.densities.get("thing", *PLAIN)
+    built = density_of(ctx, *PLAIN)
     assert built.density is not None
     rows = built.density.positions, built.density.quaternions_xyzw
     weights = importance_weights(built.proposal_density)
@@ -171,13 +175,13 @@ def test_weights_are_the_balance_heuristic_while_a_sweep_runs(
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (100, 1))
     extended: list[Built] = []
     for chunk in range(second["chunks"] + 1):
-        built = ctx.densities.get("thing", *PLAIN)
+        built = density_of(ctx, *PLAIN)
         assert built.density is not None
         share = 500 * chunk / grids[1].total
         expected = 1.0 / exposure(built.density.positions, [(grids[0], 1.0), (grids[1], share)])
         np.testing.assert_allclose(built.density.weights, expected / expected.sum(), rtol=1e-6)
         other = create_app(Settings(database_url=database_url)).state.context
-        fresh = other.densities.get("thing", *PLAIN)
+        fresh = density_of(other, *PLAIN)
         other.close()
         np.testing.assert_allclose(
             built.density.log_density(Poses.of(probe, turns)),
@@ -195,9 +199,9 @@ def test_failures_alone_move_the_weights_of_two_grids(box: httpx.Client, ctx: Co
     work(box)
     sweep(box, {**COARSE, "position_step_m": 0.007, "region": RIGHT})
     work(box, jobs=1)
-    before = ctx.densities.get("thing", *PLAIN)
+    before = density_of(ctx, *PLAIN)
     work(box, field=lambda position: np.zeros(len(position), dtype=bool))
-    after = ctx.densities.get("thing", *PLAIN)
+    after = density_of(ctx, *PLAIN)
     assert before.density is not None
     assert after.density is not None
     assert after.density.size == before.density.size
@@ -222,7 +226,7 @@ def test_sweeps_of_one_lattice_count_each_pose_once(
     work(box)
     sweep(box, COARSE)
     work(box)
-    built = ctx.densities.get("thing", *PLAIN)
+    built = density_of(ctx, *PLAIN)
     assert built.density is not None
     np.testing.assert_allclose(built.density.weights * built.density.size, 1.0, rtol=1e-9)
     told = weights_told(box)
@@ -237,7 +241,7 @@ def test_halves_of_one_lattice_weigh_by_how_much_was_tried(box: httpx.Client, ct
     work(box)
     sweep(box, {**COARSE, "region": RIGHT})
     work(box)
-    built = ctx.densities.get("thing", *PLAIN)
+    built = density_of(ctx, *PLAIN)
     assert built.density is not None
     right = built.density.positions[:, 0] > -0.004
     expected = np.where(right, 1.0, 1.0 / share)
@@ -254,12 +258,12 @@ def test_grids_beside_trials_that_know_their_own_density(
     poses = rng.normal(size=(40, 3)) * 0.01, np.tile([0.0, 0.0, 0.0, 1.0], (40, 1))
     post(box, "thing", poses, gripper="pg70", protocol="wrench", source="robot")
     assert weights_told(box)["kind"] == "equal"
-    before = ctx.densities.get("thing", *PLAIN)
+    before = density_of(ctx, *PLAIN)
     g = rng.uniform(500.0, 5_000.0, 40)
     post(box, "thing", poses, gripper="pg70", protocol="wrench", proposal_density=g)
     told = weights_told(box)
     assert (told["kind"], told["without_proposal_density"]) == ("mixture-and-own", 40)
-    built = ctx.densities.get("thing", *PLAIN)
+    built = density_of(ctx, *PLAIN)
     assert before.density is not None
     assert built.density is not None
     grid = PoseGrid((-0.02,) * 3, (0.02,) * 3, 0.01, 60.0, 0.02)

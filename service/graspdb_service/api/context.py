@@ -16,6 +16,7 @@ from graspdb_service.usecases.kernels import fit
 from graspdb_service.usecases.reports.registry import Reports
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.runtime.runs import Runs
+from graspdb_service.usecases.trials.selection import Selections
 
 
 @dataclass(kw_only=True)
@@ -29,7 +30,9 @@ class Context(Estimators):
     def create(cls, settings: Settings, database: Database) -> Context:
         compute = Compute(settings.threads)
         features = Features(database, compute)
-        densities = Densities(database, compute, features, settings.max_density_cache_bytes)
+        densities = Densities(
+            database, Selections(database), compute, features, settings.max_density_cache_bytes
+        )
         scenes = Scenes(database, compute, features)
         reports = Reports(settings, database, densities, scenes)
         fits = fit.run_kind(densities, features, settings.threads)

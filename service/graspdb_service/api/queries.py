@@ -216,15 +216,15 @@ def _pinned(ctx: Context, slug: str, query: Q) -> Q:
     """With the id of the newest kernel in the place of ``anisotropic``: another answer, another ETag."""
     if query.kernel != "anisotropic":
         return query
-    row, selected = ctx.densities.current(slug, Filters.of(query))
-    return query.model_copy(update={"kernel": ctx.densities.stored(row, selected, "anisotropic").id})
+    selected = ctx.densities.selections.resolve(slug, Filters.of(query))
+    return query.model_copy(update={"kernel": ctx.densities.stored(selected, "anisotropic").id})
 
 
 def _known(ctx: Context, slug: str, request: Request, query: Selection) -> Response | None:
     """304 where the client has the answer of this revision already."""
     if "if-none-match" not in request.headers:
         return None
-    row, _ = ctx.densities.current(slug, Filters.of(query))
+    row = ctx.densities.selections.resolve(slug, Filters.of(query)).row
     return not_modified(request, _tag(row.id, row.revision, query))
 
 

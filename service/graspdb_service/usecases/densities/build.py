@@ -81,10 +81,6 @@ class Built:
     asked for.
     """
 
-    revision: int
-    epoch: int
-    last_seq: int
-    object_row: ObjectRow
     selected: Selected
     exposure: Exposure
     kernel: KernelInfo
@@ -97,6 +93,15 @@ class Built:
     sampled: GraspDensity | None = None
     search: ModeSearch | None = None
     success_kernel: DiagonalKernel | None = None
+
+    @property
+    def object_row(self) -> ObjectRow:
+        """The object as it was."""
+        return self.selected.row
+
+    @property
+    def revision(self) -> int:
+        return self.selected.row.revision
 
     @property
     def asked(self) -> GraspDensity | MixtureDensity | None:
@@ -146,7 +151,6 @@ def build(
     choice: KernelChoice,
     stored: KernelRow | None,
     axes: Axes,
-    row: ObjectRow,
     selected: Selected,
     exposure: Exposure,
     rows: TrialColumns,
@@ -169,10 +173,6 @@ def build(
     # A kernel that predicts success shapes no density: that one is as if none was asked for.
     for_success = stored is not None and stored.kind == "probability"
     built = Built(
-        revision=row.revision,
-        epoch=row.epoch,
-        last_seq=row.last_seq,
-        object_row=row,
         selected=selected,
         exposure=exposure,
         kernel=_info(choice) if stored is None else stored_kernel.info_of(stored, _info(KernelChoice())),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,21 +13,18 @@ from graspdb_service.problems import ProblemError, conflict, invalid, not_found
 from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
-from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import rows as trial_rows
 from graspdb_service.usecases.densities import build, proposal_density, stored_kernel
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.geometry.features import Features
-from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
-from graspdb_service.usecases.trials.selection import Filters, Selected, resolve
+from graspdb_service.usecases.trials.selection import Filters, Selected, Selections, as_of
 
 __all__ = ["Built", "Densities", "KernelChoice", "kernel_of"]
 
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
-_RESOLVED = 4_096
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
@@ -97,51 +92,42 @@ class Densities:
     the next answer of this one. Nothing is computed inside a transaction.
     """
 
-    def __init__(self, database: Database, compute: Compute, features: Features, max_bytes: int) -> None:
+    def __init__(
+        self,
+        database: Database,
+        selections: Selections,
+        compute: Compute,
+        features: Features,
+        max_bytes: int,
+    ) -> None:
         self._database = database
+        self.selections = selections
         self._compute = compute
         self._features = features
         self._cache: SingleFlightCache[_Key, Built] = SingleFlightCache(max_bytes, lambda b: b.nbytes)
-        self._resolved: OrderedDict[tuple[int, Filters], tuple[int, Selected]] = OrderedDict()
-        self._lock = threading.Lock()
 
-    def current(self, slug: str, filters: Filters) -> tuple[ObjectRow, Selected]:
-        """The object as it is now, and which of its trials the filters select (404, 409 where ambiguous)."""
-        with self._database.read() as tx:
-            row = require(tx, slug)
-            with self._lock:
-                known = self._resolved.get((row.id, filters))
-            if known is not None and known[0] == row.revision:
-                return row, known[1]
-            selected = resolve(tx, row.id, filters)
-        with self._lock:
-            self._resolved[row.id, filters] = row.revision, selected
-            self._resolved.move_to_end((row.id, filters))
-            while len(self._resolved) > _RESOLVED:
-                self._resolved.popitem(last=False)
-        return row, selected
-
-    def get(self, slug: str, filters: Filters, kernel: KernelChoice) -> Built:
-        """The density at least as new as the object is now; refused as :meth:`current`."""
-        row, selected = self.current(slug, filters)
+    def get(self, selected: Selected, kernel: KernelChoice) -> Built:
+        """The density of a selection, at least as new; refused as :meth:`stored`, and as the selection where
+        the object has changed since.
+        """
         stored = None
         if kernel.stored is not None:
-            stored = self.stored(row, selected, kernel.stored)
+            stored = self.stored(selected, kernel.stored)
             kernel = KernelChoice(stored=stored.id)
-        key = _Key(row.id, selected.filters, kernel)
         return self._cache.get(
-            key,
-            lambda built: built.revision >= row.revision,
-            lambda before: self._refresh(key, slug, before, stored),
+            _Key(selected.row.id, selected.filters, kernel),
+            lambda built: built.revision >= selected.row.revision,
+            lambda before: self._refresh(selected, kernel, stored, before),
         )
 
-    def asked(self, slug: str, request: Selection) -> Built:
-        """The density that a request is about, as :meth:`get`."""
+    def requested(self, slug: str, request: Selection) -> Built:
+        """The density that a request is about."""
         choice, _ = kernel_of(request)
-        return self.get(slug, Filters.of(request), choice)
+        return self.get(self.selections.resolve(slug, Filters.of(request)), choice)
 
-    def stored(self, row: ObjectRow, selected: Selected, name: str) -> KernelRow:
+    def stored(self, selected: Selected, name: str) -> KernelRow:
         """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""
+        row = selected.row
         with self._database.read() as tx:
             if name == "anisotropic":
                 newest = kernels.newest(tx, row.id, selected.gripper)
@@ -175,33 +161,28 @@ class Densities:
     def __len__(self) -> int:
         return len(self._cache)
 
-    def _refresh(self, key: _Key, slug: str, before: Built | None, stored: KernelRow | None) -> Built:
+    def _refresh(
+        self, selected: Selected, kernel: KernelChoice, stored: KernelRow | None, before: Built | None
+    ) -> Built:
         with self._database.read() as tx:
-            row = require(tx, slug, object_id=key.object_id)
-            selected = resolve(tx, row.id, key.filters)
-            if before is not None and before.epoch != row.epoch:
+            selected = as_of(tx, selected)
+            row = selected.row
+            if before is not None and before.object_row.epoch != row.epoch:
                 before = None
-            exposure = proposal_density.read(tx, row.id, selected)
+            exposure = proposal_density.read(tx, selected)
             rows = trial_rows.read(
                 tx,
                 row.id,
                 provenance_ids=list(selected.provenances),
                 successes_only=True,
-                after_seq=0 if before is None else before.last_seq,
+                after_seq=0 if before is None else before.object_row.last_seq,
                 batches=True,
             )
         # Failures of one grid change no weight, those of several do.
         if before is not None and not len(rows) and (exposure == before.exposure or not exposure.several):
-            return replace(
-                before,
-                revision=row.revision,
-                last_seq=row.last_seq,
-                object_row=row,
-                selected=selected,
-                exposure=exposure,
-            )
+            return replace(before, selected=selected, exposure=exposure)
         threads = self._compute.threads
-        axes = None if stored is None else stored_kernel.axes(stored.alignment, row, selected, self._features)
+        axes = None if stored is None else stored_kernel.axes(stored.alignment, selected, self._features)
         return self._compute.run(
-            lambda: build.build(key.kernel, stored, axes, row, selected, exposure, rows, before, threads)
+            lambda: build.build(kernel, stored, axes, selected, exposure, rows, before, threads)
         )

@@ -10,7 +10,7 @@ from graspdb_service.usecases.densities.estimators import Estimators
 def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, int]:
     """What is known of a density, and the object's internal id."""
     with ctx.compute.admitted():
-        built = ctx.densities.asked(slug, request)
+        built = ctx.densities.requested(slug, request)
     density, selected = built.density, built.selected
     size = 0 if density is None else density.size
     effective = 0.0 if density is None else density.effective_sample_size
@@ -23,7 +23,7 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
     info = DensityInfo(
         object=slug,
         revision=built.revision,
-        epoch=built.epoch,
+        epoch=built.object_row.epoch,
         gripper=selected.gripper,
         protocol=selected.protocol,
         source=selected.source,

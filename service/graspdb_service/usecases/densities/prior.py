@@ -19,7 +19,6 @@ from graspdb.wire import KernelInfo
 from graspdb_density import GraspDensity, IsotropicKernel, ModeSearch, se3
 from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_service.problems import ProblemError, conflict
-from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.densities.build import KernelChoice
 from graspdb_service.usecases.geometry.collision import CollisionTest, Scenes
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
@@ -75,7 +74,7 @@ class Priors:
         self._scenes = scenes
         self._cache: SingleFlightCache[_Key, _Made] = SingleFlightCache(_MAX_BYTES, lambda m: m.nbytes)
 
-    def get(self, row: ObjectRow, selected: Selected, choice: KernelChoice) -> Prior:
+    def get(self, selected: Selected, choice: KernelChoice) -> Prior:
         """The prior of an object for a gripper; ``choice`` may name other widths than 10 mm and 15 degrees.
 
         409 ``mesh-missing`` without geometry, ``gripper-unknown`` where none is named, ``no-surface-pairs``
@@ -84,8 +83,9 @@ class Priors:
         metres = _POSITION_M if choice.sigma_position_m is None else choice.sigma_position_m
         degrees = _ROTATION_DEG if choice.sigma_rotation_deg is None else choice.sigma_rotation_deg
         kernel = IsotropicKernel(metres, math.radians(degrees))
-        opposed = self._scenes.features.opposed(row, selected)
-        test = self._scenes.require(row, selected)
+        row = selected.row
+        opposed = self._scenes.features.opposed(selected)
+        test = self._scenes.require(selected)
         assert selected.profile is not None
         if not opposed:
             raise conflict(
@@ -124,10 +124,10 @@ class Priors:
         )
         return Prior(made.search, info)
 
-    def known(self, row: ObjectRow, selected: Selected, choice: KernelChoice) -> Prior | None:
+    def known(self, selected: Selected, choice: KernelChoice) -> Prior | None:
         """As :meth:`get`, None where there is none or it can't be known."""
         try:
-            return self.get(row, selected, choice)
+            return self.get(selected, choice)
         except ProblemError as problem:
             if problem.status != 409:
                 raise

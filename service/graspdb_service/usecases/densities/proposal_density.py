@@ -94,9 +94,9 @@ class Exposure:
         return pooled_density(columns, [lattice.tried for lattice in self.lattices])
 
 
-def read(tx: Tx, object_id: int, selected: Selected) -> Exposure:
+def read(tx: Tx, selected: Selected) -> Exposure:
     """The exposure of a selection as the transaction sees it."""
-    grids = outcomes.tried_grids(tx, object_id, provenance_ids=selected.provenances)
+    grids = outcomes.tried_grids(tx, selected.row.id, provenance_ids=selected.provenances)
     lattices: dict[str, dict[tuple[object, ...], list[TriedGrid]]] = {}
     for grid in grids:
         same = (grid.grid["region"] and str(grid.grid["region"]), _order(grid))

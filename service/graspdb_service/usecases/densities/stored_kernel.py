@@ -45,13 +45,13 @@ def _component(row: KernelRow) -> IsotropicKernel:
     return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
 
 
-def axes(alignment: str, row: ObjectRow, selected: Selected, features: Features) -> Axes:
+def axes(alignment: str, selected: Selected, features: Features) -> Axes:
     """The axes that translations are along on an object; 409 where its geometry has none to tell."""
     if alignment == "gripper":
         return None
     if alignment == "object":
-        return principal_axes(row)
-    return features.frames(alignment, row, selected)
+        return principal_axes(selected.row)
+    return features.frames(alignment, selected)
 
 
 def axes_at(found: Axes, positions: Floats, quaternions: Floats) -> Floats | None:

@@ -18,12 +18,11 @@ from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials, Stored
-from graspdb_service.usecases.trials.selection import Filters, Selected, resolve
+from graspdb_service.usecases.trials.selection import Filters, Selected, as_of
 
 Floats = NDArray[np.float64]
 
@@ -91,13 +90,13 @@ class Successes:
         self._compute = compute
         self._cache: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
-    def model(self, slug: str, built: Built, *, collisions_known: bool) -> Model | None:
+    def model(self, built: Built, *, collisions_known: bool) -> Model | None:
         """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
 
         With ``collisions_known``, by geometry and gripper, attempts that collided are left out.
         """
         key = _Key(
-            built.object_row.id,
+            built.selected.row.id,
             built.selected.filters,
             built.kernel.sigma_position_m,
             built.kernel.sigma_rotation_deg,
@@ -105,7 +104,9 @@ class Successes:
             built.success_kernel,
         )
         found = self._cache.get(
-            key, lambda a: a.revision >= built.revision, lambda before: self._refresh(key, slug, before)
+            key,
+            lambda a: a.revision >= built.revision,
+            lambda before: self._refresh(key, built.selected, before),
         )
         if found.model is None or not found.model.size:
             return None
@@ -117,23 +118,19 @@ class Successes:
         return self._cache.nbytes
 
     def estimate(
-        self, slug: str, built: Built, positions: Floats, quaternions: Floats, free: NDArray[np.bool_] | None
-    ) -> Estimates:
-        """Success probability of poses (n, 3), (n, 4) under the kernel of a density.
-
-        ``free`` (n,) is whether the open gripper is free of the object; None where either is unknown.
-        """
-        model = self.model(slug, built, collisions_known=free is not None)
-        return self.under(model, positions, quaternions, free)
-
-    def under(
         self,
         model: Model | None,
         positions: Floats,
         quaternions: Floats,
         free: NDArray[np.bool_] | None,
     ) -> Estimates:
-        """As :meth:`estimate`, under a model from :meth:`model`."""
+        """Success probability of poses (n, 3), (n, 4) under a model from :meth:`model`.
+
+        Parameters
+        ----------
+        free : (n,) bool or None
+            Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
+        """
         estimates = Estimates.unknown(len(positions))
         if model is not None:
 
@@ -151,20 +148,20 @@ class Successes:
                 column[~free] = 0.0
         return estimates
 
-    def _refresh(self, key: _Key, slug: str, before: _Attempts | None) -> _Attempts:
+    def _refresh(self, key: _Key, selected: Selected, before: _Attempts | None) -> _Attempts:
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]
         with self._database.read() as tx:
-            row = require(tx, slug, object_id=key.object_id)
-            selected = resolve(tx, row.id, key.filters)
+            selected = as_of(tx, selected)
+            row = selected.row
             # A source whose first failure has come counts from now on with all it has posted.
             if before is not None and (before.epoch != row.epoch or before.tried != selected.tried):
                 before = None
-            stored = _fetch(tx, row.id, selected, without, before)
+            stored = _fetch(tx, selected, without, before)
             names = {**({} if before is None else before.sweeps), **stored.repeat_keys}
             if before is not None and len(set(names.values())) < len(names):
                 # Two sweeps of one grid share poses, which count once: looked at together.
                 before = None
-                stored = _fetch(tx, row.id, selected, without, None)
+                stored = _fetch(tx, selected, without, None)
         isotropic = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
         kernel = key.success_kernel or isotropic
         old, sample = (None, None) if before is None else (before.model, before.sample)
@@ -172,7 +169,7 @@ class Successes:
         size = len(new.success) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
-            return self._refresh(key, slug, None)
+            return self._refresh(key, selected, None)
         model = self._compute.run(lambda: _extended(old, new, kernel))
         if size > _LARGE:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
@@ -181,12 +178,9 @@ class Successes:
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
-def _fetch(
-    tx: Tx, object_id: int, selected: Selected, without: Sequence[int], before: _Attempts | None
-) -> Stored:
+def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts | None) -> Stored:
     return attempts.fetch(
         tx,
-        object_id,
         selected,
         without=without,
         after_seq=0 if before is None else before.last_seq,

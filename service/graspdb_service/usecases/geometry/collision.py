@@ -77,16 +77,16 @@ class Scenes:
             _MAX_BYTES, lambda p: p.nbytes
         )
 
-    def test(self, row: ObjectRow, selected: Selected) -> CollisionTest | None:
+    def test(self, selected: Selected) -> CollisionTest | None:
         """The collision test of a selection; None where geometry or gripper is not known."""
         if selected.profile is None:
             return None
-        solid = self._solid(row)
+        solid = self._solid(selected.row)
         return None if solid is None else CollisionTest(solid, shape_of(selected.profile))
 
-    def require(self, row: ObjectRow, selected: Selected) -> CollisionTest:
+    def require(self, selected: Selected) -> CollisionTest:
         """As :meth:`test`, or 409 saying what is missing and how to give it."""
-        test = self.test(row, selected)
+        test, row = self.test(selected), selected.row
         if test is not None:
             return test
         reasons = []

@@ -65,42 +65,43 @@ class Features:
             )
         return found
 
-    def pairs(self, row: ObjectRow, selected: Selected) -> JawPairs:
+    def pairs(self, selected: Selected) -> JawPairs:
         """The pairs of surfaces and edges that the selection's gripper can close on.
 
         409 ``mesh-missing`` without geometry, ``gripper-unknown`` where no opening is known,
         ``no-surface-pairs``.
         """
         opening = _opening(selected)
-        found = self._prepared(row, opening).pairs
+        found = self._prepared(selected.row, opening).pairs
         if found is None or not len(found):
             raise conflict(
                 "no-surface-pairs",
-                f"Object {row.slug!r} has no two opposed surfaces or edges within {1e3 * opening:.0f} mm, as"
-                " far as the jaw opens: name a wider gripper, or go without (alignment=gripper or edge)",
+                f"Object {selected.row.slug!r} has no two opposed surfaces or edges within"
+                f" {1e3 * opening:.0f} mm, as far as the jaw opens: name a wider gripper, or go without"
+                " (alignment=gripper or edge)",
             )
         return found
 
-    def opposed(self, row: ObjectRow, selected: Selected) -> list[JawPairs]:
+    def opposed(self, selected: Selected) -> list[JawPairs]:
         """What the selection's gripper can close on: pairs of surfaces and edges, and opposed points of the
         surface, which tell of curved objects, too; none that is empty. 409 as :meth:`pairs`.
         """
-        found = self._prepared(row, _opening(selected), points=True)
+        found = self._prepared(selected.row, _opening(selected), points=True)
         return [pairs for pairs in (found.pairs, found.points) if pairs is not None and len(pairs)]
 
-    def known_pairs(self, row: ObjectRow, selected: Selected) -> JawPairs | None:
+    def known_pairs(self, selected: Selected) -> JawPairs | None:
         """As :meth:`pairs`, None where there are none or they can't be known."""
         try:
-            return self.pairs(row, selected)
+            return self.pairs(selected)
         except ProblemError:
             return None
 
-    def frames(self, alignment: str, row: ObjectRow, selected: Selected) -> FramesOf:
+    def frames(self, alignment: str, selected: Selected) -> FramesOf:
         """The axes of grasps by ``edge`` or ``surface-pair``; 409 as :meth:`ridges` and :meth:`pairs`."""
         if alignment == "edge":
-            ridges = self.ridges(row)
+            ridges = self.ridges(selected.row)
             return lambda positions, _: ridges.frames(positions)
-        pairs = self.pairs(row, selected)
+        pairs = self.pairs(selected)
         return lambda positions, quaternions: pairs.frames(ToolPoses(positions, quaternions))
 
     def _prepared(self, row: ObjectRow, opening_m: float, *, points: bool = False) -> _Prepared:

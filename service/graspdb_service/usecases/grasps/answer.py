@@ -34,9 +34,9 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     """
     choice, _ = kernel_of(request)
     with ctx.compute.admitted():
-        _, selected = ctx.densities.current(slug, Filters.of(request))
+        selected = ctx.densities.selections.resolve(slug, Filters.of(request))
         limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
-        built = ctx.densities.get(slug, Filters.of(request), choice)
+        built = ctx.densities.get(selected, choice)
         question = question_of(ctx, request, built, limits)
         answer: dict[str, Any] = {"status": "no_successes", "grasps": [], "kernel": built.kernel}
         if question is not None:
@@ -86,7 +86,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     free, widths, nearest, relative = ctx.compute.run(known)
     estimates = None
     if question.chances:
-        estimates = ctx.successes.under(question.model, positions, quaternions, free)
+        estimates = ctx.successes.estimate(question.model, positions, quaternions, free)
     grasps = []
     for i, item in enumerate(found):
         chances: dict[str, object] = {}

@@ -65,7 +65,7 @@ def likelihood(
         return include is None or any(name in include for name in names)
 
     with ctx.compute.admitted():
-        built = ctx.densities.asked(slug, request)
+        built = ctx.densities.requested(slug, request)
         logs = relative = free = None
         if asked("density", "log_density", "relative"):
             search = built.search
@@ -77,10 +77,13 @@ def likelihood(
                     relative = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
         chances = asked("success_probability", "interval", "effective_trials")
         if chances or asked("collision_free"):
-            test = ctx.scenes.test(built.object_row, built.selected)
+            test = ctx.scenes.test(built.selected)
             if test is not None:
                 free = _free(ctx, test, positions, quaternions)
-        estimates = ctx.successes.estimate(slug, built, positions, quaternions, free) if chances else None
+        estimates = None
+        if chances:
+            model = ctx.successes.model(built, collisions_known=free is not None)
+            estimates = ctx.successes.estimate(model, positions, quaternions, free)
     return LikelihoodAnswer(
         object_id=built.object_row.id,
         revision=built.revision,

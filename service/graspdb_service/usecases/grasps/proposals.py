@@ -67,12 +67,12 @@ def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw
 
 def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     with ctx.compute.admitted():
-        built = ctx.densities.asked(slug, request)
+        built = ctx.densities.requested(slug, request)
         density = built.density
         if density is None:
             raise samples.no_successes(slug)
-        test = ctx.scenes.test(built.object_row, built.selected)
-        model = ctx.successes.model(slug, built, collisions_known=test is not None)
+        test = ctx.scenes.test(built.selected)
+        model = ctx.successes.model(built, collisions_known=test is not None)
         if model is None:
             raise conflict(
                 "no-attempts",
@@ -95,9 +95,9 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     if choice.stored is not None:
         raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
     with ctx.compute.admitted():
-        row, selected = ctx.densities.current(slug, Filters.of(request))
-        prior = ctx.priors.get(row, selected, choice)
-        return samples.drawn_from(ctx, prior.density, row, prior.kernel, request.count, request.seed)
+        selected = ctx.densities.selections.resolve(slug, Filters.of(request))
+        prior = ctx.priors.get(selected, choice)
+        return samples.drawn_from(ctx, prior.density, selected.row, prior.kernel, request.count, request.seed)
 
 
 def uncertain(

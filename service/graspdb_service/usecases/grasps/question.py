@@ -73,13 +73,13 @@ def question_of(
     source = _prior(ctx, request, built) if built.search is None else built
     row, selected = built.object_row, built.selected
     needed = request.collision_free or request.pregrasp_distance_m is not None or request.max_width_m
-    test = (ctx.scenes.require if needed else ctx.scenes.test)(row, selected)
+    test = (ctx.scenes.require if needed else ctx.scenes.test)(selected)
     if limits.obstacles and selected.profile is None:
         raise conflict("gripper-unknown", "Obstacles need the gripper's shape: name one (gripper=)")
     if source is None or source.search is None:
         return None
     chances = _wants_chances(request, built)
-    model = ctx.successes.model(row.slug, built, collisions_known=test is not None) if chances else None
+    model = ctx.successes.model(built, collisions_known=test is not None) if chances else None
     by_success = _by_success(request, model)
     if by_success and model is None:
         if built.search is None:
@@ -120,7 +120,7 @@ def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | 
     if request.prior is False or choice.stored is not None:
         return None
     get = ctx.priors.get if request.prior else ctx.priors.known
-    return get(built.object_row, built.selected, choice)
+    return get(built.selected, choice)
 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:

@@ -48,7 +48,7 @@ def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int
     """
     check_count(ctx, count)
     with ctx.compute.admitted():
-        built = ctx.densities.asked(slug, selection)
+        built = ctx.densities.requested(slug, selection)
         if built.asked is None:
             raise no_successes(slug)
         return drawn_from(ctx, built.asked, built.object_row, built.kernel, count, seed)

@@ -29,12 +29,13 @@ def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
     assert request.object is not None
     filters = Filters(request.gripper, request.protocol, request.source)
     with ctx.compute.admitted():
-        row, selected = ctx.densities.current(request.object, filters)
+        selected = ctx.densities.selections.resolve(request.object, filters)
+        row = selected.row
         # Said first: without axes no number of trials helps.
-        axes = stored_kernel.axes(request.alignment, row, selected, ctx.scenes.features)
+        axes = stored_kernel.axes(request.alignment, selected, ctx.scenes.features)
         assert not callable(axes)
-        everything = attempts.read(ctx.database, row, selected)
-        tested = ctx.scenes.test(row, selected) is not None
+        everything = attempts.read(ctx.database, selected)
+        tested = ctx.scenes.test(selected) is not None
         kept = ~everything.collided if tested else np.ones(len(everything), dtype=bool)
         try:
             fit = ctx.compute.run(

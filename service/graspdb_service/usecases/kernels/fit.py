@@ -82,9 +82,9 @@ def fitted(
     """
     assert request.object is not None
     window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
-    built = densities.get(request.object, filters_of(request), KernelChoice())
+    built = densities.get(densities.selections.resolve(request.object, filters_of(request)), KernelChoice())
     # Said first: without axes no number of trials helps.
-    axes = stored_kernel.axes(request.alignment, built.object_row, built.selected, features)
+    axes = stored_kernel.axes(request.alignment, built.selected, features)
     if built.density is None:
         raise conflict(
             "too-few-trials",

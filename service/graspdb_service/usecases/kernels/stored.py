@@ -217,7 +217,7 @@ def _started(
 ) -> Created:
     """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
     assert request.object is not None
-    row, _ = ctx.densities.current(request.object, fit.filters_of(request))
+    row = ctx.densities.selections.resolve(request.object, fit.filters_of(request)).row
     lease = runs.place()
     id = str(uuid.uuid4())
 

@@ -73,7 +73,7 @@ def anisotropy_report(
     inputs: ReportInputs, built: Built, options: AnisotropyOptions, progress: Progress
 ) -> AnisotropyReport:
     method, alignment = options.method, options.alignment
-    frames = stored_kernel.axes(alignment, built.object_row, built.selected, inputs.scenes.features)
+    frames = stored_kernel.axes(alignment, built.selected, inputs.scenes.features)
     successes = built.selected.successes
     if successes < LEAST_SUCCESSES:
         raise conflict(
@@ -91,7 +91,7 @@ def anisotropy_report(
     if alignment != "gripper":
         blurred = enough(lambda: measure("gripper", None, lambda done: progress(share * (1.0 + done))))
         expected.append(sharpened(found, blurred))
-    pairs = inputs.scenes.features.known_pairs(built.object_row, built.selected)
+    pairs = inputs.scenes.features.known_pairs(built.selected)
     related = [] if pairs is None else surface_pairs.relations(everything, pairs)
     tolerances, warnings = _tolerances(found, built)
     if found.aligned < found.grasps and alignment != "gripper":

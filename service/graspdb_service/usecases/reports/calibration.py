@@ -68,10 +68,10 @@ def _model(everything: AllTrials, rows: NDArray[np.int64], kernel: SuccessKernel
 def calibration_report(
     inputs: ReportInputs, built: Built, options: SelectionQuery, progress: Progress
 ) -> CalibrationReport:
-    test = inputs.scenes.test(built.object_row, built.selected)
+    test = inputs.scenes.test(built.selected)
     # Where geometry tells them apart, those that collided are only judged, and few of them.
     most = None if test is None else _KEPT_COLLIDED
-    everything = attempts.read(inputs.database, built.object_row, built.selected, most_collided=most)
+    everything = attempts.read(inputs.database, built.selected, most_collided=most)
     successes = int(everything.success.sum())
     if everything.attempts < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
         raise conflict(

@@ -155,7 +155,7 @@ def enough(call: Callable[[], T]) -> T:
 
 
 def attempts_of(inputs: ReportInputs, built: Built) -> AllTrials:
-    return attempts.read(inputs.database, built.object_row, built.selected)
+    return attempts.read(inputs.database, built.selected)
 
 
 def need_failures(everything: AllTrials, what: str, least: int) -> None:

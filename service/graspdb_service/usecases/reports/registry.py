@@ -56,14 +56,14 @@ class Reports:
         selection = Selection(**{name: getattr(options, name, None) for name in Selection.model_fields})
         choice, _ = kernel_of(selection)
         densities = self._inputs.densities
-        row, selected = densities.current(slug, Filters.of(selection))
+        selected = densities.selections.resolve(slug, Filters.of(selection))
         if choice.stored is not None:
-            choice = KernelChoice(stored=densities.stored(row, selected, choice.stored).id)
+            choice = KernelChoice(stored=densities.stored(selected, choice.stored).id)
         own = options.model_dump(mode="json", exclude=set(Selection.model_fields), exclude_none=True)
         if report in _OF_CHECKS or own.get("matching") == "success":
             # Checks change no revision: what of them there is belongs to the question.
             with self._inputs.database.read() as tx:
-                own[report_runs.CHECKS] = outcomes.checks_stamp(tx, row.id)
+                own[report_runs.CHECKS] = outcomes.checks_stamp(tx, selected.row.id)
         parameters = {
             "report": report,
             "filters": vars(selected.filters),
@@ -71,7 +71,7 @@ class Reports:
             "options": own,
         }
         digest = hashlib.sha256(json.dumps([parameters, __version__], sort_keys=True).encode()).hexdigest()
-        return RunKey(row.id, row.revision, report, digest, parameters)
+        return RunKey(selected.row.id, selected.row.revision, report, digest, parameters)
 
     def compute(self, slug: str, parameters: Mapping[str, Any], progress: Progress) -> AnyReport:
         """The report by the parameters of a run; 409 says what is missing where the trials don't suffice."""
@@ -79,7 +79,8 @@ class Reports:
         own = {name: value for name, value in parameters["options"].items() if name != report_runs.CHECKS}
         options = REPORTS[report].options.model_validate(own)
         filters, kernel = Filters(**parameters["filters"]), KernelChoice(**parameters["kernel"])
-        built = self._inputs.densities.get(slug, filters, kernel)
+        densities = self._inputs.densities
+        built = densities.get(densities.selections.resolve(slug, filters), kernel)
         return _COMPUTE[report](self._inputs, built, options, progress)
 
     def run_kinds(self) -> dict[str, RunKind]:

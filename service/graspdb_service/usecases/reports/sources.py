@@ -62,7 +62,7 @@ def sources_report(
     simulated = attempts_of(inputs, built)
     real = _real(inputs, built, simulated)
     assert built.density is not None
-    test = inputs.scenes.test(built.object_row, built.selected)
+    test = inputs.scenes.test(built.selected)
     trials_of = {source: _all(inputs, built, selected) for source, selected in real.items()}
     progress(0.3)
     kernel = built.density.kernel
@@ -165,6 +165,7 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
     outcomes = total([counts[item.id] for item in own])
     tells = bool(outcomes.keys() - {"success", "simulation_error"})
     return Selected(
+        row=chosen.row,
         gripper=chosen.gripper,
         protocol=", ".join(sorted({item.protocol for item in own if item.protocol is not None})) or None,
         source=source,
@@ -178,7 +179,7 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
 def _all(inputs: ReportInputs, built: Built, selected: Selected) -> AllTrials:
     """Every trial of a source, of one that posts successes only, too."""
     whole = replace(selected, tried=frozenset(selected.provenances))
-    return attempts.read(inputs.database, built.object_row, whole)
+    return attempts.read(inputs.database, whole)
 
 
 def _compared(

@@ -12,7 +12,6 @@ from graspdb.wire import OUTCOME_CODES
 from graspdb_density import HAAR_VOLUME
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import outcomes, sweeps
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
@@ -94,22 +93,19 @@ class _Part:
     index: Ints | None = None
 
 
-def read(
-    database: Database, row: ObjectRow, selected: Selected, *, most_collided: int | None = None
-) -> AllTrials:
+def read(database: Database, selected: Selected, *, most_collided: int | None = None) -> AllTrials:
     """Every attempt of a selection, packed outcomes included, of sources that post failures, too.
 
     About ``most_collided`` of those that collided are drawn at random (None: all): nearly all poses of a
     large grid collide, and arrays of them would fill the memory.
     """
     with database.read() as tx:
-        stored = fetch(tx, row.id, selected)
+        stored = fetch(tx, selected)
     return joined(stored, most_collided=most_collided)
 
 
 def fetch(
     tx: Tx,
-    object_id: int,
     selected: Selected,
     *,
     without: Sequence[int] = (NO_ATTEMPT,),
@@ -121,19 +117,17 @@ def fetch(
     Sweeps that share poses with chunks from before count them again: who extends what there was compares
     :attr:`Stored.repeat_keys`, and reads all of it where two sweeps are of one grid.
     """
-    chunks = outcomes.collected(tx, object_id, provenance_ids=selected.tried, after_revision=after_revision)
-    plan = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
-    swept = [
-        Swept(
-            plan[chunk.sweep_id],
-            chunk,
-            sweep_plan.chunk_poses(tx, plan[chunk.sweep_id], chunk.start, chunk.stop),
-        )
-        for chunk in chunks
-    ]
+    chunks = outcomes.collected(
+        tx, selected.row.id, provenance_ids=selected.tried, after_revision=after_revision
+    )
+    known = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
+    swept = []
+    for chunk in chunks:
+        sweep = known[chunk.sweep_id]
+        swept.append(Swept(sweep, chunk, sweep_plan.chunk_poses(tx, sweep, chunk.start, chunk.stop)))
     rows = trial_rows.read(
         tx,
-        object_id,
+        selected.row.id,
         provenance_ids=sorted(selected.tried),
         successes_only=False,
         after_seq=after_seq,

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from graspdb.wire import OUTCOMES, GripperProfile, Selection
 from graspdb_service.problems import conflict, not_found
 from graspdb_service.storage import grippers
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
+from graspdb_service.usecases.objects import require
+
+_KEPT = 4_096
 
 
 @dataclass(frozen=True)
@@ -29,12 +35,13 @@ class Filters:
 class Selected:
     """What the filters mean for an object as it was when they were resolved.
 
-    ``gripper`` and ``protocol`` are the one named, else the only one among the trials, else None.
-    ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw is
+    ``row`` is the object; ``gripper`` and ``protocol`` are the one named, else the only one among the trials,
+    else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw is
     mirror-symmetric; ``tried`` those of sources that post failures, too: only they tell how likely a success
     is. ``outcomes`` counts selected trials by outcome, packed ones included.
     """
 
+    row: ObjectRow
     gripper: str | None
     protocol: str | None
     source: str | None
@@ -57,7 +64,41 @@ class Selected:
         return self.outcomes.get("success", 0)
 
 
-def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
+class Selections:
+    """The selections of one service process, each resolved once for a revision of its object."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._resolved: OrderedDict[tuple[int, Filters], Selected] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def resolve(self, slug: str, filters: Filters) -> Selected:
+        """The object as it is now, and which of its trials the filters select (404, 409 where ambiguous)."""
+        with self._database.read() as tx:
+            row = require(tx, slug)
+            key = row.id, filters
+            with self._lock:
+                known = self._resolved.get(key)
+            if known is not None and known.row.revision == row.revision:
+                return known
+            selected = resolve(tx, row, filters)
+        with self._lock:
+            self._resolved[key] = selected
+            self._resolved.move_to_end(key)
+            while len(self._resolved) > _KEPT:
+                self._resolved.popitem(last=False)
+        return selected
+
+
+def as_of(tx: Tx, selected: Selected) -> Selected:
+    """The selection as the transaction sees it: the same, unless something was committed since; refused as
+    :meth:`Selections.resolve`, 409 where the object was replaced.
+    """
+    row = require(tx, selected.row.slug, object_id=selected.row.id)
+    return selected if row.revision == selected.row.revision else resolve(tx, row, selected.filters)
+
+
+def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
     """Find the provenances that pass the filters.
 
     A trial without gripper or protocol fits every selection and makes none ambiguous. 404 for an unknown
@@ -66,11 +107,11 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
     profiles: dict[str, GripperProfile] = {}
     if filters.gripper is not None:
         profiles[filters.gripper] = _profile(tx, filters.gripper)
-    counts = outcome_counts(tx, object_id)
+    counts = outcome_counts(tx, row.id)
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = [
         item
-        for item in provenances.of_object(tx, object_id)
+        for item in provenances.of_object(tx, row.id)
         if item.id in counts
         and filters.source in (None, item.source)
         and (filters.gripper is None or item.gripper in (None, filters.gripper))
@@ -93,6 +134,7 @@ def resolve(tx: Tx, object_id: int, filters: Filters) -> Selected:
         profiles.setdefault(name, _profile(tx, name))
     failing = {item.source for item in candidates if counts[item.id].keys() - {"success", "simulation_error"}}
     return Selected(
+        row=row,
         gripper=chosen["gripper"],
         protocol=chosen["protocol"],
         source=filters.source,
