@@ -36,9 +36,9 @@ class Selected:
     """What the filters mean for an object as it was when they were resolved.
 
     ``row`` is the object; ``gripper`` and ``protocol`` are the one named, else the only one among the trials,
-    else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw is
-    mirror-symmetric; ``tried`` those of sources that post failures, too: only they tell how likely a success
-    is. ``outcomes`` counts selected trials by outcome, packed ones included.
+    else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw
+    is mirror-symmetric; ``tried`` those of sources that post failures, too: only they tell how likely a
+    success is. ``outcomes`` counts selected trials by outcome, packed ones included.
     """
 
     row: ObjectRow
