@@ -169,28 +169,6 @@ def hopf_grid(step_deg: float) -> HopfGrid:
     return HopfGrid(nside, pixels, turns)
 
 
-def hopf_rotations(step_deg: float, *, symmetric: bool = False) -> FloatArray:
-    """All rotations of the grid as quaternions xyzw.
-
-    Parameters
-    ----------
-    step_deg : float
-        Wanted spacing, [1, 90] degrees.
-    symmetric : bool
-        Keep one of each pair that the jaw's half turn about its z axis exchanges (psi < pi).
-
-    Returns
-    -------
-    (72 nside^3, 4) or, if symmetric, (36 nside^3, 4) float64
-        4,608 or 2,304 rotations for 15 degrees.
-    """
-    grid = hopf_grid(float(step_deg))
-    index = np.arange(grid.size, dtype=np.int64)
-    if symmetric:
-        index = index[index % grid.psi_count < grid.psi_count // 2]
-    return grid.quaternions(index)
-
-
 @dataclass(frozen=True)
 class PoseGrid:
     """The poses of a sweep, in a fixed order, without storing them.

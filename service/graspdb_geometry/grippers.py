@@ -61,11 +61,6 @@ class GripperShape:
         if not (math.isfinite(self.tip_offset_m) and 0.0 <= self.tip_offset_m <= self.finger_length_m):
             raise ValueError("tip_offset_m must lie between 0 and finger_length_m")
 
-    @property
-    def stroke_m(self) -> float:
-        """How far each finger can travel from open to closed."""
-        return self.max_opening_m / 2.0
-
     def boxes(self, opening_m: float | None = None) -> tuple[FloatArray, FloatArray]:
         """Boxes of the gripper, axis-aligned in the tool frame.
 

@@ -191,19 +191,6 @@ def properties(mesh: Mesh, unit: str = "m") -> MeshProperties:
     )
 
 
-def convex_part(mesh: Mesh) -> Part | None:
-    """The mesh as its own convex part, or None if it is not convex and watertight."""
-    if not is_convex(mesh):
-        return None
-    return mesh.vertices, mesh.faces
-
-
-def is_convex(mesh: Mesh) -> bool:
-    """Whether the mesh is watertight and fills its convex hull to within :data:`CONVEX_TOLERANCE`."""
-    volume, _, _ = _mass_properties(mesh.vertices[mesh.faces])
-    return _closed(mesh.faces) and volume > 0 and _is_hull(mesh.vertices, mesh.faces, volume)
-
-
 # ------------------------------------------------------------------------------------- convex parts
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_density.se3 import Poses
-from graspdb_density.vicinity import anisotropy
+from graspdb_density.vicinity.anisotropy import empirical_anisotropy
+from graspdb_density.vicinity.displacement_density import density_anisotropy
 
 ROUNDS = 5
 
@@ -48,7 +49,7 @@ def main() -> None:
         times, busy = [], []
         for turn in range(ROUNDS + 1):
             started, spent = time.perf_counter(), time.process_time()
-            report = anisotropy.empirical(p, q, success, **keys, seed=turn)  # type: ignore[arg-type]
+            report = empirical_anisotropy(Poses.of(p, q), success, **keys, seed=turn)  # type: ignore[arg-type]
             times.append(time.perf_counter() - started)
             busy.append(time.process_time() - spent)
         pairs = report.translation_pairs + report.rotation_pairs
@@ -61,9 +62,9 @@ def main() -> None:
     chosen = np.flatnonzero(success)[:20_000]
     density = GraspDensity.build(Poses.of(p[chosen], q[chosen]), kernel=kernel)
     volume = len(np.unique(position)) * 1e-6
-    anisotropy.smoothed(density, len(p) / (8.0 * math.pi**2 * volume), max_grasps=2)
+    density_anisotropy(density, len(p) / (8.0 * math.pi**2 * volume), max_grasps=2)
     started = time.perf_counter()
-    anisotropy.smoothed(density, len(p) / (8.0 * math.pi**2 * volume))
+    density_anisotropy(density, len(p) / (8.0 * math.pi**2 * volume))
     print(f"density method, {density.size} kernels, 100 grasps: {time.perf_counter() - started:.2f} s")
 
 

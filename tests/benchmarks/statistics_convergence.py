@@ -25,13 +25,14 @@ from graspdb_density import IsotropicKernel, se3
 from graspdb_density._compiled.threads import processors
 from graspdb_density.kde.weighted_sums import LEAST, KernelRows
 from graspdb_density.kernels.gaussian_mixture import Kernel
+from graspdb_density.se3 import Poses
 from graspdb_density.statistics.convergence import bootstrap_similarity
-from graspdb_density.statistics.incremental_bootstrap import GrowingCurve, convergence_curve
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 
 sys.path.append(str(Path(__file__).parents[1] / "density"))
 from ellipsoid_shell import shell
 
-Poses = tuple[se3.Floats, se3.Floats]
+Pair = tuple[se3.Floats, se3.Floats]
 KERNEL = IsotropicKernel(0.015, math.radians(15.0))
 REPLICATES = 50
 
@@ -94,11 +95,11 @@ def growth(count: int, added: int, rng: np.random.Generator) -> None:
     """Print what a report costs that has a curve of ``count`` grasps and gets ``added`` more."""
     p, q = shell(count + added, rng)
     for name, kernel in (("isotropic", KERNEL), ("anisotropic", Gaussian())):
-        kept = GrowingCurve.grown(None, p[:count], q[:count], kernel)
+        kept = IncrementalCurve.of(Poses.of(p[:count], q[:count]), kernel)
 
-        def grown(known: GrowingCurve | None, kernel: Kernel = kernel) -> tuple[GrowingCurve, float]:
+        def grown(known: IncrementalCurve | None, kernel: Kernel = kernel) -> tuple[IncrementalCurve, float]:
             began = time.process_time()
-            return GrowingCurve.grown(known, p, q, kernel), time.process_time() - began
+            return IncrementalCurve.of(Poses.of(p, q), kernel, before=known), time.process_time() - began
 
         whole, at_once = grown(None)
         more, extended = grown(kept)
@@ -154,7 +155,7 @@ def main() -> None:
     growth(20_000, 500, rng)
     for count in (20_000, 160_000):
         poses = shell(count, rng)
-        wall, cpu = timed(lambda poses=poses: convergence_curve(*poses, KERNEL), 1)  # type: ignore[misc]
+        wall, cpu = timed(lambda poses=poses: IncrementalCurve.of(Poses.of(*poses), KERNEL), 1)  # type: ignore[misc]
         print(
             f"curve to {count} grasps, 5 subsets a point, held-out likelihood: {wall:.1f} s, CPU {cpu:.1f} s"
         )

@@ -15,8 +15,10 @@ from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_density._compiled.pairs import composition_angles
 from graspdb_density.kde import brute_force
 from graspdb_density.se3 import Floats, Poses
-from graspdb_density.vicinity import anisotropy as an
 from graspdb_density.vicinity import pair_candidates
+from graspdb_density.vicinity.anisotropy import empirical_anisotropy
+from graspdb_density.vicinity.displacement_bins import PLANES, Alignment, Bins, Frames, Histogram
+from graspdb_density.vicinity.displacement_density import density_anisotropy
 from graspdb_density.vicinity.half_width import tolerances
 
 AXES = {"rx": np.eye(3)[0], "ry": np.eye(3)[1], "rz": np.eye(3)[2]}
@@ -32,8 +34,8 @@ class Trials:
     rotation_keys: np.ndarray
     position_keys: np.ndarray
 
-    def parts(self) -> tuple[Floats, Floats, np.ndarray]:
-        return self.positions, self.quaternions, self.success
+    def parts(self) -> tuple[Poses, np.ndarray]:
+        return Poses.of(self.positions, self.quaternions), self.success
 
 
 def _about(axis: str, angle: Floats | float) -> Floats:
@@ -90,7 +92,7 @@ def _scattered(count: int, rng: np.random.Generator) -> Trials:
 def test_composition_angles_are_the_nearest(
     plane: int, alpha: float, beta: float, off: float, seed: int
 ) -> None:
-    first, second = an.PLANES[plane]
+    first, second = PLANES[plane]
     exact = se3.multiply(_about(first, alpha), _about(second, beta))
     axis = np.random.default_rng(seed).standard_normal(3)
     q = se3.multiply(exact, se3.from_rotation_vector(off * axis / np.linalg.norm(axis)))
@@ -158,7 +160,7 @@ def _brute_rotations(trials: Trials, reach: float, tolerance: float) -> tuple[Fl
                 continue
             relative = turns[int(i)].inv() * turns[int(j)]
             for variant in (relative, relative * half, half * relative, half * relative * half):
-                for plane, names in enumerate(an.PLANES):
+                for plane, names in enumerate(PLANES):
                     a, b, _ = composition_angles(se3.canonical(variant.as_quat()), plane)
                     found = Rotation.from_rotvec(a * AXES[names[0]]) * Rotation.from_rotvec(
                         b * AXES[names[1]]
@@ -170,7 +172,7 @@ def _brute_rotations(trials: Trials, reach: float, tolerance: float) -> tuple[Fl
     return tried, won
 
 
-def _same(histograms: tuple[an.Histogram, ...], tried: Floats, won: Floats) -> None:
+def _same(histograms: tuple[Histogram, ...], tried: Floats, won: Floats) -> None:
     for histogram, n, s in zip(histograms, tried, won, strict=True):
         np.testing.assert_array_equal(histogram.count, n)
         known = n > 0
@@ -179,11 +181,11 @@ def _same(histograms: tuple[an.Histogram, ...], tried: Floats, won: Floats) -> N
 
 
 @pytest.mark.parametrize("alignment", ["gripper", "object", "edge", "surface-pair"])
-def test_pairs_by_tolerance_equal_brute_force(alignment: an.Alignment) -> None:
+def test_pairs_by_tolerance_equal_brute_force(alignment: Alignment) -> None:
     rng = np.random.default_rng(1)
     trials = _scattered(110, rng)
     tolerance = math.radians(7.5)
-    frames: an.Frames | None = None
+    frames: Frames | None = None
     aligned = int(trials.success.sum())
     used = se3.to_matrix(trials.quaternions)
     if alignment == "object":
@@ -196,9 +198,12 @@ def test_pairs_by_tolerance_equal_brute_force(alignment: an.Alignment) -> None:
         aligned = int(np.isfinite(own[trials.success, 0, 0]).sum())
         frames = own
         if alignment == "surface-pair":
-            frames = lambda p, q: own[[int(np.flatnonzero((trials.positions == x).all(1))[0]) for x in p]]  # noqa: E731
+
+            def frames(at: Poses) -> Floats:
+                return own[[int(np.flatnonzero((trials.positions == x).all(1))[0]) for x in at.positions]]
+
             trials = replace(trials, positions=trials.positions + np.arange(110)[:, None] * 1e-9)
-    got = an.empirical(*trials.parts(), alignment=alignment, frames=frames)
+    got = empirical_anisotropy(*trials.parts(), alignment=alignment, frames=frames)
     _same(got.translations, *_brute_translations(trials, used, tolerance, alignment != "object"))
     _same(got.rotations, *_brute_rotations(trials, 0.005, tolerance))
     assert got.grasps == trials.success.sum()
@@ -207,10 +212,13 @@ def test_pairs_by_tolerance_equal_brute_force(alignment: an.Alignment) -> None:
 
 def test_jaws_without_symmetry_have_no_twins() -> None:
     trials = _scattered(120, np.random.default_rng(2))
-    one = an.empirical(*trials.parts(), symmetric=False)
+    one = empirical_anisotropy(*trials.parts(), symmetric=False)
     twin = np.random.default_rng(3).random(120) < 0.5
     q = np.where(twin[:, None], se3.jaw_twin(trials.quaternions), trials.quaternions)
-    with_twins = [an.empirical(trials.positions, each, trials.success) for each in (trials.quaternions, q)]
+    with_twins = [
+        empirical_anisotropy(Poses.of(trials.positions, each), trials.success)
+        for each in (trials.quaternions, q)
+    ]
     for a, b in zip(with_twins[0].rotations, with_twins[1].rotations, strict=True):
         np.testing.assert_array_equal(a.count, b.count)
         np.testing.assert_allclose(a.probability, b.probability)
@@ -220,11 +228,11 @@ def test_jaws_without_symmetry_have_no_twins() -> None:
 
 
 def test_keys_on_a_grid_agree_with_tolerances(box: Trials) -> None:
-    keyed = an.empirical(
+    keyed = empirical_anisotropy(
         *box.parts(), rotation_keys=box.rotation_keys, position_keys=box.position_keys, max_grasps=40
     )
     # Ten degrees apart, so that 7.5 degrees reach the same rotation only.
-    free = an.empirical(*box.parts(), max_grasps=40, max_candidates=10**9)
+    free = empirical_anisotropy(*box.parts(), max_grasps=40, max_candidates=10**9)
     for a, b in zip(keyed.translations + keyed.rotations, free.translations + free.rotations, strict=True):
         np.testing.assert_array_equal(a.count, b.count)
         np.testing.assert_allclose(a.probability, b.probability)
@@ -257,7 +265,7 @@ def test_candidates_miss_nothing(seed: int, angle: float) -> None:
 
 
 def test_tolerances_of_a_box(box: Trials) -> None:
-    got = an.empirical(
+    got = empirical_anisotropy(
         *box.parts(),
         rotation_keys=box.rotation_keys,
         position_keys=box.position_keys,
@@ -283,8 +291,8 @@ def test_tolerances_of_a_box(box: Trials) -> None:
 
 def test_the_object_s_frame_sharpens_what_the_gripper_s_blurs(box: Trials) -> None:
     keys = {"rotation_keys": box.rotation_keys, "position_keys": box.position_keys}
-    along = an.empirical(*box.parts(), **keys, alignment="object", frames=np.eye(3))
-    blurred = an.empirical(*box.parts(), **keys)
+    along = empirical_anisotropy(*box.parts(), **keys, alignment="object", frames=np.eye(3))
+    blurred = empirical_anisotropy(*box.parts(), **keys)
     longest = [max(t.half_width for t in r.tolerances[:3]) for r in (along, blurred)]
     shortest = [min(t.half_width for t in r.tolerances[:3]) for r in (along, blurred)]
     assert longest[0] > longest[1] + 0.005
@@ -292,7 +300,7 @@ def test_the_object_s_frame_sharpens_what_the_gripper_s_blurs(box: Trials) -> No
 
 
 def test_gripper_histograms_have_the_jaw_s_symmetry(box: Trials) -> None:
-    got = an.empirical(*box.parts(), rotation_keys=box.rotation_keys, position_keys=box.position_keys)
+    got = empirical_anisotropy(*box.parts(), rotation_keys=box.rotation_keys, position_keys=box.position_keys)
     for histogram in got.translations:
         np.testing.assert_allclose(histogram.probability, histogram.probability[::-1, ::-1], atol=1e-6)
     plane = got.rotations[0]
@@ -307,7 +315,7 @@ def test_gripper_histograms_have_the_jaw_s_symmetry(box: Trials) -> None:
 
 def test_intervals_hold_the_value_and_shrink_with_grasps(box: Trials) -> None:
     keys = {"rotation_keys": box.rotation_keys, "position_keys": box.position_keys}
-    few, many = (an.empirical(*box.parts(), **keys, max_grasps=n) for n in (40, 640))
+    few, many = (empirical_anisotropy(*box.parts(), **keys, max_grasps=n) for n in (40, 640))
     width = []
     for report in (few, many):
         middle = report.translations[2]
@@ -322,11 +330,11 @@ def test_intervals_over_grasps_cover(box: Trials) -> None:
     """Against nearly all successes as A: intervals from samples of 60 cover about as often as they say."""
     keys = {"rotation_keys": box.rotation_keys, "position_keys": box.position_keys}
     every = {"alignment": "object", "frames": np.eye(3)}
-    truth = an.empirical(*box.parts(), **keys, **every, max_grasps=3_000, max_candidates=10**9)
+    truth = empirical_anisotropy(*box.parts(), **keys, **every, max_grasps=3_000, max_candidates=10**9)
     target = truth.translations[2].probability[6, 4]
     hits = 0
     for seed in range(40):
-        found = an.empirical(*box.parts(), **keys, **every, max_grasps=60, seed=seed).translations[2]
+        found = empirical_anisotropy(*box.parts(), **keys, **every, max_grasps=60, seed=seed).translations[2]
         hits += found.low[6, 4] <= target <= found.high[6, 4]
     assert 30 <= hits <= 40
 
@@ -335,14 +343,16 @@ def test_weights_choose_whose_vicinity_counts(box: Trials) -> None:
     keys = {"rotation_keys": box.rotation_keys, "position_keys": box.position_keys}
     left = box.positions[:, 0] < -0.03
     kept = box.success & left
-    got = an.empirical(*box.parts(), **keys, alignment="object", frames=np.eye(3), weights=kept.astype(float))
+    got = empirical_anisotropy(
+        *box.parts(), **keys, alignment="object", frames=np.eye(3), weights=kept.astype(float)
+    )
     x = got.tolerances[0]
     assert x.plus > x.minus + 0.03
 
 
 @pytest.fixture(scope="module")
 def densities(box: Trials) -> tuple[GraspDensity, GraspDensity]:
-    p, q, success = box.parts()
+    p, q, success = box.positions, box.quaternions, box.success
     near = np.max(np.abs(p) - HALF_M, axis=1) < 0.05
     kernel = IsotropicKernel(0.006, math.radians(8.0))
     return (
@@ -354,10 +364,10 @@ def densities(box: Trials) -> tuple[GraspDensity, GraspDensity]:
 def test_smoothed_ranks_the_axes_of_a_box(densities: tuple[GraspDensity, GraspDensity]) -> None:
     """The kernel's smoothing takes from P near the rim, so widths come out smaller but in order."""
     successes, attempts = densities
-    layout = an.Bins(across=3, slices=1, angles=8, reach_m=0.08, profile_m=0.01)
-    got = an.smoothed(
+    layout = Bins(across=3, slices=1, angles=8, reach_m=0.08, profile_m=0.01)
+    got = density_anisotropy(
         successes,
-        an.attempt_density(attempts),
+        lambda at: attempts.size * attempts.density(at),
         alignment="object",
         frames=np.eye(3),
         bins=layout,
@@ -379,10 +389,10 @@ def test_smoothed_is_the_mean_of_the_definition(densities: tuple[GraspDensity, G
     """At hardly any displacement, against the float64 reference with A's row removed."""
     successes, attempts = densities
     rho = 3.0 * float(
-        np.median(attempts.size * attempts.density(successes.positions, successes.quaternions_xyzw))
+        np.median(attempts.size * attempts.density(Poses(successes.positions, successes.quaternions_xyzw)))
     )
-    layout = an.Bins(across=1, slices=1, angles=2, reach_m=1e-6, profile_m=1e-6, reach=1e-6, profile=1e-6)
-    got = an.smoothed(successes, rho, bins=layout, max_grasps=successes.size)
+    layout = Bins(across=1, slices=1, angles=2, reach_m=1e-6, profile_m=1e-6, reach=1e-6, profile=1e-6)
+    got = density_anisotropy(successes, rho, bins=layout, max_grasps=successes.size)
     p, q, n = successes.positions, successes.quaternions_xyzw, successes.size
     share = []
     for row in range(0, n, 7):
@@ -406,12 +416,12 @@ def test_smoothed_leaves_the_grasp_itself_out() -> None:
     density = GraspDensity.build(
         Poses.of(p, se3.random_quaternions(30, rng)), kernel=IsotropicKernel(0.01, 0.2)
     )
-    got = an.smoothed(density, 1.0, max_grasps=30)
+    got = density_anisotropy(density, 1.0, max_grasps=30)
     peak = float(np.exp(density.kernel.log_peak))
     assert peak > 100.0
     assert got.translations[2].probability[4, 4] < 1.0
     assert all(np.nanmax(h.probability) < 1.0 for h in got.translations)
-    scaled = an.smoothed(density, 1e-3 * peak, max_grasps=30)
+    scaled = density_anisotropy(density, 1e-3 * peak, max_grasps=30)
     assert np.nanmax(scaled.translations[2].probability) < 1e-2
 
 
@@ -428,35 +438,37 @@ def test_a_profile_that_stays_high_is_a_lower_bound() -> None:
 
 
 def test_too_little_is_refused_with_what_is_needed(box: Trials) -> None:
-    p, q, success = box.parts()
+    p, q, success = box.positions, box.quaternions, box.success
     few = np.zeros(len(p), dtype=bool)
     few[:7] = True
     with pytest.raises(ValueError, match=r"at least 20 successes; there are 7, so 13 more"):
-        an.empirical(p, q, few)
+        empirical_anisotropy(Poses.of(p, q), few)
     with pytest.raises(ValueError, match="needs failures"):
-        an.empirical(p[success], q[success], success[success])
+        empirical_anisotropy(Poses.of(p[success], q[success]), success[success])
     with pytest.raises(ValueError, match="needs its frames"):
-        an.empirical(p, q, success, alignment="object")
+        empirical_anisotropy(Poses.of(p, q), success, alignment="object")
     with pytest.raises(ValueError, match="takes no frames"):
-        an.empirical(p, q, success, frames=np.eye(3))
+        empirical_anisotropy(Poses.of(p, q), success, frames=np.eye(3))
     with pytest.raises(ValueError, match="orthonormal"):
-        an.empirical(p, q, success, alignment="object", frames=2.0 * np.eye(3))
+        empirical_anisotropy(Poses.of(p, q), success, alignment="object", frames=2.0 * np.eye(3))
     with pytest.raises(ValueError, match="integers"):
-        an.empirical(p, q, success, rotation_keys=np.zeros(len(p)))
+        empirical_anisotropy(Poses.of(p, q), success, rotation_keys=np.zeros(len(p)))
     with pytest.raises(ValueError, match="success has shape"):
-        an.empirical(p, q, success[:-1])
+        empirical_anisotropy(Poses.of(p, q), success[:-1])
     far = np.arange(60)[:, None] * np.array([1.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="no trial lies within reach"):
-        an.empirical(far, se3.random_quaternions(60, np.random.default_rng(0)), np.arange(60) < 30)
+        empirical_anisotropy(
+            Poses.of(far, se3.random_quaternions(60, np.random.default_rng(0))), np.arange(60) < 30
+        )
     density = GraspDensity.build(Poses.of(p[:30], q[:30]), kernel=IsotropicKernel(0.01, 0.2))
     with pytest.raises(ValueError, match="density of attempts"):
-        an.smoothed(density, 0.0)
+        density_anisotropy(density, 0.0)
 
 
 def test_progress_rises_and_cancels(box: Trials) -> None:
     keys = {"rotation_keys": box.rotation_keys, "position_keys": box.position_keys}
     seen: list[float] = []
-    an.empirical(*box.parts(), **keys, max_grasps=200, progress=seen.append)
+    empirical_anisotropy(*box.parts(), **keys, max_grasps=200, progress=seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
 
@@ -464,11 +476,11 @@ def test_progress_rises_and_cancels(box: Trials) -> None:
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        an.empirical(*box.parts(), **keys, progress=stop)
+        empirical_anisotropy(*box.parts(), **keys, progress=stop)
 
 
 def test_work_is_limited(box: Trials) -> None:
     keys = {"rotation_keys": box.rotation_keys, "position_keys": box.position_keys}
-    limited = an.empirical(*box.parts(), **keys, max_candidates=200_000)
+    limited = empirical_anisotropy(*box.parts(), **keys, max_candidates=200_000)
     assert 20 <= limited.grasps < box.success.sum()
     assert limited.translation_pairs + limited.rotation_pairs <= 200_000

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel, se3
-from graspdb_density.se3 import Floats
+from graspdb_density.se3 import Floats, Poses
 from graspdb_density.success.axis_bandwidth import AxisBandwidths, fit_axis_bandwidths
 from graspdb_density.success.kernel_regression import PRIOR_TRIALS, SUCCESS_CUTOFF
 
@@ -49,11 +49,11 @@ def test_the_model_is_the_sum_over_attempts(seed: int) -> None:
     p, q, won = scattered(300, seed)
     won[:2] = True, False
     twin = rng.random(300) < 0.6
-    model = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(WIDTHS), symmetric=twin)
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(WIDTHS), symmetric=twin)
     at = rng.integers(300, size=20)
     x = p[at] + rng.normal(size=(20, 3)) * 0.008
     r = se3.multiply(q[at], se3.from_rotation_vector(rng.normal(size=(20, 3)) * 0.2))
-    found = model.evaluate(x, r)
+    found = model.evaluate(Poses.of(x, r))
     for j in range(20):
         chance, trials = brute(p, q, won, twin, x[j], r[j], WIDTHS)
         assert found.effective_trials[j] == pytest.approx(trials, rel=2e-3, abs=1e-6)
@@ -62,14 +62,16 @@ def test_the_model_is_the_sum_over_attempts(seed: int) -> None:
     assert (found.probability <= found.high + 1e-9).all()
     # The order of coming does not matter, nor which way round a symmetric jaw is held.
     grown = SuccessModel.build(
-        p[:120], q[:120], won[:120], kernel=DiagonalKernel.of(WIDTHS), symmetric=twin[:120]
+        Poses.of(p[:120], q[:120]), won[:120], kernel=DiagonalKernel.of(WIDTHS), symmetric=twin[:120]
     )
-    grown = grown.extend(p[120:], q[120:], won[120:], twin[120:])
-    np.testing.assert_allclose(grown.evaluate(x, r).probability, found.probability, atol=1e-5)
+    grown = grown.extend(Poses.of(p[120:], q[120:]), won[120:], twin[120:])
+    np.testing.assert_allclose(grown.evaluate(Poses.of(x, r)).probability, found.probability, atol=1e-5)
     assert (grown.size, grown.successes) == (300, int(won.sum()))
-    every = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(WIDTHS))
+    every = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(WIDTHS))
     np.testing.assert_allclose(
-        every.evaluate(x, se3.jaw_twin(r)).probability, every.evaluate(x, r).probability, atol=1e-5
+        every.evaluate(Poses.of(x, se3.jaw_twin(r))).probability,
+        every.evaluate(Poses.of(x, r)).probability,
+        atol=1e-5,
     )
 
 
@@ -77,13 +79,15 @@ def test_fixed_axes_are_those_of_the_sum() -> None:
     rng = np.random.default_rng(5)
     p, q, won = scattered(300, 5)
     axes = se3.to_matrix(se3.random_quaternions(1, rng))[0]
-    model = SuccessModel.build(p[:200], q[:200], won[:200], kernel=DiagonalKernel.of(WIDTHS, axes))
-    model = model.extend(p[200:], q[200:], won[200:])
+    model = SuccessModel.build(Poses.of(p[:200], q[:200]), won[:200], kernel=DiagonalKernel.of(WIDTHS, axes))
+    model = model.extend(Poses.of(p[200:], q[200:]), won[200:])
     at = rng.integers(300, size=20)
     x = p[at] + rng.normal(size=(20, 3)) * 0.008
     r = se3.multiply(q[at], se3.from_rotation_vector(rng.normal(size=(20, 3)) * 0.2))
-    found = model.evaluate(x, r)
-    narrow = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(0.5 * WIDTHS, axes)).evaluate(x, r)
+    found = model.evaluate(Poses.of(x, r))
+    narrow = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(0.5 * WIDTHS, axes)).evaluate(
+        Poses.of(x, r)
+    )
     for j in range(20):
         k = np.zeros((2, 300))
         for turned in (q, se3.jaw_twin(q)):
@@ -100,20 +104,20 @@ def test_fixed_axes_are_those_of_the_sum() -> None:
         assert found.probability[j] == pytest.approx(told[0], abs=2e-4)
         assert narrow.probability[j] == pytest.approx(told[1], abs=2e-4)
     with pytest.raises(ValueError, match="orthonormal"):
-        SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(WIDTHS, 2.0 * axes))
+        SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(WIDTHS, 2.0 * axes))
 
 
 def test_equal_widths_agree_with_the_isotropic_model() -> None:
     p, q, won = scattered(4_000, 3)
     kernel = IsotropicKernel(0.008, math.radians(9.0))
     widths = np.repeat([kernel.sigma_position_m, kernel.sigma_rotation], 3)
-    plain = SuccessModel.build(p, q, won, kernel=kernel)
-    shaped = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(widths))
+    plain = SuccessModel.build(Poses.of(p, q), won, kernel=kernel)
+    shaped = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(widths))
     x, r, _ = scattered(300, 4)
-    ours, theirs = shaped.evaluate(x, r), plain.evaluate(x, r)
+    ours, theirs = shaped.evaluate(Poses.of(x, r)), plain.evaluate(Poses.of(x, r))
     assert np.abs(ours.probability - theirs.probability).mean() < 5e-3
     with pytest.raises(ValueError, match="widths"):
-        SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(np.zeros(6)))
+        SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(np.zeros(6)))
 
 
 def field(count: int, seed: int) -> tuple[Floats, Floats, np.ndarray]:
@@ -128,7 +132,7 @@ def field(count: int, seed: int) -> tuple[Floats, Floats, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> AxisBandwidths:
-    return fit_axis_bandwidths(*field(8_000, 0), symmetric=False)
+    return fit_axis_bandwidths(Poses.of(*field(8_000, 0)[:2]), field(8_000, 0)[2], symmetric=False)
 
 
 def test_widths_are_narrow_where_success_changes_and_wide_where_not(fitted: AxisBandwidths) -> None:
@@ -147,9 +151,9 @@ def test_the_gain_holds_for_attempts_never_seen(fitted: AxisBandwidths) -> None:
     x = x + rng.normal(size=x.shape) * 0.004
     base = se3.random_quaternions(1, np.random.default_rng(0))[0]
     truth = 0.5 + 0.45 * np.sin(2.0 * math.pi * (x @ se3.to_matrix(base)[:, 0]) / 0.048)
-    shaped = SuccessModel.build(p, q, won, kernel=fitted.kernel, symmetric=False)
-    plain = SuccessModel.build(p, q, won, kernel=fitted.isotropic, symmetric=False)
-    errors = [np.mean((model.evaluate(x, r).probability - truth) ** 2) for model in (shaped, plain)]
+    shaped = SuccessModel.build(Poses.of(p, q), won, kernel=fitted.kernel, symmetric=False)
+    plain = SuccessModel.build(Poses.of(p, q), won, kernel=fitted.isotropic, symmetric=False)
+    errors = [np.mean((model.evaluate(Poses.of(x, r)).probability - truth) ** 2) for model in (shaped, plain)]
     assert errors[0] < 0.8 * errors[1]
 
 
@@ -161,7 +165,10 @@ def test_along_a_body_s_axis_widths_are_wide_however_grippers_are_turned() -> No
     line = se3.to_matrix(se3.random_quaternions(1, rng))[0]
     chance = 0.5 + 0.45 * np.sin(2.0 * math.pi * (p @ line[:, 1]) / 0.04)
     won = rng.random(len(p)) < chance
-    along, gripper = fit_axis_bandwidths(p, q, won, axes=line), fit_axis_bandwidths(p, q, won)
+    along, gripper = (
+        fit_axis_bandwidths(Poses.of(p, q), won, axes=line),
+        fit_axis_bandwidths(Poses.of(p, q), won),
+    )
     assert along.kernel.sigmas[0] > 1.8 * along.kernel.sigmas[1]
     assert along.log_loss < gripper.log_loss - 0.02
     assert along.skill > gripper.skill + 0.02
@@ -174,7 +181,7 @@ def test_too_little_is_said_with_numbers() -> None:
     won[:] = False
     won[:20] = True
     with pytest.raises(ValueError, match="at least 50 successes and 50 failures; there are 20 and 180"):
-        fit_axis_bandwidths(p, q, won)
+        fit_axis_bandwidths(Poses.of(p, q), won)
     won[:100] = True
     with pytest.raises(ValueError, match="one block"):
-        fit_axis_bandwidths(np.zeros((200, 3)), q, won)
+        fit_axis_bandwidths(Poses.of(np.zeros((200, 3)), q), won)

@@ -26,7 +26,7 @@ def _data(seed: int, count: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def test_scores_agree_with_scikit_learn(seed: int, weighted: bool) -> None:
     p, y, w = _data(seed)
     weights = w if weighted else None
-    assert cal.brier_score(p, y, weights=weights) == pytest.approx(
+    assert cal.calibrate(p, y, weights=weights).brier == pytest.approx(
         brier_score_loss(y, p, sample_weight=weights)
     )
     assert cal.area_under_curve(p, y, weights=weights) == pytest.approx(
@@ -122,15 +122,15 @@ def test_skill_interval_covers() -> None:
 def test_bad_input_is_named() -> None:
     for bad in ([0.5, np.nan], [0.5, 1.2], [-0.1, 0.2]):
         with pytest.raises(ValueError, match="probabilities"):
-            cal.brier_score(bad, [True, False])
+            cal.brier_skill(bad, [True, False])
     with pytest.raises(ValueError, match="one length"):
-        cal.brier_score([0.5], [True, False])
+        cal.brier_skill([0.5], [True, False])
     with pytest.raises(ValueError, match="at least 1"):
-        cal.brier_score([], [])
+        cal.brier_skill([], [])
     with pytest.raises(ValueError, match="true or false"):
-        cal.brier_score([0.5, 0.5], [0, 2])
+        cal.brier_skill([0.5, 0.5], [0, 2])
     with pytest.raises(ValueError, match="weights"):
-        cal.brier_score([0.5, 0.5], [0, 1], weights=[0.0, 0.0])
+        cal.brier_skill([0.5, 0.5], [0, 1], weights=[0.0, 0.0])
     with pytest.raises(ValueError, match="rising"):
         cal.reliability([0.5, 0.5], [0, 1], bins=[0.0, 0.5, 0.5, 1.0])
     # Scores for ranking may be anything but nan.

@@ -17,12 +17,12 @@ from graspdb_density.bandwidth import matching
 from graspdb_density.kde import brute_force
 from graspdb_density.kde.weighted_sums import KernelRows
 from graspdb_density.kernels.gaussian_mixture import rotation_normaliser
-from graspdb_density.se3 import Floats
+from graspdb_density.se3 import Floats, Poses
 from graspdb_density.statistics import convergence as cv
-from graspdb_density.statistics import incremental_bootstrap
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 
-Poses = tuple[Floats, Floats]
-Shell = Callable[[int, np.random.Generator], Poses]
+Pair = tuple[Floats, Floats]
+Shell = Callable[[int, np.random.Generator], Pair]
 KERNEL = IsotropicKernel(0.015, math.radians(15.0))
 MIRROR = np.diag([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
 
@@ -51,7 +51,7 @@ def _random_mixture(rng: np.random.Generator, scale: float = 1.0) -> Mixture:
     return Mixture(np.array([0.3, 0.3, 0.2, 0.2]), np.array(means), np.array(covariances))
 
 
-def _brute_log_density(kernel: Mixture, rows: Poses, frames: Floats | None, at: Poses) -> Floats:
+def _brute_log_density(kernel: Mixture, rows: Pair, frames: Floats | None, at: Pair) -> Floats:
     """Sum over rows, twins, components and both wraps in float64 with general-purpose pieces only."""
     lists: list[Floats] = []
     normaliser = rotation_normaliser(kernel.means[:, 3:], kernel.covariances[:, 3:, 3:])
@@ -291,9 +291,9 @@ def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
 @pytest.fixture(scope="module")
 def curve(shell: Shell) -> cv.ConvergenceCurve:
     p, q = shell(1_600, np.random.default_rng(8))
-    return incremental_bootstrap.convergence_curve(
-        p, q, IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3
-    )
+    return IncrementalCurve.of(
+        Poses.of(p, q), IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3
+    ).curve
 
 
 def test_curve_rises_and_shows_its_parts(curve: cv.ConvergenceCurve) -> None:
@@ -309,9 +309,9 @@ def test_curve_rises_and_shows_its_parts(curve: cv.ConvergenceCurve) -> None:
 
 def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: cv.ConvergenceCurve) -> None:
     p, q = shell(1_600, np.random.default_rng(8))
-    wide = incremental_bootstrap.convergence_curve(
-        p, q, IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3
-    )
+    wide = IncrementalCurve.of(
+        Poses.of(p, q), IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3
+    ).curve
     assert all(w.similarity > n.similarity for w, n in zip(wide.points, curve.points, strict=True))
     assert wide.points[-1].log_likelihood < curve.points[-1].log_likelihood
     value, low, high = cv.needed_ratio(wide, curve, target=0.9)
@@ -321,7 +321,7 @@ def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: 
 def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
     p, q = shell(200, np.random.default_rng(9))
     one, two, other = (
-        incremental_bootstrap.convergence_curve(p, q, KERNEL, points=200, replicates=5, seed=seed)
+        IncrementalCurve.of(Poses.of(p, q), KERNEL, points=200, replicates=5, seed=seed).curve
         for seed in (1, 1, 2)
     )
     assert [a.similarity for a in one.points] == [a.similarity for a in two.points]
@@ -332,14 +332,14 @@ def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
 def test_too_few_grasps_say_how_many_are_needed(shell: Shell) -> None:
     p, q = shell(37, np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"at least 200 .* there are 37, so 163 more"):
-        incremental_bootstrap.convergence_curve(p, q, KERNEL)
+        IncrementalCurve.of(Poses.of(p, q), KERNEL)
     with pytest.raises(ValueError, match="at least 200"):
-        incremental_bootstrap.convergence_curve(p[:0], q[:0], KERNEL)
+        IncrementalCurve.of(Poses.of(p[:0], q[:0]), KERNEL)
     p, q = shell(200, np.random.default_rng(0))
     with pytest.raises(ValueError, match="2 replicates and 2 points"):
-        incremental_bootstrap.convergence_curve(p, q, KERNEL, replicates=1)
+        IncrementalCurve.of(Poses.of(p, q), KERNEL, replicates=1)
     with pytest.raises(ValueError, match="5 subsets"):
-        incremental_bootstrap.convergence_curve(p, q, KERNEL, subsets=4)
+        IncrementalCurve.of(Poses.of(p, q), KERNEL, subsets=4)
 
 
 def _synthetic(exponent: float, scale: float, noise: float, seed: int = 0) -> cv.ConvergenceCurve:
@@ -487,9 +487,9 @@ def test_few_draws_tell_less_of_the_width_that_matches() -> None:
 def test_a_ratio_knows_how_well_the_reference_is_known(shell: Shell) -> None:
     p, q = shell(400, np.random.default_rng(3))
     narrow, curve, wide = (
-        incremental_bootstrap.convergence_curve(
-            p, q, matching.scaled(KERNEL, factor), points=2_000, replicates=20
-        )
+        IncrementalCurve.of(
+            Poses.of(p, q), matching.scaled(KERNEL, factor), points=2_000, replicates=20
+        ).curve
         for factor in (0.8, 1.0, 1.25)
     )
     value, low, high = cv.needed_ratio(curve, curve, target=0.9)
@@ -510,8 +510,8 @@ def test_a_curve_under_an_anisotropic_kernel(shell: Shell, framed: bool) -> None
     frames = se3.to_matrix(se3.random_quaternions(400, rng)) if framed else None
     kernel = IsotropicKernel(0.03, math.radians(12.0))
     gaussian = _gaussian(*[0.03] * 3, *[math.radians(12.0)] * 3)
-    one = incremental_bootstrap.convergence_curve(p, q, kernel, points=2_000, replicates=20)
-    two = incremental_bootstrap.convergence_curve(p, q, gaussian, frames=frames, points=2_000, replicates=20)
+    one = IncrementalCurve.of(Poses.of(p, q), kernel, points=2_000, replicates=20).curve
+    two = IncrementalCurve.of(Poses.of(p, q), gaussian, frames=frames, points=2_000, replicates=20).curve
     for a, b in zip(one.points, two.points, strict=True):
         assert a.similarity == pytest.approx(b.similarity, abs=0.03)
         assert a.log_likelihood == pytest.approx(b.log_likelihood, abs=0.3)

@@ -14,10 +14,11 @@ import pytest
 
 from graspdb_density import IsotropicKernel, SuccessModel, se3
 from graspdb_density.kde import brute_force
+from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SUCCESS_CUTOFF
 
 Field = Callable[[se3.Floats, se3.Floats], se3.Floats]
-Poses = tuple[se3.Floats, se3.Floats]
+Pair = tuple[se3.Floats, se3.Floats]
 
 KERNEL = IsotropicKernel(0.015, math.radians(15))
 #: Edges of the bins of data density, in effective trials.
@@ -44,14 +45,14 @@ def waves(p: se3.Floats, q: se3.Floats) -> se3.Floats:
     return np.asarray(0.5 + 0.35 * np.sin(50.0 * p[:, 0] + 2.0 * tilt[:, 0]) * np.cos(45.0 * p[:, 2]))
 
 
-def attempts(count: int, rng: np.random.Generator) -> Poses:
+def attempts(count: int, rng: np.random.Generator) -> Pair:
     """Dense in the middle and thinning out: from hundreds of effective trials to hardly one."""
     spread = np.exp(rng.uniform(math.log(0.008), math.log(0.12), (count, 1)))
     turn = np.exp(rng.uniform(math.log(0.15), math.log(2.0), (count, 1)))
     return rng.normal(size=(count, 3)) * spread, se3.from_rotation_vector(rng.normal(size=(count, 3)) * turn)
 
 
-def smoothed(field: Field, rows: Poses, poses: Poses) -> se3.Floats:
+def smoothed(field: Field, rows: Pair, poses: Pair) -> se3.Floats:
     """``sum k f / sum k`` over the rows within reach, both twins of each."""
     chance, twins = field(*rows), se3.jaw_twin(rows[1])
     out = np.empty(len(poses[0]))
@@ -76,9 +77,9 @@ def test_every_bin_of_data_density_is_covered(field: Field) -> None:
     covered: list[list[bool]] = [[] for _ in BINS]
     for _ in range(40):
         rows = attempts(6_000, rng)
-        model = SuccessModel.build(*rows, rng.random(6_000) < field(*rows), kernel=KERNEL)
+        model = SuccessModel.build(Poses.of(*rows), rng.random(6_000) < field(*rows), kernel=KERNEL)
         poses = attempts(120, rng)
-        estimate = model.evaluate(*poses)
+        estimate = model.evaluate(Poses.of(*poses))
         truth = smoothed(field, rows, poses)
         inside = (estimate.low <= truth) & (truth <= estimate.high)
         for i in np.flatnonzero(estimate.effective_trials > 0.0):

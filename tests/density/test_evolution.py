@@ -19,9 +19,10 @@ from graspdb_density import (
     expected,
     se3,
 )
+from graspdb_density.se3 import Poses
 
-Poses = tuple[se3.Floats, se3.Floats]
-Shell = Callable[[int, np.random.Generator], Poses]
+Pair = tuple[se3.Floats, se3.Floats]
+Shell = Callable[[int, np.random.Generator], Pair]
 
 KERNEL = IsotropicKernel(0.015, math.radians(15.0))
 
@@ -63,16 +64,16 @@ def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> Non
     q = np.tile(se3.IDENTITY, (len(p), 1))
     won = np.arange(len(p)) < 301
     won[:60] = False
-    model = SuccessModel.build(p, q, won, kernel=KERNEL)
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=KERNEL)
     density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=KERNEL)
-    found = ModeSearch(density).maxima(score=lambda a, b: model.evaluate(a, b).low, count=2)
+    found = ModeSearch(density).maxima(score=lambda a, b: model.evaluate(Poses.of(a, b)).low, count=2)
     assert found[0].position[0] < -0.05
     assert found[0].score > found[1].score
-    estimate = model.evaluate(found[0].position[None], found[0].quaternion_xyzw[None])
+    estimate = model.evaluate(Poses.of(found[0].position[None], found[0].quaternion_xyzw[None]))
     assert found[0].score == pytest.approx(estimate.low[0])
-    every = model.evaluate(p, q, level=0.8)
-    np.testing.assert_array_equal(model.lower_end(p, q, level=0.8), every.low)
-    np.testing.assert_array_equal(model.probability(p, q), every.probability)
+    every = model.evaluate(Poses.of(p, q), level=0.8)
+    np.testing.assert_array_equal(model.lower_end(Poses.of(p, q), level=0.8), every.low)
+    np.testing.assert_array_equal(model.probability(Poses.of(p, q)), every.probability)
 
 
 def test_refused_poses_are_never_returned(shell: Shell) -> None:

@@ -10,8 +10,9 @@ import pytest
 from graspdb_density import se3
 from graspdb_density.se3 import Floats, Poses
 from graspdb_density.success.block_bootstrap import shares
-from graspdb_density.vicinity import anisotropy as an
+from graspdb_density.vicinity.anisotropy import empirical_anisotropy
 from graspdb_density.vicinity.displacement_bins import Anisotropy
+from graspdb_density.vicinity.displacement_density import density_anisotropy
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 
 #: Half extents (m) in which grasps of a bar hold, along x, y and z, and half turns (deg) about them.
@@ -44,7 +45,7 @@ def by_name(found: list[Hypothesis]) -> dict[str, Hypothesis]:
 
 
 def test_a_bar_held_along_its_edge_confirms_them() -> None:
-    found = by_name(wide_axes(an.empirical(*bar())))
+    found = by_name(wide_axes(empirical_anisotropy(Poses.of(*bar()[:2]), bar()[2])))
     for name in ("x-wide", "z-wide", "ry-wide"):
         item = found[name]
         assert item.verdict == "confirmed", item
@@ -53,17 +54,18 @@ def test_a_bar_held_along_its_edge_confirms_them() -> None:
 
 
 def test_the_other_way_round_denies_them() -> None:
-    found = by_name(wide_axes(an.empirical(*bar(((0.02, 0.05, 0.02), (60.0, 20.0, 60.0))))))
+    p, q, won = bar(((0.02, 0.05, 0.02), (60.0, 20.0, 60.0)))
+    found = by_name(wide_axes(empirical_anisotropy(Poses.of(p, q), won)))
     assert [found[name].verdict for name in ("x-wide", "z-wide", "ry-wide")] == ["denied"] * 3
     assert found["ry-wide"].high < 1.0
 
 
 def test_what_is_alike_or_unknown_stays_undecided() -> None:
     p, q, won = bar(((0.03, 0.03, 0.03), (40.0, 40.0, 40.0)))
-    assert {item.verdict for item in wide_axes(an.empirical(p, q, won))} == {"undecided"}
+    assert {item.verdict for item in wide_axes(empirical_anisotropy(Poses.of(p, q), won))} == {"undecided"}
     # Without a trial turned about any axis nothing can be said of those.
     still = (p != 0.0).any(axis=1) | (q == q[0]).all(axis=1)
-    turns = by_name(wide_axes(an.empirical(p[still], q[still], won[still])))["ry-wide"]
+    turns = by_name(wide_axes(empirical_anisotropy(Poses.of(p[still], q[still]), won[still])))["ry-wide"]
     assert turns.verdict == "undecided"
     assert math.isnan(turns.ratio)
 
@@ -74,27 +76,29 @@ def test_a_bound_decides_only_what_it_can_not_overturn() -> None:
     p = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
     won = np.abs(p[:, 1]) < 0.016
     q = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(p), 4))
-    wide = by_name(wide_axes(an.empirical(p, q, won)))["x-wide"]
+    wide = by_name(wide_axes(empirical_anisotropy(Poses.of(p, q), won)))["x-wide"]
     assert (wide.verdict, wide.bound) == ("confirmed", "lower")
     across = p[:, [1, 0, 2]]
-    narrow = by_name(wide_axes(an.empirical(across, q, won)))["x-wide"]
+    narrow = by_name(wide_axes(empirical_anisotropy(Poses.of(across, q), won)))["x-wide"]
     assert (narrow.verdict, narrow.bound) == ("denied", "upper")
 
 
 def test_alignment_sharpens_where_the_gripper_lies_across() -> None:
     p, q, won = bar(turned=math.radians(45.0))
     axes = np.eye(3)
-    blurred = an.empirical(p, q, won)
+    blurred = empirical_anisotropy(Poses.of(p, q), won)
     for alignment, frames in (
         ("object", axes),
-        ("edge", lambda p, q: np.broadcast_to(axes, (len(p), 3, 3))),
+        ("edge", lambda poses: np.broadcast_to(axes, (len(poses), 3, 3))),
     ):
-        found = sharpened(an.empirical(p, q, won, alignment=alignment, frames=frames), blurred)
+        found = sharpened(
+            empirical_anisotropy(Poses.of(p, q), won, alignment=alignment, frames=frames), blurred
+        )
         assert found.verdict == "confirmed", found
     itself = sharpened(blurred, blurred)
     assert (itself.ratio, itself.verdict) == (1.0, "undecided")
     with pytest.raises(ValueError, match="same grasps"):
-        sharpened(an.empirical(p, q, won, max_grasps=30), blurred)
+        sharpened(empirical_anisotropy(Poses.of(p, q), won, max_grasps=30), blurred)
 
 
 def test_hypotheses_know_the_smoothed_method_too() -> None:
@@ -111,7 +115,7 @@ def test_hypotheses_know_the_smoothed_method_too() -> None:
         float(np.median(density.density(Poses.of(density.positions, density.quaternions_xyzw))))
         * density.size
     )
-    found: Anisotropy = an.smoothed(density, 0.6 * peak)
+    found: Anisotropy = density_anisotropy(density, 0.6 * peak)
     assert by_name(wide_axes(found))["x-wide"].ratio > 1.0
 
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.kde.weighted_sums import KernelRows
 from graspdb_density.kernels.gaussian_mixture import Kernel
-from graspdb_density.se3 import Floats
+from graspdb_density.se3 import Floats, Poses
 from graspdb_density.statistics import convergence as cv
-from graspdb_density.statistics.counter_rng import FixedDraws
-from graspdb_density.statistics.incremental_bootstrap import GrowingCurve, curve_prefix
+from graspdb_density.statistics.counter_rng import CounterRng
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve, curve_prefix
 
-Poses = tuple[Floats, Floats]
-Shell = Callable[[int, np.random.Generator], Poses]
+Pair = tuple[Floats, Floats]
+Shell = Callable[[int, np.random.Generator], Pair]
 ISOTROPIC = IsotropicKernel(0.02, math.radians(20.0))
 
 
@@ -48,15 +48,14 @@ class Grasps:
     frames: Floats | None = None
 
     def grown(
-        self, count: int, kernel: Kernel, before: GrowingCurve | None = None, **options: int
-    ) -> GrowingCurve:
+        self, count: int, kernel: Kernel, before: IncrementalCurve | None = None, **options: int
+    ) -> IncrementalCurve:
         """The curve of the first rows."""
         weights, symmetric, frames = self.weights, self.symmetric, self.frames
-        return GrowingCurve.grown(
-            before,
-            self.p[:count],
-            self.q[:count],
+        return IncrementalCurve.of(
+            Poses.of(self.p[:count], self.q[:count]),
             kernel,
+            before=before,
             weights=None if weights is None else weights[:count],
             symmetric=True if symmetric is None else symmetric[:count],
             frames=frames if frames is None or frames.ndim == 2 else frames[:count],
@@ -64,7 +63,7 @@ class Grasps:
         )
 
 
-def assert_same(one: GrowingCurve, other: GrowingCurve) -> None:
+def assert_same(one: IncrementalCurve, other: IncrementalCurve) -> None:
     assert one.curve.held_out == other.curve.held_out
     for a, b in zip(one.curve.points, other.curve.points, strict=True):
         assert a.grasps == b.grasps
@@ -171,7 +170,7 @@ def test_late_heavy_grasps_bring_no_flood_of_points(shell: Shell) -> None:
 
 
 def test_counts_are_poisson_and_stay() -> None:
-    draws = FixedDraws(5)
+    draws = CounterRng(5)
     counts = draws.counts(2, 0, 5_000, 50)
     assert counts.shape == (5_000, 50)
     assert counts.mean() == pytest.approx(1.0, abs=0.01)
@@ -185,7 +184,7 @@ def test_counts_are_poisson_and_stay() -> None:
     np.testing.assert_array_equal(draws.counts(2, 1_000, 3_100, 50), counts[1_000:3_100])
     np.testing.assert_array_equal(draws.counts(2, 7, 8, 50), counts[7:8])
     assert (draws.counts(1, 0, 5_000, 50) != counts).any()
-    assert (FixedDraws(6).counts(2, 0, 5_000, 50) != counts).any()
+    assert (CounterRng(6).counts(2, 0, 5_000, 50) != counts).any()
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -195,13 +194,13 @@ def test_poisson_counts_and_drawing_with_replacement_agree(shell: Shell, count: 
     rng = np.random.default_rng(count)
     p, q = shell(count, rng)
     weights = rng.lognormal(0.0, 0.7, count) if weighted else None
-    curve = GrowingCurve.grown(
-        None, p, q, ISOTROPIC, weights=weights, replicates=200, points=20_000, threads=2
+    curve = IncrementalCurve.of(
+        Poses.of(p, q), ISOTROPIC, weights=weights, replicates=200, points=20_000, threads=2
     )
     last = curve.curve.points[-1]
     rows = KernelRows(se3.Poses.of(p, q), ISOTROPIC, weights=weights)
     # As many points as a group has: what they add to the deviation is then alike.
-    points = len(curve._groups[0].positions)
+    points = len(curve._groups[0].poses.positions)
     drawn = [
         cv.bootstrap_similarity(rows, rng, replicates=200, points=points, threads=2).replicates
         for _ in range(5)
@@ -217,12 +216,12 @@ def test_poisson_counts_and_drawing_with_replacement_agree(shell: Shell, count: 
 def test_the_first_points_of_a_group_follow_the_density(shell: Shell) -> None:
     """Draws that grow along are distributed as the density is: the mean log density is its own."""
     p, q = shell(399, np.random.default_rng(3))
-    curve = GrowingCurve.grown(None, p, q, ISOTROPIC, points=20_000, replicates=2)
+    curve = IncrementalCurve.of(Poses.of(p, q), ISOTROPIC, points=20_000, replicates=2)
     rows = KernelRows(se3.Poses.of(p, q), ISOTROPIC)
     expected = rows.log_density(se3.Poses.of(*rows.sample(20_000, np.random.default_rng(0))))
     at = (
-        np.concatenate([g.positions for g in curve._groups]),
-        np.concatenate([g.quaternions for g in curve._groups]),
+        np.concatenate([g.poses.positions for g in curve._groups]),
+        np.concatenate([g.poses.quaternions_xyzw for g in curve._groups]),
     )
     assert 10_000 < len(at[0]) <= 20_000
     got = rows.log_density(se3.Poses.of(*at))
@@ -233,12 +232,12 @@ def test_the_first_points_of_a_group_follow_the_density(shell: Shell) -> None:
 def test_progress_rises_and_can_cancel(shell: Shell) -> None:
     grasps = Grasps(*shell(700, np.random.default_rng(4)))
     seen: list[float] = []
-    before = GrowingCurve.grown(None, grasps.p[:500], grasps.q[:500], ISOTROPIC, progress=seen.append)
+    before = IncrementalCurve.of(Poses.of(grasps.p[:500], grasps.q[:500]), ISOTROPIC, progress=seen.append)
     assert seen == sorted(seen)
     assert 0.0 < seen[0] < 0.2
     assert seen[-1] == pytest.approx(1.0)
     seen.clear()
-    GrowingCurve.grown(before, grasps.p, grasps.q, ISOTROPIC, progress=seen.append)
+    IncrementalCurve.of(Poses.of(grasps.p, grasps.q), ISOTROPIC, before=before, progress=seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == pytest.approx(1.0)
 
@@ -250,4 +249,4 @@ def test_progress_rises_and_can_cancel(shell: Shell) -> None:
             raise StopError
 
     with pytest.raises(StopError):
-        GrowingCurve.grown(before, grasps.p, grasps.q, ISOTROPIC, progress=stop)
+        IncrementalCurve.of(Poses.of(grasps.p, grasps.q), ISOTROPIC, before=before, progress=stop)

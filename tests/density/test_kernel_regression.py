@@ -12,15 +12,16 @@ from scipy.stats import beta
 
 from graspdb_density import IsotropicKernel, SuccessModel, se3
 from graspdb_density.kde import brute_force
+from graspdb_density.se3 import Poses
 
-Poses = tuple[se3.Floats, se3.Floats]
-Shell = Callable[[int, np.random.Generator], Poses]
+Pair = tuple[se3.Floats, se3.Floats]
+Shell = Callable[[int, np.random.Generator], Pair]
 
 KERNELS = [IsotropicKernel(0.015, math.radians(15.0)), IsotropicKernel(0.02, math.radians(30.0))]
 
 
 def by_definition(
-    kernel: IsotropicKernel, rows: Poses, won: NDArray[np.bool_], flags: NDArray[np.bool_], poses: Poses
+    kernel: IsotropicKernel, rows: Pair, won: NDArray[np.bool_], flags: NDArray[np.bool_], poses: Pair
 ) -> tuple[se3.Floats, se3.Floats]:
     """P and effective trials with every kernel above e^-12.5 of its peak, in float64."""
     probability, trials = np.empty(len(poses[0])), np.empty(len(poses[0]))
@@ -52,14 +53,14 @@ def test_equals_its_definition(kernel: IsotropicKernel, parts: int, shell: Shell
     flags = rng.random(4_000) < 0.8
     first, *rest = np.array_split(np.arange(4_000), parts)
     model = SuccessModel.build(
-        rows[0][first], rows[1][first], won[first], kernel=kernel, symmetric=flags[first]
+        Poses.of(rows[0][first], rows[1][first]), won[first], kernel=kernel, symmetric=flags[first]
     )
     for chunk in rest:
-        model = model.extend(rows[0][chunk], rows[1][chunk], won[chunk], flags[chunk])
+        model = model.extend(Poses.of(rows[0][chunk], rows[1][chunk]), won[chunk], flags[chunk])
     assert (model.size, model.successes) == (4_000, int(won.sum()))
     poses = shell(300, rng)
     poses[0][:20] += 5.0
-    estimate = model.evaluate(*poses, threads=2)
+    estimate = model.evaluate(Poses.of(*poses), threads=2)
     probability, trials = by_definition(kernel, rows, won, flags, poses)
     np.testing.assert_allclose(estimate.effective_trials, trials, rtol=3e-3, atol=1e-6)
     np.testing.assert_allclose(estimate.probability, probability, atol=1e-3)
@@ -84,14 +85,14 @@ def test_interval_covers_the_smoothed_truth() -> None:
     for _ in range(4):
         rows = rng.uniform(-side, side, (60_000, 3)), se3.random_quaternions(60_000, rng)
         truth = field(*rows)
-        model = SuccessModel.build(*rows, rng.random(60_000) < truth, kernel=kernel)
+        model = SuccessModel.build(Poses.of(*rows), rng.random(60_000) < truth, kernel=kernel)
         poses = rng.uniform(-side / 2, side / 2, (150, 3)), se3.random_quaternions(150, rng)
         # The field smoothed over the attempts: sin is odd in p and the jaw's turn keeps the approach.
         smoothed = np.empty(150)
         for j in range(150):
             dp, dq = kernel.sample_displacements(4_000, rng)
             smoothed[j] = field(poses[0][j] + dp, se3.multiply(poses[1][j], dq)).mean()
-        estimate = model.evaluate(*poses)
+        estimate = model.evaluate(Poses.of(*poses))
         covered += int(np.sum((estimate.low <= smoothed) & (smoothed <= estimate.high)))
         count += 150
     assert 0.85 <= covered / count <= 0.97
@@ -99,13 +100,13 @@ def test_interval_covers_the_smoothed_truth() -> None:
 
 def test_without_successes_the_interval_is_not_a_point() -> None:
     rows = np.zeros((20, 3)), np.tile(se3.IDENTITY, (20, 1))
-    model = SuccessModel.build(*rows, np.zeros(20, dtype=bool), kernel=KERNELS[0])
-    estimate = model.evaluate(rows[0][:1], rows[1][:1])
+    model = SuccessModel.build(Poses.of(*rows), np.zeros(20, dtype=bool), kernel=KERNELS[0])
+    estimate = model.evaluate(Poses.of(rows[0][:1], rows[1][:1]))
     assert estimate.probability[0] == 0.0
     assert 0.0 < estimate.high[0] < 0.2
     assert estimate.effective_trials[0] == pytest.approx(20.0, rel=1e-5)
-    sure = SuccessModel.build(*rows, np.ones(20, dtype=bool), kernel=KERNELS[0]).evaluate(
-        rows[0][:1], rows[1][:1]
+    sure = SuccessModel.build(Poses.of(*rows), np.ones(20, dtype=bool), kernel=KERNELS[0]).evaluate(
+        Poses.of(rows[0][:1], rows[1][:1])
     )
     assert sure.probability[0] == 1.0
     assert 0.8 < sure.low[0] < 1.0
@@ -114,9 +115,9 @@ def test_without_successes_the_interval_is_not_a_point() -> None:
 def test_a_wide_kernel_blurs_an_edge_more_than_one_half_as_wide() -> None:
     rng = np.random.default_rng(2)
     rows = rng.normal(size=(40_000, 3)) * 0.02, se3.random_quaternions(40_000, rng)
-    inside = np.array([[0.012, 0.0, 0.0]]), se3.IDENTITY[None]
+    inside = Poses.of([[0.012, 0.0, 0.0]], se3.IDENTITY[None])
     wide, narrow = (
-        SuccessModel.build(*rows, rows[0][:, 0] > 0.0, kernel=kernel).probability(*inside)[0]
+        SuccessModel.build(Poses.of(*rows), rows[0][:, 0] > 0.0, kernel=kernel).probability(inside)[0]
         for kernel in (
             IsotropicKernel(0.015, math.radians(60.0)),
             IsotropicKernel(0.0075, math.radians(30.0)),
@@ -128,13 +129,15 @@ def test_a_wide_kernel_blurs_an_edge_more_than_one_half_as_wide() -> None:
 def test_bad_input_is_refused() -> None:
     p, q = np.zeros((2, 3)), np.tile(se3.IDENTITY, (2, 1))
     with pytest.raises(ValueError, match="success must be bools"):
-        SuccessModel.build(p, q, [1.0, 0.0], kernel=KERNELS[0])
+        SuccessModel.build(Poses.of(p, q), [1.0, 0.0], kernel=KERNELS[0])
     with pytest.raises(ValueError, match="symmetric"):
-        SuccessModel.build(p, q, [True, False], kernel=KERNELS[0], symmetric=[True])
-    model = SuccessModel.build(p, q, [True, False], kernel=KERNELS[0])
+        SuccessModel.build(Poses.of(p, q), [True, False], kernel=KERNELS[0], symmetric=[True])
+    model = SuccessModel.build(Poses.of(p, q), [True, False], kernel=KERNELS[0])
     with pytest.raises(ValueError, match="level"):
-        model.evaluate(p, q, level=1.0)
+        model.evaluate(Poses.of(p, q), level=1.0)
     with pytest.raises(ValueError, match="cutoff"):
-        model.evaluate(p, q, cutoff=1.0)
+        model.evaluate(Poses.of(p, q), cutoff=1.0)
     with pytest.raises(ValueError, match="at least one attempt"):
-        SuccessModel.build(p[:0], q[:0], np.zeros(0, dtype=bool), kernel=KERNELS[0]).evaluate(p, q)
+        SuccessModel.build(Poses.of(p[:0], q[:0]), np.zeros(0, dtype=bool), kernel=KERNELS[0]).evaluate(
+            Poses.of(p, q)
+        )

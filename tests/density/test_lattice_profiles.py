@@ -11,14 +11,22 @@ import pytest
 from scipy.optimize import isotonic_regression
 
 from graspdb_density import se3
-from graspdb_density.se3 import Floats
-from graspdb_density.vicinity import anisotropy as an
-from graspdb_density.vicinity.lattice_profiles import Profiles
-from graspdb_geometry.grids import hopf_rotations
+from graspdb_density.se3 import Floats, Poses
+from graspdb_density.vicinity.anisotropy import empirical_anisotropy
+from graspdb_density.vicinity.displacement_bins import Anisotropy
+from graspdb_density.vicinity.lattice_profiles import LatticeProfiles
+from graspdb_geometry.grids import hopf_grid
 
 STEP = 0.01
 #: Whether grasps at positions (..., 3) with axes (..., 3, 3) hold.
 Region = Callable[[Floats, Floats], np.ndarray]
+
+
+def half_of_rotations() -> Floats:
+    """A grid of 15 degrees, one of each pair that the jaw's half turn exchanges."""
+    grid = hopf_grid(15.0)
+    index = np.arange(grid.size)
+    return grid.quaternions(index[index % grid.psi_count < grid.psi_count // 2])
 
 
 def box(*half: float) -> Region:
@@ -51,10 +59,9 @@ class Grid:
     success: np.ndarray
     rotation_keys: np.ndarray
 
-    def found(self, **options: int) -> an.Anisotropy:
-        return an.empirical(
-            self.positions,
-            self.quaternions,
+    def found(self, **options: int) -> Anisotropy:
+        return empirical_anisotropy(
+            Poses.of(self.positions, self.quaternions),
             self.success,
             rotation_keys=self.rotation_keys,
             position_keys=np.arange(len(self.positions)),
@@ -67,7 +74,7 @@ def swept(region: Region, rotations: int, rng: np.random.Generator) -> Grid:
     side = np.arange(-9, 10) * STEP
     lattice = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     lattice = lattice + rng.uniform(-0.5, 0.5, 3) * STEP
-    every = hopf_rotations(15.0, symmetric=True)
+    every = half_of_rotations()
     chosen = rng.permutation(len(every))[:rotations]
     held = [region(lattice, se3.to_matrix(every[r])) for r in chosen]
     keys = np.repeat(chosen, len(lattice))
@@ -113,7 +120,7 @@ def test_profiles_do_not_zigzag() -> None:
         along = np.abs(np.einsum("...ji,...j->...i", axes, p)) <= [1.0, 0.014, 0.02]
         return np.asarray(along.all(axis=-1) & (np.abs(p[..., 2]) < reach))
 
-    every = hopf_rotations(15.0, symmetric=True)
+    every = half_of_rotations()
     steep = np.abs(se3.to_matrix(every)[:, 2, 0])
     side = np.arange(-9, 10) * STEP
     lattice = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -146,7 +153,7 @@ def test_a_part_of_a_grid_is_less_sure_but_not_elsewhere() -> None:
 def test_turns_at_one_position() -> None:
     """Success within 20, 50 and 30 degrees of a rotation that is another at every position."""
     rng = np.random.default_rng(1)
-    every = hopf_rotations(15.0, symmetric=True)
+    every = half_of_rotations()
     middle = se3.random_quaternions(120, rng)
     limits = np.radians([20.0, 50.0, 30.0])
 
@@ -158,8 +165,8 @@ def test_turns_at_one_position() -> None:
     won = np.concatenate([held(every, about) for about in middle])
     keys = np.repeat(np.arange(len(middle)), len(every))
     p, q = rng.uniform(-1.0, 1.0, (len(middle), 3))[keys], np.tile(every, (len(middle), 1))
-    found = an.empirical(
-        p, q, won, rotation_keys=np.arange(len(p)), position_keys=keys, max_grasps=600
+    found = empirical_anisotropy(
+        Poses.of(p, q), won, rotation_keys=np.arange(len(p)), position_keys=keys, max_grasps=600
     ).tolerances[3:]
     some = rng.permutation(np.flatnonzero(won))[:600]
     angle = np.radians(np.arange(1.0, 80.0))
@@ -176,12 +183,12 @@ def test_turns_at_one_position() -> None:
 
 def test_pairs_on_the_axis_are_shares_themselves() -> None:
     """At the lattice's own displacements nothing is corrected or blurred; between them shares are linear."""
-    profiles = Profiles(2, 9, 0.005, 0.005)
-    middle = profiles.found.shape[2] // 2
+    profiles = LatticeProfiles(2, 9, 0.005, 0.005)
+    middle = profiles.pair_sums.shape[2] // 2
     for grasp, (way, hit) in ((0, (2, 1.0)), (0, (4, 0.0)), (1, (2, 0.0)), (1, (4, 0.0))):
         for sign in (-1, 1):
             at = sign * way * 0.005
-            profiles.found[grasp, :, middle + sign * way] += [1.0, hit, at, 0.0, 0.0]
+            profiles.pair_sums[grasp, :, middle + sign * way] += [1.0, hit, at, 0.0, 0.0]
     share, weight = profiles.shares(np.ones((2, 1), dtype=np.float32), mirrored=False)
     x = share[:9, 0]
     np.testing.assert_allclose(x, x[::-1])

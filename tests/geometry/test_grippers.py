@@ -19,7 +19,6 @@ def test_pg70_boxes() -> None:
     np.testing.assert_allclose(high[:, 2], [0.023, 0.023, -0.047])  # the palm starts where the fingers do
     # The base is 140 mm behind the tool's origin in RobWork's files: 139 here.
     assert low[grippers.PALM, 2] == pytest.approx(-0.139)
-    assert grippers.PG70.stroke_m == pytest.approx(0.035)
 
 
 def test_pandas_base_is_103_4_mm_behind_the_pads_centre() -> None:

@@ -358,10 +358,10 @@ def test_part_files_are_checked() -> None:
 
 
 def test_a_convex_mesh_is_its_own_part() -> None:
-    part = meshes.convex_part(meshes.load(example("cone").stl(), "model/stl"))
-    assert part is not None
-    assert len(meshes.check_parts([part])) == 1
-    assert meshes.convex_part(meshes.load(example("mug").stl(), "model/stl")) is None
+    cone = meshes.load(example("cone").stl(), "model/stl")
+    assert meshes.properties(cone).convex
+    assert len(meshes.check_parts([(cone.vertices, cone.faces)])) == 1
+    assert not meshes.properties(meshes.load(example("mug").stl(), "model/stl")).convex
 
 
 @settings(max_examples=30, deadline=None)
@@ -369,12 +369,12 @@ def test_a_convex_mesh_is_its_own_part() -> None:
 def test_hulls_are_convex_and_pushed_in_vertices_are_not(seed: int) -> None:
     rng = np.random.default_rng(seed)
     hull = trimesh.convex.convex_hull(rng.normal(size=(30, 3)) * 0.05)
-    assert meshes.is_convex(meshes.Mesh(hull.vertices, hull.faces))
+    assert meshes.properties(meshes.Mesh(hull.vertices, hull.faces)).convex
     vertices = np.array(hull.vertices)
     vertices[0] = hull.center_mass + 0.5 * (vertices[0] - hull.center_mass)
     # Pushing one corner halfway in dents the solid unless its neighbours' hull was that shallow already.
     if trimesh.convex.convex_hull(vertices).volume > 1.01 * trimesh.Trimesh(vertices, hull.faces).volume:
-        assert not meshes.is_convex(meshes.Mesh(vertices, np.asarray(hull.faces)))
+        assert not meshes.properties(meshes.Mesh(vertices, np.asarray(hull.faces))).convex
 
 
 @settings(max_examples=150, deadline=None)

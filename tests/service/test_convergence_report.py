@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire.reports import ConvergenceOptions
 from graspdb_density import se3
-from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.api.context import Context
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
@@ -36,14 +36,14 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many grasps every curve took over from the one before; with few points, to be quick."""
     monkeypatch.setattr(convergence, "POINTS", 2_000)
     found: list[int] = []
-    plain = GrowingCurve.grown
+    plain = IncrementalCurve.of
 
-    def grown(*arguments: Any, **options: Any) -> GrowingCurve:
+    def grown(*arguments: Any, **options: Any) -> IncrementalCurve:
         curve = plain(*arguments, **options)
         found.append(curve.kept)
         return curve
 
-    monkeypatch.setattr(GrowingCurve, "grown", staticmethod(grown))
+    monkeypatch.setattr(IncrementalCurve, "of", staticmethod(grown))
     return found
 
 

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graspdb_density import AnisotropicKernel, DiagonalKernel, MixtureDensity, SuccessModel, se3
+from graspdb_density.se3 import Poses
 from graspdb_geometry.features.jaw_pairs import pairs_of_mesh
 from graspdb_geometry.features.ridges import ridges_of_mesh
 from graspdb_geometry.poses import ToolPoses
 
 Floats = NDArray[np.float64]
-Poses = tuple[Floats, Floats]
+Pair = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 PutBox = Callable[..., Any]
@@ -33,7 +34,7 @@ def box(size: tuple[float, float, float]) -> tuple[Floats, NDArray[np.int64]]:
     return np.asarray(made.vertices), np.asarray(made.faces, dtype=np.int64)
 
 
-def grasps(count: int, seed: int = 0) -> Poses:
+def grasps(count: int, seed: int = 0) -> Pair:
     """From -x, all along the bar, at any of a few rolls: long along its edges, whatever the gripper's."""
     rng = np.random.default_rng(seed)
     side = Rotation.from_matrix(np.stack([[0, 0, 1], [0, -1, 0], [1, 0, 0]], axis=-1))
@@ -68,7 +69,7 @@ def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
     return body
 
 
-def expected(kernel: dict[str, Any], poses: Poses, size: tuple[float, float, float], at: Poses) -> Floats:
+def expected(kernel: dict[str, Any], poses: Pair, size: tuple[float, float, float], at: Pair) -> Floats:
     """The density under a stored kernel by the maths, its frames from the box's own geometry."""
     ridges = ridges_of_mesh(*box(size))
     if kernel["alignment"] == "edge":
@@ -105,7 +106,7 @@ def test_fitted_along_its_edges_and_used_on_another(
         assert kernel["widths_m"][0] > 2 * kernel["widths_m"][1]
         assert source["log_likelihood"] > along["provenance"]["log_likelihood"]
 
-    def asked(slug: str, at: Poses) -> Floats:
+    def asked(slug: str, at: Pair) -> Floats:
         body = {
             "poses": {"position": at[0].tolist(), "quaternion_xyzw": at[1].tolist()},
             "kernel": kernel["id"],
@@ -168,7 +169,7 @@ def test_aligned_kernels_that_are_none(http: httpx.Client, make_object: Make, po
 # -- what predicts success
 
 
-def field(count: int, seed: int) -> tuple[Poses, NDArray[np.bool_]]:
+def field(count: int, seed: int) -> tuple[Pair, NDArray[np.bool_]]:
     """Success changes within millimetres along the gripper's x and within centimetres along y."""
     rng = np.random.default_rng(seed)
     p = rng.uniform(-0.08, 0.08, (count, 3))
@@ -191,7 +192,7 @@ def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     assert source["brier_skill"] > source["isotropic_brier_skill"] + 0.02
     assert kernel["widths_m"][1] > 1.5 * kernel["widths_m"][0]
 
-    def asked(at: Poses, **more: Any) -> dict[str, Any]:
+    def asked(at: Pair, **more: Any) -> dict[str, Any]:
         poses = {"position": at[0].tolist(), "quaternion_xyzw": at[1].tolist()}
         return ok(http.post("/objects/thing/likelihood", json={"poses": poses, **more}))
 
@@ -202,8 +203,8 @@ def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     # The density is the default one.
     np.testing.assert_allclose(by["density"], plain["density"], rtol=1e-6)
     widths = [*kernel["widths_m"], *np.radians(kernel["widths_deg"])]
-    model = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(widths))
-    found = model.evaluate(*at)
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(widths))
+    found = model.evaluate(Poses.of(*at))
     np.testing.assert_allclose(by["success_probability"], found.probability, atol=1e-4)
     np.testing.assert_allclose(by["interval"]["low"], found.low, atol=1e-3)
     truth = 0.5 + 0.45 * np.sin(2 * math.pi * at[0][:, 0] / 0.048)
@@ -249,8 +250,8 @@ def test_success_predicted_along_the_object_s_own_axes(
     found = ok(http.post("/objects/thing/likelihood", json=asked))
     assert found["kernel"]["alignment"] == "object"
     widths = [*along["widths_m"], *np.radians(along["widths_deg"])]
-    model = SuccessModel.build(p, q, won, kernel=DiagonalKernel.of(widths, np.eye(3)[::-1]))
-    expected = model.evaluate(p[:50], q[50:100]).probability
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(widths, np.eye(3)[::-1]))
+    expected = model.evaluate(Poses.of(p[:50], q[50:100])).probability
     np.testing.assert_allclose(found["success_probability"], expected, atol=1e-4)
     judged = ok(http.get(f"/objects/thing/reports/calibration?kernel={along['id']}"))
     assert judged["kernel"]["id"] == along["id"]

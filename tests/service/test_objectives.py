@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import BestGraspRequest
 from graspdb_density import GraspDensity, IsotropicKernel, PoseNoise, Region, SuccessModel, expected, se3
+from graspdb_density.se3 import Poses
 from graspdb_density.search.mode_search import MeanShiftSearch, ModeSearch
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
@@ -29,7 +30,7 @@ from graspdb_service.usecases.grasps.answer import best_grasps
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Poses = tuple[Floats, Floats]
+Pair = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 
@@ -46,7 +47,7 @@ def ask(http: httpx.Client, **query: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def lucky(clusters: Callable[..., Poses]) -> tuple[Poses, list[str]]:
+def lucky(clusters: Callable[..., Pair]) -> tuple[Pair, list[str]]:
     """Left 80 % of 300 succeed, right all of 3, in the middle the most successes, but one in two."""
     parts = [
         clusters([((-0.1, 0, 0), UP)], 300, seed=1),
@@ -61,7 +62,7 @@ def lucky(clusters: Callable[..., Poses]) -> tuple[Poses, list[str]]:
 
 
 def test_success_probability_ranks_by_the_lower_end(
-    http: httpx.Client, make_object: Make, post: Post, lucky: tuple[Poses, list[str]]
+    http: httpx.Client, make_object: Make, post: Post, lucky: tuple[Pair, list[str]]
 ) -> None:
     make_object(http)
     poses, outcomes = lucky
@@ -81,12 +82,12 @@ def test_success_probability_ranks_by_the_lower_end(
     assert {round(grasp["position"][0], 1) for grasp in answer["grasps"]} == {-0.1, 0.0, 0.1}
     # No pose that any of many tries finds near a success is better.
     won = np.array(outcomes) == "success"
-    model = SuccessModel.build(*poses, won, kernel=KERNEL)
+    model = SuccessModel.build(Poses.of(*poses), won, kernel=KERNEL)
     rng = np.random.default_rng(1)
     rows = rng.choice(np.flatnonzero(won), 20_000)
     p = poses[0][rows] + rng.normal(size=(20_000, 3)) * 0.006
     q = se3.multiply(poses[1][rows], se3.from_rotation_vector(rng.normal(size=(20_000, 3)) * 0.1))
-    assert best["score"] >= model.evaluate(p, q).low.max() * 0.999
+    assert best["score"] >= model.evaluate(Poses.of(p, q)).low.max() * 0.999
     # Candidates are ranked by the same.
     body = {
         "candidates": {"position": [[0, 0, 0], [-0.1, 0, 0]], "quaternion_xyzw": [list(UP)] * 2},
@@ -102,7 +103,7 @@ def test_a_sample_of_many_attempts_finds_nearly_the_same(
     sqlite_http: httpx.Client,
     make_object: Make,
     post: Post,
-    lucky: tuple[Poses, list[str]],
+    lucky: tuple[Pair, list[str]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     http = sqlite_http
@@ -110,21 +111,21 @@ def test_a_sample_of_many_attempts_finds_nearly_the_same(
     monkeypatch.setattr(success_models, "_SAMPLE", 500)
     make_object(http)
     (p, q), outcomes = lucky
-    model = SuccessModel.build(p, q, np.array(outcomes) == "success", kernel=KERNEL)
+    model = SuccessModel.build(Poses.of(p, q), np.array(outcomes) == "success", kernel=KERNEL)
     order = np.random.default_rng(2).permutation(len(p))
     # Before it is large, as it grows large, and as a large one is extended.
     for part in np.split(order, [600, 1_000]):
         post(http, "thing", (p[part], q[part]), [outcomes[i] for i in part])
         assert ask(http, objective="success_probability")["status"] == "ok"
     (best,) = ask(http, objective="success_probability")["grasps"]
-    (estimate,) = model.evaluate([best["position"]], [best["quaternion_xyzw"]]).low
+    (estimate,) = model.evaluate(Poses.of([best["position"]], [best["quaternion_xyzw"]])).low
     assert best["score"] == pytest.approx(estimate, abs=2e-3)
-    top = model.evaluate(p, q).low[np.linalg.norm(p - [-0.1, 0, 0], axis=1) < 0.01].max()
+    top = model.evaluate(Poses.of(p, q)).low[np.linalg.norm(p - [-0.1, 0, 0], axis=1) < 0.01].max()
     assert best["score"] > 0.97 * top
 
 
 def test_robust_prefers_what_survives_noise(
-    http: httpx.Client, make_object: Make, post: Post, clusters: Callable[..., Poses]
+    http: httpx.Client, make_object: Make, post: Post, clusters: Callable[..., Pair]
 ) -> None:
     """A sharp cluster with the higher density and a broad one; failures all around the sharp one."""
     make_object(http)
@@ -140,7 +141,7 @@ def test_robust_prefers_what_survives_noise(
     assert ask(http, **narrow)["grasps"][0]["position"][0] > 0.05
     kernel = IsotropicKernel(0.006, math.radians(10))
     density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=kernel)
-    model = SuccessModel.build(p, q, won, kernel=kernel)
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=kernel)
     middle = (p[won].min(axis=0) + p[won].max(axis=0)) / 2
     at_object = PoseNoise(0.02, math.radians(2), tuple(middle))  # type: ignore[arg-type]
     for query, noise, value in (
@@ -158,7 +159,7 @@ def test_robust_prefers_what_survives_noise(
         assert ("left" in told) == ("pose_noise_m" in query)
 
         def chance(a: Floats, b: Floats) -> Floats:
-            return model.evaluate(a, b).probability
+            return model.evaluate(Poses.of(a, b)).probability
 
         mean = expected(density.density if value == "density" else chance, samples=4_096, **noise)  # type: ignore[arg-type]
         (exact,) = mean(np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]]))
@@ -202,7 +203,7 @@ def test_scores_of_chance_come_where_they_cost_little_or_are_asked_for(
     sqlite_http: httpx.Client,
     make_object: Make,
     post: Post,
-    two_clusters: Poses,
+    two_clusters: Pair,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     http = sqlite_http
@@ -374,7 +375,7 @@ class Field:
         rows, self.positions, self.quaternions = rows[free], p[free], q[free]
         self.won = rng.random(len(rows)) < shares[rows]
         self.scene = scene
-        self.model = SuccessModel.build(self.positions, self.quaternions, self.won, kernel=KERNEL)
+        self.model = SuccessModel.build(Poses.of(self.positions, self.quaternions), self.won, kernel=KERNEL)
         self.density = GraspDensity.build(
             se3.Poses.of(self.positions[self.won], self.quaternions[self.won]), kernel=KERNEL
         )
@@ -385,7 +386,7 @@ class Field:
             values = np.zeros(len(p))
             free = np.flatnonzero(~self.scene.collides(ToolPoses(p, q), PG70, threads=2))
             if len(free):
-                found = self.model.evaluate(p[free], q[free], level=0.9, threads=2)
+                found = self.model.evaluate(Poses.of(p[free], q[free]), level=0.9, threads=2)
                 values[free] = getattr(found, column)
             return values
 
@@ -432,7 +433,7 @@ class Field:
         return float(values.max())
 
     @property
-    def successes(self) -> Poses:
+    def successes(self) -> Pair:
         return self.density.positions, self.density.quaternions_xyzw
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
+from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, box_part
 from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
@@ -21,7 +22,7 @@ from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.proposals import uncertain
 
 Floats = NDArray[np.float64]
-Poses = tuple[Floats, Floats]
+Pair = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 
@@ -45,7 +46,7 @@ def arrays(answer: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.fixture
-def known_and_unknown(clusters: Callable[..., Poses]) -> tuple[Poses, list[str]]:
+def known_and_unknown(clusters: Callable[..., Pair]) -> tuple[Pair, list[str]]:
     """400 attempts on the left, 12 on the right, half of either successful."""
     left, right = clusters([((-0.1, 0, 0), UP)], 400, seed=1), clusters([((0.1, 0, 0), UP)], 12, seed=2)
     poses = np.concatenate([left[0], right[0]]), np.concatenate([left[1], right[1]])
@@ -53,7 +54,7 @@ def known_and_unknown(clusters: Callable[..., Poses]) -> tuple[Poses, list[str]]
 
 
 def test_uncertainty_goes_where_little_is_known(
-    http: httpx.Client, make_object: Make, post: Post, known_and_unknown: tuple[Poses, list[str]]
+    http: httpx.Client, make_object: Make, post: Post, known_and_unknown: tuple[Pair, list[str]]
 ) -> None:
     make_object(http)
     post(http, "thing", *known_and_unknown)
@@ -65,10 +66,10 @@ def test_uncertainty_goes_where_little_is_known(
     assert (p[:, 0] > 0).mean() > 4 * (by_density[0][:, 0] > 0).mean()
     # One more trial there is expected to lower the variance of the estimate more.
     poses, outcomes = known_and_unknown
-    model = SuccessModel.build(*poses, np.array(outcomes) == "success", kernel=KERNEL)
+    model = SuccessModel.build(Poses.of(*poses), np.array(outcomes) == "success", kernel=KERNEL)
 
     def gain(positions: Floats, quaternions: Floats) -> float:
-        found = model.evaluate(positions, quaternions)
+        found = model.evaluate(Poses.of(positions, quaternions))
         chance, trials = found.probability, found.effective_trials + 1
         now = chance * (1 - chance) / (trials + 1)
         after = np.zeros(len(trials))
@@ -92,7 +93,7 @@ def test_proposals_integrate_to_one(
     sqlite_http: httpx.Client,
     make_object: Make,
     post: Post,
-    known_and_unknown: tuple[Poses, list[str]],
+    known_and_unknown: tuple[Pair, list[str]],
     strategy: str,
 ) -> None:
     """The mean of h / g over draws from g is the integral of h wherever g is: here 1, both twins included."""
@@ -119,7 +120,7 @@ def test_any_uncertainty_integrates_to_one(seed: int, symmetric: bool) -> None:
     won = rng.random(60) < 0.4
     won[:2] = True, False
     density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=kernel, symmetric=symmetric)
-    model = SuccessModel.build(p, q, won, kernel=kernel, symmetric=symmetric)
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=kernel, symmetric=symmetric)
     proposal = uncertain(density, model, None)
     assert proposal is not None
     low, high = proposal.positions.min(axis=0) - 0.05, proposal.positions.max(axis=0) + 0.05
@@ -130,7 +131,7 @@ def test_any_uncertainty_integrates_to_one(seed: int, symmetric: bool) -> None:
 
 
 def test_trials_of_proposals_are_weighted(
-    sqlite_http: httpx.Client, make_object: Make, post: Post, known_and_unknown: tuple[Poses, list[str]]
+    sqlite_http: httpx.Client, make_object: Make, post: Post, known_and_unknown: tuple[Pair, list[str]]
 ) -> None:
     http = sqlite_http
     make_object(http)
@@ -146,14 +147,14 @@ def test_trials_of_proposals_are_weighted(
     np.testing.assert_allclose(answer["density"], density.density(se3.Poses.of(p, q)), rtol=5e-3)
 
 
-def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Poses]) -> None:
+def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Pair]) -> None:
     scene = Scene([box_part([0.01, 0.03, 0.05], [0, 0, 0], [0, 0, 0, 1])])
     p, q = clusters([((0, 0, 0.045), (1.0, 0, 0, 0))], 300, sigma_m=0.004, sigma_rad=0.05)
     free = ~scene.collides(ToolPoses(p, q), PG70)
     p, q = p[free], q[free]
     won = np.arange(len(p)) % 2 == 0
     density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=KERNEL)
-    model = SuccessModel.build(p, q, won, kernel=KERNEL)
+    model = SuccessModel.build(Poses.of(p, q), won, kernel=KERNEL)
     blind, seeing = uncertain(density, model, None), uncertain(density, model, CollisionTest(scene, PG70))
     assert blind is not None
     assert seeing is not None
@@ -165,7 +166,7 @@ def test_uncertainty_leaves_out_what_collides(clusters: Callable[..., Poses]) ->
 
 
 def test_what_can_not_be_proposed_says_why(
-    sqlite_http: httpx.Client, make_object: Make, post: Post, two_clusters: Poses
+    sqlite_http: httpx.Client, make_object: Make, post: Post, two_clusters: Pair
 ) -> None:
     http = sqlite_http
     make_object(http)

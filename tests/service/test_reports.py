@@ -15,17 +15,18 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, choose_widths, se3
+from graspdb_density.se3 import Poses
 from graspdb_density.statistics.convergence import verdict
-from graspdb_density.statistics.incremental_bootstrap import convergence_curve
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_density.success.calibration import area_under_curve, assign_blocks, calibrate
-from graspdb_density.vicinity.anisotropy import empirical
+from graspdb_density.vicinity.anisotropy import empirical_anisotropy
 from graspdb_geometry.poses import ToolPoses
 from graspdb_service.storage import objects, report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import RunKey
 
 Floats = NDArray[np.float64]
-Poses = tuple[Floats, Floats]
+Pair = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 Serve = Callable[..., str]
@@ -33,8 +34,8 @@ Serve = Callable[..., str]
 REPORT = "/objects/thing/reports/"
 
 
-def field(count: int, seed: int = 0) -> tuple[Poses, NDArray[np.bool_]]:
-    """Poses near one grasp of a bar and whether they hold: wide along x and about y, narrow otherwise."""
+def field(count: int, seed: int = 0) -> tuple[Pair, NDArray[np.bool_]]:
+    """Pair near one grasp of a bar and whether they hold: wide along x and about y, narrow otherwise."""
     rng = np.random.default_rng(seed)
     widths = np.array([0.03, 0.006, 0.012, 0.2, 0.8, 0.2])
     xi = rng.uniform(-2.0, 2.0, (count, 6)) * widths
@@ -46,13 +47,13 @@ def outcomes(won: NDArray[np.bool_]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def trials() -> tuple[Poses, NDArray[np.bool_]]:
+def trials() -> tuple[Pair, NDArray[np.bool_]]:
     return field(4_000)
 
 
 @pytest.fixture
 def filled(
-    sqlite_url: str, serve: Serve, make_object: Make, post: Post, trials: tuple[Poses, NDArray[np.bool_]]
+    sqlite_url: str, serve: Serve, make_object: Make, post: Post, trials: tuple[Pair, NDArray[np.bool_]]
 ) -> httpx.Client:
     """A service with one object that the trials were posted to; it waits for whatever is asked."""
     http = httpx.Client(base_url=serve(sqlite_url, report_wait_s=60), timeout=90)
@@ -88,12 +89,12 @@ def finished(http: httpx.Client, location: str, *states: str) -> dict[str, Any]:
 
 
 def test_convergence_is_the_curve_of_the_maths(
-    filled: httpx.Client, trials: tuple[Poses, NDArray[np.bool_]]
+    filled: httpx.Client, trials: tuple[Pair, NDArray[np.bool_]]
 ) -> None:
     (p, q), won = trials
     body = ok(filled.get(REPORT + "convergence"))
-    kernel = choose_widths(p[won], q[won]).kernel
-    curve = convergence_curve(p[won], q[won], kernel, threads=2)
+    kernel = choose_widths(Poses.of(p[won], q[won])).kernel
+    curve = IncrementalCurve.of(Poses.of(p[won], q[won]), kernel, threads=2).curve
     judged = verdict(curve)
     (found,) = body["curves"]
     assert [point["grasps"] for point in found["points"]] == [point.grasps for point in curve.points]
@@ -134,11 +135,11 @@ def test_convergence_beside_the_matched_isotropic_kernel(filled: httpx.Client) -
 
 
 def test_empirical_anisotropy_is_that_of_the_maths(
-    filled: httpx.Client, trials: tuple[Poses, NDArray[np.bool_]]
+    filled: httpx.Client, trials: tuple[Pair, NDArray[np.bool_]]
 ) -> None:
     (p, q), won = trials
     body = ok(filled.get(REPORT + "anisotropy"))
-    found = empirical(p, q, won)
+    found = empirical_anisotropy(Poses.of(p, q), won)
     assert (body["attempts"], body["grasps"]) == (4_000, found.grasps)
     assert body["translation_pairs"] == found.translation_pairs
     for item, expected in zip(body["tolerances"], found.tolerances, strict=True):
@@ -182,7 +183,7 @@ def test_anisotropy_by_density_agrees_on_what_is_wide(filled: httpx.Client) -> N
 
 
 def test_calibration_judges_blocks_left_out(
-    filled: httpx.Client, trials: tuple[Poses, NDArray[np.bool_]]
+    filled: httpx.Client, trials: tuple[Pair, NDArray[np.bool_]]
 ) -> None:
     (p, q), won = trials
     body = ok(filled.get(REPORT + "calibration?sigma_position_m=0.006&sigma_rotation_deg=10"))
@@ -191,8 +192,8 @@ def test_calibration_judges_blocks_left_out(
     predicted, ranked = np.zeros(len(p)), np.zeros(len(p))
     for fold in range(blocks.folds):
         train, held = blocks.fold != fold, blocks.fold == fold
-        model = SuccessModel.build(p[train], q[train], won[train], kernel=kernel)
-        predicted[held] = model.evaluate(p[held], q[held]).probability
+        model = SuccessModel.build(Poses.of(p[train], q[train]), won[train], kernel=kernel)
+        predicted[held] = model.evaluate(Poses.of(p[held], q[held])).probability
         density = GraspDensity.build(se3.Poses.of(p[train & won], q[train & won]), kernel=kernel)
         ranked[held] = density.log_density(se3.Poses.of(p[held], q[held]))
     expected = calibrate(predicted, won, blocks=blocks.block)

@@ -12,16 +12,17 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, SuccessModel, se3
+from graspdb_density.se3 import Poses
 
-Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
+Pair = tuple[NDArray[np.float64], NDArray[np.float64]]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 PATH = "/objects/thing/reports/sources"
 WIDTHS = np.array([0.03, 0.012, 0.02, 0.3, 0.8, 0.3])
 
 
-def field(count: int, seed: int, shift: float = 0.0) -> tuple[Poses, NDArray[np.bool_]]:
-    """Poses around one grasp and whether they hold; ``shift`` moves what holds along x."""
+def field(count: int, seed: int, shift: float = 0.0) -> tuple[Pair, NDArray[np.bool_]]:
+    """Pair around one grasp and whether they hold; ``shift`` moves what holds along x."""
     rng = np.random.default_rng(seed)
     xi = rng.uniform(-2.0, 2.0, (count, 6)) * WIDTHS
     off = xi / WIDTHS
@@ -65,8 +66,8 @@ def test_predictions_at_a_robots_poses_are_judged(simulated: httpx.Client, post:
     assert robot["share"]["low"] < won.mean() < robot["share"]["high"]
     # By the model itself, over all attempts.
     (sp, sq), swon = field(3_000, 0)
-    model = SuccessModel.build(sp, sq, swon, kernel=IsotropicKernel(0.008, math.radians(12.0)))
-    answer = model.evaluate(p, q)
+    model = SuccessModel.build(Poses.of(sp, sq), swon, kernel=IsotropicKernel(0.008, math.radians(12.0)))
+    answer = model.evaluate(Poses.of(p, q))
     known = answer.effective_trials >= 1.0
     assert robot["within_reach"] == pytest.approx(int(known.sum()), abs=2)
     assert robot["predicted"] == pytest.approx(answer.probability[known].mean(), abs=5e-3)
@@ -111,7 +112,7 @@ def test_what_is_missing_is_said(sqlite_http: httpx.Client, make_object: Make, p
     (robot,) = body["sources"]
     assert (robot["agreement"], robot["similarity"]) == (None, None)
     assert any("more trials within reach" in text for text in body["warnings"])
-    # Poses where nothing was simulated are not judged.
+    # Pair where nothing was simulated are not judged.
     post(http, "thing", (p + 1.0, q), ["failure"] * 10, gripper="pg70", source="robot")
     away = ok(http.get(PATH))
     assert away["sources"][0]["trials"] == 20

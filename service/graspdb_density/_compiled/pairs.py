@@ -1,27 +1,98 @@
 """Compiled loops over pairs of trials: what became of trials B displaced by so much from a successful A.
 
-A bin of a histogram is a row of ``tried`` and ``won`` (bins, R): column 0 counts with A's own weight, the
-others with its weight in every bootstrap resample of the grasps A. ``pairs`` (bins,) counts observations and
-``moved`` (bins,) sums their displacements, so that a profile knows where its data lie.
-
 Candidates B of the A at ``a`` are the rows ``order[run[0]:run[1]]`` of ``runs[first[a]:first[a + 1]]``.
 Only A's own row is left out: another trial of the same pose tells how repeatable success is.
 
-``nearby`` (A, 3, bins, 5) takes the pairs of profiles one grasp A at a time, see `profiles`, in the place of
-``line_tried`` and ``line_won``; with no grasps those are filled.
+``nearby`` (A, 3, bins, 5) takes the pairs of profiles one grasp A at a time, see `LatticeProfiles`, in the
+place of the profiles' ``tried`` and ``won``; with no grasps those are filled.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .options import exact, inlined
 
-__all__ = ["rotation_pairs", "translation_pairs"]
+__all__ = [
+    "Displaced",
+    "RotationBins",
+    "Tally",
+    "TranslationBins",
+    "Trials",
+    "rotation_pairs",
+    "translation_pairs",
+]
+
+Floats = NDArray[np.float64]
 
 _EDGE_M = 1e-9
+
+
+class Trials(NamedTuple):
+    """Trials (N,), and their rows in an order (N,) that runs refer to."""
+
+    positions: Floats
+    quaternions: Floats
+    success: NDArray[np.bool_]
+    order: NDArray[np.int64]
+
+
+class Displaced(NamedTuple):
+    """Successes A: rows (A,), frames (A, 3, 3) or as quaternions (A, 4), weights (A, 1 + resamples), and runs
+    of candidates.
+    """
+
+    rows: NDArray[np.int64]
+    frames: Floats
+    weights: NDArray[np.float32]
+    first: NDArray[np.int64]
+    runs: NDArray[np.int64]
+
+
+class TranslationBins(NamedTuple):
+    """``across`` bins span -extent .. extent in x and y; ``slices`` slices of ``slice_m`` in z; profiles have
+    ``profile_bins`` bins of ``profile_m``, the middle one about 0, the other axes within ``off_axis_m``.
+    """
+
+    extent: float
+    slices: int
+    slice_m: float
+    across: int
+    profile_m: float
+    profile_bins: int
+    off_axis_m: float
+
+
+class RotationBins(NamedTuple):
+    """``bins`` span the circle, the first centred on -pi, so that one is centred on 0; profiles as there."""
+
+    bins: int
+    profile: float
+    profile_bins: int
+    off_axis: float
+
+
+class Tally(NamedTuple):
+    """What became of displaced trials, by bin: weighted, as observed (column 0) and in every resample of the
+    grasps A.
+
+    Attributes
+    ----------
+    tried, won : (bins, 1 + resamples) float32
+    pairs : (bins,) int64
+        Observations.
+    moved : (bins,)
+        The sum of their displacements, so that a profile knows where its data lie.
+    """
+
+    tried: NDArray[np.float32]
+    won: NDArray[np.float32]
+    pairs: NDArray[np.int64]
+    moved: Floats
 
 
 @inlined
@@ -54,18 +125,16 @@ def _own_and_twin(qa, qb):  # type: ignore[no-untyped-def]
 
 
 @exact
-def translation_pairs(  # type: ignore[no-untyped-def]
-    positions, quaternions, success, order, grasps, frames, weights, first, runs, symmetric, least_cosine,
-    extent, slices, slice_m, across, profile_m, profile_bins, tolerance_m,
-    tried, won, pairs, line_tried, line_won, line_pairs, line_moved, nearby,
-):  # fmt: skip
+def translation_pairs(trials, displaced, bins, symmetric, least_cosine, planes, lines, nearby):  # type: ignore[no-untyped-def]
     """Pairs of the same rotation into the histograms (slice, x, y) and the profiles (axis, bin); how many.
 
-    Parameters: ``least_cosine`` of half the angle for trials off the grid, -1 where runs hold one rotation
-    only; ``across`` bins span -extent .. extent in x and y; ``slices`` slices of ``slice_m`` in z; profiles
-    have ``profile_bins`` bins of ``profile_m``, the middle one about 0, the other axes within
-    ``tolerance_m``.
+    ``least_cosine``: of half the angle for trials off the grid, -1 where runs hold one rotation only.
     """
+    positions, quaternions, success, order = trials
+    grasps, frames, weights, first, runs = displaced
+    extent, slices, slice_m, across, profile_m, profile_bins, off_axis_m = bins
+    tried, won, pairs, _ = planes
+    line_tried, line_won, line_pairs, line_moved = lines
     used = 0
     half_depth = 0.5 * slices * slice_m
     middle = profile_bins // 2
@@ -99,7 +168,7 @@ def translation_pairs(  # type: ignore[no-untyped-def]
                     hit = True
                 for axis in range(3):
                     u, v = abs(t[(axis + 1) % 3]), abs(t[(axis + 2) % 3])
-                    if u <= tolerance_m + _EDGE_M and v <= tolerance_m + _EDGE_M:
+                    if u <= off_axis_m + _EDGE_M and v <= off_axis_m + _EDGE_M:
                         b = middle + math.floor(t[axis] / profile_m + 0.5)
                         if apart:
                             _note(nearby[a, axis], b + margin, success[j], t[axis], u, v)
@@ -157,26 +226,26 @@ def composition_angles(q, plane):  # type: ignore[no-untyped-def]
 
 
 @exact
-def rotation_pairs(  # type: ignore[no-untyped-def]
-    positions, quaternions, success, order, grasps, frames, weights, first, runs, symmetric, framed,
-    reach_m, bins, profile_bins, profile_step, tolerance,
-    tried, won, pairs, line_tried, line_won, line_pairs, line_moved, nearby,
-):  # fmt: skip
+def rotation_pairs(trials, displaced, bins, symmetric, framed, reach_m, planes, lines, nearby):  # type: ignore[no-untyped-def]
     """Pairs at the same position into the histograms (plane, alpha, beta) and the profiles (axis, bin); how
     many.
 
-    ``frames`` (A, 4): quaternions of the frames whose axes rotations are about, used where ``framed``, else
-    the gripper's own. ``reach_m``: distance for trials off the grid, negative where runs hold one position.
-    ``bins`` bins span the circle, the first centred on -pi, so that one is centred on 0. Of a symmetric jaw
+    Rotations are about the axes of A's frame (a quaternion) where ``framed``, else about the gripper's own.
+    ``reach_m``: distance for trials off the grid, negative where runs hold one position. Of a symmetric jaw
     both A and B stand for their twins too.
     """
+    positions, quaternions, success, order = trials
+    grasps, frames, weights, first, runs = displaced
+    circle, profile_step, profile_bins, off_axis = bins
+    tried, won, pairs, _ = planes
+    line_tried, line_won, line_pairs, line_moved = lines
     used = 0
-    sine = math.sin(tolerance)
-    least = math.cos(0.5 * tolerance) ** 2
+    sine = math.sin(off_axis)
+    least = math.cos(0.5 * off_axis) ** 2
     middle = profile_bins // 2
     apart = nearby.shape[0] > 0
     margin = (nearby.shape[2] - profile_bins) // 2
-    step = 2.0 * math.pi / bins
+    step = 2.0 * math.pi / circle
     turn = np.array([0.0, 0.0, 1.0, 0.0])
     back = np.array([0.0, 0.0, -1.0, 0.0])
     inverse, relative, other, left = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
@@ -227,9 +296,9 @@ def rotation_pairs(  # type: ignore[no-untyped-def]
                         # Most are too far from every composition: told before any angle is taken.
                         if 2.0 * abs(relative[3] * h - e * g) <= sine:
                             alpha, beta, _ = composition_angles(relative, plane)
-                            x = math.floor((alpha + math.pi) / step + 0.5) % bins
-                            y = math.floor((beta + math.pi) / step + 0.5) % bins
-                            b = (plane * bins + x) * bins + y
+                            x = math.floor((alpha + math.pi) / step + 0.5) % circle
+                            y = math.floor((beta + math.pi) / step + 0.5) % circle
+                            b = (plane * circle + x) * circle + y
                             _add(tried, won, pairs, b, success[j], weights[a])
                             hit = True
                     for axis in range(3):

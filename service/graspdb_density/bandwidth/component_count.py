@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .. import se3
-from ..kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, bhattacharyya, sampled_kernel_rows
-from ..kde.weighted_sums import KernelRows, Progress
+from ..kde.bhattacharyya import DisplacementWindow, SampledKernelPoint
+from ..kde.weighted_sums import Progress
 from ..kernels.gaussian_mixture import MOST_ROTATION, AnisotropicKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats
-from .mixture_fit import Displacements, mixture_parts
+from .matching import overall_covariance
+from .mixture_fit import Displacements, mixture_parts, sampled_rows, similarity_to_sampled
 
 __all__ = ["MIXTURES", "mixture_curve"]
 
@@ -55,17 +55,15 @@ def mixture_curve(
         ``samples`` is the number of Gaussians.
     """
     share = found.weights / found.weights.sum()
-    turns = se3.from_rotation_vector(found.vectors[:, 3:])
     whole_rows = rng.choice(len(share), size=min(reference, len(share)), replace=False, p=share)
-    whole = sampled_kernel_rows(se3.Poses.of(found.vectors[whole_rows, :3], turns[whole_rows]), components)
+    whole = sampled_rows(found.vectors[whole_rows], components)
     chosen = rng.choice(len(share), size=min(fitted, len(share)), replace=False, p=share)
-    added = np.diag([components.sigma_position_m**2] * 3 + [components.sigma_rotation**2] * 3)
+    added = overall_covariance(components)
     result = []
     for number, count in enumerate(counts):
         weights, means, covariances = mixture_parts(found.vectors[chosen], count)
         kernel = AnisotropicKernel.symmetrised(weights, means, _narrowed(covariances + added))
-        alone = KernelRows(se3.Poses(np.zeros((1, 3)), se3.IDENTITY[None]), kernel, symmetric=False)
-        likeness = bhattacharyya(whole, alone, rng, points=points, window=window, threads=threads)
+        likeness = similarity_to_sampled(kernel, whole, rng, points=points, window=window, threads=threads)
         result.append(SampledKernelPoint(count, likeness.value, likeness.standard_error))
         if progress is not None:
             progress((number + 1) / len(counts))

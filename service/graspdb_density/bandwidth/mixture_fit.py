@@ -25,8 +25,9 @@ from ..kde.mixture import MixtureDensity
 from ..kde.weighted_sums import KernelRows, Progress
 from ..kernels.gaussian_mixture import AnisotropicKernel, mirror
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from ..success.calibration import assign_blocks
+from .matching import overall_covariance
 
 __all__ = [
     "LEAST_DISPLACEMENTS",
@@ -36,6 +37,8 @@ __all__ = [
     "displacements",
     "fit_kernel",
     "mixture_parts",
+    "sampled_rows",
+    "similarity_to_sampled",
 ]
 
 #: Fewer successes or displacements than this shape no kernel.
@@ -100,8 +103,7 @@ class FittedKernel:
 
 
 def displacements(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    poses: Poses,
     *,
     window: DisplacementWindow,
     rng: np.random.Generator,
@@ -115,7 +117,7 @@ def displacements(
 
     Parameters
     ----------
-    positions, quaternions_xyzw : (N, 3) metres, (N, 4)
+    poses : N
     weights : (N,) or None
         Importance (eq 1). Successes to start from are drawn by it, those arrived at count with it.
     frame : (3, 3), (N, 3, 3) or None
@@ -123,7 +125,7 @@ def displacements(
     per_grasp : int
         At most this many from one success, drawn at random and weighted for the rest.
     """
-    p, q = se3.Poses.of(positions, quaternions_xyzw)
+    p, q = poses.positions, poses.quaternions_xyzw
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
     flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p))
     reach = window.position_m * math.sqrt(3.0)
@@ -158,9 +160,9 @@ def displacements(
     return Displacements(np.concatenate(vectors), share / share.mean(), np.concatenate(origins))
 
 
+# long: its parameters are explained one by one, and its steps are one after the other.
 def fit_kernel(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    poses: Poses,
     *,
     window: DisplacementWindow,
     widths: IsotropicKernel,
@@ -177,7 +179,7 @@ def fit_kernel(
 
     Parameters
     ----------
-    positions, quaternions_xyzw : (N, 3) metres, (N, 4)
+    poses : N
     window
         Displacements looked at.
     widths
@@ -199,39 +201,38 @@ def fit_kernel(
         For too few successes or displacements (saying how many are needed), a mixture in axes that do not
         turn with the jaw, or a fit whose rotations are wider than a component may be.
     """
-    p, q = se3.Poses.of(positions, quaternions_xyzw)
-    if len(p) < LEAST_SUCCESSES:
+    if len(poses) < LEAST_SUCCESSES:
         raise ValueError(
-            f"a kernel is fitted on at least {LEAST_SUCCESSES} successes; there are {len(p)}, so "
-            f"{LEAST_SUCCESSES - len(p)} more are needed"
+            f"a kernel is fitted on at least {LEAST_SUCCESSES} successes; there are {len(poses)}, so "
+            f"{LEAST_SUCCESSES - len(poses)} more are needed"
         )
     if frame is not None and components not in (None, 1):
         raise ValueError(
             "axes that do not turn with the jaw have no sign: a kernel aligned with them has 1 component"
         )
-    frames = None if frame is None else _own_where_unknown(frame, q)
-    w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
-    flags = np.array(np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p)))
+    frames = None if frame is None else _own_where_unknown(frame, poses.quaternions_xyzw)
+    w = np.ones(len(poses)) if weights is None else np.asarray(weights, dtype=np.float64)
+    flags = np.array(np.broadcast_to(np.asarray(symmetric, dtype=bool), len(poses)))
     rng = np.random.default_rng(seed)
-    found = displacements(p, q, window=window, rng=rng, weights=w, symmetric=flags, frame=frames)
+    found = displacements(poses, window=window, rng=rng, weights=w, symmetric=flags, frame=frames)
     if len(found.vectors) < LEAST_DISPLACEMENTS:
         raise ValueError(
             f"the window holds {len(found.vectors)} displacements between successes, and a kernel is fitted "
             f"on at least {LEAST_DISPLACEMENTS}: widen the window or add trials"
         )
-    added = np.diag([widths.sigma_position_m**2] * 3 + [widths.sigma_rotation**2] * 3)
+    added = overall_covariance(widths)
     tried = (1,) if frame is not None else _TRIED_COMPONENTS if components is None else (components,)
     told = progress or (lambda _: None)
     shape, likelihoods = _shape(
         found, tried, added, frame is not None, rng, lambda done: told(_SHAPE_SHARE * done)
     )
-    turns = se3.from_rotation_vector(found.vectors[:, 3:])
-    chosen = rng.choice(len(turns), size=min(_SAMPLES, len(turns)), p=found.weights / found.weights.sum())
-    sampled = sampled_kernel_rows(se3.Poses.of(found.vectors[chosen, :3], turns[chosen]), widths)
-    alone = KernelRows(se3.Poses(np.zeros((1, 3)), se3.IDENTITY[None]), shape, symmetric=False,
-                       frames=None if frame is None else np.eye(3))  # fmt: skip
-    similarity = bhattacharyya(sampled, alone, rng, points=4_000, window=window, threads=threads)
-    judge = _Judge(p, q, w, flags, frames, compared, rng, threads)
+    chosen = rng.choice(
+        len(found.vectors), size=min(_SAMPLES, len(found.vectors)), p=found.weights / found.weights.sum()
+    )
+    similarity = similarity_to_sampled(
+        shape, sampled_rows(found.vectors[chosen], widths), rng, points=4_000, window=window, threads=threads
+    )
+    judge = _Judge(poses, w, flags, frames, compared, rng, threads)
     # Where nothing can be held out, the size of the kernel compared with.
     fallback = compared.sigma_position_m / shape.isotropic.sigma_position_m
     candidates = [(f, k) for f in (*_FACTORS, fallback) if (k := _scaled(shape, f)) is not None]
@@ -249,7 +250,7 @@ def fit_kernel(
         kernel=candidates[best][1],
         scale=candidates[best][0],
         displacements=len(found.vectors),
-        successes=len(p),
+        successes=len(poses),
         similarity=similarity,
         likelihoods=likelihoods,
         log_likelihood=values[best],
@@ -273,8 +274,7 @@ class _Judge:
 
     def __init__(
         self,
-        p: Floats,
-        q: Floats,
+        poses: Poses,
         w: Floats,
         flags: NDArray[np.bool_],
         frame: Floats | None,
@@ -282,7 +282,8 @@ class _Judge:
         rng: np.random.Generator,
         threads: int,
     ) -> None:
-        rows = np.sort(rng.permutation(len(p))[:_SCALED_MOST])
+        rows = np.sort(rng.permutation(len(poses))[:_SCALED_MOST])
+        p, q = poses.positions, poses.quaternions_xyzw
         self._p, self._q, self._w, self._flags = p[rows], q[rows], w[rows], flags[rows]
         self._frame = frame if frame is None or frame.ndim == 2 else frame[rows]
         self._threads = threads
@@ -375,25 +376,43 @@ def _shape(
 
 
 def _fitted(x: Floats, w: Floats, count: int, added: Floats, plain: bool) -> AnisotropicKernel:
-    # A density over rotations is one over rotation vectors divided by the volume element.
-    half = 0.5 * np.linalg.norm(x[:, 3:], axis=1)
-    v = w / np.maximum(np.sinc(half / np.pi) ** 2, 1e-3)
-    second = np.einsum("n,ni,nj->ij", v / v.sum(), x, x)
-    if count == 1:
-        if plain:
-            second[:3, :3] = np.diag(np.diag(second)[:3])
-            second[:3, 3:] = second[3:, :3] = 0.0
-        return AnisotropicKernel.gaussian(second + added, frame="fixed" if plain else "gripper")
-    weights, means, covariances = _expectation_maximisation(x, v, count, second)
-    return AnisotropicKernel.symmetrised(weights, means, covariances + added)
+    weights, means, covariances = mixture_parts(x, count, w)
+    if count > 1:
+        return AnisotropicKernel.symmetrised(weights, means, covariances + added)
+    second = covariances[0]
+    if plain:
+        second[:3, :3] = np.diag(np.diag(second)[:3])
+        second[:3, 3:] = second[3:, :3] = 0.0
+    return AnisotropicKernel.gaussian(second + added, frame="fixed" if plain else "gripper")
 
 
-def mixture_parts(vectors: Floats, count: int) -> tuple[Floats, Floats, Floats]:
+def sampled_rows(vectors: Floats, components: IsotropicKernel) -> KernelRows:
+    """The sampled kernel of displacements (n, 6)."""
+    return sampled_kernel_rows(Poses(vectors[:, :3], se3.from_rotation_vector(vectors[:, 3:])), components)
+
+
+def similarity_to_sampled(
+    kernel: AnisotropicKernel,
+    sampled: KernelRows,
+    rng: np.random.Generator,
+    *,
+    points: int,
+    window: DisplacementWindow,
+    threads: int,
+) -> Coefficient:
+    """Bhattacharyya coefficient of a kernel with a sampled one, inside a window."""
+    frames = None if kernel.frame == "gripper" else np.eye(3)
+    alone = KernelRows(Poses(np.zeros((1, 3)), se3.IDENTITY[None]), kernel, symmetric=False, frames=frames)
+    return bhattacharyya(sampled, alone, rng, points=points, window=window, threads=threads)
+
+
+def mixture_parts(vectors: Floats, count: int, weights: ArrayLike = 1.0) -> tuple[Floats, Floats, Floats]:
     """Weights (C,), means (C, 6) and covariances (C, 6, 6) of mirrored pairs of Gaussians, fitted to
-    displacements (n, 6) that count alike.
+    displacements (n, 6); one is about no displacement.
     """
+    # A density over rotations is one over rotation vectors divided by the volume element.
     half = 0.5 * np.linalg.norm(vectors[:, 3:], axis=1)
-    v = 1.0 / np.maximum(np.sinc(half / np.pi) ** 2, 1e-3)
+    v = np.asarray(weights) / np.maximum(np.sinc(half / np.pi) ** 2, 1e-3)
     second = np.einsum("n,ni,nj->ij", v / v.sum(), vectors, vectors)
     if count == 1:
         return np.ones(1), np.zeros((1, 6)), second[None]

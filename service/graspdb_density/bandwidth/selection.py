@@ -17,13 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import se3
 from .._compiled import isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import scaled_radius
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 
 __all__ = [
     "DEFAULT_KERNEL",
@@ -80,23 +79,21 @@ def widths_prefix(count: int) -> int:
 
 
 def choose_widths(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    poses: Poses,
     *,
     weights: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
     threads: int = 1,
 ) -> WidthChoice:
-    """Choose widths for grasps (N, 3), (N, 4) in commit order."""
-    p, q = se3.Poses.of(positions, quaternions_xyzw)
-    count = widths_prefix(len(p))
+    """Choose widths for N grasps in commit order."""
+    count = widths_prefix(len(poses))
     if count == 0:
         return WidthChoice(DEFAULT_KERNEL, "default", 0, math.nan)
     w = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)[:count]
-    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(p),))[:count]
-    p, q, w = p[:count], q[:count], w / w.mean()
+    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(poses),))[:count]
+    w = w / w.mean()
     best: tuple[float, IsotropicKernel] | None = None
-    for kernel, held, values in _tried(p, q, w, flags, threads):
+    for kernel, held, values in _scored(poses[:count], w, flags, threads):
         value = float(np.average(values, weights=w[held])) if held.size else -math.inf
         if best is None or value > best[0]:
             best = value, kernel
@@ -126,8 +123,7 @@ class WidthScore:
 
 
 def score_widths(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    poses: Poses,
     *,
     weights: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
@@ -143,22 +139,23 @@ def score_widths(
     ValueError
         For fewer than `LEAST_ROWS` rows, saying how many more are needed.
     """
-    p, q = se3.Poses.of(positions, quaternions_xyzw)
-    if len(p) < LEAST_ROWS:
+    count = len(poses)
+    if count < LEAST_ROWS:
         raise ValueError(
-            f"widths are told apart from {LEAST_ROWS} successes on; there are {len(p)}, so"
-            f" {LEAST_ROWS - len(p)} more are needed"
+            f"widths are told apart from {LEAST_ROWS} successes on; there are {count}, so"
+            f" {LEAST_ROWS - count} more are needed"
         )
-    w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
-    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(p),))
-    rows = np.unique(np.linspace(0, len(p) - 1, min(len(p), MOST_ROWS)).astype(np.int64))
-    p, q, w, flags = p[rows], q[rows], w[rows] / w[rows].mean(), flags[rows]
+    w = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
+    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (count,))
+    rows = np.unique(np.linspace(0, count - 1, min(count, MOST_ROWS)).astype(np.int64))
+    poses, w, flags = poses[rows], w[rows] / w[rows].mean(), flags[rows]
+    p = poses.positions
     # Neighbours are alike: errors count cubes as wide as the widest block, not rows.
     edge = BLOCK_WIDTHS * DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * _STEPS_POSITION[-1])
     _, cube = np.unique(np.floor((p - p.min(axis=0)) / edge).astype(np.int64), axis=0, return_inverse=True)
     cube = cube.reshape(-1)
     tables = []
-    for kernel, held, values in _tried(p, q, w, flags, threads):
+    for kernel, held, values in _scored(poses, w, flags, threads):
         full = np.full(len(p), np.nan)
         full[held] = values
         tables.append((kernel, full))
@@ -185,22 +182,23 @@ def _mean_and_error(values: Floats, weights: Floats, cube: NDArray[np.int64]) ->
     return mean, float(np.linalg.norm(sums) / w.sum())
 
 
-def _tried(
-    p: Floats, q: Floats, w: Floats, flags: NDArray[np.bool_], threads: int
+def _scored(
+    poses: Poses, w: Floats, flags: NDArray[np.bool_], threads: int
 ) -> Iterator[tuple[IsotropicKernel, NDArray[np.int64], Floats]]:
     """Every pair of widths with the rows left out and their log density under it."""
     for step in _STEPS_POSITION:
         sigma = DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * step)
-        cells = Cells.build(se3.Poses(p, q), w, flags, sigma)
+        cells = Cells.build(poses, w, flags, sigma)
         for turn in _STEPS_ROTATION:
             kernel = IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
-            yield kernel, *_held_out(kernel, cells, p, q, w, threads)
+            yield kernel, *_held_out(kernel, cells, poses, w, threads)
 
 
 def _held_out(
-    kernel: IsotropicKernel, cells: Cells, p: Floats, q: Floats, w: Floats, threads: int
+    kernel: IsotropicKernel, cells: Cells, poses: Poses, w: Floats, threads: int
 ) -> tuple[NDArray[np.int64], Floats]:
     """Rows, and their log density given those outside their block."""
+    p, q = poses.positions, poses.quaternions_xyzw
     edge = BLOCK_WIDTHS * kernel.sigma_position_m
     low = p.min(axis=0)
     cell = np.floor((p - low) / edge).astype(np.int64)

@@ -102,6 +102,16 @@ class ConvergenceCurve:
     points: tuple[CurvePoint, ...]
     held_out: int
 
+    @property
+    def sizes(self) -> Floats:
+        """(P,) numbers of grasps."""
+        return np.array([point.grasps for point in self.points], dtype=np.float64)
+
+    @property
+    def similarities(self) -> Floats:
+        """(P,) s of the points."""
+        return np.array([point.similarity for point in self.points])
+
 
 @dataclass(frozen=True, slots=True)
 class Needed:
@@ -301,9 +311,8 @@ def grasps_needed(
     A curve that is above the target from its first point on gives that point's number: an upper bound.
     """
     _checked_target(target, level)
-    sizes = np.array([point.grasps for point in curve.points], dtype=np.float64)
-    best, outside = _needed(sizes, np.array([[point.similarity for point in curve.points]]), target)
-    spread, _ = _needed(sizes, _resampled(curve, np.random.default_rng(seed)), target)
+    best, outside = _needed(curve.sizes, curve.similarities[None], target)
+    spread, _ = _needed(curve.sizes, _resampled(curve, np.random.default_rng(seed)), target)
     low, high = _interval(spread, level)
     return Needed(target, float(best[0]), low, high, level, bool(outside[0]))
 
@@ -329,8 +338,7 @@ def needed_ratio(
     _checked_target(target, level)
     values = []
     for number, one in enumerate((curve, reference)):
-        sizes = np.array([point.grasps for point in one.points], dtype=np.float64)
-        spread, _ = _needed(sizes, _resampled(one, np.random.default_rng((seed, number))), target)
+        spread, _ = _needed(one.sizes, _resampled(one, np.random.default_rng((seed, number))), target)
         values.append((grasps_needed(one, target=target, level=level, seed=seed).grasps, spread))
     (best, spread), (base, base_spread) = values
     with np.errstate(invalid="ignore"):
@@ -355,8 +363,7 @@ def verdict(curve: ConvergenceCurve, *, target: float = TARGET, level: float = 0
     last = curve.points[-1]
     low, high = _interval(resampled[:, -1], level)
     state = "enough" if low >= target else "more" if high < target else "borderline"
-    sizes = np.array([point.grasps for point in curve.points], dtype=np.float64)
-    exponent, _ = _fit(sizes, np.array([point.similarity for point in curve.points]))
+    exponent, _ = _fit(curve.sizes, curve.similarities)
     least, best, most = (max(0.0, n - last.grasps) for n in (needed.low, needed.grasps, needed.high))
     return Verdict(
         state=state,

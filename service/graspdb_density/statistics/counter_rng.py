@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..kde.weighted_sums import KernelRows
 from ..se3 import Floats
 
-__all__ = ["FixedDraws"]
+__all__ = ["CounterRng"]
 
 #: Rows and points whose random numbers are made together.
 _ROW_BLOCK, _POINT_BLOCK = 1_024, 256
@@ -32,7 +32,7 @@ _POISSON = _poisson_table()
 
 
 @dataclass(frozen=True, slots=True)
-class FixedDraws:
+class CounterRng:
     """Draws of a seed; groups are independent of each other."""
 
     seed: int

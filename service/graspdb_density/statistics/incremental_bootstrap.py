@@ -1,4 +1,4 @@
-"""A convergence curve that grows with its grasps: sums are kept, and new grasps are added to them.
+"""A convergence curve extended with its grasps: sums are kept, and new grasps are added to them.
 
 The last point of a curve is s of all grasps (eq 9). Its kernel sums are kept, at the points drawn from the
 density and for every bootstrap replicate, so that a new grasp costs its own kernels only. That needs
@@ -13,7 +13,7 @@ replicates and points which new grasps leave as they are:
 
 The other points of a curve are of subsets of the first 200, 400, 800, ... grasps, at most half of them, with
 replicates that draw with replacement. Those and the held-out grasps stay the same until the number doubles,
-and so do default widths (see `widths`). So a curve that has grown and one computed at once agree within
+and so do default widths (see `selection`). So a curve that was extended and one computed at once agree within
 rounding. Where the order of commitment is not random, smaller points are of what was tried first.
 """
 
@@ -27,11 +27,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import se3
 from ..kde.weighted_sums import TRUSTED_SUM, KernelRows, Progress
 from ..kernels.gaussian_mixture import Kernel
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from .convergence import (
     LEAST_GRASPS,
     ConvergenceCurve,
@@ -40,9 +39,9 @@ from .convergence import (
     coefficients,
     curve_sizes,
 )
-from .counter_rng import FixedDraws
+from .counter_rng import CounterRng
 
-__all__ = ["GrowingCurve", "convergence_curve", "curve_prefix"]
+__all__ = ["IncrementalCurve", "curve_prefix"]
 
 #: Grasps held out for the likelihood: this share of the first ones, but no more than.
 _HELD_OUT_SHARE, _HELD_OUT_MOST = 0.1, 2_000
@@ -73,8 +72,8 @@ class _Plan:
         return max(2, self.points // self.subsets)
 
     @property
-    def draws(self) -> FixedDraws:
-        return FixedDraws(self.seed)
+    def draws(self) -> CounterRng:
+        return CounterRng(self.seed)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,7 +82,7 @@ class _Group:
 
     Attributes
     ----------
-    positions, quaternions : (M, 3), (M, 4)
+    poses : M
     sums : (M, 1 + B) float64
         Under the raw weights, then under those times each replicate's counts. In float64, since grasps may
         come one by one.
@@ -93,32 +92,20 @@ class _Group:
         How many grasps each replicate counts.
     """
 
-    positions: Floats
-    quaternions: Floats
+    poses: Poses
     sums: Floats
     totals: Floats
     counted: Floats
 
     @classmethod
     def empty(cls, replicates: int) -> _Group:
-        columns = 1 + replicates
-        return cls(
-            np.empty((0, 3)),
-            np.empty((0, 4)),
-            np.empty((0, columns)),
-            np.zeros(columns),
-            np.zeros(replicates),
-        )
+        nowhere = Poses(np.empty((0, 3)), np.empty((0, 4)))
+        return cls(nowhere, np.empty((0, 1 + replicates)), np.zeros(1 + replicates), np.zeros(replicates))
 
     @property
     def nbytes(self) -> int:
-        return (
-            self.positions.nbytes
-            + self.quaternions.nbytes
-            + self.sums.nbytes
-            + self.totals.nbytes
-            + self.counted.nbytes
-        )
+        arrays = self.poses.positions, self.poses.quaternions_xyzw, self.sums, self.totals, self.counted
+        return sum(array.nbytes for array in arrays)
 
     def values(self, size: int) -> Floats:
         """BC of every replicate with the whole of ``size`` grasps, (B,), as if it had counted that many."""
@@ -149,8 +136,8 @@ class _HeldOut:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class GrowingCurve:
-    """A convergence curve and the sums that it grows from. Immutable.
+class IncrementalCurve:
+    """A convergence curve and the sums that it is extended from. Immutable.
 
     Attributes
     ----------
@@ -162,7 +149,7 @@ class GrowingCurve:
     kept : int
         Grasps whose sums were taken from the curve before; 0 where it was computed at once.
     generation : bytes
-        The same while a curve grows, another one when it is computed anew.
+        The same while a curve is extended, another one when it is computed anew.
     """
 
     curve: ConvergenceCurve
@@ -176,20 +163,29 @@ class GrowingCurve:
     _held: _HeldOut
     _groups: tuple[_Group, ...]
 
+    def _begins(self, given: _Given, signature: bytes, raw: Floats) -> bool:
+        """Whether this is a curve of the first of some rows."""
+        return (
+            self._signature == signature
+            and self.size <= len(raw)
+            and np.allclose(self._raw, raw[: self.size], rtol=_SAME, atol=0.0)
+            and self._digest == given.digest(self.size)
+        )
+
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held."""
         points = sum(point.replicates.nbytes for point in self.curve.points)
         return sum(group.nbytes for group in self._groups) + self._held.nbytes + self._raw.nbytes + points
 
+    # long: the options of the report, explained one by one.
     @classmethod
-    def grown(
+    def of(
         cls,
-        before: GrowingCurve | None,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         kernel: Kernel,
         *,
+        before: IncrementalCurve | None = None,
         weights: ArrayLike | None = None,
         symmetric: ArrayLike | bool = True,
         frames: ArrayLike | None = None,
@@ -199,19 +195,19 @@ class GrowingCurve:
         seed: int = 0,
         threads: int = 1,
         progress: Progress | None = None,
-    ) -> GrowingCurve:
+    ) -> IncrementalCurve:
         """s and the held-out likelihood against the number of grasps (figures 6 and 14).
 
         Parameters
         ----------
+        poses : N
+            Successful grasps in commit order, one row a physical grasp.
+        kernel, weights, symmetric, frames
+            As `KernelRows` takes them.
         before
             A curve of the first of these grasps. What of it still holds is kept: all of it while grasps are
             added under the same kernel, weights of the first ones and frames, up to twice as many; nothing
             otherwise. It makes the answer quicker and no different.
-        positions, quaternions_xyzw : (N, 3) metres, (N, 4)
-            Successful grasps in commit order, one row a physical grasp.
-        kernel, weights, symmetric, frames
-            As `KernelRows` takes them.
         subsets : int
             Subsets drawn without replacement at each size, at least 5. At the whole number they are the same
             grasps with other draws.
@@ -224,29 +220,23 @@ class GrowingCurve:
         ValueError
             Where there are too few grasps (saying how many are needed) or an argument is out of range.
         """
-        p, q = se3.Poses.of(positions, quaternions_xyzw)
-        count = len(p)
+        count = len(poses)
         sizes = curve_sizes(count)
         if subsets < 5:
             raise ValueError("a point of a curve is the mean over at least 5 subsets")
         if replicates < 2 or points < 2:
             raise ValueError("a bootstrap needs at least 2 replicates and 2 points")
         plan = _Plan(subsets, replicates, points, seed)
-        rows = KernelRows(se3.Poses.of(p, q), kernel, weights=weights, symmetric=symmetric, frames=frames)
+        rows = KernelRows(poses, kernel, weights=weights, symmetric=symmetric, frames=frames)
         prefix = curve_prefix(count)
         # In units of the first ones' mean, which stays.
         raw = rows.weights / rows.weights[:prefix].mean()
         # Heavy grasps that come late do not bring more points than there may be.
         thinned = 2 ** max(0, math.floor(math.log2(raw.sum() / prefix)))
         step = thinned * 2.0 * prefix / plan.per_subset
-        given = _Given(rows, positions, quaternions_xyzw, frames)
+        given = _Given(rows, poses, frames)
         signature = given.signature(plan, prefix, step)
-        if before is not None and not (
-            before._signature == signature
-            and before.size <= count
-            and np.allclose(before._raw, raw[: before.size], rtol=_SAME, atol=0.0)
-            and before._digest == given.digest(before.size)
-        ):
+        if before is not None and not before._begins(given, signature, raw):
             before = None
         if before is not None and before.size == count:
             return replace(before, kept=count)
@@ -255,7 +245,7 @@ class GrowingCurve:
         work = _Work(rows, raw, plan, step, threads, _Steps(progress))
         ladder = plan.per_subset * subsets * sum(sizes[:-1]) if before is None else 0
         drawn = work.drawn()
-        present = sum(len(group.positions) for group in groups)
+        present = sum(len(group.poses) for group in groups)
         fresh = count - first
         work.steps.total = ladder + (present + _HELD_OUT_MOST) * fresh + (drawn * subsets - present) * count
         split, *children = np.random.default_rng(seed).spawn(1 + len(sizes[:-1]) * subsets)
@@ -284,35 +274,12 @@ class GrowingCurve:
         )
 
 
-def convergence_curve(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
-    kernel: Kernel,
-    *,
-    weights: ArrayLike | None = None,
-    symmetric: ArrayLike | bool = True,
-    frames: ArrayLike | None = None,
-    subsets: int = 5,
-    replicates: int = 50,
-    points: int = 20_000,
-    seed: int = 0,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> ConvergenceCurve:
-    """The curve of `GrowingCurve.grown`, computed at once."""
-    return GrowingCurve.grown(
-        None, positions, quaternions_xyzw, kernel, weights=weights, symmetric=symmetric, frames=frames,
-        subsets=subsets, replicates=replicates, points=points, seed=seed, threads=threads, progress=progress,
-    ).curve  # fmt: skip
-
-
 @dataclass(frozen=True, slots=True)
 class _Given:
     """What a curve was asked of, to tell whether another one is of the same."""
 
     rows: KernelRows
-    positions: ArrayLike
-    quaternions: ArrayLike
+    poses: Poses
     frames: ArrayLike | None
 
     def signature(self, plan: _Plan, prefix: int, step: float) -> bytes:
@@ -331,10 +298,10 @@ class _Given:
     def digest(self, count: int) -> bytes:
         """Of the first rows as they were given."""
         found = hashlib.blake2b()
+        first = self.poses[:count]
         arrays: list[NDArray[np.generic]] = [
-            np.asarray(a, dtype=np.float64)[:count] for a in (self.positions, self.quaternions)
-        ]
-        arrays.append(self.rows.symmetric[:count])
+            first.positions, first.quaternions_xyzw, self.rows.symmetric[:count]
+        ]  # fmt: skip
         if self.frames is not None:
             frames = np.asarray(self.frames, dtype=np.float64)
             arrays.append(frames if frames.ndim == 2 else frames[:count])
@@ -447,7 +414,7 @@ class _Work:
         """A group with the rows from ``first`` on: added at its points, and bringing points of their own."""
         plan, rows, raw = self.plan, self.rows, self.raw
         fresh = np.arange(first, rows.size)
-        present = len(group.positions)
+        present = len(group.poses)
         weightings, counted = self._weightings(number, first)
         totals = group.totals + weightings.sum(axis=0, dtype=np.float64)
         counted = counted + group.counted
@@ -455,7 +422,7 @@ class _Work:
         if present:
             amount = present * len(fresh)
             sums = sums + rows.subset(fresh).sums(
-                se3.Poses(group.positions, group.quaternions), weightings,
+                group.poses, weightings,
                 threads=self.threads, progress=self.steps.part(amount),
             )  # fmt: skip
             self.steps.finish(amount)
@@ -471,15 +438,10 @@ class _Work:
         if first:
             weightings, _ = self._weightings(number, 0)
         amount = len(row) * rows.size
-        added = rows.sums(se3.Poses(p, q), weightings, threads=self.threads, progress=self.steps.part(amount))
+        added = rows.sums(Poses(p, q), weightings, threads=self.threads, progress=self.steps.part(amount))
         self.steps.finish(amount)
-        return _Group(
-            np.concatenate([group.positions, p]),
-            np.concatenate([group.quaternions, q]),
-            np.concatenate([sums, added]),
-            totals,
-            counted,
-        )
+        poses = Poses.concatenate([group.poses, Poses(p, q)])
+        return _Group(poses, np.concatenate([sums, added]), totals, counted)
 
     def _weightings(self, group: int, first: int) -> tuple[NDArray[np.float32], Floats]:
         """Of the rows from ``first`` on, (n, 1 + B): their weights, and times each replicate's counts; and

@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from .._compiled import diagonal
 from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
-from .calibration import assign_blocks, brier_skill
-from .kernel_regression import checked_attempts, shrunk_share
+from ..se3 import Floats, Poses
+from .calibration import Blocks, assign_blocks, brier_skill
+from .kernel_regression import checked_outcomes, shrunk_share
 
 __all__ = ["LEAST_OF_EACH", "AxisBandwidths", "fit_axis_bandwidths"]
 
@@ -71,8 +71,7 @@ class AxisBandwidths:
 
 
 def fit_axis_bandwidths(
-    positions: ArrayLike,
-    quaternions_xyzw: ArrayLike,
+    poses: Poses,
     success: ArrayLike,
     *,
     axes: ArrayLike | None = None,
@@ -83,7 +82,7 @@ def fit_axis_bandwidths(
 
     Parameters
     ----------
-    positions, quaternions_xyzw : (N, 3) metres, (N, 4)
+    poses : N
         Attempts; where collisions are tested, those that did not collide.
     success : (N,) bool
     axes : (3, 3) or None
@@ -94,7 +93,7 @@ def fit_axis_bandwidths(
     ValueError
         For fewer than `LEAST_OF_EACH` successes or failures, or attempts all in one place.
     """
-    p, q, won, flags = checked_attempts(positions, quaternions_xyzw, success, symmetric)
+    won, flags = checked_outcomes(success, symmetric, len(poses))
     wins, losses = int(won.sum()), int((~won).sum())
     if min(wins, losses) < LEAST_OF_EACH:
         raise ValueError(
@@ -102,12 +101,11 @@ def fit_axis_bandwidths(
             f" {LEAST_OF_EACH} failures; there are {wins} and {losses}"
         )
     rng = np.random.default_rng(seed)
-    kept = np.sort(rng.permutation(len(p))[:_TRAINED_MOST])
-    blocks = assign_blocks(p[kept], edge_m=_BLOCK_M)
-    along = DiagonalKernel.of(_START, axes).along(p[kept])
-    held = _HeldOut(
-        along, q[kept], won[kept], flags[kept], blocks.fold, blocks.block, turning=axes is None, rng=rng
-    )
+    kept = np.sort(rng.permutation(len(poses))[:_TRAINED_MOST])
+    poses, won, flags = poses[kept], won[kept], flags[kept]
+    blocks = assign_blocks(poses.positions, edge_m=_BLOCK_M)
+    along = Poses(DiagonalKernel.of(_START, axes).along(poses.positions), poses.quaternions_xyzw)
+    held = _HeldOut(along, won, flags, blocks, turning=axes is None, rng=rng)
     alike = _coordinate_descent(held, _START, ((0, 1, 2), (3, 4, 5)))
     widths = _coordinate_descent(held, alike, tuple((axis,) for axis in range(6)))
     (loss, skill), (alike_loss, alike_skill) = held.verdict(widths), held.verdict(alike)
@@ -128,12 +126,10 @@ class _HeldOut:
 
     def __init__(
         self,
-        p: Floats,
-        q: Floats,
+        poses: Poses,
         won: NDArray[np.bool_],
         symmetric: NDArray[np.bool_],
-        fold: NDArray[np.int64],
-        block: NDArray[np.int64],
+        blocks: Blocks,
         *,
         turning: bool,
         rng: np.random.Generator,
@@ -145,7 +141,7 @@ class _HeldOut:
         few = judged[: max(1, len(judged) // 20)]
         nothing = np.empty(0, dtype=np.int32), np.empty((0, 6), dtype=np.float32)
         first = np.empty(len(few) + 1, dtype=np.int64)
-        every = p, q, symmetric, fold
+        every = poses.positions, poses.quaternions_xyzw, symmetric, blocks.fold
         each = diagonal.near_pairs(*every, few, turning, _REACH, _CUT, first, *nothing) / len(few)
         judged = judged[: max(50, int(_PAIRS_MOST / max(1.2 * each, 1.0)))]
         room = min(_PAIRS_MOST, int(1.5 * each * len(judged)) + 10_000)
@@ -158,9 +154,9 @@ class _HeldOut:
         self.share = float(won.mean())
         shares = {y: np.mean(won == y) / max(np.mean(self.outcome == y), 1e-9) for y in (True, False)}
         self.weight = np.where(self.outcome, shares[True], shares[False])
-        names = np.unique(block)
+        names = np.unique(blocks.block)
         first_half = rng.permutation(names)[: (len(names) + 1) // 2]
-        self.choosing = np.isin(block[judged], first_half)
+        self.choosing = np.isin(blocks.block[judged], first_half)
         if self.choosing.all() or not self.choosing.any():
             self.choosing = np.arange(len(judged)) % 2 == 0
 

@@ -22,7 +22,6 @@ __all__ = [
     "ReliabilityBin",
     "area_under_curve",
     "assign_blocks",
-    "brier_score",
     "brier_skill",
     "calibrate",
     "expected_calibration_error",
@@ -60,7 +59,7 @@ class Calibration:
     Attributes
     ----------
     brier : float
-        Mean squared difference between prediction and outcome.
+        Mean squared difference between prediction and outcome (Brier 1950).
     skill, skill_low, skill_high : float
         ``1 - brier / (m (1 - m))`` with m the share of successes: 1 is perfect, 0 no better than always
         saying m; interval over blocks (or predictions where none are given).
@@ -121,21 +120,12 @@ def _checked(
     return p, y.astype(bool), w
 
 
-def brier_score(predictions: ArrayLike, outcomes: ArrayLike, *, weights: ArrayLike | None = None) -> float:
-    """Mean squared difference between predicted probability and outcome (Brier 1950); 0 is perfect."""
-    p, y, w = _checked(predictions, outcomes, weights)
-    return float(np.average((p - y) ** 2, weights=w))
-
-
 def brier_skill(predictions: ArrayLike, outcomes: ArrayLike, *, weights: ArrayLike | None = None) -> float:
     """``1 - brier / (m (1 - m))``, m the share of successes; nan where all outcomes are the same."""
     p, y, w = _checked(predictions, outcomes, weights)
-    return _skill(float(np.average((p - y) ** 2, weights=w)), float(np.average(y, weights=w)))
-
-
-def _skill(score: float, share: float) -> float:
+    share = float(np.average(y, weights=w))
     reference = share * (1.0 - share)
-    return 1.0 - score / reference if reference > 0.0 else math.nan
+    return 1.0 - float(np.average((p - y) ** 2, weights=w)) / reference if reference > 0.0 else math.nan
 
 
 def reliability(
@@ -308,7 +298,7 @@ def calibrate(
     if not 0.0 < level < 1.0:
         raise ValueError("level lies between 0 and 1")
     score = float(np.average((p - y) ** 2, weights=w))
-    skill = _skill(score, float(np.average(y, weights=w)))
+    skill = brier_skill(p, y, weights=w)
     group = np.arange(len(p)) if blocks is None else _group(blocks, len(p))
     groups = int(group.max()) + 1
     # Many independent predictions are resampled in 2,000 random groups: the same interval for less.

@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
-from .. import se3
 from .._compiled import diagonal, isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
 from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 
 __all__ = ["PRIOR_TRIALS", "SUCCESS_CUTOFF", "SuccessEstimate", "SuccessKernel", "SuccessModel"]
 
@@ -72,8 +71,7 @@ class SuccessModel:
     @classmethod
     def build(
         cls,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         success: ArrayLike,
         *,
         kernel: SuccessKernel,
@@ -83,7 +81,7 @@ class SuccessModel:
 
         Parameters
         ----------
-        positions, quaternions_xyzw : (N, 3), (N, 4)
+        poses : N
             Every attempt, failures included; attempts that broke off for reasons of their own are left out.
         success : (N,) bool
         kernel
@@ -93,19 +91,19 @@ class SuccessModel:
         Raises
         ------
         ValueError
-            For wrong shapes or values that are not finite.
+            For wrong shapes.
         """
-        return cls(kernel, None, None).extend(positions, quaternions_xyzw, success, symmetric)
+        return cls(kernel, None, None).extend(poses, success, symmetric)
 
     def extend(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         success: ArrayLike,
         symmetric: ArrayLike | bool = True,
     ) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
-        p, q, won, flags = checked_attempts(positions, quaternions_xyzw, success, symmetric)
+        won, flags = checked_outcomes(success, symmetric, len(poses))
+        p, q = poses.positions, poses.quaternions_xyzw
         if isinstance(self.kernel, IsotropicKernel):
             widest = self.kernel.sigma_position_m
         else:
@@ -113,7 +111,7 @@ class SuccessModel:
             p, widest = self.kernel.along(p), max(self.kernel.sigmas[:3])
         parts: list[Cells | None] = []
         for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
-            columns = se3.Poses(p[chosen], q[chosen]), np.ones(int(chosen.sum())), flags[chosen]
+            columns = Poses(p[chosen], q[chosen]), np.ones(int(chosen.sum())), flags[chosen]
             if not len(columns[0]):
                 parts.append(present)
             elif present is None:
@@ -143,14 +141,13 @@ class SuccessModel:
 
     def evaluate(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         level: float = 0.9,
         cutoff: float = SUCCESS_CUTOFF,
         threads: int = 1,
     ) -> SuccessEstimate:
-        """Success probability with its interval at poses (M, 3), (M, 4).
+        """Success probability with its interval at M poses.
 
         Raises
         ------
@@ -159,7 +156,7 @@ class SuccessModel:
         """
         if not 0.0 < level < 1.0:
             raise ValueError(f"level must be between 0 and 1, not {level!r}")
-        probability, trials, alpha, beta = self._beta(positions, quaternions_xyzw, cutoff, threads)
+        probability, trials, alpha, beta = self._beta(poses, cutoff, threads)
         tail = 0.5 * (1.0 - level)
         low = _quantiles(alpha, beta, tail, threads)
         high = _quantiles(alpha, beta, 1.0 - tail, threads)
@@ -167,37 +164,32 @@ class SuccessModel:
 
     def probability(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         cutoff: float = SUCCESS_CUTOFF,
         threads: int = 1,
     ) -> Floats:
         """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""
-        return self._beta(positions, quaternions_xyzw, cutoff, threads)[0]
+        return self._beta(poses, cutoff, threads)[0]
 
     def lower_end(
         self,
-        positions: ArrayLike,
-        quaternions_xyzw: ArrayLike,
+        poses: Poses,
         *,
         level: float = 0.9,
         cutoff: float = SUCCESS_CUTOFF,
         threads: int = 1,
     ) -> Floats:
         """The lower end of `evaluate` alone, (M,)."""
-        _, _, alpha, beta = self._beta(positions, quaternions_xyzw, cutoff, threads)
+        _, _, alpha, beta = self._beta(poses, cutoff, threads)
         return _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
 
-    def _beta(
-        self, positions: ArrayLike, quaternions_xyzw: ArrayLike, cutoff: float, threads: int
-    ) -> tuple[Floats, Floats, Floats, Floats]:
+    def _beta(self, poses: Poses, cutoff: float, threads: int) -> tuple[Floats, Floats, Floats, Floats]:
         """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
         if not self.size:
             raise ValueError("a success probability needs at least one attempt")
-        p, q = se3.Poses.of(positions, quaternions_xyzw)
-        won = self._sums(self._succeeded, p, q, cutoff, threads)
-        lost = self._sums(self._failed, p, q, cutoff, threads)
+        won = self._sums(self._succeeded, poses, cutoff, threads)
+        lost = self._sums(self._failed, poses, cutoff, threads)
         prior = self.prior_share
         total, squares = (won + lost).T
         probability, trials, share = shrunk_share(won[:, 0], total, squares, prior)
@@ -210,12 +202,13 @@ class SuccessModel:
             alpha, beta = alpha + (softened - prior), beta - (softened - prior)
         return probability, trials, alpha, beta
 
-    def _sums(self, cells: Cells | None, p: Floats, q: Floats, cutoff: float, threads: int) -> Floats:
+    def _sums(self, cells: Cells | None, poses: Poses, cutoff: float, threads: int) -> Floats:
         """Sums of k and k^2 (M, 2)."""
-        out = np.zeros((len(p), 2))
+        out = np.zeros((len(poses), 2))
         radius = scaled_radius(cutoff)
-        if cells is None or not len(p):
+        if cells is None or not len(poses):
             return out
+        p, q = poses.positions, poses.quaternions_xyzw
         kernel = self.kernel
         if isinstance(kernel, DiagonalKernel):
             p = kernel.along(p)
@@ -272,15 +265,14 @@ def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Float
     return out
 
 
-def checked_attempts(
-    positions: ArrayLike, quaternions_xyzw: ArrayLike, success: ArrayLike, symmetric: ArrayLike | bool
-) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Attempts as arrays of one length, or a `ValueError` that says what is wrong."""
-    p, q = se3.Poses.of(positions, quaternions_xyzw)
+def checked_outcomes(
+    success: ArrayLike, symmetric: ArrayLike | bool, count: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether attempts (N,) succeeded and their jaws are symmetric, checked."""
     won = np.asarray(success)
-    if won.shape != (len(p),) or won.dtype != np.bool_:
-        raise ValueError(f"success must be bools of shape ({len(p)},), not {won.dtype} of shape {won.shape}")
+    if won.shape != (count,) or won.dtype != np.bool_:
+        raise ValueError(f"success must be bools of shape ({count},), not {won.dtype} of shape {won.shape}")
     flags = np.asarray(symmetric, dtype=bool)
-    if flags.ndim and flags.shape != (len(p),):
-        raise ValueError(f"symmetric is one flag or has shape ({len(p)},), not {flags.shape}")
-    return p, q, won, np.broadcast_to(flags, (len(p),))
+    if flags.ndim and flags.shape != (count,):
+        raise ValueError(f"symmetric is one flag or has shape ({count},), not {flags.shape}")
+    return won, np.broadcast_to(flags, (count,))

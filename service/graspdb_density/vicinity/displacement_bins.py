@@ -1,5 +1,5 @@
-"""What the two ways to measure a grasp's vicinity share: how displacements are binned and aligned, weighted
-tallies of what became of them, and the report made of those.
+"""What the two ways to measure a grasp's vicinity share: how displacements are binned and aligned, how the
+grasps are resampled, and the report made of weighted tallies.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import se3
-from ..se3 import Floats
+from .._compiled.pairs import Tally
+from ..se3 import Floats, Poses
 from .half_width import Tolerance, quantiles, tolerances
 
 __all__ = [
@@ -22,19 +23,17 @@ __all__ = [
     "Alignment",
     "Anisotropy",
     "Bins",
-    "Counts",
     "Frames",
     "Histogram",
-    "Tallies",
     "aligned_axes",
+    "bootstrap_weights",
     "check_enough",
-    "report",
-    "resampling",
+    "summary",
 ]
 
 Alignment = Literal["gripper", "object", "edge", "surface-pair"]
-#: Axes of grasps: an array, or what tells those (n, 3, 3) of poses (n, 3), (n, 4).
-Frames = ArrayLike | Callable[[Floats, Floats], Floats]
+#: Axes of grasps: an array, or what tells those (n, 3, 3) of poses (n).
+Frames = ArrayLike | Callable[[Poses], Floats]
 #: Fewer successes than this say nothing about their vicinity.
 LEAST_SUCCESSES = 20
 PLANES = (("rx", "ry"), ("rx", "rz"), ("ry", "rz"))
@@ -79,6 +78,18 @@ class Bins:
         reach, step = (self.reach_m, self.profile_m) if kind == "position" else (self.reach, self.profile)
         return 2 * max(1, round(reach / step)) + 1
 
+    def side(self) -> Floats:
+        """Edges in x and y, metres."""
+        return np.linspace(-self.extent_m, self.extent_m, self.across + 1)
+
+    def depth(self) -> Floats:
+        """Edges of the slices in z, metres."""
+        return np.asarray((np.arange(self.slices + 1) - 0.5 * self.slices) * self.slice_m)
+
+    def circle(self) -> Floats:
+        """Edges of the angles, radians."""
+        return np.asarray((np.arange(self.angles + 1) - 0.5) * (2.0 * math.pi / self.angles) - math.pi)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Histogram:
@@ -94,7 +105,7 @@ class Histogram:
     probability, low, high : (n, n)
         First axis first; nan where nothing was tried.
     count : (n, n) int64
-        Pairs (empirical; one counts at its mirror image too) or evaluations (smoothed) behind each bin.
+        Pairs (empirical; one counts at its mirror image too) or evaluations (of a density) behind each bin.
     """
 
     axes: tuple[str, str]
@@ -112,7 +123,7 @@ class Anisotropy:
     along and about every axis.
 
     ``grasps`` successes A were displaced, ``aligned`` of them along axes of their own, the others along the
-    gripper's; ``translation_pairs`` and ``rotation_pairs`` are pairs of trials, 0 for the smoothed method.
+    gripper's; ``translation_pairs`` and ``rotation_pairs`` are pairs of trials, 0 for the density's method.
     Intervals hold with probability ``level``.
     """
 
@@ -128,44 +139,6 @@ class Anisotropy:
     aligned: int
 
 
-@dataclass(eq=False, slots=True)
-class Counts:
-    """Weighted tallies, column 0 as observed and one for every resample: (bins, 1 + resamples)."""
-
-    tried: NDArray[np.float32]
-    won: NDArray[np.float32]
-    pairs: NDArray[np.int64]
-    moved: Floats
-
-    @classmethod
-    def empty(cls, bins: int, columns: int) -> Counts:
-        return cls(
-            np.zeros((bins, columns), dtype=np.float32),
-            np.zeros((bins, columns), dtype=np.float32),
-            np.zeros(bins, dtype=np.int64),
-            np.zeros(bins),
-        )
-
-    def mirror(self, images: NDArray[np.int64], *, turns: NDArray[np.bool_] | None = None) -> None:
-        """Add to every bin what was counted in its mirror image."""
-        for name in ("tried", "won", "pairs"):
-            value = getattr(self, name)
-            setattr(self, name, value + value[images])
-        sign = np.ones(len(images)) if turns is None else np.where(turns, -1.0, 1.0)
-        self.moved = self.moved + sign * self.moved[images]
-
-    def probability(self) -> Floats:
-        """(bins, 1 + resamples), nan where nothing was tried."""
-        tried = self.tried.astype(np.float64)
-        return np.asarray(np.where(tried > 0.0, self.won / np.where(tried > 0.0, tried, 1.0), np.nan))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Tallies:
-    planes: Counts
-    lines: Counts
-
-
 def check_enough(successes: int) -> None:
     """Refuse a statement from too few successes."""
     if successes < LEAST_SUCCESSES:
@@ -176,10 +149,11 @@ def check_enough(successes: int) -> None:
 
 
 def aligned_axes(
-    alignment: Alignment, frames: Frames | None, p: Floats, q: Floats, grasps: NDArray[np.int64]
+    alignment: Alignment, frames: Frames | None, poses: Poses, grasps: NDArray[np.int64]
 ) -> tuple[Floats, int]:
     """Frames (A, 3, 3) of the grasps, and how many have one of their own rather than the gripper's."""
-    own = se3.to_matrix(q[grasps])
+    chosen = poses[grasps]
+    own = se3.to_matrix(chosen.quaternions_xyzw)
     if alignment == "gripper":
         if frames is not None:
             raise ValueError("alignment with the gripper takes no frames")
@@ -195,12 +169,8 @@ def aligned_axes(
         f = np.broadcast_to(f, (len(grasps), 3, 3))
         known = np.ones(len(grasps), dtype=bool)
     else:
-        if callable(frames):
-            f = np.asarray(frames(p[grasps], q[grasps]), dtype=np.float64)
-            expected = len(grasps)
-        else:
-            f = np.asarray(frames, dtype=np.float64)
-            expected = len(q)
+        f = np.asarray(frames(chosen) if callable(frames) else frames, dtype=np.float64)
+        expected = len(grasps) if callable(frames) else len(poses)
         if f.shape != (expected, 3, 3):
             raise ValueError(f"frames of grasps have shape ({expected}, 3, 3), not {f.shape}")
         f = f if callable(frames) else f[grasps]
@@ -212,7 +182,7 @@ def aligned_axes(
     return np.ascontiguousarray(f), int(known.sum())
 
 
-def resampling(
+def bootstrap_weights(
     weights: ArrayLike | None, grasps: NDArray[np.int64], rows: int, rng: np.random.Generator
 ) -> NDArray[np.float32]:
     """Weight of every A as observed and in each resample of the grasps, (A, 1 + resamples)."""
@@ -227,40 +197,38 @@ def resampling(
     return np.ascontiguousarray(columns.T, dtype=np.float32)
 
 
-def report(
+def summary(
+    layout: Bins,
+    along: tuple[Tally, Tally],
+    about: tuple[Tally, Tally],
+    *,
     method: str,
     alignment: Alignment,
-    layout: Bins,
-    along: Tallies,
-    about: Tallies,
     grasps: int,
-    used: tuple[int, int],
-    level: float,
     aligned: int,
+    pairs: tuple[int, int],
+    level: float,
 ) -> Anisotropy:
-    """Tallies along translations and about rotations as the report."""
+    """The report of tallies in planes and on lines, along translations and about rotations."""
     if not 0.0 < level < 1.0:
         raise ValueError("level lies between 0 and 1")
-    side: Floats = np.linspace(-layout.extent_m, layout.extent_m, layout.across + 1)
-    depth = (np.arange(layout.slices + 1) - 0.5 * layout.slices) * layout.slice_m
-    circle = np.asarray(np.arange(layout.angles + 1) - 0.5, dtype=np.float64)
-    circle = circle * (2.0 * math.pi / layout.angles) - math.pi
+    side, depth, circle = layout.side(), layout.depth(), layout.circle()
     cells = (layout.slices, layout.across, layout.across)
     translations = tuple(
         Histogram(("x", "y"), (side, side), (float(depth[i]), float(depth[i + 1])), *parts)
-        for i, parts in enumerate(_quantiles(along.planes, cells, level))
+        for i, parts in enumerate(_quantiles(along[0], cells, level))
     )
     rotations = tuple(
         Histogram(PLANES[i], (circle, circle), None, *parts)
-        for i, parts in enumerate(_quantiles(about.planes, (3, layout.angles, layout.angles), level))
+        for i, parts in enumerate(_quantiles(about[0], (3, layout.angles, layout.angles), level))
     )
     lines: list[Tolerance] = []
-    for counts, names, step in (
-        (along.lines, ("x", "y", "z"), layout.profile_m),
-        (about.lines, ("rx", "ry", "rz"), layout.profile),
+    for tally, names, step in (
+        (along[1], ("x", "y", "z"), layout.profile_m),
+        (about[1], ("rx", "ry", "rz"), layout.profile),
     ):
         lines += tolerances(
-            names, counts.probability(), counts.tried, counts.pairs, counts.moved, step=step, level=level
+            names, _probability(tally), tally.tried, tally.pairs, tally.moved, step=step, level=level
         )
     return Anisotropy(
         method=method,
@@ -269,21 +237,27 @@ def report(
         rotations=rotations,
         tolerances=tuple(lines),
         grasps=grasps,
-        translation_pairs=used[0],
-        rotation_pairs=used[1],
+        translation_pairs=pairs[0],
+        rotation_pairs=pairs[1],
         level=level,
         aligned=aligned,
     )
 
 
+def _probability(tally: Tally) -> Floats:
+    """(bins, 1 + resamples), nan where nothing was tried."""
+    tried = tally.tried.astype(np.float64)
+    return np.asarray(np.where(tried > 0.0, tally.won / np.where(tried > 0.0, tried, 1.0), np.nan))
+
+
 def _quantiles(
-    counts: Counts, shape: tuple[int, int, int], level: float
+    tally: Tally, shape: tuple[int, int, int], level: float
 ) -> list[tuple[Floats, Floats, Floats, NDArray[np.int64]]]:
     """Probability, interval and pairs of every histogram."""
-    value = counts.probability()
+    value = _probability(tally)
     low, high = quantiles(value[:, 1:], level)
     # Resamples may have left out every A of a bin; a bin whose few pairs agree has no spread to resample.
     low, high = np.fmin(low, value[:, 0]), np.fmax(high, value[:, 0])
     parts = [array.reshape(shape) for array in (value[:, 0], low, high)]
-    number = counts.pairs.reshape(shape)
+    number = tally.pairs.reshape(shape)
     return [(parts[0][i], parts[1][i], parts[2][i], number[i]) for i in range(shape[0])]

@@ -9,29 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import se3
+from .._compiled.pairs import Tally
 from ..kde import brute_force
 from ..kde.isotropic import GraspDensity
 from ..kde.weighted_sums import Progress
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from .displacement_bins import (
     Alignment,
     Anisotropy,
     Bins,
-    Counts,
     Frames,
-    Tallies,
     aligned_axes,
+    bootstrap_weights,
     check_enough,
-    report,
-    resampling,
+    summary,
 )
 
-__all__ = ["attempt_density", "smoothed"]
+__all__ = ["density_anisotropy"]
+
+#: Attempts per m^3 rad^3: everywhere the same, or a function of poses.
+Attempts = float | Callable[[Poses], Floats]
 
 
-def smoothed(
+def density_anisotropy(
     successes: GraspDensity,
-    attempts: float | Callable[[Floats, Floats], Floats],
+    attempts: Attempts,
     *,
     alignment: Alignment = "gripper",
     frames: Frames | None = None,
@@ -52,9 +54,9 @@ def smoothed(
     successes : GraspDensity
     attempts : float or callable
         Attempts per m^3 rad^3, twins sharing one attempt: for a grid its attempts / (8 pi^2 times its
-        volume); or a function of poses, see `attempt_density`.
+        volume); or a function of poses, such as their number times their density.
     alignment, frames
-        As for `empirical`; frames (N, 3, 3) are those of the rows of ``successes``.
+        As for `empirical_anisotropy`; frames (N, 3, 3) are those of the rows of ``successes``.
     max_grasps : int
         Successes A, drawn at random by weight.
 
@@ -70,63 +72,66 @@ def smoothed(
     rng = np.random.default_rng(seed)
     count = min(max_grasps, successes.size)
     grasps = rng.choice(successes.size, size=count, replace=False, p=successes.weights).astype(np.int64)
-    axes, aligned = aligned_axes(alignment, frames, successes.positions, successes.quaternions_xyzw, grasps)
-    share = resampling(None, grasps, successes.size, rng)
-    moves = _bin_moves(layout)
-    values: list[Floats] = []
+    poses = Poses(successes.positions, successes.quaternions_xyzw)
+    axes, aligned = aligned_axes(alignment, frames, poses, grasps)
+    share = bootstrap_weights(None, grasps, successes.size, rng)
+    corners = [
+        _plane_translations(layout),
+        _line_displacements(layout.line("position"), layout.profile_m, 0),
+        _plane_rotations(layout),
+        _line_displacements(layout.line("rotation"), layout.profile, 3),
+    ]
+    low, high = (np.concatenate(ends) for ends in zip(*corners, strict=True))
+    values = np.empty((count, len(low)))
     for number, a in enumerate(grasps):
-        vectors = [_drawn(low, high, rng) for low, high in moves]
-        values.append(_shares(successes, attempts, int(a), axes[number], alignment, vectors, rng, threads))
+        moves = low + (high - low) * rng.random(low.shape)
+        values[number] = _shares(successes, attempts, int(a), axes[number], alignment, moves, rng, threads)
         if progress is not None:
             progress((number + 1) / count)
-    table = np.array(values)
-    parts = np.split(table, np.cumsum([len(low) for low, _ in moves])[:-1], axis=1)
-    counts = [_mean_counts(part, share) for part in parts]
-    for line, (low, high), columns in ((counts[1], moves[1], (0, 1, 2)), (counts[3], moves[3], (3, 4, 5))):
-        line.moved = (0.5 * (low + high))[:, columns].sum(axis=1) * line.pairs
-    along, about = Tallies(counts[0], counts[1]), Tallies(counts[2], counts[3])
-    return report("density", alignment, layout, along, about, count, (0, 0), level, aligned)
+    bounds = np.cumsum([len(first) for first, _ in corners])[:-1]
+    parts = zip(np.split(values, bounds, axis=1), np.split(0.5 * (low + high), bounds), strict=True)
+    planes, lines, turned_planes, turned_lines = (_mean_tally(part, share, middle) for part, middle in parts)
+    return summary(
+        layout,
+        (planes, lines),
+        (turned_planes, turned_lines),
+        method="density",
+        alignment=alignment,
+        grasps=count,
+        aligned=aligned,
+        pairs=(0, 0),
+        level=level,
+    )
 
 
-def attempt_density(attempts: GraspDensity) -> Callable[[Floats, Floats], Floats]:
-    """Attempts per m^3 rad^3 around poses, for `smoothed`, from the density of all of them."""
-    return lambda p, q: attempts.size * attempts.density(se3.Poses(p, q))
+def _plane_translations(layout: Bins) -> tuple[Floats, Floats]:
+    """Corners (n, 6) of the bins of the histograms of translations.
 
-
-def _bin_moves(layout: Bins) -> list[tuple[Floats, Floats]]:
-    """Corners (n, 6) of the displacements of every bin: planes and lines of translations, then of rotations.
-
-    Rotations are stored as angles about x, y, z, composed in that order.
+    Displacements are translations, then angles about x, y, z, composed in that order.
     """
-    result: list[tuple[Floats, Floats]] = []
-    side = np.linspace(-layout.extent_m, layout.extent_m, layout.across + 1)
-    depth = (np.arange(layout.slices + 1) - 0.5 * layout.slices) * layout.slice_m
-    cells = np.stack(
-        np.meshgrid(*(np.arange(n) for n in (layout.slices, layout.across, layout.across)), indexing="ij"),
-        axis=-1,
-    ).reshape(-1, 3)
-    low, high = np.zeros((len(cells), 6)), np.zeros((len(cells), 6))
+    slice_, x, y = np.indices((layout.slices, layout.across, layout.across)).reshape(3, -1)
+    side, depth = layout.side(), layout.depth()
+    low, high = np.zeros((len(x), 6)), np.zeros((len(x), 6))
     for corner, shift in ((low, 0), (high, 1)):
-        corner[:, 0], corner[:, 1] = side[cells[:, 1] + shift], side[cells[:, 2] + shift]
-        corner[:, 2] = depth[cells[:, 0] + shift]
-    result.append((low, high))
-    result.append(_line_moves(layout.line("position"), layout.profile_m, 0))
-    step = 2.0 * math.pi / layout.angles
-    start = (np.arange(layout.angles) - 0.5) * step - math.pi
-    low = np.zeros((3, layout.angles, layout.angles, 6))
-    for plane, (a, b) in enumerate(((3, 4), (3, 5), (4, 5))):
-        low[plane, :, :, a] = start[:, None]
-        low[plane, :, :, b] = start[None, :]
-    low = low.reshape(-1, 6)
-    used = np.zeros((3, layout.angles**2, 6))
-    for plane, pair in enumerate(((3, 4), (3, 5), (4, 5))):
-        used[plane, :, pair] = step
-    result.append((low, low + used.reshape(-1, 6)))
-    result.append(_line_moves(layout.line("rotation"), layout.profile, 3))
-    return result
+        corner[:, 0], corner[:, 1], corner[:, 2] = side[x + shift], side[y + shift], depth[slice_ + shift]
+    return low, high
 
 
-def _line_moves(count: int, step: float, first: int) -> tuple[Floats, Floats]:
+def _plane_rotations(layout: Bins) -> tuple[Floats, Floats]:
+    """Corners (n, 6) of the bins of the histograms of rotations."""
+    step, start = 2.0 * math.pi / layout.angles, layout.circle()
+    plane, i, j = np.indices((3, layout.angles, layout.angles)).reshape(3, -1)
+    low, row = np.zeros((len(plane), 6)), np.arange(len(plane))
+    first, second = np.array([3, 3, 4])[plane], np.array([4, 5, 5])[plane]
+    low[row, first], low[row, second] = start[i], start[j]
+    high = low.copy()
+    high[row, first] += step
+    high[row, second] += step
+    return low, high
+
+
+def _line_displacements(count: int, step: float, first: int) -> tuple[Floats, Floats]:
+    """Corners (n, 6) of the bins of three profiles, along or about the axes from ``first`` on."""
     low, high = np.zeros((3, count, 6)), np.zeros((3, count, 6))
     for axis in range(3):
         centre = (np.arange(count) - count // 2) * step
@@ -134,22 +139,17 @@ def _line_moves(count: int, step: float, first: int) -> tuple[Floats, Floats]:
     return low.reshape(-1, 6), high.reshape(-1, 6)
 
 
-def _drawn(low: Floats, high: Floats, rng: np.random.Generator) -> Floats:
-    return np.asarray(low + (high - low) * rng.random(low.shape), dtype=np.float64)
-
-
 def _shares(
     successes: GraspDensity,
-    attempts: float | Callable[[Floats, Floats], Floats],
+    attempts: Attempts,
     row: int,
     frame: Floats,
     alignment: Alignment,
-    vectors: list[Floats],
+    moves: Floats,
     rng: np.random.Generator,
     threads: int,
 ) -> Floats:
     """``min(1, n d(T(A)) / rho)`` for one A and one displacement in every bin."""
-    moves = np.concatenate(vectors)
     twin = bool(successes.symmetric[row])
     own = successes.quaternions_xyzw[row]
     # Either twin may be the one displaced: for frames that turn with the jaw that mirrors x and y.
@@ -175,15 +175,16 @@ def _shares(
         turned_centre = se3.Poses(centre.positions, se3.jaw_twin(own))
         mine = 0.5 * (mine + np.exp(brute_force.kernel_log_density(kernel, poses, turned_centre)))
     rest = np.maximum(density - weight * mine, 0.0) * successes.size
-    rho = attempts(p, q) if callable(attempts) else attempts
+    rho = attempts(Poses(p, q)) if callable(attempts) else attempts
     with np.errstate(divide="ignore", invalid="ignore"):
         quotient = np.where(rest > 0.0, rest / rho, 0.0)
     return np.asarray(np.minimum(1.0, quotient), dtype=np.float64)
 
 
-def _mean_counts(values: Floats, share: NDArray[np.float32]) -> Counts:
-    """Tallies of shares (A, bins) in the place of successes."""
+def _mean_tally(values: Floats, share: NDArray[np.float32], middle: Floats) -> Tally:
+    """Tally of shares (A, bins) in the place of successes; ``middle`` (bins, 6) of the displacements."""
     bins = values.shape[1]
     tried = np.broadcast_to(share.sum(axis=0), (bins, share.shape[1])).astype(np.float32)
     won = (values.T @ share.astype(np.float64)).astype(np.float32)
-    return Counts(tried, won, np.full(bins, len(values), dtype=np.int64), np.zeros(bins))
+    pairs = np.full(bins, len(values), dtype=np.int64)
+    return Tally(tried, won, pairs, middle.sum(axis=1) * pairs)

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from .._compiled.options import exact
 from ..se3 import Floats
 
-__all__ = ["MARGIN", "Profiles"]
+__all__ = ["LatticeProfiles"]
 
 #: Bins beyond a profile's reach whose pairs its outermost bins still weigh.
-MARGIN = 2
-#: A grid's step, in tolerances: pairs are off the axis by half a step at most.
+_MARGIN = 2
+#: A grid's step, of the largest offset: pairs are off the axis by half a step at most.
 _STEP = 2.0
 #: How far around a bin pairs tell slopes, in steps: fewer make those noisy, more make them another place's.
 _AROUND = 2.5
@@ -46,7 +46,7 @@ _RIDGE = 1e-3
 _BLOCK = 256
 
 
-class Profiles:
+class LatticeProfiles:
     """Pairs near three axes by grasp, in bins of displacement of ``step``, the middle one about 0.
 
     Parameters
@@ -55,18 +55,18 @@ class Profiles:
         Successes A; 0 where trials are on no grid.
     bins : int
         Of each profile, odd.
-    step, tolerance : float
+    step, off_axis : float
         Width of a bin, and how far pairs may be off an axis: metres or radians.
 
     Attributes
     ----------
-    found : (grasps, 3, bins and margins, 5)
+    pair_sums : (grasps, 3, bins and margins, 5)
         Where the loops over pairs note number, successes, and sums of displacements and of both offsets.
     """
 
-    def __init__(self, grasps: int, bins: int, step: float, tolerance: float) -> None:
-        self.bins, self.step, self.tolerance = bins, step, tolerance
-        self.found: Floats = np.zeros((grasps, 3, bins + 2 * MARGIN, 5))
+    def __init__(self, grasps: int, bins: int, step: float, off_axis: float) -> None:
+        self.bins, self.step, self.off_axis = bins, step, off_axis
+        self.pair_sums: Floats = np.zeros((grasps, 3, bins + 2 * _MARGIN, 5))
 
     def shares(self, weights: NDArray[np.float32], *, mirrored: bool) -> tuple[Floats, Floats]:
         """Share that succeeds at each bin's middle, and its weight; nan without pairs.
@@ -86,7 +86,7 @@ class Profiles:
         if mirrored:
             sums[:, :2] += sums[:, :2, ::-1].copy()
         away = np.abs(np.arange(self.bins) - middle)
-        own = np.clip(1.0 - away * self.step / (_STEP * self.tolerance), 0.0, None) * sums[..., 4]
+        own = np.clip(1.0 - away * self.step / (_STEP * self.off_axis), 0.0, None) * sums[..., 4]
         weight = sums[..., 0] + own
         with np.errstate(divide="ignore", invalid="ignore"):
             plain = (sums[..., 1] + own) / weight
@@ -103,8 +103,8 @@ class Profiles:
     def _slopes(self, fall: Floats, weights: NDArray[np.float32]) -> Floats:
         """Share lost by offset, of what there is, (columns, 3, bins // 2 + 1, 2)."""
         sums = self._summed(weights, _EQUATIONS, fall)
-        # Offsets in tolerances, so that the numbers are alike.
-        scale = np.array([1.0, self.tolerance, self.tolerance])
+        # Offsets of the largest, so that the numbers are alike.
+        scale = np.array([1.0, self.off_axis, self.off_axis])
         matrix = sums[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*sums.shape[:-1], 3, 3)
         matrix = matrix / (scale[:, None] * scale)
         trace = np.trace(matrix, axis1=-2, axis2=-1)
@@ -123,19 +123,19 @@ class Profiles:
             found = np.zeros_like(slopes)
             found[..., [i - 1 for i in used[1:]]] = solved[..., 1:]
             slopes = np.where(better[..., None], found, slopes)
-        return np.asarray(slopes / self.tolerance, dtype=np.float64)
+        return np.asarray(slopes / self.off_axis, dtype=np.float64)
 
     def _summed(self, weights: NDArray[np.float32], number: int, fall: Floats | None = None) -> Floats:
         """Sums over the grasps of what the compiled loops tell of each, (columns, 3, bins, number)."""
         rows = self.bins if fall is None else self.bins // 2 + 1
         total = np.zeros((weights.shape[1], 3 * rows * number))
-        for begin in range(0, len(self.found), _BLOCK):
-            found = self.found[begin : begin + _BLOCK]
+        for begin in range(0, len(self.pair_sums), _BLOCK):
+            found = self.pair_sums[begin : begin + _BLOCK]
             each = np.zeros((len(found), 3, rows, number))
             if fall is None:
-                _sum_shares(found, self.step, _STEP * self.tolerance, each)
+                _sum_shares(found, self.step, _STEP * self.off_axis, each)
             else:
-                _sum_equations(found, fall, self.step, _AROUND * _STEP * self.tolerance, each)
+                _sum_equations(found, fall, self.step, _AROUND * _STEP * self.off_axis, each)
             part = each.reshape(len(found), total.shape[1]).astype(np.float32)
             total += weights[begin : begin + _BLOCK].T @ part
         return total.reshape(-1, 3, rows, number)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .. import se3
 from ..se3 import Floats
@@ -40,18 +40,13 @@ class Candidates:
         total = np.concatenate([[0], np.cumsum(self.runs[:, 1] - self.runs[:, 0])])
         return np.asarray(total[self.first[1:]] - total[self.first[:-1]], dtype=np.int64)
 
-    def head(self, count: int) -> Candidates:
-        """Those of the first grasps only."""
-        return Candidates(self.order, self.first[: count + 1], self.runs)
 
-
-def same_key(keys: ArrayLike, grasps: Ints) -> Candidates:
+def same_key(keys: Ints, grasps: Ints) -> Candidates:
     """Rows with the same key as each grasp."""
-    k = np.asarray(keys, dtype=np.int64)
-    order = np.argsort(k, kind="stable").astype(np.int64)
-    ordered = k[order]
-    begin = np.searchsorted(ordered, k[grasps], side="left")
-    end = np.searchsorted(ordered, k[grasps], side="right")
+    order = np.argsort(keys, kind="stable").astype(np.int64)
+    ordered = keys[order]
+    begin = np.searchsorted(ordered, keys[grasps], side="left")
+    end = np.searchsorted(ordered, keys[grasps], side="right")
     return Candidates(order, np.arange(len(grasps) + 1), np.stack([begin, end], axis=1).astype(np.int64))
 
 

@@ -161,6 +161,7 @@ def _to_tool(v: FloatArray, p: FloatArray, r: FloatArray, out: FloatArray) -> No
     out[2] = r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz
 
 
+# long: a chain of tests, cheapest first, in one compiled loop.
 @nb.njit(cache=True)
 def _near(
     part: int,
@@ -241,6 +242,7 @@ def _near(
     return mask
 
 
+# long: two loops over the same poses that share their buffers.
 @nb.njit(cache=True, nogil=True)
 def classify(
     positions: FloatArray,

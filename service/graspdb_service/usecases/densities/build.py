@@ -340,7 +340,9 @@ def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelI
         weights = importance_weights(proposal[first])
         weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
     position, quaternion, symmetric = (column[first] for column in poses)
-    found = choose_widths(position, quaternion, weights=weights, symmetric=symmetric, threads=threads)
+    found = choose_widths(
+        se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric, threads=threads
+    )
     return KernelInfo(
         kind="isotropic",
         sigma_position_m=found.kernel.sigma_position_m,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
+from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases.densities.cache import Built
@@ -136,7 +137,7 @@ class Successes:
 
             def work(part: slice) -> None:
                 answer = model.whole.evaluate(
-                    positions[part], quaternions[part], level=LEVEL, threads=self._compute.threads
+                    Poses.of(positions[part], quaternions[part]), level=LEVEL, threads=self._compute.threads
                 )
                 estimates.probability[part] = answer.probability
                 estimates.low[part], estimates.high[part] = answer.low, answer.high
@@ -191,7 +192,7 @@ def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts
 def _extended(old: SuccessModel | None, new: _Columns, kernel: SuccessKernel) -> SuccessModel | None:
     if not len(new.success):
         return old
-    columns = new.position, new.quaternion, new.success
+    columns = Poses.of(new.position, new.quaternion), new.success
     if old is not None:
         return old.extend(*columns, symmetric=new.symmetric)
     return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)

@@ -94,9 +94,9 @@ def success_score(
             return values
         p, q = positions[index], quaternions[index]
         if column == "low":
-            values[index] = model.lower_end(p, q, level=LEVEL, threads=threads)
+            values[index] = model.lower_end(Poses.of(p, q), level=LEVEL, threads=threads)
         else:
-            values[index] = model.probability(p, q, threads=threads)
+            values[index] = model.probability(Poses.of(p, q), threads=threads)
         return values
 
     return score

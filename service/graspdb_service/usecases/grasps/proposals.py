@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from graspdb.wire import ProposalsRequest
 from graspdb.wire.queries import Strategy
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
+from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import PRIOR_TRIALS
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases.densities.cache import kernel_of
@@ -121,7 +122,7 @@ def uncertain(
     p, q = p[kept], q[kept]
     if not len(p):
         return None
-    found = model.evaluate(p, q, threads=threads)
+    found = model.evaluate(Poses.of(p, q), threads=threads)
     trials = PRIOR_TRIALS + found.effective_trials
     gain = found.probability * (1.0 - found.probability) / (trials + 1.0) ** 2
     # Weights are told apart in float32.

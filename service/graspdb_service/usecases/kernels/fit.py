@@ -24,6 +24,7 @@ from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
 from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacements, fit_kernel
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage import kernels
 from graspdb_service.storage.kernels import KernelRow
@@ -135,8 +136,7 @@ def _fit(
     assert density is not None
     assert not isinstance(count, list)
     fit = fit_kernel(
-        density.positions,
-        density.quaternions_xyzw,
+        Poses.of(density.positions, density.quaternions_xyzw),
         window=_window(window),
         widths=_isotropic(widths),
         compared=density.kernel,
@@ -166,8 +166,7 @@ def _sample(
     assert density is not None
     count = request.components if isinstance(request.components, int) else SAMPLED
     found = displacements(
-        density.positions,
-        density.quaternions_xyzw,
+        Poses.of(density.positions, density.quaternions_xyzw),
         window=_window(window),
         rng=rng,
         weights=density.weights,

@@ -19,15 +19,11 @@ from graspdb.wire.reports import (
 )
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.vicinity.anisotropy import (
-    LEAST_SUCCESSES,
-    Anisotropy,
-    Frames,
-    Tolerance,
-    attempt_density,
-    empirical,
-    smoothed,
-)
+from graspdb_density.se3 import Poses
+from graspdb_density.vicinity.anisotropy import empirical_anisotropy
+from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES, Anisotropy, Frames
+from graspdb_density.vicinity.displacement_density import density_anisotropy
+from graspdb_density.vicinity.half_width import Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities import stored_kernel
@@ -73,7 +69,10 @@ def anisotropy_report(
     inputs: ReportInputs, built: Built, options: AnisotropyOptions, progress: Progress
 ) -> AnisotropyReport:
     method, alignment = options.method, options.alignment
-    frames = stored_kernel.axes(alignment, built.selected, inputs.scenes.features)
+    axes = stored_kernel.axes(alignment, built.selected, inputs.scenes.features)
+    frames: Frames | None = (
+        (lambda poses: axes(poses.positions, poses.quaternions_xyzw)) if callable(axes) else axes
+    )
     successes = built.selected.successes
     if successes < LEAST_SUCCESSES:
         raise conflict(
@@ -129,7 +128,7 @@ def _measure(
         density = built.density
         assert density is not None
         local = _local_attempts(everything, density.kernel)
-        return lambda alignment, frames, progress: smoothed(
+        return lambda alignment, frames, progress: density_anisotropy(
             density,
             local,
             alignment=alignment,
@@ -143,9 +142,8 @@ def _measure(
         weights = importance_weights(everything.proposal)
     keys = everything.keys
     symmetric = bool(everything.symmetric.all())
-    return lambda alignment, frames, progress: empirical(
-        everything.position,
-        everything.quaternion,
+    return lambda alignment, frames, progress: empirical_anisotropy(
+        Poses.of(everything.position, everything.quaternion),
         everything.success,
         rotation_keys=None if keys is None else keys[0],
         position_keys=None if keys is None else keys[1],
@@ -185,7 +183,7 @@ def _tolerances(found: Anisotropy, built: Built) -> tuple[list[AnisotropyToleran
     return tolerances, warnings
 
 
-def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Floats, Floats], Floats]:
+def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Poses], Floats]:
     """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
     rows = np.arange(len(everything))
     if len(rows) > _LOCAL_ATTEMPTS:
@@ -195,8 +193,7 @@ def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[
         kernel=kernel,
         symmetric=everything.symmetric[rows],
     )
-    local, share = attempt_density(density), len(everything) / len(rows)
-    return lambda p, q: share * local(p, q)
+    return lambda poses: len(everything) * density.density(poses)
 
 
 def _tolerance(item: Tolerance) -> AnisotropyTolerance:

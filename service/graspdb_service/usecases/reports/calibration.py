@@ -16,6 +16,7 @@ from graspdb.wire.reports import (
 )
 from graspdb_density import GraspDensity, SuccessModel, importance_weights, se3
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import (
     Blocks,
     Calibration,
@@ -25,7 +26,7 @@ from graspdb_density.success.calibration import (
     reliability,
 )
 from graspdb_density.success.kernel_regression import SuccessKernel
-from graspdb_density.vicinity.anisotropy import LEAST_SUCCESSES
+from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
@@ -60,9 +61,9 @@ _CHECKED_BINS = 5
 
 def _model(everything: AllTrials, rows: NDArray[np.int64], kernel: SuccessKernel) -> SuccessModel:
     """Of some attempts."""
-    attempts = everything.position[rows], everything.quaternion[rows], everything.success[rows]
+    poses = Poses.of(everything.position[rows], everything.quaternion[rows])
     symmetric = everything.symmetric[rows]
-    return SuccessModel.build(*attempts, kernel=kernel, symmetric=symmetric)
+    return SuccessModel.build(poses, everything.success[rows], kernel=kernel, symmetric=symmetric)
 
 
 def calibration_report(
@@ -144,7 +145,7 @@ def _predictions(
             continue
         model = _model(everything, train, built.success_kernel or kernel)
         progress((fold + 0.5) / blocks.folds)
-        predicted[held] = model.evaluate(p[held], q[held], threads=inputs.threads).probability
+        predicted[held] = model.evaluate(Poses.of(p[held], q[held]), threads=inputs.threads).probability
         kept = train[everything.success[train]]
         if kept.size:
             own = GraspDensity.build(
@@ -201,7 +202,7 @@ def _checked(
     predicted = np.zeros(len(p))
     if near.any():
         model = _model(everything, np.flatnonzero(near), diagonal or kernel)
-        predicted = model.evaluate(p, q, threads=inputs.threads).probability.copy()
+        predicted = model.evaluate(Poses.of(p, q), threads=inputs.threads).probability.copy()
     if test is not None:
         predicted[~test.free(p, q, threads=inputs.threads)] = 0.0
     outcomes = verification.tally(codes)

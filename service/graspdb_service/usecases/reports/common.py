@@ -16,7 +16,7 @@ from graspdb.wire.reports import ReportRange
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.matching import Match
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.problems import conflict
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import Built, Densities
@@ -55,7 +55,7 @@ class KeptCurves:
     """
 
     def __init__(self, max_bytes: int) -> None:
-        self._curves: SingleFlightCache[tuple[int, Filters, str | None, float, float], GrowingCurve]
+        self._curves: SingleFlightCache[tuple[int, Filters, str | None, float, float], IncrementalCurve]
         self._curves = SingleFlightCache(max_bytes, lambda curve: curve.nbytes)
         self._matches: SingleFlightCache[tuple[bytes, str], Match]
         self._matches = SingleFlightCache(_MATCHES_BYTES, lambda _: _MATCH_BYTES)
@@ -64,9 +64,9 @@ class KeptCurves:
         self,
         built: Built,
         matched: Match | None,
-        grow: Callable[[GrowingCurve | None, Progress], GrowingCurve],
+        grow: Callable[[IncrementalCurve | None, Progress], IncrementalCurve],
         progress: Progress,
-    ) -> GrowingCurve:
+    ) -> IncrementalCurve:
         """The curve of a density, or of the isotropic kernel matched to it, made by ``grow`` of the one kept
         before.
         """
@@ -80,7 +80,7 @@ class KeptCurves:
         # A curve that nothing is to be added to comes back as it is.
         return self._curves.get(key, lambda _: False, lambda before: grow(before, progress))
 
-    def match(self, curve: GrowingCurve, rule: str, make: Callable[[], Match]) -> Match:
+    def match(self, curve: IncrementalCurve, rule: str, make: Callable[[], Match]) -> Match:
         """The isotropic kernel matched to a curve's: the same until the curve is computed anew."""
         return self._matches.get((curve.generation, rule), lambda _: True, lambda _: make())
 

@@ -30,8 +30,9 @@ from graspdb_density.bandwidth.matching import (
 )
 from graspdb_density.kde.weighted_sums import KernelRows, Progress
 from graspdb_density.kernels.gaussian_mixture import Kernel
+from graspdb_density.se3 import Poses
 from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
-from graspdb_density.statistics.incremental_bootstrap import GrowingCurve
+from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.bandwidth import simulated_draws
@@ -107,7 +108,11 @@ def convergence_report(
 
 
 def _report(
-    built: Built, grown: GrowingCurve, curves: list[CurveModel], match: Match | None = None, **matched: Any
+    built: Built,
+    grown: IncrementalCurve,
+    curves: list[CurveModel],
+    match: Match | None = None,
+    **matched: Any,
 ) -> ConvergenceReport:
     warnings = []
     if not curves[0].verdict.exponent > 0:
@@ -140,17 +145,16 @@ def _curve(
     kernel: Kernel,
     frames: Floats | None,
     progress: Progress,
-) -> GrowingCurve:
+) -> IncrementalCurve:
     """The curve under a kernel: what was kept of it, and the trials that came since."""
     density = built.density
     assert density is not None
 
-    def grow(before: GrowingCurve | None, progress: Progress) -> GrowingCurve:
-        return GrowingCurve.grown(
-            before,
-            density.positions,
-            density.quaternions_xyzw,
+    def grow(before: IncrementalCurve | None, progress: Progress) -> IncrementalCurve:
+        return IncrementalCurve.of(
+            Poses.of(density.positions, density.quaternions_xyzw),
             kernel,
+            before=before,
             weights=density.raw_weights,
             symmetric=density.symmetric,
             frames=frames,
@@ -167,7 +171,7 @@ def _curve(
 def _matched(
     inputs: ReportInputs,
     density: GraspDensity,
-    grown: GrowingCurve,
+    grown: IncrementalCurve,
     kernel: Kernel,
     frames: Floats | None,
     rule: str,

@@ -20,6 +20,7 @@ from graspdb.wire.reports import (
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import conflict
 from graspdb_service.storage.trials import provenances
@@ -114,7 +115,7 @@ def _predictions(
     predicted = np.zeros(len(everything))
     reached = np.zeros(len(everything), dtype=bool)
     if model is not None:
-        answer = model.evaluate(everything.position, everything.quaternion, threads=threads)
+        answer = model.evaluate(Poses.of(everything.position, everything.quaternion), threads=threads)
         predicted = answer.probability.copy()
         reached = answer.effective_trials >= _WITHIN_REACH
     if test is not None:
@@ -138,8 +139,7 @@ def _model(
     if not near.any():
         return None
     return SuccessModel.build(
-        simulated.position[near],
-        simulated.quaternion[near],
+        Poses.of(simulated.position[near], simulated.quaternion[near]),
         simulated.success[near],
         kernel=kernel,
         symmetric=simulated.symmetric[near],

@@ -16,6 +16,7 @@ from graspdb_density import (
     choose_widths,
     se3,
 )
+from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
@@ -47,10 +48,10 @@ def _exercise() -> None:
     def free(p: se3.Floats, q: se3.Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         return ~scene.collides(ToolPoses(p, q), PG70)
 
-    choose_widths(positions, quaternions)
+    choose_widths(Poses.of(positions, quaternions))
     success = rng.random(300) < 0.5
-    model = SuccessModel.build(positions, quaternions, success, kernel=kernel)
-    model.extend(positions, quaternions, success).evaluate(positions[:5], quaternions[:5])
+    model = SuccessModel.build(Poses.of(positions, quaternions), success, kernel=kernel)
+    model.extend(Poses.of(positions, quaternions), success).evaluate(Poses.of(positions[:5], quaternions[:5]))
     density = GraspDensity.build(se3.Poses.of(positions, quaternions), kernel=kernel)
     density = density.extend(density.sample(10, rng))
     density.log_density(se3.Poses.of(positions, quaternions))
@@ -65,4 +66,4 @@ def _exercise() -> None:
     search.maxima(admissible=elsewhere)
     density.nearest_rows(se3.Poses(positions[0], quaternions[0]), 5)
     density.nearest_each(se3.Poses(positions[:5], quaternions[:5]), within=2.0)
-    model.lower_end(positions[:5], quaternions[:5])
+    model.lower_end(Poses.of(positions[:5], quaternions[:5]))
