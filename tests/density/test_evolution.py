@@ -66,7 +66,7 @@ def test_success_probability_is_ranked_by_the_lower_end_of_its_interval() -> Non
     won[:60] = False
     model = SuccessModel.build(Poses.of(p, q), won, kernel=KERNEL)
     density = GraspDensity.build(se3.Poses.of(p[won], q[won]), kernel=KERNEL)
-    found = ModeSearch(density).maxima(score=lambda a, b: model.evaluate(Poses.of(a, b)).low, count=2)
+    found = ModeSearch(density).maxima(score=lambda poses: model.evaluate(poses).low, count=2)
     assert found[0].position[0] < -0.05
     assert found[0].score > found[1].score
     estimate = model.evaluate(Poses.of(found[0].position[None], found[0].quaternion_xyzw[None]))
@@ -80,8 +80,8 @@ def test_refused_poses_are_never_returned(shell: Shell) -> None:
     rng = np.random.default_rng(4)
     density = GraspDensity.build(se3.Poses.of(*shell(500, rng)), kernel=KERNEL)
 
-    def admissible(p: se3.Floats, q: se3.Floats) -> NDArray[np.bool_]:
-        return np.asarray(p[:, 0] > 0.05, dtype=bool)
+    def admissible(poses: se3.Poses) -> NDArray[np.bool_]:
+        return np.asarray(poses.positions[:, 0] > 0.05, dtype=bool)
 
     found = ModeSearch(density).maxima(score=density.log_density, count=3, admissible=admissible)
     assert found
@@ -93,9 +93,9 @@ def test_tool_noise_is_a_wider_kernel(shell: Shell) -> None:
     rows = shell(300, rng)
     density = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL)
     wider = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL.widened(0.01, math.radians(8.0)))
-    poses = rows[0][:40], rows[1][:40]
-    mean = expected(density.density, tool_noise=PoseNoise(0.01, math.radians(8.0)), samples=1024)(*poses)
-    np.testing.assert_allclose(mean, wider.density(*poses), rtol=0.08)
+    poses = se3.Poses.of(rows[0][:40], rows[1][:40])
+    mean = expected(density.density, tool_noise=PoseNoise(0.01, math.radians(8.0)), samples=1024)(poses)
+    np.testing.assert_allclose(mean, wider.density(poses), rtol=0.08)
 
 
 def test_object_noise_grows_with_the_lever() -> None:
@@ -103,17 +103,15 @@ def test_object_noise_grows_with_the_lever() -> None:
     q = se3.IDENTITY[None]
     noise = PoseNoise(0.0, math.radians(5.0))
     for p, least, most in ((near, 0.9, 1.0), (far, 0.0, 0.6)):
-        density = GraspDensity.build(se3.Poses.of(p, q), kernel=IsotropicKernel(0.015, math.radians(60.0)))
-        share = expected(density.density, object_noise=noise, samples=256)(p, q) / density.density(
-            se3.Poses.of(p, q)
-        )
+        at = se3.Poses.of(p, q)
+        density = GraspDensity.build(at, kernel=IsotropicKernel(0.015, math.radians(60.0)))
+        share = expected(density.density, object_noise=noise, samples=256)(at) / density.density(at)
         assert least < share[0] < most
     # About the grasp itself there is no lever.
-    density = GraspDensity.build(se3.Poses.of(far, q), kernel=IsotropicKernel(0.015, math.radians(60.0)))
+    at = se3.Poses.of(far, q)
+    density = GraspDensity.build(at, kernel=IsotropicKernel(0.015, math.radians(60.0)))
     about = PoseNoise(0.0, math.radians(5.0), (0.0, 0.0, 0.3))
-    share = expected(density.density, object_noise=about, samples=256)(far, q) / density.density(
-        se3.Poses.of(far, q)
-    )
+    share = expected(density.density, object_noise=about, samples=256)(at) / density.density(at)
     assert share[0] > 0.97
 
 
@@ -139,4 +137,4 @@ def test_bad_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="samples"):
         expected(density.density, samples=0)
     with pytest.raises(ValueError, match="the score answered shape"):
-        ModeSearch(density).maxima(score=lambda p, q: np.zeros(1 + len(p)))
+        ModeSearch(density).maxima(score=lambda poses: np.zeros(1 + len(poses)))

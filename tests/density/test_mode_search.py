@@ -213,7 +213,7 @@ def test_nothing_is_found_out_of_reach(shell: Shell) -> None:
     density = GraspDensity.build(se3.Poses.of(*shell(500, rng)), kernel=KERNEL)
     region = Region(half_spaces=Region.box([1.0, 1.0, 1.0], [2.0, 2.0, 2.0]))
     assert ModeSearch(density).maxima(region) == []
-    assert ModeSearch(density).maxima(admissible=lambda p, q: np.zeros(len(p), dtype=bool)) == []
+    assert ModeSearch(density).maxima(admissible=lambda poses: np.zeros(len(poses), dtype=bool)) == []
     empty = Region(half_spaces=[[1.0, 0.0, 0.0, 0.1], [-1.0, 0.0, 0.0, 0.1]])
     assert ModeSearch(density).maxima(empty) == []
     for one, reached in ((empty, False), (region, True)):
@@ -226,8 +226,9 @@ def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed:
     density = GraspDensity.build(se3.Poses.of(*shell(1_500, rng)), kernel=KERNEL)
     top = ModeSearch(density).global_maximum()
 
-    def admissible(p: se3.Floats, q: se3.Floats) -> NDArray[np.bool_]:
+    def admissible(poses: se3.Poses) -> NDArray[np.bool_]:
         # A forbidden ball about the global maximum and a forbidden half: a curved and a flat edge.
+        p = poses.positions
         free = np.linalg.norm(p - top.position, axis=1) > 0.02
         return np.asarray(free & (p[:, 2] > -0.5 * abs(top.position[2])), dtype=bool)
 
@@ -282,7 +283,7 @@ def test_bad_searches_are_refused() -> None:
     with pytest.raises(ValueError, match="lower corner"):
         Region.box([1.0, 0.0, 0.0], [0.0, 1.0, 1.0])
     with pytest.raises(ValueError, match="admissible answered shape"):
-        ModeSearch(density).maxima(admissible=lambda p, q: np.ones(1 + len(p), dtype=bool))
+        ModeSearch(density).maxima(admissible=lambda poses: np.ones(1 + len(poses), dtype=bool))
 
 
 def climbed_from(density: GraspDensity, region: Region, starts: se3.Poses, steps: int) -> se3.Poses:

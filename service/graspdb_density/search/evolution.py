@@ -80,7 +80,7 @@ class EvolutionSearch(MultiStart):
 
     def values(self, score: Score, poses: Poses) -> Floats:
         """A score at poses (K,)."""
-        values = np.asarray(score(poses.positions, poses.quaternions_xyzw), dtype=np.float64)
+        values = np.asarray(score(poses), dtype=np.float64)
         if values.shape != (len(poses),):
             raise ValueError(f"the score answered shape {values.shape} for {len(poses)} poses")
         return values
@@ -110,18 +110,18 @@ class EvolutionSearch(MultiStart):
         some = rng.integers(0, len(near[0]), _DRAWN)
         centres = self.centres(near[0][some], near[1][some])
         moves, turns = self.density.kernel.sample_displacements(_DRAWN, rng)
-        drawn, inside = self.landed(centres.positions + moves, se3.multiply(centres.quaternions_xyzw, turns))
+        moved = Poses(centres.positions + moves, se3.multiply(centres.quaternions_xyzw, turns))
+        drawn, inside = self.landed(moved)
         return self.add_distinct(starts, self.valued(drawn[inside]), len(starts) + _JOINING, separation)
 
     def valued(self, poses: Poses) -> ScoredPoses:
         return ScoredPoses(poses, self.values(self.rough, poses)).ranked()
 
-    def landed(self, positions: Floats, quaternions: Floats) -> tuple[Poses, Bools]:
+    def landed(self, poses: Poses) -> tuple[Poses, Bools]:
         """Poses brought into the region, pulled to where they are admissible, and which are inside then."""
-        p, q, inside = self.region.project(positions, quaternions)
-        if self.pull is not None:
-            p, q = self.pull(p, q)
-        return Poses(p, q), inside & self.region.contains(p, q)
+        p, q, inside = self.region.project(*poses)
+        poses = Poses(p, q) if self.pull is None else self.pull(Poses(p, q))
+        return poses, inside & self.region.contains(*poses)
 
     # -- random search
 
@@ -147,7 +147,7 @@ class EvolutionSearch(MultiStart):
         moves = rng.standard_normal((len(tried), 3)) * scale * kernel.sigma_position_m
         turns = rng.standard_normal((len(tried), 3)) * scale * kernel.sigma_rotation
         turned = se3.multiply(tried.quaternions_xyzw, se3.from_rotation_vector(turns))
-        tried, inside = self.landed(tried.positions + moves, turned)
+        tried, inside = self.landed(Poses(tried.positions + moves, turned))
         scores = np.full(len(tried), -np.inf)
         scores[inside] = self.values(self.rough, tried[inside])
         shape = count, _TRIES, -1
@@ -193,10 +193,10 @@ class EvolutionSearch(MultiStart):
         """Poses ``steps`` (K, 6) kernel widths away, with scores: -inf where they are refused."""
         away = steps * np.repeat(self.widths(1.0), 3)
         turned = se3.multiply(at.quaternions_xyzw, se3.from_rotation_vector(away[:, 3:]))
-        poses, allowed = self.landed(at.positions + away[:, :3], turned)
+        poses, allowed = self.landed(Poses(at.positions + away[:, :3], turned))
         for refuses in (apart, self.admissible and self.check):
             if refuses is not None and allowed.any():
-                allowed[allowed] = refuses(poses.positions[allowed], poses.quaternions_xyzw[allowed])
+                allowed[allowed] = refuses(poses[allowed])
         values = np.full(len(poses), -np.inf)
         if allowed.any():
             values[allowed] = self.values(self.score, poses[allowed])

@@ -122,7 +122,7 @@ class ModeSearch:
         separation
             The jaw's twins are one grasp where every row is symmetric.
         admissible
-            Called with poses (K, 3), (K, 4), answers (K,) bool. Never is a pose returned that it refused.
+            Called with K poses, answers (K,) bool. Never is a pose returned that it refused.
         score
             What is best. None: the density.
         rough, pull
@@ -175,10 +175,9 @@ class MeanShiftSearch(MultiStart):
         finalists = max(_FINALISTS, 2 * count)
         passed, ends = self.climbed(starts.poses, finalists)
         best = ends.ranked()[:1]
-        at = best.poses.positions, best.poses.quaternions_xyzw
-        feasible = bool(self.region.contains(*at)[0])
+        feasible = bool(self.region.contains(*best.poses)[0])
         # Where the gripper collides there, look around the best poses where it does not.
-        blocked = feasible and self.admissible is not None and not self.check(*at)[0]
+        blocked = feasible and self.admissible is not None and not self.check(best.poses)[0]
         if count > 1 or blocked or not feasible:
             # Starts, too, because all are admissible and far from each other.
             seen = ScoredPoses.joined(self.thinned(passed, 4 * finalists, _APART), starts)
@@ -291,7 +290,7 @@ class MeanShiftSearch(MultiStart):
 
 
 def _scored(density: GraspDensity | MixtureDensity, threads: int) -> Score:
-    return lambda p, q: density.log_density(Poses(p, q), threads=threads)
+    return lambda poses: density.log_density(poses, threads=threads)
 
 
 def _along(rows: Floats) -> ScoredPoses:

@@ -175,7 +175,7 @@ class MultiStart:
             # one comes up next, and a call costs as much as ten poses.
             line = index[~confirmed[index]][: len(poses) - len(index)]
             batch = np.union1d(doubtful, line)
-            allowed = self.check(poses.positions[batch], poses.quaternions_xyzw[batch])
+            allowed = self.check(poses[batch])
             confirmed[batch[allowed]] = True
             usable[batch[~allowed]] = False
 
@@ -187,13 +187,13 @@ class MultiStart:
         )
         return kept[:total]
 
-    def check(self, positions: Floats, quaternions: Floats) -> Bools:
+    def check(self, poses: Poses) -> Bools:
         """Ask ``admissible``."""
         assert self.admissible is not None
-        self.checks += len(positions)
-        allowed = np.asarray(self.admissible(positions, quaternions), dtype=bool)
-        if allowed.shape != (len(positions),):
-            raise ValueError(f"admissible answered shape {allowed.shape} for {len(positions)} poses")
+        self.checks += len(poses)
+        allowed = np.asarray(self.admissible(poses), dtype=bool)
+        if allowed.shape != (len(poses),):
+            raise ValueError(f"admissible answered shape {allowed.shape} for {len(poses)} poses")
         return allowed
 
     def best_tries(
@@ -204,7 +204,7 @@ class MultiStart:
         """
         better = scores > least[:, None]
         if self.admissible is not None and better.any():
-            better[better] = self.check(positions[better], quaternions[better])
+            better[better] = self.check(Poses(positions[better], quaternions[better]))
         scores[~better] = -np.inf
         each, winner = np.arange(len(at)), scores.argmax(axis=1)
         moved: Bools = scores[each, winner] > -np.inf
@@ -221,7 +221,7 @@ class MultiStart:
         """The answer, best first by ``scores``, or by log density."""
         if not len(best):
             return []
-        logs = self.log_density(best.poses.positions, best.poses.quaternions_xyzw)
+        logs = self.log_density(best.poses)
         scores = logs if scores is None else scores
         order = np.argsort(-scores, kind="stable")
         p, q = best.poses.positions[order], se3.canonical(best.poses.quaternions_xyzw[order])

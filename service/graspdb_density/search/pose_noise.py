@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from .. import se3
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 from .scored_poses import Score
 
 __all__ = ["PoseNoise", "expected"]
@@ -57,12 +56,12 @@ def expected(
     right_p, right_q = _draws(tool_noise, normal[:, 6:])
     pivot = np.zeros(3) if object_noise is None else np.array(object_noise.pivot)
 
-    def mean(positions: ArrayLike, quaternions: ArrayLike) -> Floats:
-        p, q = np.asarray(positions, dtype=np.float64), np.asarray(quaternions, dtype=np.float64)
+    def mean(poses: Poses) -> Floats:
+        p, q = poses
         seen_p = pivot + se3.rotate(left_q[:, None], p[None] - pivot) + left_p[:, None]
         seen_q = se3.multiply(left_q[:, None], q[None])
-        at, to = se3.compose(se3.Poses(seen_p, seen_q), se3.Poses(right_p[:, None], right_q[:, None]))
-        values = value(at.reshape(-1, 3), se3.normalise(to.reshape(-1, 4)))
+        at, to = se3.compose(Poses(seen_p, seen_q), Poses(right_p[:, None], right_q[:, None]))
+        values = value(Poses(at.reshape(-1, 3), se3.normalise(to.reshape(-1, 4))))
         return np.asarray(values.reshape(samples, len(p)).mean(axis=0), dtype=np.float64)
 
     return mean

@@ -16,12 +16,12 @@ from ..se3 import Floats, Poses
 __all__ = ["Admissible", "Maximum", "Pull", "Score", "ScoredPoses", "Separation", "distinct_from"]
 
 Bools = NDArray[np.bool_]
-#: Whether poses (K, 3), (K, 4) are free of what a region can't express, collisions for one: (K,) bool.
-Admissible = Callable[[Floats, Floats], Bools]
-#: Scores poses (K, 3), (K, 4): (K,), higher is better.
-Score = Callable[[Floats, Floats], Floats]
-#: Moves poses (K, 3), (K, 4).
-Pull = Callable[[Floats, Floats], tuple[Floats, Floats]]
+#: Whether poses are free of what a region can't express, collisions for one: (K,) bool.
+Admissible = Callable[[Poses], Bools]
+#: Scores poses: (K,), higher is better.
+Score = Callable[[Poses], Floats]
+#: Moves poses.
+Pull = Callable[[Poses], Poses]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -95,8 +95,9 @@ def distinct_from(poses: Poses, separation: Separation, *, twins: bool) -> Admis
     With ``twins`` a pose and the one turned half around the jaw's approach are the same.
     """
 
-    def distinct(p: Floats, q: Floats) -> Bools:
-        near = np.zeros(len(p), dtype=np.bool_)
+    def distinct(asked: Poses) -> Bools:
+        p, q = asked
+        near = np.zeros(len(asked), dtype=np.bool_)
         for at, to in zip(poses.positions, poses.quaternions_xyzw, strict=True):
             angle = se3.angle_between(q, to)
             if twins:
