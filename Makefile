@@ -24,7 +24,7 @@ demo: install  ## Real physics on the mug: from nothing to a best grasp (KEEP=1 
 	$(BIN)/graspdb demo $(if $(KEEP),--keep)
 
 test: check  ## Every check and every test, on SQLite and on a real PostgreSQL
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long" --ignore tests/architecture
 
 test-core: install  ## The tests without a browser
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long and not browser"
@@ -32,11 +32,12 @@ test-core: install  ## The tests without a browser
 test-long: install  ## Also what takes many minutes
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
-check: install  ## Format, lint, types, import rules
+check: install  ## Format, lint, types, import rules, the rules of the house
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy $(addprefix -p ,$(PACKAGES))
 	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q tests/architecture
 
 format: install  ## Mend what the formatter and the linter can
 	$(BIN)/ruff format .

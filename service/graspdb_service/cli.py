@@ -70,7 +70,7 @@ def serve(
 
 def _warm_up(app: Any) -> None:
     """Load what queries need while the server already answers."""
-    from graspdb_service.usecases.runtime.warmup import warm_up
+    from graspdb_service.usecases.runtime.warmup import warm_up  # extra: service
 
     threading.Thread(target=warm_up, args=(app.state.context.compute,), daemon=True).start()
 
@@ -97,7 +97,7 @@ def openapi() -> None:
 def _application(settings: Settings) -> FastAPI:
     # Imported here: migrating needs none of the numerics, which take a second to load.
     try:
-        from graspdb_service.app import create_app
+        from graspdb_service.app import create_app  # extra: service
     except ModuleNotFoundError as error:
         _fail(NEEDS.format(error.name))
     return create_app(settings)

@@ -120,8 +120,8 @@ def run(
 ) -> None:
     """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked."""
     _require_pybullet()
-    from graspdb_simworker.decomposition import supervisor as decomposition
-    from graspdb_simworker.loop import Worker, WorkerFailed
+    from graspdb_simworker.decomposition import supervisor as decomposition  # extra: sim
+    from graspdb_simworker.loop import Worker, WorkerFailed  # extra: sim
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
@@ -171,7 +171,7 @@ class _Cluster:
 @contextmanager
 def _cluster(address: str | None) -> Iterator[_Cluster]:
     """This machine, or the Dask cluster of a scheduler."""
-    from graspdb_simworker.process.local import LocalRunner
+    from graspdb_simworker.process.local import LocalRunner  # extra: sim
 
     if address is None:
         yield _Cluster(1, LocalRunner)
@@ -185,7 +185,7 @@ def _cluster(address: str | None) -> Iterator[_Cluster]:
             err=True,
         )
         raise typer.Exit(2) from None
-    from graspdb_simworker.process.executor import ExecutorRunner
+    from graspdb_simworker.process.executor import ExecutorRunner  # extra: sim
 
     try:
         client = distributed.Client(address, timeout=10)
@@ -216,7 +216,7 @@ def verify(
     verified sooner.
     """
     _require_pybullet()
-    from graspdb_simworker.inspection import agreement, inputs, stored_outcomes
+    from graspdb_simworker.inspection import agreement, inputs, stored_outcomes  # extra: sim
 
     with _explained():
         if sweep is not None:
@@ -260,7 +260,7 @@ def show(
 ) -> None:
     """Simulate one grasp and draw it from two sides, seen from the jaw."""
     _require_pybullet()
-    from graspdb_simworker.inspection import inputs, pictures
+    from graspdb_simworker.inspection import inputs, pictures  # extra: sim
 
     with _explained():
         pose = Pose.model_validate({"position": position, "quaternion_xyzw": quaternion})

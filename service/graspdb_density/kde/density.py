@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..se3 import Floats, Poses
+from .isotropic import CUTOFF, GraspDensity
 
-__all__ = ["Density"]
+__all__ = ["Density", "SearchedDensity"]
 
 
 class Density(Protocol):
@@ -32,3 +33,21 @@ class Density(Protocol):
 
     def sample(self, count: int, rng: np.random.Generator) -> Poses:
         """Grasps drawn from it."""
+
+
+class SearchedDensity(Density, Protocol):
+    """A density that queries ask and searches climb: `GraspDensity`, `MixtureDensity`."""
+
+    def sample_rows(self, rows: NDArray[np.integer], rng: np.random.Generator) -> Poses:
+        """A draw from the kernel of each of some rows, their twins left out."""
+
+    @property
+    def isotropic(self) -> GraspDensity:
+        """The same rows under the isotropic kernel of equal determinants: itself where it is that."""
+
+    def log_density(self, poses: Poses, *, cutoff: float | None = CUTOFF, threads: int = 1) -> Floats:
+        """(M,) nats, right however far from every row.
+
+        ``cutoff`` is the reach of the first sum, in standard deviations of position, where the kernel has
+        such; None: no reach, all rows are summed.
+        """

@@ -360,8 +360,14 @@ class GraspDensity:
             raise ValueError(f"cannot draw {count} samples")
         edges = np.cumsum(self._weights)
         row = np.minimum(np.searchsorted(edges, rng.random(count) * edges[-1], side="right"), self.size - 1)
-        centres = self.poses[row].turned(self._symmetric[row] & (rng.random(count) < 0.5))
-        translations, turns = self._kernel.sample_displacements(count, rng)
+        return self._displaced(self.poses[row].turned(self._symmetric[row] & (rng.random(count) < 0.5)), rng)
+
+    def sample_rows(self, rows: NDArray[np.integer], rng: np.random.Generator) -> Poses:
+        """A draw from the kernel of each of some rows, their twins left out."""
+        return self._displaced(self.poses[rows], rng)
+
+    def _displaced(self, centres: Poses, rng: np.random.Generator) -> Poses:
+        translations, turns = self._kernel.sample_displacements(len(centres), rng)
         return Poses(centres.positions + translations, se3.multiply(centres.quaternions_xyzw, turns))
 
 

@@ -155,8 +155,10 @@ class MixtureDensity:
             symmetric=self._rows.symmetric,
         )
 
-    def log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
+    def log_density(self, poses: Poses, *, cutoff: float | None = None, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row.
+
+        ``cutoff`` changes nothing: whatever matters is summed, however far.
 
         Within 1e-3 of the float64 sum near data where rotation widths are at most `NARROW`; wider kernels sum
         both twins and both wraps of every rotation.
@@ -228,6 +230,17 @@ class MixtureDensity:
     def sample(self, count: int, rng: np.random.Generator) -> Poses:
         """Draw grasps."""
         return self._rows.sample(count, rng)
+
+    def sample_rows(self, rows: NDArray[np.integer], rng: np.random.Generator) -> Poses:
+        """A draw from the kernel of each of some rows, their twins left out."""
+        kernel, centres = self._kernel, self._rows.poses[rows]
+        parts = rng.choice(len(kernel.weights), size=len(rows), p=kernel.weights / np.sum(kernel.weights))
+        roots = np.linalg.cholesky(kernel.covariances)
+        xi = kernel.means[parts] + np.einsum("nij,nj->ni", roots[parts], rng.standard_normal((len(rows), 6)))
+        return Poses(
+            centres.positions + np.einsum("nij,nj->ni", self.frames[rows], xi[:, :3]),
+            se3.multiply(centres.quaternions_xyzw, se3.from_rotation_vector(xi[:, 3:])),
+        )
 
     @property
     def symmetric(self) -> NDArray[np.bool_]:

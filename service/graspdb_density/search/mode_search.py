@@ -17,8 +17,8 @@ import numpy as np
 
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
+from ..kde.density import SearchedDensity
 from ..kde.isotropic import GraspDensity
-from ..kde.mixture import MixtureDensity
 from ..se3 import Floats, Poses
 from . import mean_shift
 from .evolution import EvolutionSearch
@@ -62,7 +62,7 @@ class ModeSearch:
         ``density.isotropic``.
     """
 
-    def __init__(self, density: GraspDensity | MixtureDensity, centres: GraspDensity | None = None) -> None:
+    def __init__(self, density: SearchedDensity, centres: GraspDensity | None = None) -> None:
         self.density = density
         self.centres = density.isotropic if centres is None else centres
         self._by_values = self if self.centres is density else ModeSearch(self.centres)
@@ -71,9 +71,7 @@ class ModeSearch:
         self._ranking: StartRanking | None = None
         self._global: Maximum | None = None
 
-    def extended(
-        self, density: GraspDensity | MixtureDensity, centres: GraspDensity | None = None
-    ) -> ModeSearch:
+    def extended(self, density: SearchedDensity, centres: GraspDensity | None = None) -> ModeSearch:
         """The search in what the density was extended to: what centres are worth is completed, not computed
         anew.
         """
@@ -289,7 +287,7 @@ class MeanShiftSearch(MultiStart):
         return ends, np.where(moved, np.minimum(step, 1.0), 0.6 * step)
 
 
-def _scored(density: GraspDensity | MixtureDensity, threads: int) -> Score:
+def _scored(density: SearchedDensity, threads: int) -> Score:
     return lambda poses: density.log_density(poses, threads=threads)
 
 

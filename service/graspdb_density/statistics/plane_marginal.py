@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from .. import se3
+from ..kde.density import SearchedDensity
 from ..kde.isotropic import GraspDensity
-from ..kde.mixture import MixtureDensity
 from ..se3 import Floats
 
 __all__ = ["Marginal", "Orientation", "Plane", "Profile", "marginal"]
@@ -140,7 +140,7 @@ class Marginal:
 
 
 def marginal(
-    density: GraspDensity | MixtureDensity,
+    density: SearchedDensity,
     plane: Plane,
     orientation: Orientation,
     *,
@@ -159,13 +159,13 @@ def marginal(
         Of the intervals, which resample rows (or draws).
     """
     rng = np.random.default_rng(seed)
-    if isinstance(density, GraspDensity):
-        p, q, w = density.positions, density.quaternions_xyzw, density.weights
-        sigma, drawn = density.kernel.sigma_position_m, 0
+    own = density.isotropic
+    if own is density:
+        p, q, w = own.positions, own.quaternions_xyzw, own.weights
+        sigma, drawn = own.kernel.sigma_position_m, 0
         passing = int(orientation.holds(q).sum())
-        share = _passing_shares(density, orientation, rng)
+        share = _passing_shares(own, orientation, rng)
     else:
-        own = density.isotropic
         passing = int(orientation.holds(own.quaternions_xyzw).sum())
         p, q, w = _drawn(density, rng)
         drawn = len(p)
@@ -210,19 +210,15 @@ def _passing_shares(density: GraspDensity, orientation: Orientation, rng: np.ran
     return passed / draws
 
 
-def _drawn(density: MixtureDensity, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+def _drawn(density: SearchedDensity, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
     """Draws from every row's kernel: positions, rotations and weights, those of a row one after another.
 
     A symmetric row's twin is not drawn: it stands for the same grasps, turned half a turn.
     """
-    own, kernel = density.isotropic, density.kernel
+    own = density.isotropic
     each = int(np.clip(_DRAWS // own.size, _LEAST_TURNS, 4 * _MOST_TURNS))
     rows = np.repeat(np.arange(own.size), each)
-    parts = rng.choice(len(kernel.weights), size=len(rows), p=kernel.weights / np.sum(kernel.weights))
-    roots = np.linalg.cholesky(kernel.covariances)
-    xi = kernel.means[parts] + np.einsum("nij,nj->ni", roots[parts], rng.standard_normal((len(rows), 6)))
-    p = own.positions[rows] + np.einsum("nij,nj->ni", density.frames[rows], xi[:, :3])
-    q = se3.multiply(own.quaternions_xyzw[rows], se3.from_rotation_vector(xi[:, 3:]))
+    p, q = density.sample_rows(rows, rng)
     return p, q, own.weights[rows] / each
 
 

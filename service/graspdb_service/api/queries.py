@@ -94,10 +94,8 @@ def get_likelihood(
     known = _known(ctx, id, request, query)
     if known is not None:
         return known
-    positions, quaternions = read_poses(
-        {"position": [list(query.position)], "quaternion_xyzw": [list(query.quaternion_xyzw)]}
-    )
-    answer = likelihood.likelihood(ctx, id, query, positions, quaternions, query.include)
+    poses = read_poses({"position": [list(query.position)], "quaternion_xyzw": [list(query.quaternion_xyzw)]})
+    answer = likelihood.likelihood(ctx, id, query, poses, query.include)
     return _likelihoods(answer, {"ETag": _tag(answer.object_id, answer.revision, query)})
 
 
@@ -116,14 +114,14 @@ def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
     """
     kind = accepted(request, JSON, ARROW)
     if media_type(request) == ARROW:
-        content, positions, quaternions = read_arrow_poses(body)
+        content, poses = read_arrow_poses(body)
         options = validated(content, LikelihoodOptions)
     else:
         content = read_object(request, body)
-        poses = content.pop("poses", None)
+        given = content.pop("poses", None)
         options = validated(content, LikelihoodOptions)
-        positions, quaternions = read_poses(poses)
-    answer = likelihood.likelihood(ctx, id, options, positions, quaternions, options.include)
+        poses = read_poses(given)
+    answer = likelihood.likelihood(ctx, id, options, poses, options.include)
     return _likelihoods(answer, {"Vary": "Accept"}, arrow=kind == ARROW)
 
 

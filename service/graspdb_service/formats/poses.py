@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from graspdb.wire import Pose
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 from graspdb_density import se3
+from graspdb_density.se3 import Poses
 from graspdb_service.formats import arrow
 from graspdb_service.formats.json_bodies import no_json
 from graspdb_service.formats.json_pieces import LongArray
@@ -39,18 +40,18 @@ def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:
         raise no_json(error) from None
 
 
-def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Floats, Floats]:
-    """What an Arrow stream says beside its poses, their positions (n, 3) and unit quaternions (n, 4)."""
+def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Poses]:
+    """What an Arrow stream says beside its poses, and these."""
     table = arrow.Table(body, ("position", "quaternion_xyzw"), prefix="poses")
     if not table.count:
         raise invalid("poses", "at least one pose")
     names = ("poses.position.{}", "poses.quaternion_xyzw.{}")
     poses = table.vectors("position", 3), table.vectors("quaternion_xyzw", 4)
-    return table.options, *_checked(*poses, names)
+    return table.options, _checked(*poses, names)
 
 
-def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
-    """Positions (n, 3) and unit quaternions (n, 4) of a list of poses or of pose columns.
+def read_poses(value: Any, field: str = "poses") -> Poses:
+    """Those of a list of poses or of pose columns.
 
     422 names the first bad field, as the wire's models would.
     """
@@ -76,7 +77,7 @@ def read_poses(value: Any, field: str = "poses") -> tuple[Floats, Floats]:
     return _checked(position, quaternion, names)
 
 
-def _checked(position: Floats, quaternion: Floats, names: tuple[str, str]) -> tuple[Floats, Floats]:
+def _checked(position: Floats, quaternion: Floats, names: tuple[str, str]) -> Poses:
     """Poses with unit quaternions, near enough; ``names`` are those of a row's fields."""
     far = np.flatnonzero(~(np.abs(position) <= MAX_COORDINATE_M).all(axis=1))
     if far.size:
@@ -92,7 +93,7 @@ def _checked(position: Floats, quaternion: Floats, names: tuple[str, str]) -> tu
             f"a quaternion (x, y, z, w) must have norm 1 within {UNIT_TOLERANCE:g};"
             f" this one has {norm[wrong[0]]:.6g}",
         )
-    return position, quaternion / norm[:, None]
+    return Poses(position, quaternion / norm[:, None])
 
 
 def _check_keys(value: dict[str, Any], wanted: set[str], field: str) -> None:

@@ -48,7 +48,7 @@ def main() -> int:
 def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
     try:
         # Imported under the limits, so that the libraries count as well.
-        from graspdb_simworker.decomposition import convexity
+        from graspdb_simworker.decomposition import convexity  # extra: sim
     except ModuleNotFoundError as error:
         channel.send(sink, channel.MISSING, str(error).encode())
         return

@@ -21,7 +21,7 @@ def main() -> int:
     complaints = os.dup(2)
     os.dup2(0, 2)  # pybullet greets on the standard error
     try:
-        from graspdb_simworker.process import serving
+        from graspdb_simworker.process import serving  # extra: sim
     except ImportError as error:
         channel.send(sink, channel.MISSING, str(error).encode())
         return 2

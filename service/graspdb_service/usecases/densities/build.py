@@ -252,18 +252,19 @@ def _shaped(
         sampled = kernel.placed(se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric)
         return _searched(replace(built, density=alike, sampled=sampled), None)
     if before is not None and before.shaped is not None and added is not None:
-        frames = stored_kernel.axes_at(axes, *fresh[:2])
+        frames = stored_kernel.axes_at(axes, se3.Poses(*fresh[:2]))
         shaped = before.shaped.extend(
             se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2], frames=frames
         )
         return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
     position, quaternion, symmetric = everything()
+    poses = se3.Poses.of(position, quaternion)
     shaped = MixtureDensity(
-        se3.Poses.of(position, quaternion),
+        poses,
         kernel=stored_kernel.load(stored),
         weights=weights,
         symmetric=symmetric,
-        frames=stored_kernel.axes_at(axes, position, quaternion),
+        frames=stored_kernel.axes_at(axes, poses),
     )
     return _searched(replace(built, density=shaped.isotropic, shaped=shaped), None)
 

@@ -149,12 +149,11 @@ def density_on(
     while True:
         found = [pairs.grasps(count // len(opposed)) for pairs in opposed]
         p, q, weights = (np.concatenate(column) for column in zip(*found, strict=True))
-        held = test.holds(p, q, threads=threads)
+        poses = se3.Poses.of(p, q)
+        held = test.holds(poses, threads=threads)
         if held.sum() >= _ENOUGH or count >= _MOST:
             break
         count = _MOST
     if not held.any():
         return None
-    return GraspDensity.build(
-        se3.Poses.of(p[held], q[held]), kernel=kernel, weights=weights[held], symmetric=symmetric
-    )
+    return GraspDensity.build(poses[held], kernel=kernel, weights=weights[held], symmetric=symmetric)

@@ -54,13 +54,13 @@ def axes(alignment: str, selected: Selected, features: Features) -> Axes:
     return features.frames(alignment, selected)
 
 
-def axes_at(found: Axes, positions: Floats, quaternions: Floats) -> Floats | None:
-    """Those of grasps (n, 3), (n, 4): (3, 3) or (n, 3, 3), the gripper's where one has none of its own."""
+def axes_at(found: Axes, poses: se3.Poses) -> Floats | None:
+    """Those of grasps (n,): (3, 3) or (n, 3, 3), the gripper's where one has none of its own."""
     if not callable(found):
         return found
-    own = found(positions, quaternions)
+    own = found(*poses)
     known = np.asarray(np.isfinite(own).all(axis=(1, 2)), dtype=bool)
-    return np.where(known[:, None, None], own, se3.to_matrix(quaternions))
+    return np.where(known[:, None, None], own, se3.to_matrix(poses.quaternions_xyzw))
 
 
 def covariance_of(row: KernelRow) -> Floats:

@@ -121,29 +121,26 @@ class Successes:
     def estimate(
         self,
         model: Model | None,
-        positions: Floats,
-        quaternions: Floats,
+        poses: Poses,
         free: NDArray[np.bool_] | None,
     ) -> Estimates:
-        """Success probability of poses (n, 3), (n, 4) under a model from :meth:`model`.
+        """Success probability of poses (n,) under a model from :meth:`model`.
 
         Parameters
         ----------
         free : (n,) bool or None
             Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
         """
-        estimates = Estimates.unknown(len(positions))
+        estimates = Estimates.unknown(len(poses))
         if model is not None:
 
             def work(part: slice) -> None:
-                answer = model.whole.evaluate(
-                    Poses.of(positions[part], quaternions[part]), level=LEVEL, threads=self._compute.threads
-                )
+                answer = model.whole.evaluate(poses[part], level=LEVEL, threads=self._compute.threads)
                 estimates.probability[part] = answer.probability
                 estimates.low[part], estimates.high[part] = answer.low, answer.high
                 estimates.effective_trials[part] = answer.effective_trials
 
-            self._compute.blocks(len(positions), 16_384, work)
+            self._compute.blocks(len(poses), 16_384, work)
         if free is not None:
             for column in (estimates.probability, estimates.low, estimates.high):
                 column[~free] = 0.0

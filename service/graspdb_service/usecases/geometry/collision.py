@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import GripperProfile
+from graspdb_density.se3 import Poses
 from graspdb_geometry import meshes
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import GripperShape
-from graspdb_geometry.poses import ToolPoses
 from graspdb_service.problems import conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
@@ -45,25 +45,21 @@ class CollisionTest:
     solid: Solid
     shape: GripperShape
 
-    def free(self, positions: Floats, quaternions: Floats, threads: int = 1) -> NDArray[np.bool_]:
-        """Which poses (n, 3), (n, 4) the open gripper can take without overlapping the object."""
-        return ~self.solid.collides(ToolPoses(positions, quaternions), self.shape, threads=threads)
+    def free(self, poses: Poses, threads: int = 1) -> NDArray[np.bool_]:
+        """Which poses (n,) the open gripper can take without overlapping the object."""
+        return ~self.solid.collides(poses, self.shape, threads=threads)
 
-    def free_on_the_way(
-        self, positions: Floats, quaternions: Floats, distance_m: float, threads: int = 1
-    ) -> NDArray[np.bool_]:
+    def free_on_the_way(self, poses: Poses, distance_m: float, threads: int = 1) -> NDArray[np.bool_]:
         """As :meth:`free`, all along the straight approach that starts this far back."""
-        return ~self.solid.collides(
-            ToolPoses(positions, quaternions), self.shape, threads=threads, retreat_m=distance_m
-        )
+        return ~self.solid.collides(poses, self.shape, threads=threads, retreat_m=distance_m)
 
-    def holds(self, positions: Floats, quaternions: Floats, threads: int = 1) -> NDArray[np.bool_]:
+    def holds(self, poses: Poses, threads: int = 1) -> NDArray[np.bool_]:
         """Which poses the open gripper can take with something between its fingers."""
-        return self.solid.holds(ToolPoses(positions, quaternions), self.shape, threads=threads)
+        return self.solid.holds(poses, self.shape, threads=threads)
 
-    def widths(self, positions: Floats, quaternions: Floats, threads: int = 1) -> Floats:
+    def widths(self, poses: Poses, threads: int = 1) -> Floats:
         """The jaw's opening (n,) once both fingers touch the object; NaN where it collides or misses."""
-        return self.solid.widths(ToolPoses(positions, quaternions), self.shape, threads=threads)
+        return self.solid.widths(poses, self.shape, threads=threads)
 
 
 class Scenes:

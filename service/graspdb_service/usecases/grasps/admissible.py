@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, se3
+from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Admissible
 from graspdb_geometry.grippers import GripperShape
-from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.grasps.constraints import Constraints
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 #: A chance is told within so many standard deviations of a success, position and rotation together. Farther
@@ -27,12 +26,12 @@ def all_of(checks: Sequence[Admissible]) -> Admissible | None:
     if not checks:
         return None
 
-    def admissible(positions: Floats, quaternions: Floats) -> Bools:
-        left = np.arange(len(positions))
+    def admissible(poses: Poses) -> Bools:
+        left = np.arange(len(poses))
         for check in checks:
             if len(left):
-                left = left[check(positions[left], quaternions[left])]
-        allowed = np.zeros(len(positions), dtype=np.bool_)
+                left = left[check(poses[left])]
+        allowed = np.zeros(len(poses), dtype=np.bool_)
         allowed[left] = True
         return allowed
 
@@ -42,12 +41,10 @@ def all_of(checks: Sequence[Admissible]) -> Admissible | None:
 def clear_of(limits: Constraints, shape: GripperShape, distance: float, threads: int) -> Admissible:
     """Whether the gripper touches no obstacle, all along an approach of this length."""
 
-    def clear(positions: Floats, quaternions: Floats) -> Bools:
-        hit = np.zeros(len(positions), dtype=np.bool_)
+    def clear(poses: Poses) -> Bools:
+        hit = np.zeros(len(poses), dtype=np.bool_)
         for solid in limits.obstacles:
-            hit |= solid.collides(
-                ToolPoses(positions, quaternions), shape, threads=threads, retreat_m=distance
-            )
+            hit |= solid.collides(poses, shape, threads=threads, retreat_m=distance)
         return ~hit
 
     return clear
@@ -60,18 +57,19 @@ class NearSuccesses:
     density: GraspDensity
     reach: float = _NEAR
 
-    def __call__(self, positions: Floats, quaternions: Floats) -> Bools:
-        _, distance = self.density.nearest_each(se3.Poses(positions, quaternions), within=self.reach)
+    def __call__(self, poses: Poses) -> Bools:
+        _, distance = self.density.nearest_each(poses, within=self.reach)
         return np.asarray(distance <= self.reach)
 
-    def pull(self, positions: Floats, quaternions: Floats) -> tuple[Floats, Floats]:
+    def pull(self, poses: Poses) -> Poses:
         """Poses a little farther from a success moved straight towards it as far as the reach."""
         density, reach = self.density, self.reach * (1.0 - 1e-4)
-        rows, distance = density.nearest_each(se3.Poses(positions, quaternions), within=1.5 * self.reach)
+        rows, distance = density.nearest_each(poses, within=1.5 * self.reach)
         far = np.flatnonzero((distance > reach) & (rows >= 0))
-        p, q = positions.copy(), quaternions.copy()
         if not len(far):
-            return p, q
+            return poses
+        positions, quaternions = poses
+        p, q = positions.copy(), quaternions.copy()
         rows = rows[far]
         centre, to = density.positions[rows], density.quaternions_xyzw[rows]
         # The end of the success's rotation, of its twin's and of both antipodes that is nearest.
@@ -89,4 +87,4 @@ class NearSuccesses:
             share *= np.minimum(reach / np.sqrt(np.maximum(squared, 1e-12)), 1.0)
         p[far] = centre + share[:, None] * (positions[far] - centre)
         q[far] = se3.normalise(to + share[:, None] * (quaternions[far] - to))
-        return p, q
+        return Poses(p, q)

@@ -64,21 +64,19 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     if not found:
         return []
     limits, test, built, threads = question.limits, question.test, question.built, ctx.compute.threads
-    positions = np.array([item.position for item in found])
-    quaternions = np.array([item.quaternion_xyzw for item in found])
+    poses = se3.Poses(
+        np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
+    )
     logs = np.array([item.log_density for item in found])
 
     def known() -> tuple[Any, Any, list[list[int]], Any]:
         """Whether they are free, how wide the jaw is, the sequence numbers of the nearest successes."""
-        free = None if test is None else test.free(positions, quaternions, threads=threads)
-        widths = None if test is None else test.widths(positions, quaternions, threads=threads)
+        free = None if test is None else test.free(poses, threads=threads)
+        widths = None if test is None else test.widths(poses, threads=threads)
         nearest: list[list[int]] = [[] for _ in found]
         if not question.prior:
             rows = (
-                question.search.centres.nearest_rows(
-                    se3.Poses(item.position, item.quaternion_xyzw), _NEAREST_TRIALS
-                )
-                for item in found
+                question.search.centres.nearest_rows(poses[i], _NEAREST_TRIALS) for i in range(len(poses))
             )
             nearest = [built.seq[row].tolist() for row in rows]
         return free, widths, nearest, question.search.relative(logs, threads)
@@ -86,7 +84,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     free, widths, nearest, relative = ctx.compute.run(known)
     estimates = None
     if question.chances:
-        estimates = ctx.successes.estimate(question.model, positions, quaternions, free)
+        estimates = ctx.successes.estimate(question.model, poses, free)
     grasps = []
     for i, item in enumerate(found):
         chances: dict[str, object] = {}

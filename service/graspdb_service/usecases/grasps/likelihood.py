@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, Selection
 from graspdb.wire.queries import LikelihoodColumn
-from graspdb_density import GraspDensity, MixtureDensity, se3
+from graspdb_density.kde.density import SearchedDensity
+from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -46,12 +47,11 @@ def likelihood(
     ctx: Estimators,
     slug: str,
     request: Selection,
-    positions: Floats,
-    quaternions: Floats,
+    poses: Poses,
     include: Collection[LikelihoodColumn] | None,
 ) -> LikelihoodAnswer:
-    """How likely poses (n, 3), (n, 4) in the object frame are under the density of the successes."""
-    count = len(positions)
+    """How likely poses (n,) in the object frame are under the density of the successes."""
+    count = len(poses)
     if count > ctx.settings.max_query_poses:
         raise ProblemError(
             413,
@@ -72,18 +72,18 @@ def likelihood(
             if search is None:
                 logs, relative = np.full(count, -np.inf), np.zeros(count)
             else:
-                logs = log_density(ctx, search.density, positions, quaternions, cutoff)
+                logs = log_density(ctx, search.density, poses, cutoff)
                 if asked("relative"):
                     relative = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
         chances = asked("success_probability", "interval", "effective_trials")
         if chances or asked("collision_free"):
             test = ctx.scenes.test(built.selected)
             if test is not None:
-                free = _free(ctx, test, positions, quaternions)
+                free = _free(ctx, test, poses)
         estimates = None
         if chances:
             model = ctx.successes.model(built, collisions_known=free is not None)
-            estimates = ctx.successes.estimate(model, positions, quaternions, free)
+            estimates = ctx.successes.estimate(model, poses, free)
     return LikelihoodAnswer(
         object_id=built.object_row.id,
         revision=built.revision,
@@ -100,32 +100,25 @@ def likelihood(
 
 def log_density(
     ctx: Estimators,
-    density: GraspDensity | MixtureDensity,
-    positions: Floats,
-    quaternions: Floats,
+    density: SearchedDensity,
+    poses: Poses,
     cutoff: float | None,
 ) -> Floats:
-    """Log densities (n,) of poses (n, 3), (n, 4), computed in blocks."""
-    logs = np.empty(len(positions))
-    threads = ctx.compute.threads
+    """Log densities (n,) of poses, computed in blocks."""
+    logs = np.empty(len(poses))
 
     def work(part: slice) -> None:
-        p, q = positions[part], quaternions[part]
-        if isinstance(density, GraspDensity):
-            logs[part] = density.log_density(se3.Poses.of(p, q), cutoff=cutoff, threads=threads)
-        else:
-            # It sums whatever matters, however far.
-            logs[part] = density.log_density(se3.Poses.of(p, q), threads=threads)
+        logs[part] = density.log_density(poses[part], cutoff=cutoff, threads=ctx.compute.threads)
 
-    ctx.compute.blocks(len(positions), _BLOCK, work)
+    ctx.compute.blocks(len(poses), _BLOCK, work)
     return logs
 
 
-def _free(ctx: Estimators, test: CollisionTest, positions: Floats, quaternions: Floats) -> NDArray[np.bool_]:
-    free = np.empty(len(positions), dtype=bool)
+def _free(ctx: Estimators, test: CollisionTest, poses: Poses) -> NDArray[np.bool_]:
+    free = np.empty(len(poses), dtype=bool)
 
     def work(part: slice) -> None:
-        free[part] = test.free(positions[part], quaternions[part], threads=ctx.compute.threads)
+        free[part] = test.free(poses[part], threads=ctx.compute.threads)
 
-    ctx.compute.blocks(len(positions), _BLOCK, work)
+    ctx.compute.blocks(len(poses), _BLOCK, work)
     return free

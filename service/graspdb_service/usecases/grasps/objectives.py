@@ -85,18 +85,17 @@ def success_score(
 ) -> Score:
     """A column of the success probability as a score: 0 where the open gripper collides."""
 
-    def score(positions: Floats, quaternions: Floats) -> Floats:
-        values = np.zeros(len(positions))
-        index = np.arange(len(positions))
+    def score(poses: Poses) -> Floats:
+        values = np.zeros(len(poses))
+        index = np.arange(len(poses))
         if test is not None:
-            index = np.flatnonzero(test.free(positions, quaternions, threads=threads))
+            index = np.flatnonzero(test.free(poses, threads=threads))
         if not len(index):
             return values
-        p, q = positions[index], quaternions[index]
         if column == "low":
-            values[index] = model.lower_end(Poses.of(p, q), level=LEVEL, threads=threads)
+            values[index] = model.lower_end(poses[index], level=LEVEL, threads=threads)
         else:
-            values[index] = model.probability(Poses.of(p, q), threads=threads)
+            values[index] = model.probability(poses[index], threads=threads)
         return values
 
     return score
@@ -110,7 +109,7 @@ def _widened(search: ModeSearch, noises: dict[str, PoseNoise]) -> tuple[Score, d
     """
     density, at_object, at_tool = search.density.isotropic, noises["pose_noise"], noises["tool_noise"]
     if density is not search.density:
-        return lambda p, q: search.density.density(Poses(p, q)), noises
+        return lambda poses: np.exp(search.density.log_density(poses)), noises
     shift = math.hypot(at_object.sigma_position_m, at_tool.sigma_position_m)
     wider = GraspDensity.build(
         density.poses,
@@ -122,7 +121,7 @@ def _widened(search: ModeSearch, noises: dict[str, PoseNoise]) -> tuple[Score, d
         "pose_noise": replace(at_object, sigma_position_m=0.0),
         "tool_noise": replace(at_tool, sigma_position_m=0.0, sigma_rotation=0.0),
     }
-    return lambda p, q: wider.density(Poses(p, q)), left
+    return wider.density, left
 
 
 def _pivot(row: ObjectRow, density: GraspDensity) -> tuple[tuple[float, float, float], str]:

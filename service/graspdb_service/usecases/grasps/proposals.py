@@ -115,14 +115,14 @@ def uncertain(
     p, q = density.sample(_PLACES, rng)
     p = p + rng.standard_normal(p.shape) * extra * kernel.sigma_position_m
     turns = se3.from_rotation_vector(rng.standard_normal(p.shape) * extra * kernel.sigma_rotation)
-    q = se3.multiply(q, turns)
-    kept = NearSuccesses(density, _REACH)(p, q)
+    poses = Poses(p, se3.multiply(q, turns))
+    kept = NearSuccesses(density, _REACH)(poses)
     if test is not None:
-        kept &= test.free(p, q, threads=threads)
-    p, q = p[kept], q[kept]
-    if not len(p):
+        kept &= test.free(poses, threads=threads)
+    poses = poses[kept]
+    if not len(poses):
         return None
-    found = model.evaluate(Poses.of(p, q), threads=threads)
+    found = model.evaluate(poses, threads=threads)
     trials = PRIOR_TRIALS + found.effective_trials
     gain = found.probability * (1.0 - found.probability) / (trials + 1.0) ** 2
     # Weights are told apart in float32.
@@ -131,6 +131,4 @@ def uncertain(
         return None
     narrow = IsotropicKernel(_NARROWER * kernel.sigma_position_m, _NARROWER * kernel.sigma_rotation)
     symmetric = bool(density.symmetric.all())
-    return GraspDensity.build(
-        se3.Poses.of(p[taught], q[taught]), kernel=narrow, weights=gain[taught], symmetric=symmetric
-    )
+    return GraspDensity.build(poses[taught], kernel=narrow, weights=gain[taught], symmetric=symmetric)

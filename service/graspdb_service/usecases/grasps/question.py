@@ -159,7 +159,7 @@ def _bounds(
     checks: list[Admissible] = []
     if built.search is None and test is not None:
         # Between the grasps on a prior's pairs lie others that hold nothing.
-        checks.append(lambda p, q: test.holds(p, q, threads))
+        checks.append(lambda poses: test.holds(poses, threads))
     if near is not None:
         checks.append(near)
     if limits.exclude is not None and len(limits.exclude):
@@ -167,11 +167,11 @@ def _bounds(
         checks.append(distinct_from(limits.exclude, separation, twins=twins))
     distance = request.pregrasp_distance_m or 0.0
     if test is not None and request.collision_free is not False:
-        checks.append(lambda p, q: test.free_on_the_way(p, q, distance, threads))
+        checks.append(lambda poses: test.free_on_the_way(poses, distance, threads))
     profile = built.selected.profile
     if limits.obstacles and profile is not None:
         checks.append(clear_of(limits, shape_of(profile), distance, threads))
     wide = request.max_width_m
     if wide is not None and test is not None:
-        checks.append(lambda p, q: test.widths(p, q, threads) <= wide)
+        checks.append(lambda poses: test.widths(poses, threads) <= wide)
     return Bounds(limits.region, all_of(checks), request.count, separation)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, Selection
-from graspdb_density import GraspDensity, MixtureDensity, se3
+from graspdb_density import se3
+from graspdb_density.kde.density import SearchedDensity
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -56,7 +57,7 @@ def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int
 
 def drawn_from(
     ctx: Estimators,
-    density: GraspDensity | MixtureDensity,
+    density: SearchedDensity,
     row: ObjectRow,
     kernel: KernelInfo,
     count: int,
@@ -64,14 +65,14 @@ def drawn_from(
 ) -> Draw:
     """Draws from a density of an object as it was at a revision."""
     chosen = secrets.randbits(63) if seed is None else seed
-    position, quaternion = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
+    poses = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
     return Draw(
         revision=row.revision,
         kernel=kernel,
         seed=chosen,
-        position=position,
-        quaternion_xyzw=se3.canonical(quaternion),
-        proposal_density=np.exp(log_density(ctx, density, position, quaternion, _CUTOFF)),
+        position=poses.positions,
+        quaternion_xyzw=se3.canonical(poses.quaternions_xyzw),
+        proposal_density=np.exp(log_density(ctx, density, poses, _CUTOFF)),
     )
 
 

@@ -33,7 +33,7 @@ class Bounds:
         """Rows of the poses that everything but the region admits."""
         if self.admissible is None or not len(poses):
             return np.arange(len(poses))
-        return np.flatnonzero(self.admissible(poses.positions, poses.quaternions_xyzw))
+        return np.flatnonzero(self.admissible(poses))
 
     def maxima(self, search: ModeSearch, **by: Any) -> list[Maximum]:
         """Those of a search, which takes ``by`` besides."""
@@ -91,13 +91,13 @@ class ScoreEvolution:
 
     def scored(self, poses: Poses) -> tuple[Floats, Floats]:
         logs = self.search.density.log_density(poses, threads=self.threads)
-        return logs, self.score(poses.positions, poses.quaternions_xyzw)
+        return logs, self.score(poses)
 
     def shortlist(self, poses: Poses, most: int) -> Poses:
         """Only those that may be among the best are worth the score itself."""
         if self.rough is self.score or len(poses) <= most:
             return poses
-        rough = self.rough(poses.positions, poses.quaternions_xyzw)
+        rough = self.rough(poses)
         return poses[np.argsort(-rough, kind="stable")[:most]]
 
 
@@ -112,7 +112,7 @@ class CandidateRanking:
     def best(self, bounds: Bounds) -> list[Maximum]:
         region = bounds.region
         poses = self.candidates
-        poses = poses[region.contains(poses.positions, poses.quaternions_xyzw)]
+        poses = poses[region.contains(*poses)]
         poses = poses[bounds.allowed(poses)]
         if not len(poses):
             return []
@@ -125,7 +125,7 @@ class CandidateRanking:
                 break
             if self.separated and chosen:
                 apart = distinct_from(poses[np.array(chosen)], bounds.separation, twins=twins)
-                if not apart(poses.positions[i : i + 1], poses.quaternions_xyzw[i : i + 1])[0]:
+                if not apart(poses[i : i + 1])[0]:
                     continue
             chosen.append(int(i))
         p, q = poses.positions, poses.quaternions_xyzw
@@ -141,7 +141,7 @@ class CandidateRanking:
 def closest(engine: Engine, bounds: Bounds, poses: Poses, widths: Separation) -> list[Maximum]:
     """The pose that violates the region least, in ``widths`` of a kernel, and is otherwise admissible; or
     none."""
-    p, q, _ = bounds.region.project(poses.positions, poses.quaternions_xyzw)
+    p, q, _ = bounds.region.project(*poses)
     shift = np.sum((p - poses.positions) ** 2, axis=1) / widths.metres**2
     turn = se3.angle_between(q, poses.quaternions_xyzw) ** 2 / widths.radians**2
     order = np.argsort(shift + turn, kind="stable")

@@ -24,7 +24,6 @@ from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
 from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacements, fit_kernel
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage import kernels
 from graspdb_service.storage.kernels import KernelRow
@@ -136,14 +135,14 @@ def _fit(
     assert density is not None
     assert not isinstance(count, list)
     fit = fit_kernel(
-        Poses.of(density.positions, density.quaternions_xyzw),
+        density.poses,
         window=_window(window),
         widths=_isotropic(widths),
         compared=density.kernel,
         components=None if count == "auto" else count or 1,
         weights=density.weights,
         symmetric=density.symmetric,
-        frame=stored_kernel.axes_at(axes, density.positions, density.quaternions_xyzw),
+        frame=stored_kernel.axes_at(axes, density.poses),
         threads=threads,
         progress=progress,
     )
@@ -166,7 +165,7 @@ def _sample(
     assert density is not None
     count = request.components if isinstance(request.components, int) else SAMPLED
     found = displacements(
-        Poses.of(density.positions, density.quaternions_xyzw),
+        density.poses,
         window=_window(window),
         rng=rng,
         weights=density.weights,

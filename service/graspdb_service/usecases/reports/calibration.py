@@ -134,7 +134,7 @@ def _predictions(
     kernel = built.density.kernel
     p, q = everything.position[judged], everything.quaternion[judged]
     predicted, ranked = np.zeros(len(judged)), np.full(len(judged), -np.inf)
-    free = None if test is None else test.free(p, q, threads=inputs.threads)
+    free = None if test is None else test.free(Poses(p, q), threads=inputs.threads)
     learned = everything.collided if test is not None else np.zeros(len(everything), dtype=bool)
     proposal_known = not np.isnan(everything.proposal).all()
     for fold in range(blocks.folds):
@@ -204,7 +204,7 @@ def _checked(
         model = _model(everything, np.flatnonzero(near), diagonal or kernel)
         predicted = model.evaluate(Poses.of(p, q), threads=inputs.threads).probability.copy()
     if test is not None:
-        predicted[~test.free(p, q, threads=inputs.threads)] = 0.0
+        predicted[~test.free(Poses(p, q), threads=inputs.threads)] = 0.0
     outcomes = verification.tally(codes)
     won = outcomes.get("success", 0)
     success = np.isin(codes, [OUTCOME_CODES["success"]])

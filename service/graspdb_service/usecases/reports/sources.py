@@ -119,7 +119,7 @@ def _predictions(
         predicted = answer.probability.copy()
         reached = answer.effective_trials >= _WITHIN_REACH
     if test is not None:
-        free = test.free(everything.position, everything.quaternion, threads=threads)
+        free = test.free(Poses(everything.position, everything.quaternion), threads=threads)
         predicted[~free] = 0.0
         # Geometry tells of a collision wherever it is.
         reached |= ~free
