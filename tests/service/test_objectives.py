@@ -16,6 +16,7 @@ from graspdb.wire import BestGraspRequest
 from graspdb_density import GraspDensity, IsotropicKernel, PoseNoise, Region, SuccessModel, expected, se3
 from graspdb_density.se3 import Poses
 from graspdb_density.search.mode_search import MeanShiftSearch, ModeSearch
+from graspdb_density.search.scored_poses import Score
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
@@ -158,15 +159,15 @@ def test_robust_prefers_what_survives_noise(
         assert told.startswith("20 mm")
         assert ("left" in told) == ("pose_noise_m" in query)
 
-        def chance(a: Floats, b: Floats) -> Floats:
-            return model.evaluate(Poses.of(a, b)).probability
+        def chance(poses: Poses) -> Floats:
+            return model.evaluate(poses).probability
 
         mean = expected(density.density if value == "density" else chance, samples=4_096, **noise)  # type: ignore[arg-type]
-        (exact,) = mean(np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]]))
+        (exact,) = mean(Poses(np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]])))
         assert grasp["score"] == pytest.approx(exact, rel=0.08)
         rng = np.random.default_rng(1)
         rows = rng.integers(0, 550, 200)
-        assert grasp["score"] > 0.93 * mean(p[rows], q[rows]).max()
+        assert grasp["score"] > 0.93 * mean(Poses(p[rows], q[rows])).max()
     # What is averaged by default is the chance, where there is one to average.
     default = ask(http, objective="robust", tool_noise_m=0.02, **narrow)
     assert default["ranking"]["robust_of"] == "success_probability"
@@ -381,12 +382,12 @@ class Field:
         )
         self.near = NearSuccesses(self.density, 2.0)
 
-    def chance(self, column: str) -> Callable[[Floats, Floats], Floats]:
-        def score(p: Floats, q: Floats) -> Floats:
-            values = np.zeros(len(p))
-            free = np.flatnonzero(~self.scene.collides(ToolPoses(p, q), PG70, threads=2))
+    def chance(self, column: str) -> Score:
+        def score(poses: Poses) -> Floats:
+            values = np.zeros(len(poses))
+            free = np.flatnonzero(~self.scene.collides(poses, PG70, threads=2))
             if len(free):
-                found = self.model.evaluate(Poses.of(p[free], q[free]), level=0.9, threads=2)
+                found = self.model.evaluate(poses[free], level=0.9, threads=2)
                 values[free] = getattr(found, column)
             return values
 
@@ -394,8 +395,8 @@ class Field:
 
     def best(
         self,
-        rough: Callable[[Floats, Floats], Floats],
-        score: Callable[[Floats, Floats], Floats],
+        rough: Score,
+        score: Score,
         region: Region,
         free: bool,
         climbers: int,
@@ -413,20 +414,20 @@ class Field:
         p, q = p[inside], q[inside]
 
         def allowed(p: Floats, q: Floats) -> Bools:
-            ok = self.near(p, q)
+            ok = self.near(Poses(p, q))
             return ok & ~self.scene.collides(ToolPoses(p, q), PG70, threads=2) if free else ok
 
         ok = allowed(p, q) if len(p) else np.zeros(0, dtype=bool)
         p, q = p[ok], q[ok]
         if not len(p):
             return -math.inf
-        top = np.argsort(-rough(p, q))[:climbers]
-        p, q, values = p[top], q[top], score(p[top], q[top])
+        top = np.argsort(-rough(Poses(p, q)))[:climbers]
+        p, q, values = p[top], q[top], score(Poses(p[top], q[top]))
         for step in np.repeat([0.5, 0.25, 0.12, 0.06, 0.03], 12):
             moved = p + rng.standard_normal(p.shape) * step * KERNEL.sigma_position_m
             turned = se3.from_rotation_vector(rng.standard_normal(p.shape) * step * KERNEL.sigma_rotation)
             new_p, new_q, inside = region.project(moved, se3.multiply(q, turned))
-            new = score(new_p, new_q)
+            new = score(Poses(new_p, new_q))
             better = np.flatnonzero(inside & (new > values))
             better = better[allowed(new_p[better], new_q[better])]
             p[better], q[better], values[better] = new_p[better], new_q[better], new[better]
@@ -477,11 +478,11 @@ def compare_scores(
                 assert best == -math.inf, seed
                 continue
             (grasp,) = answer.grasps
-            pose = np.array([grasp.position]), np.array([grasp.quaternion_xyzw])
+            pose = Poses(np.array([grasp.position]), np.array([grasp.quaternion_xyzw]))
             assert region.contains(*pose).all(), seed
-            assert field.near(*pose).all(), seed
-            assert not query["collision_free"] or not field.scene.collides(ToolPoses(*pose), PG70).any(), seed
-            assert grasp.score == pytest.approx(float(score(*pose)[0]), rel=1e-3, abs=1e-6), seed
+            assert field.near(pose).all(), seed
+            assert not query["collision_free"] or not field.scene.collides(pose, PG70).any(), seed
+            assert grasp.score == pytest.approx(float(score(pose)[0]), rel=1e-3, abs=1e-6), seed
             assert grasp.score >= 0.999 * best, (seed, grasp.score / best, query)
 
 
