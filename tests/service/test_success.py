@@ -34,11 +34,11 @@ COLLISION = OUTCOME_CODES["collision"]
 def by_definition(trials: Poses, success: Bools, queries: Poses) -> tuple[Floats, Floats, Floats, Floats]:
     """P, its interval's ends and n_e: the sums of the definition in float64, without a cut-off."""
     first = brute_force.kernel_log_density(
-        KERNEL, se3.Poses.of(queries[0][:, None], queries[1][:, None]), se3.Poses.of(trials[0], trials[1])
+        KERNEL, se3.Poses(queries[0][:, None], queries[1][:, None]), se3.Poses.of(trials[0], trials[1])
     )
     second = brute_force.kernel_log_density(
         KERNEL,
-        se3.Poses.of(queries[0][:, None], queries[1][:, None]),
+        se3.Poses(queries[0][:, None], queries[1][:, None]),
         se3.Poses.of(trials[0], se3.jaw_twin(trials[1])),
     )
     k = np.exp(first) + np.exp(second)
