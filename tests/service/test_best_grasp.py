@@ -455,12 +455,12 @@ def test_candidates_are_ranked_as_they_are(thing: httpx.Client, two_clusters: Po
     there = se3.compose(se3.Poses(shift, turn), se3.Poses(p, q))
     listed = [
         {"position": a, "quaternion_xyzw": b}
-        for a, b in zip(there[0].tolist(), there[1].tolist(), strict=True)
+        for a, b in zip(there.positions.tolist(), there.quaternions_xyzw.tolist(), strict=True)
     ]
     answer = posted(thing, candidates=listed, object_pose=[*shift, *turn])
     (grasp,) = answer["grasps"]
     assert grasp["candidate"] == order[0]
-    np.testing.assert_allclose(grasp["world"]["position"], there[0][order[0]], atol=1e-9)
+    np.testing.assert_allclose(grasp["world"]["position"], there.positions[order[0]], atol=1e-9)
     # None fits: the nearest one is said.
     answer = posted(thing, candidates=candidates, box_min=[1, 1, 1])
     assert (answer["status"], answer["grasps"]) == ("infeasible", [])

@@ -355,3 +355,36 @@ class Proposals(Samples):
 
     strategy: Strategy
     criterion: str
+
+
+# -- in query strings, and beside poses that are read as arrays
+
+
+def _listed(value: Any) -> Any:
+    """``include=density,relative`` and ``include=density&include=relative`` mean the same."""
+    if isinstance(value, list):
+        return [
+            part.strip() for item in value for part in (item.split(",") if isinstance(item, str) else [item])
+        ]
+    return value
+
+
+class LikelihoodQuery(SelectionQuery):
+    """One pose in a query string."""
+
+    position: Position
+    quaternion_xyzw: Quaternion
+    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
+
+
+class BestGraspQuery(GraspConstraints):
+    """The best grasp's constraints in a query string."""
+
+    kernel: Slug | None = None
+    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
+
+
+class LikelihoodOptions(Selection):
+    """A likelihood request without its poses, which are read as arrays."""
+
+    include: list[LikelihoodColumn] | None = None

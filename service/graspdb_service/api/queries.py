@@ -6,13 +6,12 @@ import hashlib
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, BeforeValidator
+from pydantic import BaseModel
 
 from graspdb.wire import (
     BestGraspRequest,
     BestGrasps,
     DensityInfo,
-    GraspConstraints,
     LikelihoodRequest,
     Likelihoods,
     Proposals,
@@ -20,10 +19,14 @@ from graspdb.wire import (
     Samples,
     SamplesRequest,
     Selection,
-    Slug,
 )
-from graspdb.wire.base import Position, Quaternion
-from graspdb.wire.queries import MAX_OBSTACLE_POINTS, LikelihoodColumn, SelectionQuery
+from graspdb.wire.queries import (
+    MAX_OBSTACLE_POINTS,
+    BestGraspQuery,
+    LikelihoodOptions,
+    LikelihoodQuery,
+    SelectionQuery,
+)
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing.caching import etag, not_modified
@@ -34,7 +37,6 @@ from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted, media_type
 from graspdb_service.formats.poses import read_arrow_poses, read_poses
 from graspdb_service.usecases.densities.info import density_info
-from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.grasps import likelihood, proposals, samples
 from graspdb_service.usecases.grasps.answer import best_grasps
 from graspdb_service.usecases.trials.selection import Filters
@@ -42,36 +44,6 @@ from graspdb_service.usecases.trials.selection import Filters
 router = APIRouter(tags=["queries"])
 
 Q = TypeVar("Q", bound=Selection)
-
-
-def _listed(value: Any) -> Any:
-    """``include=density,relative`` and ``include=density&include=relative`` mean the same."""
-    if isinstance(value, list):
-        return [
-            part.strip() for item in value for part in (item.split(",") if isinstance(item, str) else [item])
-        ]
-    return value
-
-
-class LikelihoodQuery(SelectionQuery):
-    """One pose in a query string."""
-
-    position: Position
-    quaternion_xyzw: Quaternion
-    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
-
-
-class BestGraspQuery(GraspConstraints):
-    """The best grasp's constraints in a query string."""
-
-    kernel: Slug | None = None
-    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
-
-
-class LikelihoodOptions(Selection):
-    """A likelihood request without its poses, which are read as arrays."""
-
-    include: list[LikelihoodColumn] | None = None
 
 
 @router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read"))
@@ -185,23 +157,8 @@ def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
 def _likelihoods(
     answer: likelihood.LikelihoodAnswer, headers: dict[str, str] | None = None, *, arrow: bool = False
 ) -> Response:
-    columns: dict[str, Any] = {
-        name: getattr(answer, name)
-        for name in (
-            "density",
-            "log_density",
-            "relative",
-            "success_probability",
-            "effective_trials",
-            "collision_free",
-        )
-        if getattr(answer, name) is not None
-    }
-    if answer.interval is not None:
-        low, high = answer.interval
-        columns["interval"] = {"level": LEVEL, "low": low, "high": high}
     head = {"revision": answer.revision, "kernel": answer.kernel.model_dump()}
-    return (columns_arrow if arrow else columns_json)(head, columns, headers)
+    return (columns_arrow if arrow else columns_json)(head, answer.columns(), headers)
 
 
 def _json(answer: BaseModel, tag: str | None = None) -> Response:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.geometry.collision import CollisionTest
 
 Floats = NDArray[np.float64]
@@ -41,6 +43,21 @@ class LikelihoodAnswer:
     success_probability: Floats | None = None
     interval: tuple[Floats, Floats] | None = None
     effective_trials: Floats | None = None
+
+    def columns(self) -> dict[str, Any]:
+        """Those there are, by their names in an answer."""
+        names = (
+            "density",
+            "log_density",
+            "relative",
+            "success_probability",
+            "effective_trials",
+            "collision_free",
+        )
+        columns = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if self.interval is not None:
+            columns["interval"] = {"level": LEVEL, "low": self.interval[0], "high": self.interval[1]}
+        return columns
 
 
 def likelihood(
