@@ -225,6 +225,7 @@ def composition_angles(q, plane):  # type: ignore[no-untyped-def]
     return _wrapped(both + apart), _wrapped(both - apart), 2.0 * abs(w * c - a * b)
 
 
+# long: one compiled loop over pairs, whose buffers and frames all steps share.
 @exact
 def rotation_pairs(trials, displaced, bins, symmetric, framed, reach_m, planes, lines, nearby):  # type: ignore[no-untyped-def]
     """Pairs at the same position into the histograms (plane, alpha, beta) and the profiles (axis, bin); how

@@ -31,6 +31,7 @@ __all__ = ["density_anisotropy"]
 Attempts = float | Callable[[Poses], Floats]
 
 
+# long: the options of the report, explained one by one.
 def density_anisotropy(
     successes: GraspDensity,
     attempts: Attempts,
