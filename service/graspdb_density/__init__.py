@@ -3,7 +3,7 @@
 from . import se3
 from .bandwidth.selection import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
 from .kde import brute_force
-from .kde.importance_weights import effective_sample_size, importance_weights, mixture_weights
+from .kde.importance_weights import effective_sample_size, importance_weights
 from .kde.isotropic import GraspDensity
 from .kde.mixture import MixtureDensity
 from .kde.sample_kernel import SampledKernel
@@ -38,7 +38,6 @@ __all__ = [
     "effective_sample_size",
     "expected",
     "importance_weights",
-    "mixture_weights",
     "se3",
     "widths_prefix",
 ]

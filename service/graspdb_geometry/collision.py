@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_geometry._compiled import convex, surface
 from graspdb_geometry._compiled.widths import surface_extents
 from graspdb_geometry.grippers import GripperShape
-from graspdb_geometry.poses import Poses, ToolPoses, checked
+from graspdb_geometry.poses import PoseArrays, ToolPoses, checked
 
 FloatArray = npt.NDArray[np.float64]
 CodeArray = npt.NDArray[np.uint8]
@@ -71,7 +71,9 @@ class Scene:
             np.array([s.radius for s in solids]),
         )
 
-    def classify(self, poses: Poses, shape: GripperShape, threads: int = 1) -> tuple[CodeArray, FloatArray]:
+    def classify(
+        self, poses: PoseArrays, shape: GripperShape, threads: int = 1
+    ) -> tuple[CodeArray, FloatArray]:
         """What the open gripper meets in each pose.
 
         Parameters
@@ -105,7 +107,7 @@ class Scene:
 
     def collides(
         self,
-        poses: Poses,
+        poses: PoseArrays,
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
@@ -139,12 +141,12 @@ class Scene:
         hits: npt.NDArray[np.bool_] = codes == COLLIDES
         return hits
 
-    def holds(self, poses: Poses, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
+    def holds(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
         """Whether the open gripper is free and something lies between its fingers, (n,)."""
         codes, _ = self.classify(poses, shape, threads)
         return np.asarray(codes == CONTACT)
 
-    def widths(self, poses: Poses, shape: GripperShape, threads: int = 1) -> FloatArray:
+    def widths(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> FloatArray:
         """How far apart the fingers are once both touch the object, metres, (n,).
 
         That is the object's extent along y between the fingers, for a free object is centred as they close.
@@ -190,7 +192,7 @@ class Surface:
 
     def collides(
         self,
-        poses: Poses,
+        poses: PoseArrays,
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,
@@ -207,7 +209,7 @@ class Surface:
         _in_blocks(run, len(p), threads)
         return hits
 
-    def holds(self, poses: Poses, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
+    def holds(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
         """As :meth:`Scene.holds`; much quicker than asking how wide."""
         p, q = checked(poses)
         column = np.ascontiguousarray(_gripper_boxes(shape, None, 0.0)[3:])
@@ -219,7 +221,7 @@ class Surface:
         _in_blocks(run, len(p), threads)
         return met & ~self.collides(poses, shape, threads=threads)
 
-    def widths(self, poses: Poses, shape: GripperShape, threads: int = 1) -> FloatArray:
+    def widths(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> FloatArray:
         """As :meth:`Scene.widths`."""
         p, q = checked(poses)
         column = np.ascontiguousarray(_gripper_boxes(shape, None, 0.0)[3])
@@ -292,7 +294,7 @@ class PointCloud:
 
     def collides(
         self,
-        poses: Poses,
+        poses: PoseArrays,
         shape: GripperShape,
         opening_m: float | None = None,
         threads: int = 1,

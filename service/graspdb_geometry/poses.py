@@ -7,12 +7,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Poses", "ToolPoses", "checked"]
+__all__ = ["PoseArrays", "ToolPoses", "checked"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
-class Poses(Protocol):
+class PoseArrays(Protocol):
     """Whatever has the arrays of n poses: `ToolPoses`, or a value of the caller's own."""
 
     @property
@@ -31,7 +31,7 @@ class ToolPoses(NamedTuple):
     quaternions_xyzw: npt.ArrayLike
 
 
-def checked(poses: Poses) -> tuple[FloatArray, FloatArray]:
+def checked(poses: PoseArrays) -> tuple[FloatArray, FloatArray]:
     """The arrays, contiguous, quaternions normalised.
 
     Raises

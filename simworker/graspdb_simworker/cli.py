@@ -132,7 +132,7 @@ def run(
     limits = None
     if decompose_seconds > 0:
         if decomposition.available():
-            limits = decomposition.Limits(decompose_seconds, decompose_memory_mib * 2**20)
+            limits = decomposition.ResourceLimits(decompose_seconds, decompose_memory_mib * 2**20)
         else:
             log.warning("coacd is missing: meshes that are not convex are left to other workers")
 

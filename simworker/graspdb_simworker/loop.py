@@ -37,9 +37,9 @@ from graspdb.wire import (
     SimulatePayload,
     SimulateResult,
 )
-from graspdb_simworker.decomposition.supervisor import DecompositionFailed, Limits, decompose
+from graspdb_simworker.decomposition.supervisor import DecompositionFailed, ResourceLimits, decompose
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import Cancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
 
 log = logging.getLogger("graspdb.simworker")
 
@@ -74,7 +74,7 @@ class Lease:
 
 
 @dataclass
-class Tally:
+class WorkTally:
     """What a worker has done since it started."""
 
     jobs: int = 0
@@ -107,7 +107,7 @@ class Worker:
         exit_when_idle: bool = False,
         once: bool = False,
         make_runner: Callable[[], ChunkRunner] = LocalRunner,
-        decompositions: Limits | None = None,
+        decompositions: ResourceLimits | None = None,
     ) -> None:
         if processes < 1:
             raise ValueError("processes must be at least 1")
@@ -124,7 +124,7 @@ class Worker:
         self._leases: dict[str, Lease] = {}
         self._parts: dict[str, bytes] = {}
         self._fatal: WorkerFailed | None = None
-        self.tally = Tally()
+        self.tally = WorkTally()
 
     def stop(self) -> None:
         """Stop soon: children are killed and leases given back. May be called from a signal handler."""
@@ -262,7 +262,7 @@ class Worker:
                     return
                 parts = self._parts_of(payload, lease)
                 result = runner.run(payload, parts, wanted=lambda: self._wanted(lease))
-            except Cancelled:
+            except ChunkCancelled:
                 self._abandon(lease)
             except ChunkFailed as error:
                 log.error("job %s failed: %s", job.id, error)
@@ -323,8 +323,8 @@ class Worker:
     def _parts_of(self, payload: SimulatePayload, lease: Lease) -> bytes:
         """The object's convex parts as GLB, fetched once for each hash.
 
-        Cancelled if the job is not wanted any more before they came; ChunkFailed if the service does not have
-        those that the sweep was planned with.
+        ChunkCancelled if the job is not wanted any more before they came; ChunkFailed if the service does not
+        have those that the sweep was planned with.
         """
         digest = payload.parts_sha256
         with self._lock:
@@ -342,7 +342,7 @@ class Worker:
         failures = 0
         while True:
             if not self._wanted(lease):
-                raise Cancelled
+                raise ChunkCancelled
             try:
                 data = self._transport.request("GET", path, retries=0).content
                 break

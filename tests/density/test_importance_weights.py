@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspdb_density import effective_sample_size, importance_weights, mixture_weights
+from graspdb_density import effective_sample_size, importance_weights
 from graspdb_density.kde.importance_weights import pooled_density
 
 POSITIVE = st.lists(st.floats(1e-12, 1e12), min_size=1, max_size=30)
@@ -44,22 +44,20 @@ def test_mixture_recovers_an_expectation_that_own_weights_recover_badly() -> Non
     counts = np.array([20_000, 20_000])
     x = np.concatenate([rng.random(counts[0]), rng.beta(5.0, 1.0, counts[1])])
     densities = np.stack([np.ones_like(x), 5.0 * x**4], axis=1)
-    mixed = mixture_weights(densities, counts)
+    mixed = importance_weights(pooled_density(densities, counts))
     assert mixed.sum() == pytest.approx(1.0)
     assert mixed @ x**2 == pytest.approx(1.0 / 3.0, abs=0.005)
     own = importance_weights(np.concatenate([densities[: counts[0], 0], densities[counts[0] :, 1]]))
     assert effective_sample_size(mixed) > 3.0 * effective_sample_size(own)
 
 
-def test_mixture_of_one_strategy_is_its_reciprocal() -> None:
+def test_one_strategy_weighs_by_its_reciprocal() -> None:
     g = np.array([0.5, 2.0, 4.0])
-    np.testing.assert_allclose(mixture_weights(g[:, None], [3]), importance_weights(g))
-    filled = mixture_weights(g[:, None], [3], known=[True, True, False])
-    assert filled[2] == pytest.approx(filled[:2].mean())
+    np.testing.assert_allclose(importance_weights(pooled_density(g[:, None], [3])), importance_weights(g))
     with pytest.raises(ValueError, match="positive and finite"):
-        mixture_weights([[0.0]], [1])
+        importance_weights(pooled_density([[0.0]], [1]))
     with pytest.raises(ValueError, match="shape"):
-        mixture_weights([[1.0]], [1, 2])
+        pooled_density([[1.0]], [1, 2])
 
 
 def test_effective_sample_size() -> None:
@@ -74,7 +72,8 @@ def test_pooled_strategies_weigh_as_the_mixture_does() -> None:
     densities = np.stack([np.full(4, 1.0), np.where(inside, 2.0, 0.0)], axis=1)
     pooled = pooled_density(densities, [100, 300])
     np.testing.assert_allclose(pooled, np.where(inside, 1.75, 0.25))
-    np.testing.assert_allclose(importance_weights(pooled), mixture_weights(densities, [100, 300]))
+    tried = densities @ [100, 300]
+    np.testing.assert_allclose(importance_weights(pooled), (1 / tried) / (1 / tried).sum())
     # One strategy by itself is what it says, whatever it drew.
     np.testing.assert_allclose(pooled_density(densities[:, :1], [7]), 1.0)
     with pytest.raises(ValueError, match="at least one strategy"):

@@ -23,11 +23,11 @@ from graspdb.wire import DecomposePayload
 from graspdb_geometry import meshes
 from graspdb_geometry.deviation import deviation
 from graspdb_simworker.decomposition import supervisor
-from graspdb_simworker.decomposition.supervisor import DecompositionFailed, Limits
+from graspdb_simworker.decomposition.supervisor import DecompositionFailed, ResourceLimits
 from graspdb_simworker.loop import Worker
-from graspdb_simworker.process.runner import Cancelled
+from graspdb_simworker.process.runner import ChunkCancelled
 
-LIMITS = Limits(seconds=120.0)
+LIMITS = ResourceLimits(seconds=120.0)
 PAYLOAD = DecomposePayload(object="angle", mesh="/objects/angle/mesh", mesh_sha256="", unit="mm")
 
 
@@ -71,7 +71,7 @@ def test_an_angle_is_split_the_same_every_time() -> None:
 
 def test_too_little_time_is_said_with_the_way_out() -> None:
     with pytest.raises(DecompositionFailed, match=r"more than 0\.05 s .*--decompose-seconds.*convex parts"):
-        supervisor.decompose(PAYLOAD, angle_stl(), limits=Limits(seconds=0.05))
+        supervisor.decompose(PAYLOAD, angle_stl(), limits=ResourceLimits(seconds=0.05))
 
 
 def test_work_is_bounded_and_not_the_wait() -> None:
@@ -79,7 +79,7 @@ def test_work_is_bounded_and_not_the_wait() -> None:
     script = "import resource as r; r.setrlimit(r.RLIMIT_CPU, (1, 9))\nwhile True: pass"
     with pytest.raises(DecompositionFailed, match=r"more than 60 s .*--decompose-seconds"):
         supervisor.decompose(
-            PAYLOAD, angle_stl(), limits=Limits(seconds=60.0), command=(sys.executable, "-c", script)
+            PAYLOAD, angle_stl(), limits=ResourceLimits(seconds=60.0), command=(sys.executable, "-c", script)
         )
 
 
@@ -98,7 +98,7 @@ def test_a_signal_to_the_whole_group_is_left_to_the_worker() -> None:
 
 def test_too_little_memory_is_said_with_the_way_out() -> None:
     with pytest.raises(DecompositionFailed, match="memory"):
-        supervisor.decompose(PAYLOAD, angle_stl(), limits=Limits(120.0, 150 * 2**20))
+        supervisor.decompose(PAYLOAD, angle_stl(), limits=ResourceLimits(120.0, 150 * 2**20))
 
 
 def test_what_is_no_mesh_is_refused_with_the_reason() -> None:
@@ -118,7 +118,7 @@ def test_the_best_so_far_is_taken_when_time_is_over() -> None:
         "m.receive(0); m.send(1, m.RESULT, b'coarse'); m.send(1, m.RESULT, b'finer'); time.sleep(60)"
     )
     found = supervisor.decompose(
-        PAYLOAD, angle_stl(), limits=Limits(seconds=4.0), command=(sys.executable, "-c", script)
+        PAYLOAD, angle_stl(), limits=ResourceLimits(seconds=4.0), command=(sys.executable, "-c", script)
     )
     assert found == b"finer"
 
@@ -126,7 +126,7 @@ def test_the_best_so_far_is_taken_when_time_is_over() -> None:
 def test_it_stops_when_it_is_not_wanted_any_more() -> None:
     began = time.monotonic()
     command = (sys.executable, "-c", "import time; time.sleep(600)")
-    with pytest.raises(Cancelled):
+    with pytest.raises(ChunkCancelled):
         supervisor.decompose(
             PAYLOAD,
             angle_stl(),
@@ -142,9 +142,9 @@ def test_it_ends_with_a_killed_worker(
     (tmp_path / "mesh.stl").write_bytes(trimesh.creation.torus(30, 10, 256, 128).export(file_type="stl"))
     script = (
         "import pathlib, sys; from graspdb.wire import DecomposePayload;"
-        "from graspdb_simworker.decomposition.supervisor import Limits, decompose;"
+        "from graspdb_simworker.decomposition.supervisor import ResourceLimits, decompose;"
         "decompose(DecomposePayload.model_validate_json(sys.argv[1]), pathlib.Path(sys.argv[2]).read_bytes(),"
-        " limits=Limits(), progress=lambda note: print(note, flush=True))"
+        " limits=ResourceLimits(), progress=lambda note: print(note, flush=True))"
     )
     arguments = [PAYLOAD.model_dump_json(), str(tmp_path / "mesh.stl")]
     with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as worker:
@@ -217,7 +217,9 @@ def test_a_failed_decomposition_fails_the_sweep_with_its_reason(url: str) -> Non
     with httpx.Client(base_url=url, timeout=60) as http, Transport(url, retries=0) as transport:
         upload(http, angle_stl())
         made = sweep(http)
-        worker = Worker(transport, name="hasty", exit_when_idle=True, decompositions=Limits(seconds=0.05))
+        worker = Worker(
+            transport, name="hasty", exit_when_idle=True, decompositions=ResourceLimits(seconds=0.05)
+        )
         worker.run()
         # No second attempt: it would end the same way.
         assert worker.tally.failures == 1

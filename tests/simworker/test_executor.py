@@ -15,7 +15,7 @@ from graspdb.examples import example
 from graspdb.wire import SimulatePayload
 from graspdb_simworker.process.executor import ExecutorRunner
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import Cancelled, ChunkFailed
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed
 
 MakePayload = Callable[..., SimulatePayload]
 
@@ -71,6 +71,6 @@ def test_what_is_not_wanted_any_more_leaves_the_queue(payload_of: MakePayload) -
 
     with Busy() as busy, ExecutorRunner(busy) as runner:
         asked = iter((True, True, False))
-        with pytest.raises(Cancelled):
+        with pytest.raises(ChunkCancelled):
             runner.run(payload_of("mug", start=0, stop=10), b"", wanted=lambda: next(asked))
     assert taken[0].cancelled()

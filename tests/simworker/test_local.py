@@ -19,7 +19,7 @@ from graspdb.examples import example
 from graspdb.wire import SimulatePayload
 from graspdb_simworker.process import channel, local, messages
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import Cancelled, ChunkFailed, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, PybulletMissing
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.labels import Label, Outcome
 
@@ -124,7 +124,7 @@ def test_a_chunk_that_is_not_wanted_any_more_kills_its_child(payload_of: MakePay
             pids.append(runner.pid)
             lost.set()
 
-        with pytest.raises(Cancelled):
+        with pytest.raises(ChunkCancelled):
             runner.run(
                 payload_of("mug", stop=100_000), mug_glb, wanted=lambda: not lost.is_set(), progress=progress
             )

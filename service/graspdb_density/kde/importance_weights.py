@@ -11,7 +11,6 @@ __all__ = [
     "LOW_EFFECTIVE_SHARE",
     "effective_sample_size",
     "importance_weights",
-    "mixture_weights",
     "pooled_density",
 ]
 
@@ -45,33 +44,13 @@ def importance_weights(proposal_density: ArrayLike | None, *, count: int | None 
     return _filled(g)
 
 
-def mixture_weights(densities: ArrayLike, counts: ArrayLike, *, known: ArrayLike | None = None) -> Floats:
-    """Weights of trials pooled from several strategies that can all be evaluated everywhere, summing to 1.
-
-    ``w_i = 1 / sum_k n_k g_k(x_i)``: the balance heuristic, each strategy normalised to its own exposure. It
-    never gives a trial the huge weight that ``1 / g_own`` gives one its own strategy nearly excluded but
-    another covers.
-
-    Parameters
-    ----------
-    densities : (N, K)
-        g_k at every trial, 1/(m^3 rad^3); a strategy that can't propose a pose there has 0.
-    counts : (K,)
-        Trials each strategy drew, failures included.
-    known : (N,) bool or None
-        False where a trial came from none of them: it takes the mean weight of the rest.
-    """
-    exposure = pooled_density(densities, counts)
-    if known is not None:
-        exposure = np.where(np.asarray(known, dtype=bool), exposure, np.nan)
-    return _filled(exposure)
-
-
 def pooled_density(densities: ArrayLike, counts: ArrayLike) -> Floats:
     """What trials of several strategies were drawn with when seen as one: ``sum_k n_k g_k / sum_k n_k``.
 
-    Its reciprocals are `mixture_weights` but for their scale, which is that of ``1 / g``: so strategies
-    that can be evaluated may be weighed, as one, beside trials that know their own density only.
+    Its reciprocals ``1 / sum_k n_k g_k(x_i)`` are the balance heuristic, each strategy normalised to its own
+    exposure: it never gives a trial the huge weight that ``1 / g_own`` gives one its own strategy nearly
+    excluded but another covers. Their scale is that of ``1 / g``: so strategies that can be evaluated may be
+    weighed, as one, beside trials that know their own density only.
 
     Parameters
     ----------

@@ -210,12 +210,8 @@ class KernelRows:
         p, q = poses
         if weightings.ndim != 2 or len(weightings) != self.size:
             raise ValueError(f"weightings have shape ({self.size}, B), not {weightings.shape}")
-        cells = self._cells
-        share = np.where(self.symmetric, 0.5, 1.0)[cells.rows]
-        width = -(-weightings.shape[1] // weighted.LANES) * weighted.LANES
-        padded = np.zeros((self.size, width), dtype=np.float32)
-        padded[:, : weightings.shape[1]] = weightings[cells.rows] * share[:, None].astype(np.float32)
-        out = np.empty((len(p), width), dtype=np.float32)
+        cells, padded = self._cells, self._padded(weightings)
+        out = np.empty((len(p), padded.shape[1]), dtype=np.float32)
         # Neighbours one after the other find their rows' weights in the cache.
         order = np.lexsort(np.floor(p.T / self._reach))
         p, q = p[order], q[order]
@@ -244,6 +240,15 @@ class KernelRows:
         result = np.empty((len(p), weightings.shape[1]), dtype=np.float32)
         result[order] = out[:, : weightings.shape[1]]
         return result
+
+    def _padded(self, weightings: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Weightings of the sorted rows, a twin's share each, filled up to whole vectors."""
+        rows = self._cells.rows
+        share = np.where(self.symmetric, 0.5, 1.0)[rows]
+        width = -(-weightings.shape[1] // weighted.LANES) * weighted.LANES
+        padded = np.zeros((self.size, width), dtype=np.float32)
+        padded[:, : weightings.shape[1]] = weightings[rows] * share[:, None].astype(np.float32)
+        return padded
 
     def log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), right however far from every row."""

@@ -79,11 +79,6 @@ class IsotropicKernel:
         rotation = math.log(kappa / (4.0 * math.pi**2 * float(ive(1, kappa))))
         return position + rotation - math.log(2.0) - math.log(4.0)
 
-    @property
-    def mean_cosine(self) -> float:
-        """Expected ``mu . q`` of a sample before folding, I2(kappa) / I1(kappa)."""
-        return float(ive(2, self.kappa) / ive(1, self.kappa))
-
     def widened(self, sigma_position_m: float, sigma_rotation: float) -> IsotropicKernel:
         """The kernel convolved with isotropic tool noise of the given deviations per axis (either may be
         0).

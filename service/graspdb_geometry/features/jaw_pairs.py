@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_geometry._compiled.ridges import regions
 from graspdb_geometry.collision import Surface
 from graspdb_geometry.features.ridges import Ridges, Solid, parts_solid
-from graspdb_geometry.poses import Poses, checked
+from graspdb_geometry.poses import PoseArrays, checked
 
 __all__ = ["KINDS", "MARGIN_M", "JawPairs", "Kind", "pairs_of_mesh", "pairs_of_parts"]
 
@@ -98,7 +98,7 @@ class JawPairs:
         chosen = self.gaps_m <= opening_m
         return JawPairs(self.kinds[chosen], self.centres[chosen], self.axes[chosen], self.half[chosen])
 
-    def at(self, poses: Poses) -> tuple[IntArray, FloatArray]:
+    def at(self, poses: PoseArrays) -> tuple[IntArray, FloatArray]:
         """The pair that each of n grasps is at, -1 at none, and its closing axis' angle to c.
 
         Angles are in radians, 0 to pi / 2; NaN at none.
@@ -144,7 +144,7 @@ class JawPairs:
         rotations = Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=-1))
         return positions, np.asarray(rotations.as_quat()), share[pair] / number[pair]
 
-    def frames(self, poses: Poses) -> FloatArray:
+    def frames(self, poses: PoseArrays) -> FloatArray:
         """Frames (n, 3, 3) of the pairs that grasps are at, their axes named as the gripper's.
 
         y is c, z that of the other two which the approach is nearest to, each with the sign nearest to the
@@ -440,7 +440,7 @@ def _largest(regions: list[tuple[FloatArray, FloatArray, FloatArray]]) -> Region
     return centres[order], axes[order], half[order]
 
 
-def _axes(poses: Poses) -> tuple[FloatArray, FloatArray]:
+def _axes(poses: PoseArrays) -> tuple[FloatArray, FloatArray]:
     """Positions and rotation matrices."""
     p, q = checked(poses)
     return p, np.asarray(Rotation.from_quat(q).as_matrix()) if len(p) else np.empty((0, 3, 3))

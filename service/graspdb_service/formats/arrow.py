@@ -7,6 +7,7 @@ buffers are refused, for a few bytes of them may claim any amount of memory.
 from __future__ import annotations
 
 import importlib
+import io
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -262,32 +263,19 @@ def _u32(content: bytes, at: int) -> int:
 # -- out -----------------------------------------------------------------------------------------------------
 
 
-class _Pieces:
+class _Pieces(io.RawIOBase):
     """A file whose content is taken as it is written."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
-        self.closed = False
+
+    def writable(self) -> bool:
+        return True
 
     def write(self, part: Any) -> int:
         content = bytes(part)
         self._parts.append(content)
         return len(content)
-
-    def flush(self) -> None:
-        pass
-
-    def writable(self) -> bool:
-        return True
-
-    def readable(self) -> bool:
-        return False
-
-    def seekable(self) -> bool:
-        return False
-
-    def close(self) -> None:
-        self.closed = True
 
     def take(self) -> bytes:
         content, self._parts = b"".join(self._parts), []

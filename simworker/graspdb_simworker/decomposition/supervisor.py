@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from graspdb.wire import DecomposePayload
 from graspdb_simworker.process import channel
-from graspdb_simworker.process.runner import Cancelled, ChunkFailed
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed
 
 COMMAND = (sys.executable, "-m", "graspdb_simworker.decomposition.child")
 SEED = 0
@@ -25,7 +25,7 @@ _WAY_OUT = "Simplify the mesh, or give its convex parts"
 
 
 @dataclass(frozen=True)
-class Limits:
+class ResourceLimits:
     """What one decomposition may take: processor time, and the child's address space, libraries (1 GB) too.
 
     After ``seconds`` the best candidate so far is taken, or without one the job fails; by the clock
@@ -54,7 +54,7 @@ def decompose(
     payload: DecomposePayload,
     mesh: bytes,
     *,
-    limits: Limits,
+    limits: ResourceLimits,
     wanted: Callable[[], bool] = lambda: True,
     progress: Callable[[str], None] = lambda note: None,
     command: Sequence[str] = COMMAND,
@@ -69,7 +69,7 @@ def decompose(
 
     def check() -> None:
         if not wanted():
-            raise Cancelled
+            raise ChunkCancelled
         if time.monotonic() > deadline:
             raise _Late
 
@@ -109,13 +109,13 @@ def decompose(
     return best
 
 
-def _too_long(limits: Limits) -> DecompositionFailed:
+def _too_long(limits: ResourceLimits) -> DecompositionFailed:
     return DecompositionFailed(
         f"it takes more than {limits.seconds:g} s (the worker's --decompose-seconds). {_WAY_OUT}"
     )
 
 
-def _death(code: int, limits: Limits) -> DecompositionFailed:
+def _death(code: int, limits: ResourceLimits) -> DecompositionFailed:
     if code == -signal.SIGXCPU:
         return _too_long(limits)
     cause = f"CoACD died of {signal.Signals(-code).name}" if code < 0 else f"CoACD ended with code {code}"

@@ -14,7 +14,7 @@ from concurrent import futures
 
 from graspdb.wire import SimulatePayload, SimulateResult
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import Cancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
 
 POLL_S = 0.2
 
@@ -52,7 +52,7 @@ class ExecutorRunner(ChunkRunner):
         while not futures.wait([future], POLL_S).done:
             if not wanted():
                 future.cancel()
-                raise Cancelled
+                raise ChunkCancelled
         try:
             return SimulateResult.model_validate_json(future.result())
         except (ChunkFailed, PybulletMissing):

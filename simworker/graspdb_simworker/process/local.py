@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from graspdb.processes import ChildProcess
 from graspdb.wire import SimulatePayload, SimulateResult
 from graspdb_simworker.process import channel, messages
-from graspdb_simworker.process.runner import Cancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
 from graspdb_simworker.simulation.labels import SIMULATION_ERROR, Label
 
 COMMAND = (sys.executable, "-m", "graspdb_simworker.process.child")
@@ -76,7 +76,7 @@ class LocalRunner(ChunkRunner):
 
         def check() -> None:
             if not wanted():
-                raise Cancelled
+                raise ChunkCancelled
 
         try:
             while True:

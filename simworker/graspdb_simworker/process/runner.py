@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from graspdb.wire import SimulatePayload, SimulateResult
 
 
-class Cancelled(Exception):
+class ChunkCancelled(Exception):
     """The chunk is not wanted any more."""
 
 
@@ -29,6 +29,6 @@ class ChunkRunner(AbstractContextManager[Any], Protocol):
     ) -> SimulateResult:
         """Simulate a chunk of an object with these convex parts; ``wanted`` is asked several times a second.
 
-        Cancelled if it was not wanted any more; ChunkFailed, with the reason, if the chunk as a whole can't
-        be simulated; PybulletMissing.
+        ChunkCancelled if it was not wanted any more; ChunkFailed, with the reason, if the chunk as a whole
+        can't be simulated; PybulletMissing.
         """

@@ -279,14 +279,6 @@ class BulletWorld:
         )
         return max((-float(point[8]) for point in points), default=-math.inf)
 
-    def frictions(self) -> list[float]:
-        """Coefficients between the object and palm, first and second finger, as Bullet multiplies them."""
-        roots = [
-            pybullet.getDynamicsInfo(body, link, physicsClientId=self._client)[1]
-            for body, link in ((self._object, -1), (self._jaw, -1), (self._jaw, 0), (self._jaw, 1))
-        ]
-        return [roots[0] * root for root in roots[1:]]
-
     def _aim(self) -> None:
         """Choose from where the grasp that begins is looked at."""
         low, high = np.array(pybullet.getAABB(self._object, -1, physicsClientId=self._client))

@@ -181,9 +181,7 @@ def build(
         proposal_density=proposal,
         swept=swept,
         chosen_from=widths_prefix(len(seq)) if choice.by_default or for_success else 0,
-        success_kernel=stored_kernel.load_success_kernel(stored, axes)
-        if stored is not None and for_success
-        else None,
+        success_kernel=stored_kernel.load_success_kernel(stored, axes) if stored and for_success else None,
     )
     if not len(seq):
         return built

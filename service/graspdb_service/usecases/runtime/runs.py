@@ -51,7 +51,7 @@ class RunKind:
     compute: Callable[[RunRow, Progress], Result]
 
 
-class Cancelled(Exception):
+class RunCancelled(Exception):
     """A run was cancelled, or taken over, while it was computed."""
 
 
@@ -231,14 +231,14 @@ class Runs:
         def progress(share: float) -> None:
             held.progress = min(max(share, 0.0), 1.0)
             if held.stop.is_set():
-                raise Cancelled
+                raise RunCancelled
 
         made: Result | None = None
         problem: dict[str, Any] | None = None
         try:
             progress(0.0)
             made = self._kinds[run.report].compute(run, progress)
-        except Cancelled:
+        except RunCancelled:
             self._drop(run.id)
             return
         except ProblemError as error:
@@ -253,8 +253,8 @@ class Runs:
                 result = None if made is None else made(tx)
                 if not report_runs.finish(tx, run.id, held.lease_id, result=result, problem=problem):
                     # Cancelled, or somebody else's by now: nothing of it is stored.
-                    raise Cancelled
-        except Cancelled:
+                    raise RunCancelled
+        except RunCancelled:
             log.info("report run %s ended before it was done", run.id)
         except Exception:
             # Its lease runs out, and the next who asks computes it again.
