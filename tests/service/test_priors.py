@@ -105,7 +105,7 @@ def test_their_density_integrates_to_one(sqlite_http: httpx.Client, box: Scene, 
     p, q, g = arrays(propose(sqlite_http, gripper="own", count=40_000, seed=5, sigma_rotation_deg=20))
     narrow = IsotropicKernel(0.008, math.radians(14))
     h = GraspDensity.build(se3.Poses.of(p[:400], q[:400]), kernel=narrow, symmetric=symmetric)
-    ratio = h.density(p[400:], q[400:], cutoff=None, threads=2) / g[400:]
+    ratio = h.density(se3.Poses.of(p[400:], q[400:]), cutoff=None, threads=2) / g[400:]
     error = ratio.std() / math.sqrt(len(ratio))
     assert error < 0.05
     assert ratio.mean() == pytest.approx(1.0, abs=4 * error)

@@ -104,7 +104,7 @@ def test_proposals_integrate_to_one(
     narrow = IsotropicKernel(0.006, math.radians(6))
     for symmetric in (True, False):
         h = GraspDensity.build(se3.Poses.of(p[:300], q[:300]), kernel=narrow, symmetric=symmetric)
-        ratio = h.density(p[300:], q[300:], cutoff=None, threads=2) / g[300:]
+        ratio = h.density(se3.Poses.of(p[300:], q[300:]), cutoff=None, threads=2) / g[300:]
         error = ratio.std() / math.sqrt(len(ratio))
         assert error < 0.05
         assert ratio.mean() == pytest.approx(1.0, abs=4 * error)
@@ -125,7 +125,7 @@ def test_any_uncertainty_integrates_to_one(seed: int, symmetric: bool) -> None:
     assert proposal is not None
     low, high = proposal.positions.min(axis=0) - 0.05, proposal.positions.max(axis=0) + 0.05
     at, to = rng.uniform(low, high, (60_000, 3)), se3.random_quaternions(60_000, rng)
-    values = proposal.density(at, to, cutoff=5.0) * np.prod(high - low) * 8 * math.pi**2
+    values = proposal.density(se3.Poses(at, to), cutoff=5.0) * np.prod(high - low) * 8 * math.pi**2
     error = values.std() / math.sqrt(len(values))
     assert values.mean() == pytest.approx(1.0, abs=4.5 * error + 1e-3)
 
