@@ -21,6 +21,7 @@ from .._compiled import isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import scaled_radius
+from ..kde.rows import Rows
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats, Poses
 
@@ -188,7 +189,7 @@ def _scored(
     """Every pair of widths with the rows left out and their log density under it."""
     for step in _STEPS_POSITION:
         sigma = DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * step)
-        cells = Cells.build(poses, w, flags, sigma)
+        cells = Cells.build(Rows(poses, w, flags), sigma)
         for turn in _STEPS_ROTATION:
             kernel = IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
             yield kernel, *_held_out(kernel, cells, poses, w, threads)

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._compiled import isotropic as c
-from ..se3 import Floats, Poses
+from ..se3 import Floats
+from .rows import Rows
 
 __all__ = ["Cells"]
 
@@ -70,44 +71,37 @@ class Cells:
     @classmethod
     def build(
         cls,
-        poses: Poses,
-        weights: Floats,
-        symmetric: NDArray[np.bool_],
+        rows: Rows,
         sigma_position_m: float,
     ) -> Cells:
-        """Sort all rows; ``weights`` are raw (of about 1), a symmetric row's is shared by its two twins."""
+        """Sort all rows; weights are of about 1, where float32 is fine enough."""
         scale = 1.0 / (sigma_position_m * math.sqrt(2.0))
         # The median keeps the bulk near the origin, where float32 is finest, whatever the outliers.
-        centre = np.median(poses.positions, axis=0)
-        rows = np.arange(len(poses), dtype=np.int32)
+        centre = np.median(rows.poses.positions, axis=0)
+        places = np.arange(len(rows), dtype=np.int32)
         segments = tuple(
             _sort(
-                _soa(poses, weights, chosen, flag, centre, scale),
-                rows[chosen],
+                _soa(rows[chosen], flag, centre, scale),
+                places[chosen],
                 flag,
                 centre * scale,
             )
-            for flag, chosen in ((True, symmetric), (False, ~symmetric))
+            for flag, chosen in ((True, rows.symmetric), (False, ~rows.symmetric))
             if chosen.any()
         )
         return cls._assemble(segments, centre, scale)
 
-    def extend(
-        self,
-        poses: Poses,
-        weights: Floats,
-        symmetric: NDArray[np.bool_],
-    ) -> Cells:
+    def extend(self, rows: Rows) -> Cells:
         """Add rows behind the present ones; shares nothing mutable with the old cells."""
         first = self.data.shape[1]
-        rows = np.arange(first, first + len(poses), dtype=np.int32)
+        places = np.arange(first, first + len(rows), dtype=np.int32)
         segments: list[_Segment] = []
-        for flag, chosen in ((True, symmetric), (False, ~symmetric)):
+        for flag, chosen in ((True, rows.symmetric), (False, ~rows.symmetric)):
             present = [s for s in self.segments if s.twin == flag]
             if not chosen.any():
                 segments += present
                 continue
-            data = _soa(poses, weights, chosen, flag, self.centre, self.scale)
+            data = _soa(rows[chosen], flag, self.centre, self.scale)
             tail = present[1:]
             joined = sum(s.size for s in tail) + data.shape[1]
             if present and joined > max(_TAIL_LEAST, _TAIL_SHARE * present[0].size):
@@ -116,7 +110,7 @@ class Cells:
             segments.append(
                 _sort(
                     np.concatenate([*(s.data for s in tail), data], axis=1),
-                    np.concatenate([*(s.rows for s in tail), rows[chosen]]),
+                    np.concatenate([*(s.rows for s in tail), places[chosen]]),
                     flag,
                     self.centre * self.scale,
                 )
@@ -194,22 +188,10 @@ class Cells:
         )
 
 
-def _soa(
-    poses: Poses,
-    weights: Floats,
-    chosen: NDArray[np.bool_],
-    twin: bool,
-    centre: Floats,
-    scale: float,
-) -> NDArray[np.float32]:
-    """Scaled float32 columns (8, n) of the chosen rows."""
-    return np.concatenate(
-        [
-            ((poses.positions[chosen] - centre) * scale).T,
-            poses.quaternions_xyzw[chosen].T,
-            (weights[chosen] * (0.5 if twin else 1.0))[None, :],
-        ]
-    ).astype(np.float32)
+def _soa(rows: Rows, twin: bool, centre: Floats, scale: float) -> NDArray[np.float32]:
+    """Scaled float32 columns (8, n) of rows that all have a twin or have none."""
+    p, q = rows.poses
+    return np.concatenate([((p - centre) * scale).T, q.T, rows.twin_weights[None, :]]).astype(np.float32)
 
 
 def _edges() -> tuple[float, float]:

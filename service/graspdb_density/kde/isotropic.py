@@ -21,6 +21,7 @@ from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats, Poses
 from . import brute_force
 from .cell_list import Cells
+from .rows import Rows
 
 __all__ = ["CUTOFF", "TWIN_ROTATION", "WIDE_ROTATION", "GraspDensity"]
 
@@ -44,19 +45,15 @@ class GraspDensity:
     def __init__(
         self,
         kernel: IsotropicKernel,
-        poses: Poses,
-        weights: Floats,
-        symmetric: NDArray[np.bool_],
+        rows: Rows,
         cells: Cells,
         unit: float,
     ) -> None:
         self._kernel = kernel
-        self.poses = poses
-        self._weights = weights
-        self._symmetric = symmetric
+        self._rows = rows
         self._cells = cells
         self._unit = unit
-        self._total = float(weights.sum())
+        self._total = float(rows.weights.sum())
 
     # -- building
     # ---------------------------------------------------------------------------------------------------
@@ -89,10 +86,9 @@ class GraspDensity:
         """
         if not len(poses):
             raise ValueError("a density needs at least one grasp")
-        w, flags = row_values(weights, symmetric, len(poses))
-        unit = float(w.mean())
-        cells = Cells.build(poses, w / unit, flags, kernel.sigma_position_m)
-        return cls(kernel, poses, w, flags, cells, unit)
+        rows = Rows.of(poses, weights, symmetric)
+        unit = float(rows.weights.mean())
+        return cls(kernel, rows, Cells.build(rows.over(unit), kernel.sigma_position_m), unit)
 
     def extend(
         self,
@@ -107,16 +103,9 @@ class GraspDensity:
         """
         if not len(poses):
             return self
-        w, flags = row_values(weights, symmetric, len(poses), fill=self._total / self.size)
-        cells = self._cells.extend(poses, w / self._unit, flags)
-        return GraspDensity(
-            self._kernel,
-            Poses.concatenate([self.poses, poses]),
-            np.concatenate([self._weights, w]),
-            np.concatenate([self._symmetric, flags]),
-            cells,
-            self._unit,
-        )
+        more = Rows.of(poses, weights, symmetric, fill=self._total / self.size)
+        cells = self._cells.extend(more.over(self._unit))
+        return GraspDensity(self._kernel, self._rows.joined(more), cells, self._unit)
 
     # -- what it holds
     # ----------------------------------------------------------------------------------------------
@@ -136,6 +125,11 @@ class GraspDensity:
         return len(self.poses)
 
     @property
+    def poses(self) -> Poses:
+        """(N), read-only use."""
+        return self._rows.poses
+
+    @property
     def positions(self) -> Floats:
         """(N, 3) metres, read-only use."""
         return self.poses.positions
@@ -148,28 +142,27 @@ class GraspDensity:
     @property
     def weights(self) -> Floats:
         """(N,) summing to 1."""
-        return np.asarray(self._weights / self._total, dtype=np.float64)
+        return np.asarray(self._rows.weights / self._total, dtype=np.float64)
 
     @property
     def raw_weights(self) -> Floats:
         """(N,) in the unit of the cells, of about 1."""
-        return np.asarray(self._weights / self._unit, dtype=np.float64)
+        return np.asarray(self._rows.weights / self._unit, dtype=np.float64)
 
     @property
     def symmetric(self) -> NDArray[np.bool_]:
         """(N,) whether a row has a twin."""
-        return self._symmetric
+        return self._rows.symmetric
 
     @property
     def effective_sample_size(self) -> float:
         """(sum w)^2 / sum w^2."""
-        return float(self._total**2 / np.dot(self._weights, self._weights))
+        return float(self._total**2 / np.dot(self._rows.weights, self._rows.weights))
 
     @property
     def nbytes(self) -> int:
         """Bytes of every array held."""
-        own = (*self.poses, self._weights, self._symmetric)
-        return int(sum(a.nbytes for a in own)) + self._cells.nbytes
+        return self._rows.nbytes + self._cells.nbytes
 
     @property
     def cells(self) -> Cells:
@@ -223,7 +216,7 @@ class GraspDensity:
         steps = stages(self._kernel, cutoff)
         terms, least = brute_terms(self._kernel, self._total / self._unit)
         # The least weight there can be bounds what skipping far blocks may lose.
-        margin = 16.0 + math.log(self._total / float(self._weights.min()))
+        margin = 16.0 + math.log(self._total / float(self._rows.weights.min()))
         ordered = len(p) >= _SORTED_FROM
         if ordered:
             order = cells.visiting_order(p)
@@ -282,7 +275,7 @@ class GraspDensity:
         for i in np.flatnonzero(~near):
             along[i], around[i] = brute_force.gradient(
                 self._kernel, self.poses, poses[int(i)],
-                weights=self._weights, symmetric=self._symmetric,
+                weights=self._rows.weights, symmetric=self._rows.symmetric,
             )  # fmt: skip
         return along, around
 
@@ -326,7 +319,7 @@ class GraspDensity:
         twin = se3.jaw_twin(quaternion)
         cosine = np.abs(np.einsum("ij,j->i", self.poses.quaternions_xyzw, quaternion))
         turned = np.abs(np.einsum("ij,j->i", self.poses.quaternions_xyzw, twin))
-        cosine = np.where(self._symmetric, np.maximum(cosine, turned), cosine)
+        cosine = np.where(self._rows.symmetric, np.maximum(cosine, turned), cosine)
         squared = np.sum((self.poses.positions - position) ** 2, axis=1) / kernel.sigma_position_m**2
         value = kernel.kappa * cosine - 0.5 * squared
         highest = np.argpartition(-value, count - 1)[:count]
@@ -358,9 +351,11 @@ class GraspDensity:
         """Draw grasps, both twins of symmetric rows alike."""
         if count < 0:
             raise ValueError(f"cannot draw {count} samples")
-        edges = np.cumsum(self._weights)
+        edges = np.cumsum(self._rows.weights)
         row = np.minimum(np.searchsorted(edges, rng.random(count) * edges[-1], side="right"), self.size - 1)
-        return self._displaced(self.poses[row].turned(self._symmetric[row] & (rng.random(count) < 0.5)), rng)
+        return self._displaced(
+            self.poses[row].turned(self._rows.symmetric[row] & (rng.random(count) < 0.5)), rng
+        )
 
     def sample_rows(self, rows: NDArray[np.integer], rng: np.random.Generator) -> Poses:
         """A draw from the kernel of each of some rows, their twins left out."""
@@ -423,18 +418,3 @@ def scaled_radius(cutoff: float) -> float:
     if not (math.isfinite(cutoff) and _CUTOFF_LIMITS[0] <= cutoff <= _CUTOFF_LIMITS[1]):
         raise ValueError(f"cutoff must be between 2 and 10 standard deviations or None, not {cutoff!r}")
     return cutoff / math.sqrt(2.0)
-
-
-def row_values(
-    weights: ArrayLike | None, symmetric: ArrayLike | bool, count: int, fill: float = 1.0
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Weights and flags of rows, checked; ``fill`` where no weights are given."""
-    w = np.full(count, fill) if weights is None else np.array(weights, dtype=np.float64)
-    if w.shape != (count,):
-        raise ValueError(f"weights have shape ({count},), not {w.shape}")
-    if not (np.isfinite(w).all() and (w > 0.0).all()):
-        raise ValueError("weights must be positive and finite")
-    flags = np.asarray(symmetric, dtype=bool)
-    if flags.ndim and flags.shape != (count,):
-        raise ValueError(f"symmetric is one flag or has shape ({count},), not {flags.shape}")
-    return w, np.array(np.broadcast_to(flags, (count,)))

@@ -21,7 +21,8 @@ from ..kernels.gaussian_mixture import AnisotropicKernel
 from ..kernels.isotropic import HAAR_VOLUME
 from ..se3 import Floats, Poses
 from .cell_list import Cells
-from .isotropic import GraspDensity, row_values
+from .isotropic import GraspDensity
+from .rows import Rows
 from .weighted_sums import KernelRows
 
 __all__ = ["NARROW", "MixtureDensity"]
@@ -72,8 +73,7 @@ class MixtureDensity:
         spread = math.sqrt(max(float(np.linalg.eigvalsh(s[:3, :3])[-1]) for s in kernel.covariances))
         self._offset = float(np.linalg.norm(kernel.means[:, :3], axis=1).max())
         self._spread = spread
-        raw = rows.weights * rows.size
-        self._hold(rows, Cells.build(rows.poses, raw, rows.symmetric, spread))
+        self._hold(rows, Cells.build(rows.rows.over(1.0 / rows.size), spread))
         self._log_unit = rows.log_unit
         self._mixture = rows.mixture._replace(wraps=True)
         turn = max(float(np.linalg.eigvalsh(s[3:, 3:])[-1]) for s in kernel.covariances) ** 0.5
@@ -103,22 +103,23 @@ class MixtureDensity:
         """
         if not len(poses):
             return self
-        w, flags = row_values(weights, symmetric, len(poses), fill=self._unit_mean)
-        more = KernelRows(poses, self._kernel, weights=w, symmetric=flags, frames=frames)
-        old = self._rows
+        more = Rows.of(poses, weights, symmetric, fill=self._unit_mean)
+        if frames is not None:
+            frames = np.concatenate(
+                [self._rows.frames, KernelRows(poses, self._kernel, frames=frames).frames]
+            )
+        both = self._rows.rows.over(1.0 / self._total).joined(more)
         rows = KernelRows(
-            Poses.concatenate([old.poses, poses]),
-            self._kernel,
-            weights=np.concatenate([old.weights * self._total, w]),
-            symmetric=np.concatenate([old.symmetric, flags]),
-            frames=None if frames is None else np.concatenate([old.frames, more.frames]),
+            both.poses, self._kernel, weights=both.weights, symmetric=both.symmetric, frames=frames
         )
         grown = copy.copy(self)
         grown.__dict__.pop("isotropic", None)
-        grown._total = self._total + float(w.sum())
-        grown._hold(rows, self._cells.extend(poses, w / self._unit, flags))
+        grown._total = self._total + float(more.weights.sum())
+        grown._hold(rows, self._cells.extend(more.over(self._unit)))
         if "isotropic" in self.__dict__:
-            grown.__dict__["isotropic"] = self.isotropic.extend(poses, weights=w, symmetric=flags)
+            grown.__dict__["isotropic"] = self.isotropic.extend(
+                poses, weights=more.weights, symmetric=more.symmetric
+            )
         return grown
 
     @property

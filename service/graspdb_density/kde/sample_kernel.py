@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike
 from .. import se3
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
-from .isotropic import GraspDensity, row_values
+from .isotropic import GraspDensity
+from .rows import Rows
 
 __all__ = ["MOST_COMPONENTS", "SampledKernel"]
 
@@ -53,7 +54,7 @@ class SampledKernel:
         t, q = Poses.of(self.translations, self.quaternions_xyzw)
         if not len(t):
             raise ValueError("a sampled kernel needs at least one component")
-        w, _ = row_values(self.weights, True, len(t))
+        w = Rows.of(Poses(t, q), self.weights).weights
         object.__setattr__(self, "translations", t)
         object.__setattr__(self, "quaternions_xyzw", q)
         object.__setattr__(self, "weights", w / w.sum())
@@ -103,7 +104,8 @@ class SampledKernel:
         """
         if not len(poses):
             raise ValueError("a density needs at least one grasp")
-        w, flags = row_values(weights, symmetric, len(poses))
+        rows = Rows.of(poses, weights, symmetric)
+        flags = rows.symmetric
         many = self.size * (len(poses) + int(flags.sum()))
         if many > MOST_COMPONENTS:
             raise ValueError(
@@ -113,7 +115,7 @@ class SampledKernel:
             )
         # A symmetric row's template stands at the row and at its turn, half of the weight each.
         at, to = Poses.concatenate([poses, poses[flags].turned()])
-        share = np.concatenate([np.where(flags, 0.5, 1.0) * w, 0.5 * w[flags]])
+        share = np.concatenate([rows.twin_weights, rows.twin_weights[flags]])
         twin = np.concatenate([flags, flags[flags]])
         moved, turned = se3.compose(
             Poses(at[:, None], to[:, None]), Poses(self.translations, self.quaternions_xyzw)

@@ -28,6 +28,7 @@ from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
 from .cell_list import Cells
 from .isotropic import GraspDensity
+from .rows import Rows
 
 __all__ = ["CUTOFF", "TRUSTED_SUM", "KernelRows", "Progress"]
 
@@ -80,11 +81,8 @@ class KernelRows:
         if not len(poses):
             raise ValueError("statistics of a density need at least one grasp")
         self.kernel = kernel
-        self.poses = poses
-        self.weights = _normalised(weights, len(poses))
-        self.symmetric: NDArray[np.bool_] = np.array(
-            np.broadcast_to(np.asarray(symmetric, dtype=bool), len(poses))
-        )
+        rows = Rows.of(poses, weights, symmetric)
+        self.rows = rows.over(float(rows.weights.sum()))
         self._own_frames = frames is None
         self._frames: Floats | None = None
         # What needs sorted rows sorts them: densities of their own keep other cells.
@@ -104,8 +102,7 @@ class KernelRows:
 
     @cached_property
     def _cells(self) -> Cells:
-        ones = np.ones(self.size)
-        return Cells.build(self.poses, ones, self.symmetric, self._sigma)
+        return Cells.build(Rows.of(self.poses, symmetric=self.symmetric), self._sigma)
 
     @cached_property
     def _sorted_frames(self) -> NDArray[np.float32]:
@@ -119,16 +116,17 @@ class KernelRows:
             self.poses.quaternions_xyzw,
             np.ascontiguousarray(self.frames.reshape(-1, 9)),
             self.symmetric,
-            np.log(self.weights * np.where(self.symmetric, 0.5, 1.0)),
+            np.log(self.rows.twin_weights),
             self._own_frames,
         )
 
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held, those made on demand included."""
-        held = [*self.poses, self.weights, self.symmetric]
-        held += [self.__dict__[name] for name in ("frames", "_sorted_frames") if name in self.__dict__]
-        return int(sum(a.nbytes for a in held)) + (self._cells.nbytes if "_cells" in self.__dict__ else 0)
+        made = [
+            self.__dict__[name] for name in ("frames", "_sorted_frames", "_cells") if name in self.__dict__
+        ]
+        return int(self.rows.nbytes + sum(part.nbytes for part in made))
 
     def _take_mixture(self, kernel: MixtureKernel) -> float:
         w = np.asarray(kernel.weights, dtype=np.float64)
@@ -164,9 +162,23 @@ class KernelRows:
         return self._reach / CUTOFF
 
     @property
+    def poses(self) -> Poses:
+        return self.rows.poses
+
+    @property
+    def weights(self) -> Floats:
+        """(N,) summing to 1."""
+        return self.rows.weights
+
+    @property
+    def symmetric(self) -> NDArray[np.bool_]:
+        """(N,) whether a row has a twin."""
+        return self.rows.symmetric
+
+    @property
     def size(self) -> int:
         """Rows; twins are not counted."""
-        return len(self.poses)
+        return len(self.rows)
 
     def subset(self, rows: NDArray[np.int64]) -> KernelRows:
         """The rows given, weights renormalised."""
@@ -339,17 +351,6 @@ class KernelRows:
             out[todo[kept]] = draws[kept]
             todo = todo[~kept]
         return out
-
-
-def _normalised(weights: ArrayLike | None, count: int) -> Floats:
-    if weights is None:
-        return np.full(count, 1.0 / count)
-    w = np.array(weights, dtype=np.float64)
-    if w.shape != (count,):
-        raise ValueError(f"weights have shape ({count},), not {w.shape}")
-    if not (np.isfinite(w).all() and (w > 0.0).all()):
-        raise ValueError("weights must be positive and finite")
-    return np.asarray(w / w.sum(), dtype=np.float64)
 
 
 def _frames(frames: ArrayLike, count: int) -> Floats:

@@ -15,7 +15,7 @@ from cmaes import CMA
 
 from .. import se3
 from ..se3 import Floats, Poses
-from .multi_start import MultiStart, Rows
+from .multi_start import Indices, MultiStart
 from .scored_poses import Admissible, Bools, Maximum, Pull, Score, ScoredPoses, Separation, distinct_from
 
 __all__ = ["EvolutionSearch"]
@@ -87,7 +87,7 @@ class EvolutionSearch(MultiStart):
 
     # -- starts
 
-    def candidates(self) -> Iterator[tuple[Rows, Bools]]:
+    def candidates(self) -> Iterator[tuple[Indices, Bools]]:
         bounds, turned = self.bounds(0, self.density.size)
         places = np.flatnonzero(bounds > -np.inf)
         rest = places[:0]

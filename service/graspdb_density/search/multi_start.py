@@ -24,7 +24,7 @@ from .start_ranking import StartRanking
 
 __all__ = ["MOST_CHECKS", "REACH", "MultiStart"]
 
-Rows = NDArray[np.intp]
+Indices = NDArray[np.intp]
 
 #: A pose is within a kernel's cut-off when position and rotation are each within this many
 #: standard deviations.
@@ -90,7 +90,7 @@ class MultiStart:
                 break
         return starts
 
-    def centres(self, rows: Rows, turned: Bools) -> Poses:
+    def centres(self, rows: Indices, turned: Bools) -> Poses:
         """Centres of rows, or of their jaw's twins."""
         return Poses(self.density.positions[rows], self.density.quaternions_xyzw[rows]).turned(turned)
 
@@ -98,7 +98,7 @@ class MultiStart:
         """Poses to start from, in the order in which they are to be taken."""
         return ScoredPoses.unscored(poses)
 
-    def candidates(self) -> Iterator[tuple[Rows, Bools]]:
+    def candidates(self) -> Iterator[tuple[Indices, Bools]]:
         """Rows whose feasible pose is in reach, by falling bound, in growing batches, and whether the jaw's
         twin is nearer.
         """
@@ -158,14 +158,14 @@ class MultiStart:
 
     def distinct(
         self, poses: Poses, known: int, limit: int, separation: Separation, most_checks: int
-    ) -> Rows:
+    ) -> Indices:
         """Indices of the first ``limit`` distinct admissible poses, after ``known`` that are."""
         usable = np.ones(len(poses), dtype=bool)
         confirmed = np.full(len(poses), self.admissible is None)
         confirmed[:known] = True
         while True:
             index = np.flatnonzero(usable)
-            picked: Rows = index[self.thin(poses[index], known, limit, separation)]
+            picked: Indices = index[self.thin(poses[index], known, limit, separation)]
             doubtful = picked[~confirmed[picked]]
             if not doubtful.size:
                 return picked
@@ -179,9 +179,9 @@ class MultiStart:
             confirmed[batch[allowed]] = True
             usable[batch[~allowed]] = False
 
-    def thin(self, poses: Poses, known: int, limit: int, separation: Separation) -> Rows:
+    def thin(self, poses: Poses, known: int, limit: int, separation: Separation) -> Indices:
         """Indices of at most ``limit`` mutually distinct poses, in order, the first ``known`` for certain."""
-        kept: Rows = np.arange(max(limit, known))
+        kept: Indices = np.arange(max(limit, known))
         total = mean_shift.thin(
             poses.positions, poses.quaternions_xyzw, known, limit, *separation, self.twins, kept
         )

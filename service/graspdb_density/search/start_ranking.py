@@ -20,11 +20,12 @@ from .._compiled import isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import GraspDensity
+from ..kde.rows import Rows
 from ..se3 import Floats
 
 __all__ = ["CentreSums", "StartRanking", "centre_sums", "rank_starts"]
 
-Rows = NDArray[np.int64]
+Indices = NDArray[np.int64]
 
 #: Three standard deviations rank centres well enough; refinement uses the full reach.
 _RADIUS = 3.0 / math.sqrt(2.0)
@@ -68,7 +69,7 @@ class StartRanking:
     Attributes
     ----------
     order : (N,)
-        Rows by falling sum at their centres.
+        Indices by falling sum at their centres.
     centres : (N, 8) float32
         In that order: position in metres, quaternion, log of the kernel sum. A row fills one line of the
         processor's cache.
@@ -132,7 +133,7 @@ def _completed(density: GraspDensity, known: CentreSums, threads: int) -> Centre
     else:
         drawn, weights = _systematic_sample(density, new, rate)
         if len(drawn):
-            sample = sample.extend(density.poses[drawn], weights, density.symmetric[drawn])
+            sample = sample.extend(Rows(density.poses[drawn], weights, density.symmetric[drawn]))
         within = sample
     values = np.zeros(density.size)
     values[:first] = known.values
@@ -150,7 +151,7 @@ def _completed(density: GraspDensity, known: CentreSums, threads: int) -> Centre
     return CentreSums(values, sample, rate)
 
 
-def _sums(density: GraspDensity, cells: Cells, rows: Rows, threads: int) -> Floats:
+def _sums(density: GraspDensity, cells: Cells, rows: Indices, threads: int) -> Floats:
     """Sums over ``cells`` at rows' centres."""
     # Of all rows, neighbours one after the other: kernels stay in the processor's cache.
     whole = len(rows) == density.size
@@ -170,7 +171,7 @@ def _sums(density: GraspDensity, cells: Cells, rows: Rows, threads: int) -> Floa
     return out
 
 
-def _systematic_sample(density: GraspDensity, rows: Rows, rate: float) -> tuple[Rows, Floats]:
+def _systematic_sample(density: GraspDensity, rows: Indices, rate: float) -> tuple[Indices, Floats]:
     """Systematic sample of rows in the order given, with the weights that make its sums unbiased."""
     probability = np.minimum(rate * density.raw_weights[rows], 1.0)
     steps = np.floor(np.cumsum(probability) + 0.5)
@@ -178,24 +179,22 @@ def _systematic_sample(density: GraspDensity, rows: Rows, rate: float) -> tuple[
     return rows[chosen], density.raw_weights[rows[chosen]] / probability[chosen]
 
 
-def _cells(density: GraspDensity, rows: Rows, weights: Floats) -> Cells:
+def _cells(density: GraspDensity, rows: Indices, weights: Floats) -> Cells:
     """Some rows' kernels, weighted anew."""
-    return Cells.build(
-        density.poses[rows],
-        weights,
-        density.symmetric[rows],
-        density.kernel.sigma_position_m,
-    )
+    some = Rows(density.poses[rows], weights, density.symmetric[rows])
+    return Cells.build(some, density.kernel.sigma_position_m)
 
 
-def _with_own(density: GraspDensity, values: Floats, rows: Rows, drawn: Rows, weights: Floats) -> Floats:
+def _with_own(
+    density: GraspDensity, values: Floats, rows: Indices, drawn: Indices, weights: Floats
+) -> Floats:
     """Estimated sums with every row's own kernel as it is: drawn rows would outrank their neighbours."""
     own = density.raw_weights.copy()
     own[drawn] -= weights
     return values + (own * np.where(density.symmetric, 0.5, 1.0))[rows]
 
 
-def _reached(density: GraspDensity, rows: Rows) -> Rows:
+def _reached(density: GraspDensity, rows: Indices) -> Indices:
     """How many kernels are visited for the sum at each of some centres."""
     out = np.empty(len(rows), dtype=np.int64)
     cells = density.cells

@@ -22,6 +22,7 @@ from .._compiled import diagonal, isotropic
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
+from ..kde.rows import Rows
 from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
@@ -111,13 +112,13 @@ class SuccessModel:
             p, widest = self.kernel.along(p), max(self.kernel.sigmas[:3])
         parts: list[Cells | None] = []
         for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
-            columns = Poses(p[chosen], q[chosen]), np.ones(int(chosen.sum())), flags[chosen]
-            if not len(columns[0]):
+            rows = Rows.of(Poses(p[chosen], q[chosen]), symmetric=flags[chosen])
+            if not len(rows):
                 parts.append(present)
             elif present is None:
-                parts.append(Cells.build(*columns, widest))
+                parts.append(Cells.build(rows, widest))
             else:
-                parts.append(present.extend(*columns))
+                parts.append(present.extend(rows))
         return SuccessModel(self.kernel, parts[0], parts[1])
 
     @property
