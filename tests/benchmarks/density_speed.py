@@ -275,7 +275,7 @@ def maxima(rng: np.random.Generator) -> None:
         build, extend, best, ten = interleaved(
             ROUNDS,
             lambda r=rows, k=kernel: GraspDensity.build(se3.Poses.of(*r), kernel=k),
-            lambda d=density, r=more, k=known: centre_sums(d.extend(*r), k, 1),
+            lambda d=density, r=more, k=known: centre_sums(d.extend(se3.Poses.of(*r)), k, 1),
             lambda s=search: s.maxima(region),
             lambda s=search: s.maxima(region, count=10),
         )

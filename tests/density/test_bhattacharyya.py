@@ -142,12 +142,11 @@ class Known:
     def __init__(self, values: list[float]) -> None:
         self._values = values
 
-    def log_density(self, positions: object, quaternions_xyzw: object, *, threads: int = 1) -> np.ndarray:
-        count = len(np.asarray(positions))
-        return np.resize(np.array(self._values), count)
+    def log_density(self, poses: se3.Poses, *, threads: int = 1) -> np.ndarray:
+        return np.resize(np.array(self._values), len(poses))
 
-    def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros((count, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    def sample(self, count: int, rng: np.random.Generator) -> se3.Poses:
+        return se3.Poses(np.zeros((count, 3)), np.tile(se3.IDENTITY, (count, 1)))
 
 
 def test_where_a_density_is_zero_nothing_is_shared_and_a_wrong_one_is_not_hidden() -> None:

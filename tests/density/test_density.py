@@ -296,7 +296,7 @@ def test_rows_carried_over_keep_their_sums_up_to_date(shell: Shell) -> None:
     rows = shell(8_000, rng)
     old = GraspDensity.build(se3.Poses.of(rows[0][:7_500], rows[1][:7_500]), kernel=KERNELS[0])
     known = centre_sums(old, None, 1)
-    grown = old.extend(rows[0][7_500:], rows[1][7_500:])
+    grown = old.extend(se3.Poses.of(rows[0][7_500:], rows[1][7_500:]))
     fresh = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNELS[0])
     # New rows are added to old ones within their own reach: other cells at the rim of 3 standard deviations.
     now, anew = centre_sums(grown, known, 1), centre_sums(fresh, None, 1)

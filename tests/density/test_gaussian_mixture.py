@@ -234,7 +234,7 @@ def test_extending_equals_building(frame: str, shell: Shell, moved: Moved) -> No
     old = MixtureDensity(se3.Poses.of(p[first], q[first]), kernel=kernel, **part(first))  # type: ignore[arg-type]
     search = ModeSearch(old)
     search.global_maximum()
-    grown = old.extend(p[rest], q[rest], **part(rest))  # type: ignore[arg-type]
+    grown = old.extend(se3.Poses.of(p[rest], q[rest]), **part(rest))  # type: ignore[arg-type]
     built = MixtureDensity(se3.Poses.of(p, q), kernel=kernel, **part(slice(None)))  # type: ignore[arg-type]
     poses = moved((p, q), 300, 0.01, 0.2, rng)
     np.testing.assert_allclose(

@@ -56,8 +56,8 @@ def test_uniform_limit_is_one_over_the_volume() -> None:
     kernel = IsotropicKernel(1.0, math.radians(120.0))
     values = brute_force.kernel_log_density(
         kernel,
-        Poses.of(np.zeros(3), se3.random_quaternions(20_000, np.random.default_rng(0))),
-        Poses.of(np.zeros(3), se3.IDENTITY),
+        Poses(np.zeros(3), se3.random_quaternions(20_000, np.random.default_rng(0))),
+        Poses(np.zeros(3), se3.IDENTITY),
     )
     mean = np.exp(values + 1.5 * math.log(2.0 * math.pi)).mean()
     assert mean == pytest.approx(1.0 / HAAR_VOLUME, rel=0.02)

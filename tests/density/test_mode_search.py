@@ -235,7 +235,7 @@ def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed:
     found = ModeSearch(density).maxima(count=3, admissible=admissible)
     assert found
     for grasp in found:
-        assert admissible(grasp.position[None], grasp.quaternion_xyzw[None]).all()
+        assert admissible(se3.Poses.of(grasp.position[None], grasp.quaternion_xyzw[None])).all()
     p, q = density.positions, density.quaternions_xyzw
     free = admissible(p, q)
     best = density.log_density(se3.Poses.of(p[free], q[free])).max()
@@ -340,7 +340,9 @@ def test_sampled_centre_sums_are_unbiased_and_extended_alike(
         se3.Poses.of(p[first], q[first]), kernel=KERNEL, weights=weights[first], symmetric=symmetric[first]
     )
     known = centre_sums(old, None, 1)
-    grown = old.extend(p[8_500:], q[8_500:], weights=weights[8_500:], symmetric=symmetric[8_500:])
+    grown = old.extend(
+        se3.Poses.of(p[8_500:], q[8_500:]), weights=weights[8_500:], symmetric=symmetric[8_500:]
+    )
     now = centre_sums(grown, known, 1)
     assert known.sample is not None
     assert now.sample is not None
