@@ -237,7 +237,7 @@ def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed:
     for grasp in found:
         assert admissible(se3.Poses.of(grasp.position[None], grasp.quaternion_xyzw[None])).all()
     p, q = density.positions, density.quaternions_xyzw
-    free = admissible(p, q)
+    free = admissible(se3.Poses(p, q))
     best = density.log_density(se3.Poses.of(p[free], q[free])).max()
     for step in np.repeat([0.5, 0.2, 0.1, 0.05], 25):
         start = np.argsort(-density.log_density(se3.Poses.of(p[free], q[free])))[:200]
