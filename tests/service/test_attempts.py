@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, GridPlan
+from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.trial_columns import TrialColumns
@@ -62,7 +63,9 @@ def stored(*sweeps: tuple[SweepRow, int], rows: int = 0) -> Stored:
         quaternion_xyzw=np.tile([0.0, 0, 0, 1], (rows, 1)), outcome=np.full(rows, COLLISION, dtype=np.uint8),
         proposal_density=np.full(rows, np.nan), provenance=np.full(rows, 7),
     )  # fmt: skip
-    selected = Selected("pg70", "wrench", None, None, {7: True}, {}, frozenset({7}))
+    now = datetime.now(UTC)
+    thing = ObjectRow(1, "thing", None, None, None, None, None, 1, 0, rows, None, None, None, None, now, now)
+    selected = Selected(thing, "pg70", "wrench", None, None, {7: True}, {}, frozenset({7}))
     return Stored(columns, turns, selected, (NO_ATTEMPT,))
 
 
