@@ -245,7 +245,7 @@ def test_collisions_are_avoided_and_the_edge_of_the_free_space_is_searched(seed:
         turned = se3.multiply(
             q[free][start], se3.from_rotation_vector(rng.standard_normal((len(start), 3)) * step * 0.26)
         )
-        ok = admissible(moved, turned)
+        ok = admissible(se3.Poses(moved, turned))
         p, q = np.concatenate([p[free], moved[ok]]), np.concatenate([q[free], turned[ok]])
         free = np.ones(len(p), dtype=bool)
         best = max(best, density.log_density(se3.Poses.of(moved[ok], turned[ok])).max())
