@@ -298,7 +298,7 @@ def moments(cells, positions, quaternions, kappa, radius, wide, out):
     out[:] = 0.0
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
-        near = single(at)
+        near, row = single(at), out[j]
         for s in range(cells.table.shape[0]):
             twin = F32(cells.table[s, TWIN])
             for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
@@ -306,9 +306,9 @@ def moments(cells, positions, quaternions, kappa, radius, wide, out):
                 while begin < end:
                     stop = min(begin + BLOCK, end)
                     if wide > 0:
-                        isotropic_runs.moments_wide(cells.data, begin, stop, near, twin, out[j])
+                        isotropic_runs.moments_wide(cells.data, begin, stop, near, twin, row)
                     else:
-                        isotropic_runs.moments_narrow(cells.data, begin, stop, near, twin, out[j])
+                        isotropic_runs.moments_narrow(cells.data, begin, stop, near, twin, row)
                     begin = stop
 
 
