@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -11,7 +10,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from graspdb import Client, cli, figures
+from graspdb import Client, figures
 from graspdb.asynchronous import AsyncReports
 from graspdb.errors import ChecksNeeded, Conflict, NotFound
 from graspdb.reports import Report, Reports, Waiting
@@ -36,23 +35,6 @@ def thing(db: Client, fresh_id: str) -> GraspObject:
     item = db.objects.create(fresh_id)
     item.trials.add(*field())
     return item
-
-
-@pytest.fixture
-def run(service_url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run ``graspdb`` with these arguments: exit code, standard output, standard error."""
-    monkeypatch.setenv("GRASPDB_URL", service_url)
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def invoke(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["graspdb", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        captured = capsys.readouterr()
-        code = ended.value.code
-        return (code if isinstance(code, int) else 0 if code is None else 1), captured.out, captured.err
-
-    return invoke
 
 
 def test_a_report_is_declared_once() -> None:
