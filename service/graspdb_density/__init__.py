@@ -2,7 +2,6 @@
 
 from . import se3
 from .bandwidth.selection import DEFAULT_KERNEL, WidthChoice, choose_widths, widths_prefix
-from .kde import brute_force
 from .kde.importance_weights import effective_sample_size, importance_weights
 from .kde.isotropic import GraspDensity
 from .kde.mixture import MixtureDensity
@@ -33,7 +32,6 @@ __all__ = [
     "SuccessEstimate",
     "SuccessModel",
     "WidthChoice",
-    "brute_force",
     "choose_widths",
     "effective_sample_size",
     "expected",

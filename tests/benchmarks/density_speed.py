@@ -42,13 +42,13 @@ from graspdb_density import (
 )
 from graspdb_density._compiled import exp, isotropic
 from graspdb_density.bandwidth import mixture_fit
-from graspdb_density.kde import brute_force as reference
 from graspdb_density.kde.bhattacharyya import bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.isotropic import CUTOFF, scaled_radius
 from graspdb_density.search.mode_search import ModeSearch
 from graspdb_density.search.start_ranking import centre_sums
 
 sys.path.append(str(Path(__file__).parents[1] / "density"))
+import brute_force as reference
 from ellipsoid_shell import SEMI_AXES_M, shell
 
 Poses = tuple[se3.Floats, se3.Floats]
@@ -315,13 +315,14 @@ def replaced(rng: np.random.Generator) -> None:
     xi = np.concatenate([close, spread])
     component = IsotropicKernel(0.01, math.radians(10.0))
     turns = se3.from_rotation_vector(xi[:, 3:])
-    own = np.diag([component.sigma_position_m**2] * 3 + [component.sigma_rotation**2] * 3)
-    pair = mixture_fit._fitted(xi, np.ones(900), 2, own, False)
+    pair = mixture_fit._fitted(xi, np.ones(900), 2, component.overall_covariance, False)
     whole = sampled_kernel_rows(se3.Poses.of(xi[:, :3], turns), component)
     one = MixtureDensity(se3.Poses.of(np.zeros((1, 3)), se3.IDENTITY[None]), kernel=pair, symmetric=False)
     found = bhattacharyya(one, whole, rng, points=20_000)
     rows = shell(1_000, rng)
-    sampled = SampledKernel(xi[:, :3], turns, component).placed(se3.Poses.of(*rows))
+    sampled = SampledKernel(se3.Poses(xi[:, :3], turns), component, np.ones(len(xi))).placed(
+        se3.Poses.of(*rows)
+    )
     fitted = MixtureDensity(se3.Poses.of(*rows), kernel=pair)
     many, few = queries(rows, 5_000, component, rng), queries(rows, 100, component, rng)
     quick, cut, slow = interleaved(

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+import brute_force
 from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_density._compiled.pairs import composition_angles
-from graspdb_density.kde import brute_force
 from graspdb_density.se3 import Floats, Poses
 from graspdb_density.vicinity import pair_candidates
 from graspdb_density.vicinity.anisotropy import empirical_anisotropy

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from graspdb_density import IsotropicKernel, SuccessModel, se3
-from graspdb_density.kde import brute_force
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SUCCESS_CUTOFF
 
@@ -57,14 +56,8 @@ def smoothed(field: Field, rows: Pair, poses: Pair) -> se3.Floats:
     chance, twins = field(*rows), se3.jaw_twin(rows[1])
     out = np.empty(len(poses[0]))
     for j, (p, q) in enumerate(zip(*poses, strict=True)):
-        own = (
-            brute_force.kernel_log_density(KERNEL, se3.Poses(p, q), se3.Poses(rows[0], rows[1]))
-            - KERNEL.log_peak
-        )
-        other = (
-            brute_force.kernel_log_density(KERNEL, se3.Poses(p, q), se3.Poses(rows[0], twins))
-            - KERNEL.log_peak
-        )
+        own = KERNEL.log_kernel(se3.Poses(p, q), se3.Poses(rows[0], rows[1])) - KERNEL.log_peak
+        other = KERNEL.log_kernel(se3.Poses(p, q), se3.Poses(rows[0], twins)) - KERNEL.log_peak
         k = (np.exp(own) + np.exp(other)) * (np.maximum(own, other) >= -0.5 * SUCCESS_CUTOFF**2)
         out[j] = k @ chance / k.sum() if k.any() else np.nan
     return out

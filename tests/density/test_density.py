@@ -1,4 +1,4 @@
-"""The fast path against the float64 reference, normalisation, symmetries, gradient, samples, extension."""
+"""The fast path against the float64 reference, normalisation, symmetries, samples, extension."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import brute_force
 from graspdb_density import HAAR_VOLUME, GraspDensity, IsotropicKernel, se3
-from graspdb_density.kde import brute_force
 from graspdb_density.search.start_ranking import centre_sums
 
 Poses = tuple[se3.Floats, se3.Floats]
@@ -189,39 +189,6 @@ def test_rows_without_a_twin_are_told_from_far_away_and_half_a_turn(degrees: flo
         np.testing.assert_allclose(
             density.log_density(se3.Poses.of(*poses), cutoff=cutoff), expected, rtol=2e-6, atol=5e-3
         )
-
-
-@pytest.mark.parametrize("kernel", KERNELS[:3], ids=str)
-@pytest.mark.parametrize("flags", [True, False])
-def test_gradient_against_finite_differences(
-    kernel: IsotropicKernel, flags: bool, shell: Shell, moved: Moved
-) -> None:
-    rng = np.random.default_rng(5)
-    rows = shell(500, rng)
-    density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel, symmetric=flags)
-    p, q = moved(rows, 12, kernel.sigma_position_m, kernel.sigma_rotation, rng)
-    p[-1] += 0.5  # far away, where the cut-off would leave nothing
-    along, around = density.gradient(se3.Poses.of(p, q))
-    step = 1e-4
-
-    def value(at: se3.Floats, to: se3.Floats) -> se3.Floats:
-        return brute_force.log_density(kernel, se3.Poses.of(*rows), se3.Poses.of(at, to), symmetric=flags)
-
-    for axis in range(3):
-        delta = np.zeros(3)
-        delta[axis] = step * kernel.sigma_position_m
-        slope = (value(p + delta, q) - value(p - delta, q)) / (2.0 * delta[axis])
-        np.testing.assert_allclose(along[:, axis], slope, rtol=2e-3, atol=2e-3 / kernel.sigma_position_m)
-        turn = np.zeros(3)
-        turn[axis] = step
-        ahead = se3.multiply(q, se3.from_rotation_vector(turn))
-        behind = se3.multiply(q, se3.from_rotation_vector(-turn))
-        slope = (value(p, ahead) - value(p, behind)) / (2.0 * step)
-        direction = se3.multiply(q, np.append(turn / step, 0.0)) / 2.0
-        np.testing.assert_allclose(
-            np.sum(around * direction, axis=1), slope, rtol=2e-3, atol=2e-3 / kernel.sigma_rotation
-        )
-    np.testing.assert_allclose(np.sum(around * q, axis=1), 0.0, atol=1e-6 * np.abs(around).max())
 
 
 def test_samples_follow_the_density(shell: Shell) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.kde.weighted_sums import KernelRows
-from graspdb_density.kernels.gaussian_mixture import Kernel
+from graspdb_density.kernels.gaussian_mixture import AnisotropicKernel, Kernel
 from graspdb_density.se3 import Floats, Poses
 from graspdb_density.statistics import convergence as cv
 from graspdb_density.statistics.counter_rng import CounterRng
@@ -25,16 +25,8 @@ Shell = Callable[[int, np.random.Generator], Pair]
 ISOTROPIC = IsotropicKernel(0.02, math.radians(20.0))
 
 
-@dataclass(frozen=True)
-class Gaussian:
-    weights: Floats
-    means: Floats
-    covariances: Floats
-
-
-ANISOTROPIC = Gaussian(
-    np.ones(1), np.zeros((1, 6)), np.diag(np.square([0.03, 0.01, 0.02, 0.2, 0.5, 0.3]))[None]
-)
+WIDTHS = np.array([0.03, 0.01, 0.02, 0.2, 0.5, 0.3])
+ANISOTROPIC = AnisotropicKernel.diagonal(WIDTHS)
 
 
 @dataclass(frozen=True)
@@ -122,13 +114,14 @@ def test_what_does_not_hold_any_more_is_not_kept(shell: Shell) -> None:
     rng = np.random.default_rng(1)
     p, q = shell(380, rng)
     frames = se3.to_matrix(se3.random_quaternions(380, rng))
+    fixed = AnisotropicKernel.diagonal(WIDTHS, frame="fixed")
     grasps = Grasps(p, q, np.ones(380), np.ones(380, dtype=bool), frames)
-    before = grasps.grown(300, ANISOTROPIC)
-    assert grasps.grown(350, ANISOTROPIC, before).kept == 300
-    assert grasps.grown(300, ANISOTROPIC, before).kept == 300
+    before = grasps.grown(300, fixed)
+    assert grasps.grown(350, fixed, before).kept == 300
+    assert grasps.grown(300, fixed, before).kept == 300
     # Weights have no unit.
     heavier = Grasps(p, q, np.full(380, 7.0), grasps.symmetric, frames)
-    assert heavier.grown(350, ANISOTROPIC, before).kept == 300
+    assert heavier.grown(350, fixed, before).kept == 300
     moved = p.copy()
     moved[120, 0] += 1e-9
     without = np.delete(np.arange(380), 120)
@@ -141,19 +134,20 @@ def test_what_does_not_hold_any_more_is_not_kept(shell: Shell) -> None:
         Grasps(p, q, np.linspace(1.0, 1.01, 380), grasps.symmetric, frames),
         Grasps(p, q, grasps.weights, flags, frames),
         Grasps(p, q, grasps.weights, grasps.symmetric, frames[0]),
-        Grasps(p, q, grasps.weights, grasps.symmetric, None),
     ]
     for other in others:
-        again = other.grown(350, ANISOTROPIC, before)
+        again = other.grown(350, fixed, before)
         assert again.kept == 0
-        assert_same(again, other.grown(350, ANISOTROPIC))
-    wider = Gaussian(ANISOTROPIC.weights, ANISOTROPIC.means, ANISOTROPIC.covariances * 1.1)
+        assert_same(again, other.grown(350, fixed))
+    wider = AnisotropicKernel.diagonal(1.05 * WIDTHS, frame="fixed")
     assert grasps.grown(350, wider, before).kept == 0
     assert grasps.grown(350, ISOTROPIC, before).kept == 0
-    assert grasps.grown(350, ANISOTROPIC, before, points=601).kept == 0
-    assert grasps.grown(350, ANISOTROPIC, before, seed=1).kept == 0
+    unframed = Grasps(p, q, grasps.weights, grasps.symmetric)
+    assert unframed.grown(350, ANISOTROPIC, before).kept == 0
+    assert grasps.grown(350, fixed, before, points=601).kept == 0
+    assert grasps.grown(350, fixed, before, seed=1).kept == 0
     # Fewer grasps than before, and twice as many.
-    assert grasps.grown(250, ANISOTROPIC, before).kept == 0
+    assert grasps.grown(250, fixed, before).kept == 0
 
 
 def test_late_heavy_grasps_bring_no_flood_of_points(shell: Shell) -> None:

@@ -12,7 +12,6 @@ from scipy.integrate import quad
 from scipy.special import iv, ive
 
 from graspdb_density import HAAR_VOLUME, IsotropicKernel, se3
-from graspdb_density.kde import brute_force
 from graspdb_density.kernels.isotropic import sample_von_mises_fisher
 from graspdb_density.se3 import Poses
 
@@ -27,10 +26,7 @@ def test_rotation_part_integrates_to_one_over_the_haar_measure(width_deg: float)
     def shell(angle: float) -> float:
         # Rotations by an angle in [a, a + da] have Haar volume 4 pi (2 sin(a/2))^2 da.
         q = np.array([0.0, 0.0, math.sin(angle / 2.0), math.cos(angle / 2.0)])
-        log = (
-            brute_force.kernel_log_density(kernel, Poses(np.zeros(3), q), Poses(np.zeros(3), se3.IDENTITY))
-            - position_peak
-        )
+        log = kernel.log_kernel(Poses(np.zeros(3), q), Poses(np.zeros(3), se3.IDENTITY)) - position_peak
         return float(np.exp(log)) * 4.0 * math.pi * (2.0 * math.sin(angle / 2.0)) ** 2
 
     total, _ = quad(shell, 0.0, math.pi, epsabs=1e-13, epsrel=1e-13, limit=200)
@@ -48,14 +44,13 @@ def test_formula(width_deg: float) -> None:
     on_sphere = c4 / 2.0 * (math.exp(kappa * q[3]) + math.exp(-kappa * q[3]))
     gauss = (2.0 * math.pi * 0.02**2) ** -1.5 * math.exp(-0.5 * float(offset @ offset) / 0.02**2)
     expected = math.log(gauss * on_sphere / 4.0)
-    got = brute_force.kernel_log_density(kernel, Poses(offset, q), Poses(np.zeros(3), se3.IDENTITY))
+    got = kernel.log_kernel(Poses(offset, q), Poses(np.zeros(3), se3.IDENTITY))
     assert float(got) == pytest.approx(expected, abs=1e-12)
 
 
 def test_uniform_limit_is_one_over_the_volume() -> None:
     kernel = IsotropicKernel(1.0, math.radians(120.0))
-    values = brute_force.kernel_log_density(
-        kernel,
+    values = kernel.log_kernel(
         Poses(np.zeros(3), se3.random_quaternions(20_000, np.random.default_rng(0))),
         Poses(np.zeros(3), se3.IDENTITY),
     )
@@ -88,19 +83,13 @@ def test_symmetries_of_the_kernel(sigma: float, width_deg: float, seed: int) -> 
     kernel = IsotropicKernel(sigma, math.radians(width_deg))
     p, c = rng.normal(size=(2, 3)) * sigma
     q, r = se3.random_quaternions(2, rng)
-    value = brute_force.kernel_log_density(kernel, Poses(p, q), Poses(c, r))
-    assert float(brute_force.kernel_log_density(kernel, Poses(p, -q), Poses(c, r))) == pytest.approx(
-        float(value), abs=1e-9
-    )
-    assert float(brute_force.kernel_log_density(kernel, Poses(c, r), Poses(p, q))) == pytest.approx(
-        float(value), abs=1e-9
-    )
+    value = kernel.log_kernel(Poses(p, q), Poses(c, r))
+    assert float(kernel.log_kernel(Poses(p, -q), Poses(c, r))) == pytest.approx(float(value), abs=1e-9)
+    assert float(kernel.log_kernel(Poses(c, r), Poses(p, q))) == pytest.approx(float(value), abs=1e-9)
     frame_p, frame_q = rng.normal(size=3), se3.random_quaternions(1, rng)[0]
     there = se3.compose(Poses(frame_p, frame_q), Poses(p, q))
     here = se3.compose(Poses(frame_p, frame_q), Poses(c, r))
-    assert float(brute_force.kernel_log_density(kernel, Poses(*there), Poses(*here))) == pytest.approx(
-        float(value), abs=1e-6
-    )
+    assert float(kernel.log_kernel(Poses(*there), Poses(*here))) == pytest.approx(float(value), abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from graspdb_density import IsotropicKernel, SuccessModel, se3
-from graspdb_density.kde import brute_force
 from graspdb_density.se3 import Poses
 
 Pair = tuple[se3.Floats, se3.Floats]
@@ -27,14 +26,8 @@ def by_definition(
     probability, trials = np.empty(len(poses[0])), np.empty(len(poses[0]))
     twins = se3.jaw_twin(rows[1])
     for j, (p, q) in enumerate(zip(*poses, strict=True)):
-        own = (
-            brute_force.kernel_log_density(kernel, se3.Poses(p, q), se3.Poses(rows[0], rows[1]))
-            - kernel.log_peak
-        )
-        other = (
-            brute_force.kernel_log_density(kernel, se3.Poses(p, q), se3.Poses(rows[0], twins))
-            - kernel.log_peak
-        )
+        own = kernel.log_kernel(se3.Poses(p, q), se3.Poses(rows[0], rows[1])) - kernel.log_peak
+        other = kernel.log_kernel(se3.Poses(p, q), se3.Poses(rows[0], twins)) - kernel.log_peak
         top = np.where(flags, np.maximum(own, other), own)
         k = np.where(flags, 0.5 * (np.exp(own) + np.exp(other)), np.exp(own)) * (top >= -12.5)
         share = won.mean()

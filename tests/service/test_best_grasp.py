@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import brute_force
 from graspdb_density import GraspDensity, IsotropicKernel, Region, se3
-from graspdb_density.kde import brute_force
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses

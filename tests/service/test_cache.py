@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import brute_force
 from graspdb_density import GraspDensity, IsotropicKernel, se3
-from graspdb_density.kde import brute_force
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError

@@ -250,8 +250,7 @@ def as_sampled(kernel: dict[str, Any]) -> SampledKernel:
     means = np.array([c["mean"] for c in kernel["components"]])
     widths = kernel["provenance"]["component_widths"]
     return SampledKernel(
-        means[:, :3],
-        se3.from_rotation_vector(means[:, 3:]),
+        se3.Poses(means[:, :3], se3.from_rotation_vector(means[:, 3:])),
         IsotropicKernel(widths["sigma_position_m"], math.radians(widths["sigma_rotation_deg"])),
         np.array([c["weight"] for c in kernel["components"]]),
     )

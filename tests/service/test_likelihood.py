@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import brute_force
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.kde import brute_force
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]

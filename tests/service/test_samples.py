@@ -9,9 +9,9 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+import brute_force
 from graspdb.wire import Selection
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.kde import brute_force
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.grasps.samples import draw

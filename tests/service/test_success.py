@@ -14,7 +14,6 @@ from scipy.stats import beta
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.kde import brute_force
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import PG70
@@ -33,11 +32,10 @@ COLLISION = OUTCOME_CODES["collision"]
 
 def by_definition(trials: Poses, success: Bools, queries: Poses) -> tuple[Floats, Floats, Floats, Floats]:
     """P, its interval's ends and n_e: the sums of the definition in float64, without a cut-off."""
-    first = brute_force.kernel_log_density(
-        KERNEL, se3.Poses(queries[0][:, None], queries[1][:, None]), se3.Poses.of(trials[0], trials[1])
+    first = KERNEL.log_kernel(
+        se3.Poses(queries[0][:, None], queries[1][:, None]), se3.Poses.of(trials[0], trials[1])
     )
-    second = brute_force.kernel_log_density(
-        KERNEL,
+    second = KERNEL.log_kernel(
         se3.Poses(queries[0][:, None], queries[1][:, None]),
         se3.Poses.of(trials[0], se3.jaw_twin(trials[1])),
     )

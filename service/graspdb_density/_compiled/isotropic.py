@@ -292,27 +292,6 @@ def reached(cells, positions, radius, out):
 
 
 @fast
-def moments(cells, positions, quaternions, kappa, radius, wide, out):
-    """The moments of `isotropic_runs.moments_wide` at every pose into ``out`` (M, 9)."""
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    out[:] = 0.0
-    for j in range(positions.shape[0]):
-        at = place(cells, positions[j], quaternions[j], kappa)
-        near, row = single(at), out[j]
-        for s in range(cells.table.shape[0]):
-            twin = F32(cells.table[s, TWIN])
-            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-                begin, end = runs[r, 0], runs[r, 1]
-                while begin < end:
-                    stop = min(begin + BLOCK, end)
-                    if wide > 0:
-                        isotropic_runs.moments_wide(cells.data, begin, stop, near, twin, row)
-                    else:
-                        isotropic_runs.moments_narrow(cells.data, begin, stop, near, twin, row)
-                    begin = stop
-
-
-@fast
 def scatter_sums(cells, positions, quaternions, weights, twins, kappa, radius, wide, out):
     """Add the kernels of the given rows to the sums ``out`` (N,) at every sorted kernel's centre."""
     runs = np.empty((MAX_RUNS, 2), dtype=np.int64)

@@ -13,7 +13,6 @@ from ..kde.weighted_sums import Progress
 from ..kernels.gaussian_mixture import MOST_ROTATION, AnisotropicKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats
-from .matching import overall_covariance
 from .mixture_fit import Displacements, mixture_parts, sampled_rows, similarity_to_sampled
 
 __all__ = ["MIXTURES", "mixture_curve"]
@@ -58,7 +57,7 @@ def mixture_curve(
     whole_rows = rng.choice(len(share), size=min(reference, len(share)), replace=False, p=share)
     whole = sampled_rows(found.vectors[whole_rows], components)
     chosen = rng.choice(len(share), size=min(fitted, len(share)), replace=False, p=share)
-    added = overall_covariance(components)
+    added = components.overall_covariance
     result = []
     for number, count in enumerate(counts):
         weights, means, covariances = mixture_parts(found.vectors[chosen], count)

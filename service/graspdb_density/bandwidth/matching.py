@@ -22,7 +22,6 @@ __all__ = [
     "match_determinants",
     "match_likelihood",
     "match_success",
-    "overall_covariance",
     "scaled",
     "success_ends",
 ]
@@ -47,26 +46,12 @@ class Match:
     reached: bool
 
 
-def overall_covariance(kernel: Kernel) -> Floats:
-    """Covariance (6, 6) of a kernel's displacements, spread of a mixture's means included (m^2, m rad,
-    rad^2).
-    """
-    if isinstance(kernel, IsotropicKernel):
-        return np.diag([kernel.sigma_position_m**2] * 3 + [kernel.sigma_rotation**2] * 3)
-    w = np.asarray(kernel.weights, dtype=np.float64)
-    w = w / w.sum()
-    means = np.asarray(kernel.means, dtype=np.float64)
-    centre = w @ means
-    spread = np.einsum("c,ci,cj->ij", w, means - centre, means - centre)
-    return np.asarray(np.einsum("c,cij->ij", w, np.asarray(kernel.covariances)) + spread, dtype=np.float64)
-
-
 def match_determinants(kernel: Kernel) -> Match:
     """The isotropic kernel whose position and rotation blocks have the kernel's determinants.
 
     ``achieved`` and ``target`` are the log determinant of both blocks together.
     """
-    cov = overall_covariance(kernel)
+    cov = kernel.overall_covariance
     blocks = [float(np.linalg.slogdet(cov[part, part])[1]) for part in (slice(0, 3), slice(3, 6))]
     sigma, turn = (math.exp(value / 6.0) for value in blocks)
     found = _clipped(sigma, turn)

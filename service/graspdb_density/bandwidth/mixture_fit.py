@@ -27,7 +27,6 @@ from ..kernels.gaussian_mixture import AnisotropicKernel, mirror
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats, Poses
 from ..success.calibration import assign_blocks
-from .matching import overall_covariance
 
 __all__ = [
     "LEAST_DISPLACEMENTS",
@@ -220,7 +219,7 @@ def fit_kernel(
             f"the window holds {len(found.vectors)} displacements between successes, and a kernel is fitted "
             f"on at least {LEAST_DISPLACEMENTS}: widen the window or add trials"
         )
-    added = overall_covariance(widths)
+    added = widths.overall_covariance
     tried = (1,) if frame is not None else _TRIED_COMPONENTS if components is None else (components,)
     told = progress or (lambda _: None)
     shape, likelihoods = _shape(

@@ -4,7 +4,7 @@ A density is ``d(x) = sum_i w_i (K(x; x_i) + K(x; x_i M)) / 2`` with weights tha
 (right multiplication by half a turn about tool z); a row that is not symmetric has no twin. Unit: 1/(m^3
 rad^3), see `kernels`.
 
-Error. Against the float64 sum over every row (`reference`), see `GraspDensity.log_density`.
+Error. Against the float64 sum over every row, see `GraspDensity.log_density`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from .._compiled import isotropic, nearest
 from .._compiled.threads import for_blocks
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats, Poses
-from . import brute_force
 from .cell_list import Cells
 from .rows import Rows
 
@@ -253,41 +252,6 @@ class GraspDensity:
         """Density at poses, 1/(m^3 rad^3); underflows to 0 only below 1e-300."""
         return np.exp(self.log_density(poses, cutoff=cutoff, threads=threads))
 
-    def gradient(self, poses: Poses, *, cutoff: float = 6.0) -> tuple[Floats, Floats]:
-        """Gradient of the log density.
-
-        Returns
-        -------
-        position_gradient : (M, 3) 1/m
-        quaternion_gradient : (M, 4)
-            Tangent to the unit sphere at each quaternion. The rate along a rotation vector r in the tool
-            frame (``q <- q exp(r)``) is its product with ``multiply(q, (r, 0)) / 2``.
-        """
-        q = poses.quaternions_xyzw
-        moments = self.moments(poses, cutoff=cutoff)
-        total = moments[:, :1]
-        kappa, scale = self._kernel.kappa, self._cells.scale
-        near = total[:, 0] > math.exp(-0.5 * cutoff * cutoff)
-        safe = np.where(near[:, None], total, 1.0)
-        along = moments[:, 1:4] / safe * (2.0 * scale)
-        pull = moments[:, 4:8] / safe * kappa
-        around = pull - np.sum(pull * q, axis=1, keepdims=True) * q
-        for i in np.flatnonzero(~near):
-            along[i], around[i] = brute_force.gradient(
-                self._kernel, self.poses, poses[int(i)],
-                weights=self._rows.weights, symmetric=self._rows.symmetric,
-            )  # fmt: skip
-        return along, around
-
-    def moments(self, poses: Poses, *, cutoff: float) -> Floats:
-        """Kernel sums, displacements and pulls (M, 9) as `isotropic.moments` lays them out."""
-        cells = self._cells
-        out = np.empty((len(poses), 9))
-        isotropic.moments(
-            cells.arrays, *poses, self._kernel.kappa, scaled_radius(cutoff), self.wide, out,
-        )  # fmt: skip
-        return out
-
     def kernel_sums(self, poses: Poses, *, cutoff: float, threads: int = 1) -> Floats:
         """Kernel sums (M,) within a cut-off, 0 where nothing is in reach."""
         cells = self._cells
@@ -362,8 +326,8 @@ class GraspDensity:
         return self._displaced(self.poses[rows], rng)
 
     def _displaced(self, centres: Poses, rng: np.random.Generator) -> Poses:
-        translations, turns = self._kernel.sample_displacements(len(centres), rng)
-        return Poses(centres.positions + translations, se3.multiply(centres.quaternions_xyzw, turns))
+        move, turn = self._kernel.sample_displacements(len(centres), rng)
+        return Poses(centres.positions + move, se3.multiply(centres.quaternions_xyzw, turn))
 
 
 def brute_terms(kernel: IsotropicKernel, total: float) -> tuple[int, float]:

@@ -62,9 +62,6 @@ class MixtureDensity:
         symmetric: ArrayLike | bool = True,
         frames: ArrayLike | None = None,
     ) -> None:
-        if (frames is None) != (kernel.frame == "gripper"):
-            need = "takes no frames" if kernel.frame == "gripper" else "needs frames"
-            raise ValueError(f"a kernel in the {kernel.frame} frame {need}")
         rows = KernelRows(poses, kernel, weights=weights, symmetric=symmetric, frames=frames)
         # Weights are kept in the unit of those given, so that further rows can be added in it.
         self._total = float(rows.size) if weights is None else float(np.sum(weights))
@@ -201,24 +198,6 @@ class MixtureDensity:
     def density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Density at poses, 1/(m^3 rad^3)."""
         return np.exp(self.log_density(poses, threads=threads))
-
-    def gradient(self, poses: Poses) -> tuple[Floats, Floats]:
-        """Gradient of the log density by position (M, 3), 1/m, and by a rotation vector in the tool (M, 3).
-
-        Central differences of a thousandth of the kernel's widths in the exact float64 sum: meant for checks
-        and for few poses.
-        """
-        p, q = poses
-        steps = 1e-3 * np.sqrt(np.diag(self._kernel.overall_covariance))
-        out = np.empty((2, len(p), 3))
-        for axis in range(3):
-            for kind in (0, 1):
-                move, turn = np.zeros(3), np.zeros(3)
-                (move if kind == 0 else turn)[axis] = steps[3 * kind + axis]
-                ahead = self.reference(Poses(p + move, se3.multiply(q, se3.from_rotation_vector(turn))))
-                behind = self.reference(Poses(p - move, se3.multiply(q, se3.from_rotation_vector(-turn))))
-                out[kind, :, axis] = (ahead - behind) / (2.0 * steps[3 * kind + axis])
-        return out[0], out[1]
 
     def reference(self, poses: Poses) -> Floats:
         """Log density at poses (M,) in float64 over all rows, twins and wraps; M times N evaluations."""

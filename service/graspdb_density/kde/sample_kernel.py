@@ -10,14 +10,12 @@ component has its own twin, so that neither the row's nor the pose's orientation
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import se3
 from ..kernels.isotropic import IsotropicKernel
-from ..se3 import Floats, Poses
+from ..se3 import Poses
 from .isotropic import GraspDensity
 from .rows import Rows
 
@@ -27,64 +25,34 @@ __all__ = ["MOST_COMPONENTS", "SampledKernel"]
 MOST_COMPONENTS = 2_000_000
 
 
-@dataclass(frozen=True, eq=False)
 class SampledKernel:
     """Isotropic components at displacements from a grasp, in the gripper's frame.
 
     Parameters
     ----------
-    translations : (C, 3) metres, along the gripper's axes
-    quaternions_xyzw : (C, 4) turns, in the gripper's frame
+    displacements : (C)
+        Along the gripper's axes, and turns in its frame.
     component
         Width of every component.
-    weights : (C,) positive, normalised here; None: equal
+    weights : (C,) positive, normalised here
 
     Raises
     ------
     ValueError
-        For no component, wrong shapes, values that are not finite, or weights that are not positive.
+        For no component, wrong shapes, or weights that are not positive and finite.
     """
 
-    translations: Floats
-    quaternions_xyzw: Floats
-    component: IsotropicKernel
-    weights: Floats | None = None
-
-    def __post_init__(self) -> None:
-        t, q = Poses.of(self.translations, self.quaternions_xyzw)
-        if not len(t):
+    def __init__(self, displacements: Poses, component: IsotropicKernel, weights: ArrayLike) -> None:
+        if not len(displacements):
             raise ValueError("a sampled kernel needs at least one component")
-        w = Rows.of(Poses(t, q), self.weights).weights
-        object.__setattr__(self, "translations", t)
-        object.__setattr__(self, "quaternions_xyzw", q)
-        object.__setattr__(self, "weights", w / w.sum())
+        self.displacements, self.component = displacements, component
+        given = Rows.of(displacements, weights).weights
+        self.weights = given / given.sum()
 
     @property
     def size(self) -> int:
         """Components."""
-        return len(self.translations)
-
-    @property
-    def shares(self) -> Floats:
-        """Weights (C,), summing to 1."""
-        assert self.weights is not None
-        return self.weights
-
-    def log_kernel(self, displacements: Poses) -> Floats:
-        """Log density at displacements (M): eq 5, nats of 1/(m^3 rad^3), integrating to 1."""
-        template = GraspDensity.build(
-            Poses(self.translations, self.quaternions_xyzw),
-            kernel=self.component,
-            weights=self.weights,
-            symmetric=False,
-        )
-        return template.log_density(displacements, cutoff=None)
-
-    def sample_displacements(self, count: int, rng: np.random.Generator) -> Poses:
-        """Draw displacements."""
-        which = rng.choice(self.size, size=count, p=self.shares)
-        move, turn = self.component.sample_displacements(count, rng)
-        return Poses(self.translations[which] + move, se3.multiply(self.quaternions_xyzw[which], turn))
+        return len(self.displacements)
 
     def placed(
         self,
@@ -117,12 +85,10 @@ class SampledKernel:
         at, to = Poses.concatenate([poses, poses[flags].turned()])
         share = np.concatenate([rows.twin_weights, rows.twin_weights[flags]])
         twin = np.concatenate([flags, flags[flags]])
-        moved, turned = se3.compose(
-            Poses(at[:, None], to[:, None]), Poses(self.translations, self.quaternions_xyzw)
-        )
+        moved, turned = se3.compose(Poses(at[:, None], to[:, None]), self.displacements)
         return GraspDensity.build(
             Poses(moved.reshape(-1, 3), se3.normalise(turned.reshape(-1, 4))),
             kernel=self.component,
-            weights=(share[:, None] * self.shares[None]).reshape(-1),
+            weights=(share[:, None] * self.weights).reshape(-1),
             symmetric=np.repeat(twin, self.size),
         )

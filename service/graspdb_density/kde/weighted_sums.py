@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import se3
 from .._compiled import weighted
 from .._compiled.threads import for_blocks
-from ..kernels.gaussian_mixture import Kernel, MixtureKernel, rotation_normaliser
+from ..kernels.gaussian_mixture import AnisotropicKernel, Kernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
 from .cell_list import Cells
@@ -53,20 +53,18 @@ class KernelRows:
     ----------
     poses : (N), at least one
     kernel
-        Isotropic, or a mixture over the displacement in each row's frame. A mixture must not change when the
-        jaw is mirrored: under ``A = diag(-1, -1, 1, -1, -1, 1)`` in the gripper's frame, under
-        ``diag(1, 1, 1, -1, -1, 1)`` where ``frames`` are given (those do not turn with the jaw).
     weights : (N,) or None
         Positive, normalised here. None: equal.
     symmetric : bool or (N,)
         Whether a row has its twin under the jaw's turn.
     frames : (N, 3, 3) or (3, 3) or None
-        Columns are the axes that translations are measured along, object frame. None: each row's gripper.
+        Columns are the axes that translations are measured along, object frame; required by a kernel whose
+        frame is ``fixed``, refused by every other.
 
     Raises
     ------
     ValueError
-        For wrong shapes or values, or a covariance that is not positive definite.
+        For wrong shapes or values, or frames that do not fit the kernel.
     """
 
     def __init__(
@@ -84,16 +82,18 @@ class KernelRows:
         rows = Rows.of(poses, weights, symmetric)
         self.rows = rows.over(float(rows.weights.sum()))
         self._own_frames = frames is None
-        self._frames: Floats | None = None
-        # What needs sorted rows sorts them: densities of their own keep other cells.
-        self._sigma = 0.0
+        self._frames = None if frames is None else _frames(frames, len(poses))
         if isinstance(kernel, IsotropicKernel):
-            self._sigma = kernel.sigma_position_m
-            self._reach = CUTOFF * self._sigma
+            self._reach = CUTOFF * kernel.sigma_position_m
             self.log_unit = kernel.log_peak
-        else:
-            self._sigma = self._take_mixture(kernel)
-            self._frames = None if frames is None else _frames(frames, len(poses))
+            return
+        if self._own_frames != (kernel.frame == "gripper"):
+            need = "takes no frames" if kernel.frame == "gripper" else "needs frames"
+            raise ValueError(f"a kernel in the {kernel.frame} frame {need}")
+        spread = np.sqrt(np.linalg.eigvalsh(kernel.covariances[:, :3, :3])[:, -1])
+        self._reach = float(np.max(np.linalg.norm(kernel.means[:, :3], axis=1) + CUTOFF * spread))
+        self.log_unit = float(kernel.log_peaks.max())
+        self.mixture = _compiled_mixture(kernel)
 
     @cached_property
     def frames(self) -> Floats:
@@ -102,7 +102,8 @@ class KernelRows:
 
     @cached_property
     def _cells(self) -> Cells:
-        return Cells.build(Rows.of(self.poses, symmetric=self.symmetric), self._sigma)
+        # Made on demand: densities of their own keep other cells.
+        return Cells.build(Rows.of(self.poses, symmetric=self.symmetric), self._reach / CUTOFF)
 
     @cached_property
     def _sorted_frames(self) -> NDArray[np.float32]:
@@ -128,39 +129,6 @@ class KernelRows:
         ]
         return int(self.rows.nbytes + sum(part.nbytes for part in made))
 
-    def _take_mixture(self, kernel: MixtureKernel) -> float:
-        w = np.asarray(kernel.weights, dtype=np.float64)
-        mean = np.asarray(kernel.means, dtype=np.float64)
-        cov = np.asarray(kernel.covariances, dtype=np.float64)
-        if w.ndim != 1 or mean.shape != (len(w), 6) or cov.shape != (len(w), 6, 6) or not len(w):
-            raise ValueError("a mixture kernel has weights (C,), means (C, 6) and covariances (C, 6, 6)")
-        if not (
-            np.isfinite(w).all() and (w > 0.0).all() and np.isfinite(mean).all() and np.isfinite(cov).all()
-        ):
-            raise ValueError("a mixture kernel's weights must be positive and its components finite")
-        try:
-            root = np.linalg.cholesky(cov)
-        except np.linalg.LinAlgError:
-            raise ValueError("a mixture kernel's covariances must be positive definite") from None
-        log_volume = 3.0 * math.log(2.0 * math.pi) + np.log(np.einsum("cii->ci", root)).sum(axis=1)
-        rotation = rotation_normaliser(mean[:, 3:], cov[:, 3:, 3:])
-        peaks = np.log(w / w.sum()) - log_volume - np.log(rotation)
-        whitening = np.linalg.inv(root) / math.sqrt(2.0)
-        offset = np.einsum("cij,cj->ci", whitening, mean)
-        rows, columns = np.tril_indices(6)
-        self._draw_roots = root
-        self.log_unit = float(peaks.max())
-        spread = np.sqrt(np.linalg.eigvalsh(cov[:, :3, :3])[:, -1])
-        self._reach = float(np.max(np.linalg.norm(mean[:, :3], axis=1) + CUTOFF * spread))
-        turn = np.sqrt(np.linalg.eigvalsh(cov[:, 3:, 3:])[:, -1])
-        # Beyond pi the same rotation has another vector; it counts where a component reaches that far.
-        self.mixture = weighted.Mixture(
-            np.concatenate([whitening[:, rows, columns], offset], axis=1),
-            peaks - self.log_unit,
-            bool(np.any(np.linalg.norm(mean[:, 3:], axis=1) + 5.3 * turn > math.pi)),
-        )
-        return self._reach / CUTOFF
-
     @property
     def poses(self) -> Poses:
         return self.rows.poses
@@ -182,7 +150,7 @@ class KernelRows:
 
     def subset(self, rows: NDArray[np.int64]) -> KernelRows:
         """The rows given, weights renormalised."""
-        frames = None if self._frames is None or self._own_frames else self._frames[rows]
+        frames = None if self._frames is None else self._frames[rows]
         return KernelRows(
             self.poses[rows],
             self.kernel,
@@ -309,48 +277,36 @@ class KernelRows:
         steps = (np.arange(count) + rng.random()) / max(count, 1)
         row = np.minimum(np.searchsorted(edges, steps * edges[-1], side="right"), self.size - 1)
         turned = rng.random(count) < 0.5
-        return self.displaced(row, turned, *self.displacements(count, rng))
+        return self.displaced(row, turned, self.kernel.sample_displacements(count, rng))
 
-    def displacements(self, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Draw displacements from the kernel: translations (count, 3) in metres along a row's axes, and
-        turns (count, 4).
-        """
-        if isinstance(self.kernel, IsotropicKernel):
-            return self.kernel.sample_displacements(count, rng)
-        vectors = self._draw_vectors(count, rng)
-        return vectors[:, :3], se3.from_rotation_vector(vectors[:, 3:])
-
-    def displaced(
-        self, row: NDArray[np.intp], turned: NDArray[np.bool_], moves: Floats, turns: Floats
-    ) -> Poses:
-        """Poses at displacements from rows (n,), or from their twins where they are ``turned``
-        and have one.
+    def displaced(self, row: NDArray[np.intp], turned: NDArray[np.bool_], displacements: Poses) -> Poses:
+        """Poses at displacements from rows (n,), along their axes, or from their twins where they are
+        ``turned`` and have one.
         """
         turned = turned & self.symmetric[row]
         centre = self.poses[row].turned(turned)
+        moves, turns = displacements
         if not isinstance(self.kernel, IsotropicKernel):
             # The twin's own x and y axes point the other way.
             flip = np.where((turned & self._own_frames)[:, None], np.array([-1.0, -1.0, 1.0]), 1.0)
             moves = np.einsum("nij,nj->ni", self.frames[row], moves * flip)
         return Poses(centre.positions + moves, se3.multiply(centre.quaternions_xyzw, turns))
 
-    def _draw_vectors(self, count: int, rng: np.random.Generator) -> Floats:
-        """Displacements (count, 6) of the mixture kernel by rejection on the rotations' volume element."""
-        assert not isinstance(self.kernel, IsotropicKernel)
-        weights = np.asarray(self.kernel.weights, dtype=np.float64)
-        means = np.asarray(self.kernel.means, dtype=np.float64)
-        component = rng.choice(len(weights), size=count, p=weights / weights.sum())
-        out = np.empty((count, 6))
-        todo = np.arange(count)
-        while todo.size:
-            which = component[todo]
-            noise = rng.standard_normal((len(todo), 6))
-            draws = means[which] + np.einsum("nij,nj->ni", self._draw_roots[which], noise)
-            half = 0.5 * np.linalg.norm(draws[:, 3:], axis=1)
-            kept = rng.random(len(todo)) < np.sinc(half / np.pi) ** 2
-            out[todo[kept]] = draws[kept]
-            todo = todo[~kept]
-        return out
+
+def _compiled_mixture(kernel: AnisotropicKernel) -> weighted.Mixture:
+    """A kernel's components as the compiled loops take them."""
+    whitening = np.linalg.inv(np.linalg.cholesky(kernel.covariances)) / math.sqrt(2.0)
+    offset = np.einsum("cij,cj->ci", whitening, kernel.means)
+    rows, columns = np.tril_indices(6)
+    peaks = kernel.log_peaks
+    turn = np.sqrt(np.linalg.eigvalsh(kernel.covariances[:, 3:, 3:])[:, -1])
+    # Beyond pi the same rotation has another vector; it counts where a component reaches that far.
+    reach = np.linalg.norm(kernel.means[:, 3:], axis=1) + 5.3 * turn
+    return weighted.Mixture(
+        np.concatenate([whitening[:, rows, columns], offset], axis=1),
+        peaks - peaks.max(),
+        bool(np.any(reach > math.pi)),
+    )
 
 
 def _frames(frames: ArrayLike, count: int) -> Floats:

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from ..se3 import Floats
+from .. import se3
+from ..se3 import Floats, Poses
 from .isotropic import POSITION_LIMITS_M, IsotropicKernel
 
 __all__ = [
@@ -28,7 +30,6 @@ __all__ = [
     "AnisotropicKernel",
     "Frame",
     "Kernel",
-    "MixtureKernel",
     "mirror",
     "rotation_normaliser",
 ]
@@ -49,28 +50,6 @@ def mirror(frame: Frame) -> Floats:
     if frame == "gripper":
         return np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
     return np.array([1.0, 1.0, 1.0, -1.0, -1.0, 1.0])
-
-
-@runtime_checkable
-class MixtureKernel(Protocol):
-    """A mixture of Gaussians over displacements (translation in metres first, then rotation vector in
-    radians). It must be invariant under the jaw's mirror, see the module.
-    """
-
-    @property
-    def weights(self) -> Floats:
-        """(C,) positive, summing to 1."""
-
-    @property
-    def means(self) -> Floats:
-        """(C, 6)."""
-
-    @property
-    def covariances(self) -> Floats:
-        """(C, 6, 6) positive definite."""
-
-
-Kernel = IsotropicKernel | MixtureKernel
 
 
 def rotation_normaliser(means: ArrayLike, covariances: ArrayLike) -> Floats:
@@ -199,7 +178,7 @@ class AnisotropicKernel:
             left.remove(match)
         return True
 
-    @property
+    @cached_property
     def log_peaks(self) -> Floats:
         """Log density of every component at its mean, weight included, (C,) nats of 1/(m^3 rad^3).
 
@@ -239,10 +218,11 @@ class AnisotropicKernel:
             terms.append(self.log_peaks - 0.5 * np.einsum("...ci,cij,...cj->...c", off, inverse, off))
         return np.asarray(logsumexp(np.concatenate(terms, axis=-1), axis=-1), dtype=np.float64)
 
-    def sample_displacements(self, count: int, rng: np.random.Generator) -> Floats:
-        """Displacements (count, 6), by rejection on the volume element of rotations, which is at most 1."""
+    def sample_displacements(self, count: int, rng: np.random.Generator) -> Poses:
+        """Draw displacements, by rejection on the volume element of rotations, which is at most 1."""
         roots = np.linalg.cholesky(self.covariances)
-        component = rng.choice(len(self.weights), size=count, p=self._drawn_weights())
+        # A component is drawn by its weight, whatever share of its tangent Gaussian the rejection keeps.
+        component = rng.choice(len(self.weights), size=count, p=self.weights / self.weights.sum())
         out = np.empty((count, 6))
         todo = np.arange(count)
         while todo.size:
@@ -253,11 +233,10 @@ class AnisotropicKernel:
             kept = rng.random(len(todo)) < np.sinc(half / np.pi) ** 2
             out[todo[kept]] = draw[kept]
             todo = todo[~kept]
-        return out
+        return Poses(out[:, :3], se3.from_rotation_vector(out[:, 3:]))
 
-    def _drawn_weights(self) -> Floats:
-        # A component is drawn by its weight, whatever share of its tangent Gaussian the rejection keeps.
-        return np.asarray(self.weights / self.weights.sum(), dtype=np.float64)
+
+Kernel = IsotropicKernel | AnisotropicKernel
 
 
 def _check_covariance(cov: Floats, index: int) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kde.weighted_sums import KernelRows
-from ..se3 import Floats
+from ..kernels.gaussian_mixture import Kernel
+from ..se3 import Poses
 
 __all__ = ["CounterRng"]
 
@@ -55,18 +55,16 @@ class CounterRng:
         return np.concatenate(parts)[begin - skipped : end - skipped]
 
     def displacements(
-        self, rows: KernelRows, group: int, begin: int, end: int
-    ) -> tuple[NDArray[np.bool_], Floats, Floats]:
-        """Of points ``begin .. end``: whether from a row's twin, translation and turn, as
+        self, kernel: Kernel, group: int, begin: int, end: int
+    ) -> tuple[NDArray[np.bool_], Poses]:
+        """Of points ``begin .. end``: whether from a row's twin, and displacements, as
         `KernelRows.displaced` takes them.
         """
         first = begin // _POINT_BLOCK
-        twins, moves, turns = [], [], []
+        twins, moves = [], []
         for block in range(first, -(-end // _POINT_BLOCK)):
             rng = np.random.default_rng((self.seed, group, block))
             twins.append(rng.random(_POINT_BLOCK) < 0.5)
-            move, turn = rows.displacements(_POINT_BLOCK, rng)
-            moves.append(move)
-            turns.append(turn)
+            moves.append(kernel.sample_displacements(_POINT_BLOCK, rng))
         chosen = slice(begin - first * _POINT_BLOCK, end - first * _POINT_BLOCK)
-        return np.concatenate(twins)[chosen], np.concatenate(moves)[chosen], np.concatenate(turns)[chosen]
+        return np.concatenate(twins)[chosen], Poses.concatenate(moves)[chosen]

@@ -433,14 +433,15 @@ class _Work:
         row = np.minimum(row, rows.size - 1)
         if not len(row):
             return replace(group, sums=sums, totals=totals, counted=counted)
-        drawn = plan.draws.displacements(rows, number, present, present + len(row))
-        p, q = rows.displaced(row, *drawn)
+        drawn = rows.displaced(
+            row, *plan.draws.displacements(rows.kernel, number, present, present + len(row))
+        )
         if first:
             weightings, _ = self._weightings(number, 0)
         amount = len(row) * rows.size
-        added = rows.sums(Poses(p, q), weightings, threads=self.threads, progress=self.steps.part(amount))
+        added = rows.sums(drawn, weightings, threads=self.threads, progress=self.steps.part(amount))
         self.steps.finish(amount)
-        poses = Poses.concatenate([group.poses, Poses(p, q)])
+        poses = Poses.concatenate([group.poses, drawn])
         return _Group(poses, np.concatenate([sums, added]), totals, counted)
 
     def _weightings(self, group: int, first: int) -> tuple[NDArray[np.float32], Floats]:

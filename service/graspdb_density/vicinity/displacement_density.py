@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from .. import se3
 from .._compiled.pairs import Tally
-from ..kde import brute_force
 from ..kde.isotropic import GraspDensity
 from ..kde.weighted_sums import Progress
 from ..se3 import Floats, Poses
@@ -73,8 +72,7 @@ def density_anisotropy(
     rng = np.random.default_rng(seed)
     count = min(max_grasps, successes.size)
     grasps = rng.choice(successes.size, size=count, replace=False, p=successes.weights).astype(np.int64)
-    poses = Poses(successes.positions, successes.quaternions_xyzw)
-    axes, aligned = aligned_axes(alignment, frames, poses, grasps)
+    axes, aligned = aligned_axes(alignment, frames, successes.poses, grasps)
     share = bootstrap_weights(None, grasps, successes.size, rng)
     corners = [
         _plane_translations(layout),
@@ -167,16 +165,14 @@ def _shares(
         vector = np.zeros((len(moves), 3))
         vector[:, axis] = moves[:, 3 + axis]
         q = se3.multiply(q, se3.from_rotation_vector(vector))
-    poses, centre = se3.Poses(p, q), se3.Poses(successes.positions[row], own)
+    poses, kernel = Poses(p, q), successes.kernel
     density = successes.density(poses, threads=threads)
-    weight = successes.weights[row]
-    kernel = successes.kernel
-    mine = np.exp(brute_force.kernel_log_density(kernel, poses, centre))
+    mine = np.exp(kernel.log_kernel(poses, successes.poses[row]))
     if twin:
-        turned_centre = se3.Poses(centre.positions, se3.jaw_twin(own))
-        mine = 0.5 * (mine + np.exp(brute_force.kernel_log_density(kernel, poses, turned_centre)))
-    rest = np.maximum(density - weight * mine, 0.0) * successes.size
-    rho = attempts(Poses(p, q)) if callable(attempts) else attempts
+        turned_centre = Poses(successes.positions[row], se3.jaw_twin(own))
+        mine = 0.5 * (mine + np.exp(kernel.log_kernel(poses, turned_centre)))
+    rest = np.maximum(density - successes.weights[row] * mine, 0.0) * successes.size
+    rho = attempts(poses) if callable(attempts) else attempts
     with np.errstate(divide="ignore", invalid="ignore"):
         quotient = np.where(rest > 0.0, rest / rho, 0.0)
     return np.asarray(np.minimum(1.0, quotient), dtype=np.float64)

@@ -33,8 +33,7 @@ def load_sampled(row: KernelRow) -> SampledKernel:
     """The kernel of a stored row of the kind ``sampled``, which was checked when it came."""
     means = np.array([item["mean"] for item in row.components])
     return SampledKernel(
-        means[:, :3],
-        se3.from_rotation_vector(means[:, 3:]),
+        se3.Poses.of(means[:, :3], se3.from_rotation_vector(means[:, 3:])),
         _component(row),
         np.array([item["weight"] for item in row.components]),
     )
