@@ -222,7 +222,7 @@ def brute_force(rng: np.random.Generator) -> None:
     density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel)
     # So wide that a cut-off leaves out nothing: what a query costs then, the test of its error included.
     reached = GraspDensity.build(se3.Poses.of(*rows), kernel=IsotropicKernel(0.15, kernel.sigma_rotation))
-    cells = density.cells
+    cells = density.cells.arrays
     p, q = queries(rows, 500, kernel, rng)
     poses = np.hstack([(p - cells.centre) * cells.scale, kernel.kappa * q]).astype(np.float32)
     kappa = np.float32(kernel.kappa)
@@ -236,9 +236,7 @@ def brute_force(rng: np.random.Generator) -> None:
 
     seconds = interleaved(
         4 * ROUNDS,
-        lambda: isotropic.all_sums(
-            cells.data, cells.table, cells.centre, cells.scale, p, q, kernel.kappa, density.wide, out
-        ),
+        lambda: isotropic.all_sums(cells, p, q, kernel.kappa, density.wide, out),
         lambda: reached.log_density(se3.Poses.of(p, q)),
         lambda: _bare_kernels(cells.data, poses, kappa, out),
         lambda: _bare_exponentials(x, y, 500),
@@ -353,14 +351,14 @@ def growth(rng: np.random.Generator, plot: str | None) -> None:
             scale = math.sqrt(count / 20_000) if scaled else 1.0
             rows = shell(count, rng, semi_axes_m=scale * np.array(SEMI_AXES_M))
             density = GraspDensity.build(se3.Poses.of(*rows), kernel=kernel)
-            cells = density.cells
+            scale = density.cells.arrays.scale
             poses = queries(rows, 10_000, kernel, rng)
             within = cKDTree(rows[0]).query_ball_point(
                 poses[0][:1_000], CUTOFF * kernel.sigma_position_m, return_length=True
             )
             reaches.append(float(within.mean()))
             # The cells' own reach is rounded outwards; their share of that is in the time, not in the count.
-            assert scaled_radius(CUTOFF) / cells.scale >= CUTOFF * kernel.sigma_position_m * (1.0 - 1e-9)
+            assert scaled_radius(CUTOFF) / scale >= CUTOFF * kernel.sigma_position_m * (1.0 - 1e-9)
             tasks: list[Callable[[], object]] = [lambda d=density, q=poses: d.log_density(se3.Poses.of(*q))]
             peers = max(40, 2_000_000 // count)
             few = poses[0][:peers], poses[1][:peers]

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import se3
 from .._compiled import isotropic, nearest
-from .._compiled.threads import for_blocks
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats, Poses
 from .cell_list import Cells
+from .importance_weights import effective_sample_size
 from .rows import Rows
 
 __all__ = ["CUTOFF", "TWIN_ROTATION", "WIDE_ROTATION", "GraspDensity"]
@@ -35,7 +35,6 @@ _FLOAT32_KAPPA, _NEARER_KAPPA, _TWINS_KAPPA = 130.0, 85.0, 30.0
 _FLOAT32_SUM = 1e-9
 _CUTOFF_LIMITS = (2.0, 10.0)
 _QUERY_BLOCK = 1024
-_SORTED_FROM = 256
 
 
 class GraspDensity:
@@ -156,7 +155,7 @@ class GraspDensity:
     @property
     def effective_sample_size(self) -> float:
         """(sum w)^2 / sum w^2."""
-        return float(self._total**2 / np.dot(self._rows.weights, self._rows.weights))
+        return effective_sample_size(self._rows.weights)
 
     @property
     def nbytes(self) -> int:
@@ -210,37 +209,19 @@ class GraspDensity:
         cut-off are summed without one, as all are where there is none: there the error is 2e-5, or 1e-6 of
         what the log density lies below the kernel's peak if that is more, from rounding to float32.
         """
-        p, q = poses
-        cells = self._cells
+        cells, kappa = self._cells.arrays, self._kernel.kappa
         steps = stages(self._kernel, cutoff)
         terms, least = brute_terms(self._kernel, self._total / self._unit)
         # The least weight there can be bounds what skipping far blocks may lose.
         margin = 16.0 + math.log(self._total / float(self._rows.weights.min()))
-        ordered = len(p) >= _SORTED_FROM
-        if ordered:
-            order = cells.visiting_order(p)
-            p, q = p[order], q[order]
-        out = np.empty(len(p))
 
-        def work(begin: int, end: int) -> None:
-            if not len(steps):
-                isotropic.all_log_sums(
-                    cells.arrays, p[begin:end], q[begin:end], self._kernel.kappa, terms, least, margin,
-                    out[begin:end],
-                )  # fmt: skip
-                return
-            isotropic.log_sums(
-                cells.arrays, p[begin:end], q[begin:end], self._kernel.kappa, steps, self.wide, margin,
-                out[begin:end],
-            )  # fmt: skip
+        def loop(p: Floats, q: Floats, out: Floats) -> None:
+            if len(steps):
+                isotropic.log_sums(cells, p, q, kappa, steps, self.wide, margin, out)
+            else:
+                isotropic.all_log_sums(cells, p, q, kappa, terms, least, margin, out)
 
-        for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
-        out += self.log_unit
-        if ordered:
-            result = np.empty(len(p))
-            result[order] = out
-            return result
-        return out
+        return self._cells.at_poses(loop, poses, block=_QUERY_BLOCK, threads=threads) + self.log_unit
 
     def density(
         self,
@@ -254,18 +235,12 @@ class GraspDensity:
 
     def kernel_sums(self, poses: Poses, *, cutoff: float, threads: int = 1) -> Floats:
         """Kernel sums (M,) within a cut-off, 0 where nothing is in reach."""
-        cells = self._cells
-        p, q = poses
-        out = np.empty(len(poses))
+        cells, kappa, radius = self._cells.arrays, self._kernel.kappa, scaled_radius(cutoff)
 
-        def work(begin: int, end: int) -> None:
-            isotropic.sums(
-                cells.arrays, p[begin:end], q[begin:end], self._kernel.kappa,
-                scaled_radius(cutoff), self.wide, out[begin:end],
-            )  # fmt: skip
+        def loop(p: Floats, q: Floats, out: Floats) -> None:
+            isotropic.sums(cells, p, q, kappa, radius, self.wide, out)
 
-        for_blocks(work, len(poses), block=16, threads=threads)
-        return out
+        return self._cells.at_poses(loop, poses, block=16, threads=threads)
 
     def nearest_rows(self, pose: Poses, count: int) -> NDArray[np.intp]:
         """The ``count`` rows, or all if there are fewer, whose kernels are highest at one pose with weights

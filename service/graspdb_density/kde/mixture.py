@@ -15,12 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import se3
 from .._compiled import mixture
-from .._compiled.threads import for_blocks
-from .._compiled.weighted import mixture_log_sum
 from ..kernels.gaussian_mixture import AnisotropicKernel
 from ..kernels.isotropic import HAAR_VOLUME
 from ..se3 import Floats, Poses
 from .cell_list import Cells
+from .importance_weights import effective_sample_size
 from .isotropic import GraspDensity
 from .rows import Rows
 from .weighted_sums import KernelRows
@@ -31,7 +30,6 @@ __all__ = ["NARROW", "MixtureDensity"]
 NARROW = math.radians(25.0)
 _CUTOFF = 4.0
 _QUERY_BLOCK = 512
-_SORTED_FROM = 256
 
 
 class MixtureDensity:
@@ -67,14 +65,13 @@ class MixtureDensity:
         self._total = float(rows.size) if weights is None else float(np.sum(weights))
         self._unit = self._total / rows.size
         self._kernel = kernel
-        spread = math.sqrt(max(float(np.linalg.eigvalsh(s[:3, :3])[-1]) for s in kernel.covariances))
+        along, about = kernel.widest
         self._offset = float(np.linalg.norm(kernel.means[:, :3], axis=1).max())
-        self._spread = spread
-        self._hold(rows, Cells.build(rows.rows.over(1.0 / rows.size), spread))
+        self._spread = float(along.max())
+        self._hold(rows, Cells.build(rows.rows.over(1.0 / rows.size), self._spread))
         self._log_unit = rows.log_unit
         self._mixture = rows.mixture._replace(wraps=True)
-        turn = max(float(np.linalg.eigvalsh(s[3:, 3:])[-1]) for s in kernel.covariances) ** 0.5
-        mean_turn = float(np.linalg.norm(kernel.means[:, 3:], axis=1).max())
+        turn, mean_turn = float(about.max()), float(np.linalg.norm(kernel.means[:, 3:], axis=1).max())
         self._narrow = turn <= NARROW and mean_turn + 2.5 * turn <= math.radians(75.0)
 
     def _hold(self, rows: KernelRows, cells: Cells) -> None:
@@ -100,7 +97,7 @@ class MixtureDensity:
         """
         if not len(poses):
             return self
-        more = Rows.of(poses, weights, symmetric, fill=self._unit_mean)
+        more = Rows.of(poses, weights, symmetric, fill=self._total / self.size)
         if frames is not None:
             frames = np.concatenate(
                 [self._rows.frames, KernelRows(poses, self._kernel, frames=frames).frames]
@@ -120,11 +117,6 @@ class MixtureDensity:
         return grown
 
     @property
-    def _unit_mean(self) -> float:
-        """Mean weight, in the unit of the weights given."""
-        return self._total / self.size
-
-    @property
     def kernel(self) -> AnisotropicKernel:
         return self._kernel
 
@@ -141,7 +133,7 @@ class MixtureDensity:
     @property
     def effective_sample_size(self) -> float:
         """(sum w)^2 / sum w^2."""
-        return float(1.0 / np.dot(self._rows.weights, self._rows.weights))
+        return effective_sample_size(self._rows.weights)
 
     @cached_property
     def isotropic(self) -> GraspDensity:
@@ -163,25 +155,15 @@ class MixtureDensity:
         """
         if not self._narrow:
             return self._rows.log_density(poses, threads=threads)
-        p, q = poses
-        cells = self._cells
-        order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
-        p, q = p[order], q[order]
-        stages = self._stages()
-        rows, components = self._rows.exact, self._mixture.single()
-        unit = math.log(self._total / self._unit)
-        out = np.empty(len(p))
+        cells, stages, rows = self._cells.arrays, self._stages(), self._rows.exact
+        components, unit = self._mixture.single(), math.log(self._total / self._unit)
 
-        def work(begin: int, end: int) -> None:
+        def loop(p: Floats, q: Floats, out: Floats) -> None:
             mixture.mixture_log_sums(
-                cells.arrays, self._sorted_frames, p[begin:end], q[begin:end], components, stages, unit,
-                rows, self._mixture, out[begin:end],
-            )  # fmt: skip
+                cells, self._sorted_frames, p, q, components, stages, unit, rows, self._mixture, out
+            )
 
-        for_blocks(work, len(p), block=_QUERY_BLOCK, threads=threads)
-        result = np.empty(len(p))
-        result[order] = out
-        return result + self._log_unit
+        return self._cells.at_poses(loop, poses, block=_QUERY_BLOCK, threads=threads) + self._log_unit
 
     def _stages(self) -> Floats:
         """Radii and when to trust them, as `density.stages`."""
@@ -190,7 +172,7 @@ class MixtureDensity:
         random = math.exp(-1.5 * math.log(2.0 * math.pi) - 0.5 * logdet - self._log_unit) / HAAR_VOLUME
         rows = []
         for reach in (_CUTOFF, 1.4 * _CUTOFF):
-            radius = (self._offset + reach * self._spread) * self._cells.scale
+            radius = (self._offset + reach * self._spread) * self._cells.arrays.scale
             least = 0.04 * random * math.exp(8.0 - 0.5 * reach * reach)
             rows.append((radius, max(0.5 * reach * reach - 5.8, 2.2), least))
         return np.array(rows)
@@ -198,14 +180,6 @@ class MixtureDensity:
     def density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Density at poses, 1/(m^3 rad^3)."""
         return np.exp(self.log_density(poses, threads=threads))
-
-    def reference(self, poses: Poses) -> Floats:
-        """Log density at poses (M,) in float64 over all rows, twins and wraps; M times N evaluations."""
-        p, q = poses
-        values = [
-            mixture_log_sum(self._rows.exact, self._mixture, at, to) for at, to in zip(p, q, strict=True)
-        ]
-        return self._log_unit + np.array(values)
 
     def sample(self, count: int, rng: np.random.Generator) -> Poses:
         """Draw grasps."""
@@ -230,4 +204,4 @@ class MixtureDensity:
     @property
     def frames(self) -> Floats:
         """(N, 3, 3) columns are the axes along which a row's translations are measured, object frame."""
-        return np.broadcast_to(self._rows.frames, (self.size, 3, 3))
+        return self._rows.frames

@@ -90,8 +90,8 @@ class KernelRows:
         if self._own_frames != (kernel.frame == "gripper"):
             need = "takes no frames" if kernel.frame == "gripper" else "needs frames"
             raise ValueError(f"a kernel in the {kernel.frame} frame {need}")
-        spread = np.sqrt(np.linalg.eigvalsh(kernel.covariances[:, :3, :3])[:, -1])
-        self._reach = float(np.max(np.linalg.norm(kernel.means[:, :3], axis=1) + CUTOFF * spread))
+        along, _ = kernel.widest
+        self._reach = float(np.max(np.linalg.norm(kernel.means[:, :3], axis=1) + CUTOFF * along))
         self.log_unit = float(kernel.log_peaks.max())
         self.mixture = _compiled_mixture(kernel)
 
@@ -195,7 +195,7 @@ class KernelRows:
         # Neighbours one after the other find their rows' weights in the cache.
         order = np.lexsort(np.floor(p.T / self._reach))
         p, q = p[order], q[order]
-        radius = self._reach * cells.scale
+        radius = self._reach * cells.arrays.scale
         done = 0
         guard = threading.Lock()
 
@@ -299,9 +299,9 @@ def _compiled_mixture(kernel: AnisotropicKernel) -> weighted.Mixture:
     offset = np.einsum("cij,cj->ci", whitening, kernel.means)
     rows, columns = np.tril_indices(6)
     peaks = kernel.log_peaks
-    turn = np.sqrt(np.linalg.eigvalsh(kernel.covariances[:, 3:, 3:])[:, -1])
+    _, about = kernel.widest
     # Beyond pi the same rotation has another vector; it counts where a component reaches that far.
-    reach = np.linalg.norm(kernel.means[:, 3:], axis=1) + 5.3 * turn
+    reach = np.linalg.norm(kernel.means[:, 3:], axis=1) + 5.3 * about
     return weighted.Mixture(
         np.concatenate([whitening[:, rows, columns], offset], axis=1),
         peaks - peaks.max(),

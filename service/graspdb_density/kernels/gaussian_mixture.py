@@ -43,6 +43,8 @@ Frame = Literal["gripper", "fixed"]
 MOST_ROTATION = math.radians(40.0)
 _MOST_COMPONENTS = 64
 _TWO_PI = 2.0 * math.pi
+#: Of a displacement: its translation, and its rotation vector.
+_ALONG, _ABOUT = slice(0, 3), slice(3, 6)
 
 
 def mirror(frame: Frame) -> Floats:
@@ -187,6 +189,14 @@ class AnisotropicKernel:
         _, logdet = np.linalg.slogdet(self.covariances)
         rotation = rotation_normaliser(self.means[:, 3:], self.covariances[:, 3:, 3:])
         return np.asarray(np.log(self.weights / rotation) - 3.0 * math.log(_TWO_PI) - 0.5 * logdet)
+
+    @cached_property
+    def widest(self) -> tuple[Floats, Floats]:
+        """Largest standard deviation of each component along any axis (C,), metres, and about any (C,),
+        radians.
+        """
+        along, about = (np.linalg.eigvalsh(self.covariances[:, part, part]) for part in (_ALONG, _ABOUT))
+        return np.sqrt(along[:, -1]), np.sqrt(about[:, -1])
 
     @property
     def overall_covariance(self) -> Floats:

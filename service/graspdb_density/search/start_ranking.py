@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._compiled import isotropic
-from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import GraspDensity
 from ..kde.rows import Rows
@@ -100,7 +99,7 @@ def rank_starts(density: GraspDensity, sums: CentreSums) -> StartRanking:
     )[order]
     whole, sample = density.cells, sums.sample
     levels: tuple[Cells, ...] = (whole,) if sample is None else (sample, whole)
-    if sample is not None and _WORTH * _FINER * sample.data.shape[1] <= density.size:
+    if sample is not None and _WORTH * _FINER * len(sample.rows) <= density.size:
         finer = _systematic_sample(density, whole.rows.astype(np.int64), _FINER * sums.rate)
         levels = sample, _cells(density, *finer), whole
     return StartRanking(order, centres, density.symmetric[order], levels)
@@ -154,21 +153,12 @@ def _completed(density: GraspDensity, known: CentreSums, threads: int) -> Centre
 def _sums(density: GraspDensity, cells: Cells, rows: Indices, threads: int) -> Floats:
     """Sums over ``cells`` at rows' centres."""
     # Of all rows, neighbours one after the other: kernels stay in the processor's cache.
-    whole = len(rows) == density.size
-    order = density.cells.rows.astype(np.int64) if whole else rows
-    positions, quaternions = density.positions[order], density.quaternions_xyzw[order]
-    out = np.empty(len(order))
+    order = density.cells.rows if len(rows) == density.size else np.arange(len(rows))
 
-    def work(begin: int, end: int) -> None:
-        isotropic.sums(
-            cells.arrays, positions[begin:end], quaternions[begin:end], density.kernel.kappa, _RADIUS,
-            density.wide, out[begin:end],
-        )  # fmt: skip
+    def loop(p: Floats, q: Floats, out: Floats) -> None:
+        isotropic.sums(cells.arrays, p, q, density.kernel.kappa, _RADIUS, density.wide, out)
 
-    for_blocks(work, len(order), block=_QUERY_BLOCK, threads=threads)
-    if whole:
-        out[order] = out.copy()
-    return out
+    return cells.at_poses(loop, density.poses[rows], order=order, block=_QUERY_BLOCK, threads=threads)
 
 
 def _systematic_sample(density: GraspDensity, rows: Indices, rate: float) -> tuple[Indices, Floats]:
@@ -197,6 +187,5 @@ def _with_own(
 def _reached(density: GraspDensity, rows: Indices) -> Indices:
     """How many kernels are visited for the sum at each of some centres."""
     out = np.empty(len(rows), dtype=np.int64)
-    cells = density.cells
-    isotropic.reached(cells.arrays, density.positions[rows], _RADIUS, out)
+    isotropic.reached(density.cells.arrays, density.positions[rows], _RADIUS, out)
     return out

@@ -37,7 +37,6 @@ PRIOR_TRIALS = 1.0
 SUCCESS_CUTOFF = 5.0
 #: Poses a thread takes at once.
 _ISOTROPIC_BLOCK, _DIAGONAL_BLOCK = 256, 128
-_SORTED_FROM = 256
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -205,37 +204,25 @@ class SuccessModel:
 
     def _sums(self, cells: Cells | None, poses: Poses, cutoff: float, threads: int) -> Floats:
         """Sums of k and k^2 (M, 2)."""
-        out = np.zeros((len(poses), 2))
-        radius = scaled_radius(cutoff)
-        if cells is None or not len(poses):
-            return out
-        p, q = poses.positions, poses.quaternions_xyzw
-        kernel = self.kernel
+        radius, kernel = scaled_radius(cutoff), self.kernel
+        if cells is None:
+            return np.zeros((len(poses), 2))
+        arrays = cells.arrays
         if isinstance(kernel, DiagonalKernel):
-            p = kernel.along(p)
-        order = cells.visiting_order(p) if len(p) >= _SORTED_FROM else np.arange(len(p))
-        p, q = p[order], q[order]
-        if isinstance(kernel, DiagonalKernel):
+            poses = Poses(kernel.along(poses.positions), poses.quaternions_xyzw)
             half = 0.5 / np.array(kernel.sigmas) ** 2
-            half[:3] /= cells.scale**2
+            half[:3] /= arrays.scale**2
             turning, block = kernel.axes is None, _DIAGONAL_BLOCK
 
-            def work(begin: int, end: int) -> None:
-                diagonal.square_sums(
-                    cells.arrays, p[begin:end], q[begin:end], half, turning, radius, out[begin:end],
-                )  # fmt: skip
+            def loop(p: Floats, q: Floats, out: Floats) -> None:
+                diagonal.square_sums(arrays, p, q, half, turning, radius, out)
         else:
             kappa, wide, block = kernel.kappa, kernel.sigma_rotation > TWIN_ROTATION, _ISOTROPIC_BLOCK
 
-            def work(begin: int, end: int) -> None:
-                isotropic.square_sums(
-                    cells.arrays, p[begin:end], q[begin:end], kappa, radius, wide, out[begin:end],
-                )  # fmt: skip
+            def loop(p: Floats, q: Floats, out: Floats) -> None:
+                isotropic.square_sums(arrays, p, q, kappa, radius, wide, out)
 
-        for_blocks(work, len(p), block=block, threads=threads)
-        result = np.empty_like(out)
-        result[order] = out
-        return result
+        return cells.at_poses(loop, poses, columns=(2,), block=block, threads=threads)
 
 
 def shrunk_share(won: Floats, total: Floats, squares: Floats, prior: float) -> tuple[Floats, Floats, Floats]:
