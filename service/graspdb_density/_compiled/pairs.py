@@ -7,6 +7,9 @@ Only A's own row is left out: another trial of the same pose tells how repeatabl
 place of the profiles' ``tried`` and ``won``; with no grasps those are filled.
 """
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -42,8 +45,8 @@ class Trials(NamedTuple):
 
 
 class Displaced(NamedTuple):
-    """Successes A: rows (A,), frames (A, 3, 3) or as quaternions (A, 4), weights (A, 1 + resamples), and runs
-    of candidates.
+    """Successes A: rows (A,), frames (A, 3, 3) of translations, weights (A, 1 + resamples), and runs of
+    candidates.
     """
 
     rows: NDArray[np.int64]
@@ -96,7 +99,7 @@ class Tally(NamedTuple):
 
 
 @inlined
-def _add(tried, won, pairs, bin_, success, weights):  # type: ignore[no-untyped-def]
+def _add(tried, won, pairs, bin_, success, weights):
     pairs[bin_] += 1
     for r in range(weights.shape[0]):
         tried[bin_, r] += weights[r]
@@ -106,7 +109,7 @@ def _add(tried, won, pairs, bin_, success, weights):  # type: ignore[no-untyped-
 
 
 @inlined
-def _note(nearby, bin_, success, at, off_u, off_v):  # type: ignore[no-untyped-def]
+def _note(nearby, bin_, success, at, off_u, off_v):
     """A pair of one grasp in the profile of an axis (bins, 5)."""
     if 0 <= bin_ < nearby.shape[0]:
         nearby[bin_, 0] += 1.0
@@ -116,8 +119,23 @@ def _note(nearby, bin_, success, at, off_u, off_v):  # type: ignore[no-untyped-d
         nearby[bin_, 4] += abs(off_v)
 
 
+@inlined
+def _to_profile(lines, apart, bin_, bins, axis, at, success, weights):
+    """A pair into its bin of an axis' profile; whether it has one."""
+    if bin_ < 0 or bin_ >= bins:
+        return False
+    tried, won, pairs, moved = lines
+    place = axis * bins + bin_
+    if apart:
+        pairs[place] += 1
+    else:
+        _add(tried, won, pairs, place, success, weights)
+    moved[place] += at
+    return True
+
+
 @exact
-def _own_and_twin(qa, qb):  # type: ignore[no-untyped-def]
+def _own_and_twin(qa, qb):
     """Cosines of half the angles from a to b and to b's twin under the jaw's turn."""
     own = abs(qa[0] * qb[0] + qa[1] * qb[1] + qa[2] * qb[2] + qa[3] * qb[3])
     twin = abs(qa[0] * qb[1] - qa[1] * qb[0] + qa[2] * qb[3] - qa[3] * qb[2])
@@ -125,7 +143,7 @@ def _own_and_twin(qa, qb):  # type: ignore[no-untyped-def]
 
 
 @exact
-def translation_pairs(trials, displaced, bins, symmetric, least_cosine, planes, lines, nearby):  # type: ignore[no-untyped-def]
+def translation_pairs(trials, displaced, bins, symmetric, least_cosine, planes, lines, nearby):
     """Pairs of the same rotation into the histograms (slice, x, y) and the profiles (axis, bin); how many.
 
     ``least_cosine``: of half the angle for trials off the grid, -1 where runs hold one rotation only.
@@ -134,7 +152,6 @@ def translation_pairs(trials, displaced, bins, symmetric, least_cosine, planes, 
     grasps, frames, weights, first, runs = displaced
     extent, slices, slice_m, across, profile_m, profile_bins, off_axis_m = bins
     tried, won, pairs, _ = planes
-    line_tried, line_won, line_pairs, line_moved = lines
     used = 0
     half_depth = 0.5 * slices * slice_m
     middle = profile_bins // 2
@@ -172,20 +189,14 @@ def translation_pairs(trials, displaced, bins, symmetric, least_cosine, planes, 
                         b = middle + math.floor(t[axis] / profile_m + 0.5)
                         if apart:
                             _note(nearby[a, axis], b + margin, success[j], t[axis], u, v)
-                        if 0 <= b < profile_bins:
-                            b += axis * profile_bins
-                            if apart:
-                                line_pairs[b] += 1
-                            else:
-                                _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
-                            line_moved[b] += t[axis]
+                        if _to_profile(lines, apart, b, profile_bins, axis, t[axis], success[j], weights[a]):
                             hit = True
                 used += hit
     return used
 
 
 @exact
-def _product(a, b, out):  # type: ignore[no-untyped-def]
+def _product(a, b, out):
     out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
     out[1] = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
     out[2] = a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3]
@@ -193,13 +204,13 @@ def _product(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _wrapped(angle):  # type: ignore[no-untyped-def]
+def _wrapped(angle):
     """Into [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @inlined
-def _plane_entries(q, plane):  # type: ignore[no-untyped-def]
+def _plane_entries(q, plane):
     """The entries a, b, c of a rotation's 2x2 matrix in a plane of two axes, see `composition_angles`."""
     if plane == 0:
         return q[0], q[1], q[2]
@@ -209,7 +220,7 @@ def _plane_entries(q, plane):  # type: ignore[no-untyped-def]
 
 
 @exact
-def composition_angles(q, plane):  # type: ignore[no-untyped-def]
+def composition_angles(q, plane):
     """The composition ``R_a(alpha) R_b(beta)`` nearest to a rotation: alpha, beta and the sine of the angle
     left, for the planes 0: (x, y), 1: (x, z), 2: (y, z).
 
@@ -227,19 +238,17 @@ def composition_angles(q, plane):  # type: ignore[no-untyped-def]
 
 # long: one compiled loop over pairs, whose buffers and frames all steps share.
 @exact
-def rotation_pairs(trials, displaced, bins, symmetric, framed, reach_m, planes, lines, nearby):  # type: ignore[no-untyped-def]
+def rotation_pairs(trials, displaced, bins, symmetric, reach_m, planes, lines, nearby):
     """Pairs at the same position into the histograms (plane, alpha, beta) and the profiles (axis, bin); how
     many.
 
-    Rotations are about the axes of A's frame (a quaternion) where ``framed``, else about the gripper's own.
-    ``reach_m``: distance for trials off the grid, negative where runs hold one position. Of a symmetric jaw
-    both A and B stand for their twins too.
+    Rotations are about the gripper's own axes. ``reach_m``: distance for trials off the grid, negative where
+    runs hold one position. Of a symmetric jaw both A and B stand for their twins too.
     """
     positions, quaternions, success, order = trials
-    grasps, frames, weights, first, runs = displaced
+    grasps, _, weights, first, runs = displaced
     circle, profile_step, profile_bins, off_axis = bins
     tried, won, pairs, _ = planes
-    line_tried, line_won, line_pairs, line_moved = lines
     used = 0
     sine = math.sin(off_axis)
     least = math.cos(0.5 * off_axis) ** 2
@@ -249,17 +258,11 @@ def rotation_pairs(trials, displaced, bins, symmetric, framed, reach_m, planes, 
     step = 2.0 * math.pi / circle
     turn = np.array([0.0, 0.0, 1.0, 0.0])
     back = np.array([0.0, 0.0, -1.0, 0.0])
-    inverse, relative, other, left = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    right, twin_right = np.empty(4), np.empty(4)
+    inverse, relative, other = np.empty(4), np.empty(4), np.empty(4)
     for a in range(grasps.shape[0]):
         i = grasps[a]
         qa = quaternions[i]
         inverse[0], inverse[1], inverse[2], inverse[3] = -qa[0], -qa[1], -qa[2], qa[3]
-        if framed:
-            f = frames[a]
-            left[0], left[1], left[2], left[3] = -f[0], -f[1], -f[2], f[3]
-            _product(inverse, f, right)
-            _product(turn, right, twin_right)
         for r in range(first[a], first[a + 1]):
             for k in range(runs[r, 0], runs[r, 1]):
                 j = order[k]
@@ -271,27 +274,15 @@ def rotation_pairs(trials, displaced, bins, symmetric, framed, reach_m, planes, 
                     d2 = positions[j, 2] - positions[i, 2]
                     if d0 * d0 + d1 * d1 + d2 * d2 > reach_m * reach_m:
                         continue
-                qb = quaternions[j]
                 hit = False
-                variants = 1
-                if symmetric:
-                    variants = 2 if framed else 4
-                for variant in range(variants):
-                    if framed:
-                        # F^-1 q_b q_a^-1 F and F^-1 q_b M q_a^-1 F.
-                        _product(left, qb, other)
-                        if variant == 0:
-                            _product(other, right, relative)
-                        else:
-                            _product(other, twin_right, relative)
-                    else:
-                        _product(inverse, qb, relative)
-                        if variant & 1:
-                            other[:] = relative
-                            _product(other, turn, relative)
-                        if variant & 2:
-                            other[:] = relative
-                            _product(back, other, relative)
+                for variant in range(4 if symmetric else 1):
+                    _product(inverse, quaternions[j], relative)
+                    if variant & 1:
+                        other[:] = relative
+                        _product(other, turn, relative)
+                    if variant & 2:
+                        other[:] = relative
+                        _product(back, other, relative)
                     for plane in range(3):
                         e, g, h = _plane_entries(relative, plane)
                         # Most are too far from every composition: told before any angle is taken.
@@ -314,13 +305,9 @@ def rotation_pairs(trials, displaced, bins, symmetric, framed, reach_m, planes, 
                                 off_u = 2.0 * math.asin(min(1.0, abs(e * w - g * v)))
                                 off_v = 2.0 * math.asin(min(1.0, abs(g * w + e * v)))
                                 _note(nearby[a, axis], b + margin, success[j], angle, off_u, off_v)
-                            if 0 <= b < profile_bins:
-                                b += axis * profile_bins
-                                if apart:
-                                    line_pairs[b] += 1
-                                else:
-                                    _add(line_tried, line_won, line_pairs, b, success[j], weights[a])
-                                line_moved[b] += angle
+                            if _to_profile(
+                                lines, apart, b, profile_bins, axis, angle, success[j], weights[a]
+                            ):
                                 hit = True
                 used += hit
     return used

@@ -23,7 +23,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import se3
 from .._compiled.pairs import (
     Displaced,
     RotationBins,
@@ -53,6 +52,10 @@ __all__ = ["empirical_anisotropy"]
 
 #: Grasps in a step of the compiled loops, between calls of ``progress``.
 _STEP = 64
+_LAYOUT = Bins()
+#: How far the coordinates that a histogram or profile does not show may be off: half the usual steps of a
+#: grid.
+_OFF_AXIS_M, _OFF_AXIS = 0.005, math.radians(7.5)
 
 
 # long: the options of the report, explained one by one.
@@ -64,12 +67,8 @@ def empirical_anisotropy(
     position_keys: ArrayLike | None = None,
     alignment: Alignment = "gripper",
     frames: Frames | None = None,
-    rotate_in_frame: bool = False,
     symmetric: bool = True,
     weights: ArrayLike | None = None,
-    bins: Bins | None = None,
-    off_axis_m: float = 0.005,
-    off_axis: float = math.radians(7.5),
     max_grasps: int = 2_000,
     max_candidates: int = 50_000_000,
     level: float = 0.9,
@@ -85,21 +84,16 @@ def empirical_anisotropy(
     success : (N,) bool
     rotation_keys, position_keys : (N,) int or None
         Equal for trials at the same rotation, or position, of a grid. None: trials pair whose rotations are
-        within ``off_axis`` and whose positions are within ``off_axis_m``.
+        within 7.5 degrees and whose positions are within 5 mm.
     alignment, frames
         ``gripper``: no frames. ``object``: (3, 3), columns are the principal axes. ``edge``: (N, 3, 3),
         columns tangent, normal x tangent, normal of the edge nearest to each trial, or a function that tells
         those of poses; ``surface-pair``: likewise, the pair's axes named as the gripper's that they are
         nearest to. Where not finite, the gripper's own axes.
-    rotate_in_frame : bool
-        Rotate about the axes of the frame instead of the gripper's.
     symmetric : bool
         Whether the jaw is: then a pair counts for the twins as well.
     weights : (N,) or None
         Importance of each success as an A (eq 1), where trials were not spread evenly.
-    off_axis_m, off_axis
-        How far the coordinates that a histogram or profile does not show may be off, metres and radians. On a
-        grid: half its steps.
     max_grasps, max_candidates : int
         Limits on the successes A, drawn at random, and on the pairs looked at.
 
@@ -119,12 +113,12 @@ def empirical_anisotropy(
     rng = np.random.default_rng(seed)
     grasps = rng.permutation(np.flatnonzero(won))[:max_grasps].astype(np.int64)
     shifted = (
-        pair_candidates.near_rotations(q, grasps, off_axis)
+        pair_candidates.near_rotations(q, grasps, _OFF_AXIS)
         if rotation_keys is None
         else pair_candidates.same_key(_keys(rotation_keys, len(p)), grasps)
     )
     turned = (
-        pair_candidates.near_positions(p, grasps, off_axis_m)
+        pair_candidates.near_positions(p, grasps, _OFF_AXIS_M)
         if position_keys is None
         else pair_candidates.same_key(_keys(position_keys, len(p)), grasps)
     )
@@ -136,15 +130,17 @@ def empirical_anisotropy(
     share = bootstrap_weights(weights, grasps, len(p), rng)
     near, near_grasps = _in_order(Trials(p, q, won, shifted.order), grasps)
     translations = _Translations(
-        bins or Bins(), near, Displaced(near_grasps, axes, share, shifted.first, shifted.runs),
-        symmetric=symmetric, on_grid=rotation_keys is not None, off_axis_m=off_axis_m, off_axis=off_axis,
-    )  # fmt: skip
-    quaternions = se3.from_matrix(axes) if rotate_in_frame else q[grasps]
+        near,
+        Displaced(near_grasps, axes, share, shifted.first, shifted.runs),
+        symmetric=symmetric,
+        on_grid=rotation_keys is not None,
+    )
     rotations = _Rotations(
-        bins or Bins(), Trials(p, q, won, turned.order),
-        Displaced(grasps, quaternions, share, turned.first, turned.runs), symmetric=symmetric,
-        framed=rotate_in_frame, on_grid=position_keys is not None, off_axis_m=off_axis_m, off_axis=off_axis,
-    )  # fmt: skip
+        Trials(p, q, won, turned.order),
+        Displaced(grasps, axes, share, turned.first, turned.runs),
+        symmetric=symmetric,
+        on_grid=position_keys is not None,
+    )
     for begin in range(0, len(grasps), _STEP):
         translations.count(begin)
         rotations.count(begin)
@@ -158,9 +154,9 @@ def empirical_anisotropy(
     # The twin of A sees every translation mirrored; an edge's tangent has no sign either.
     mirrored = (symmetric and alignment in ("gripper", "surface-pair")) or alignment == "edge"
     return summary(
-        bins or Bins(),
+        _LAYOUT,
         translations.tallies(mirrored=mirrored),
-        rotations.tallies(mirrored=symmetric and not rotate_in_frame),
+        rotations.tallies(mirrored=symmetric),
         method="empirical",
         alignment=alignment,
         grasps=len(grasps),
@@ -173,21 +169,18 @@ def empirical_anisotropy(
 class _Translations:
     """Pairs at the same rotation: histograms of x and y by z, and a profile an axis."""
 
-    def __init__(
-        self, layout: Bins, trials: Trials, displaced: Displaced, *, symmetric: bool, on_grid: bool,
-        off_axis_m: float, off_axis: float,
-    ) -> None:  # fmt: skip
-        self._layout, self._trials, self._displaced, self._symmetric = layout, trials, displaced, symmetric
-        line, columns = layout.line("position"), displaced.weights.shape[1]
+    def __init__(self, trials: Trials, displaced: Displaced, *, symmetric: bool, on_grid: bool) -> None:
+        self._trials, self._displaced, self._symmetric = trials, displaced, symmetric
+        layout, line, columns = _LAYOUT, _LAYOUT.line("position"), displaced.weights.shape[1]
         self._bins = TranslationBins(
-            layout.extent_m, layout.slices, layout.slice_m, layout.across, layout.profile_m, line, off_axis_m
+            layout.extent_m, layout.slices, layout.slice_m, layout.across, layout.profile_m, line, _OFF_AXIS_M
         )
-        self._least_cosine = -1.0 if on_grid else math.cos(0.5 * off_axis)
+        self._least_cosine = -1.0 if on_grid else math.cos(0.5 * _OFF_AXIS)
         self._planes = _empty(layout.slices * layout.across**2, columns)
         self._lines = _empty(3 * line, columns)
         # Of trials on a grid profiles are told from each grasp's own pairs, which are at a lattice's places.
         grasps = len(displaced.rows) if on_grid else 0
-        self._profiles = LatticeProfiles(grasps, line, layout.profile_m, off_axis_m)
+        self._profiles = LatticeProfiles(grasps, line, layout.profile_m, _OFF_AXIS_M)
         self.used = 0
 
     def count(self, begin: int) -> None:
@@ -201,8 +194,7 @@ class _Translations:
         """In planes and on lines; what the grasps' twins saw is added where ``mirrored``."""
         planes, lines = self._planes, self._lines
         if mirrored:
-            layout = self._layout
-            cells = np.arange(len(planes.pairs)).reshape(layout.slices, layout.across, layout.across)
+            cells = np.arange(len(planes.pairs)).reshape(_LAYOUT.slices, _LAYOUT.across, _LAYOUT.across)
             planes = _mirrored(planes, cells[:, ::-1, ::-1].ravel(), np.ones(len(planes.pairs)))
             image = np.arange(len(lines.pairs)).reshape(3, -1)
             sign = np.ones(image.shape)
@@ -214,24 +206,21 @@ class _Translations:
 class _Rotations:
     """Pairs at the same position: a histogram a plane of two angles, and a profile an axis."""
 
-    def __init__(
-        self, layout: Bins, trials: Trials, displaced: Displaced, *, symmetric: bool, framed: bool,
-        on_grid: bool, off_axis_m: float, off_axis: float,
-    ) -> None:  # fmt: skip
-        self._trials, self._displaced, self._symmetric, self._framed = trials, displaced, symmetric, framed
-        line, columns = layout.line("rotation"), displaced.weights.shape[1]
-        self._bins = RotationBins(layout.angles, layout.profile, line, off_axis)
-        self._reach_m = -1.0 if on_grid else off_axis_m
+    def __init__(self, trials: Trials, displaced: Displaced, *, symmetric: bool, on_grid: bool) -> None:
+        self._trials, self._displaced, self._symmetric = trials, displaced, symmetric
+        layout, line, columns = _LAYOUT, _LAYOUT.line("rotation"), displaced.weights.shape[1]
+        self._bins = RotationBins(layout.angles, layout.profile, line, _OFF_AXIS)
+        self._reach_m = -1.0 if on_grid else _OFF_AXIS_M
         self._planes, self._lines = _empty(3 * layout.angles**2, columns), _empty(3 * line, columns)
         grasps = len(displaced.rows) if on_grid else 0
-        self._profiles = LatticeProfiles(grasps, line, layout.profile, off_axis)
+        self._profiles = LatticeProfiles(grasps, line, layout.profile, _OFF_AXIS)
         self.used = 0
 
     def count(self, begin: int) -> None:
         """The pairs of some grasps, from ``begin`` on."""
         self.used += rotation_pairs(
-            self._trials, _some(self._displaced, begin), self._bins, self._symmetric, self._framed,
-            self._reach_m, self._planes, self._lines, self._profiles.pair_sums[begin : begin + _STEP],
+            self._trials, _some(self._displaced, begin), self._bins, self._symmetric, self._reach_m,
+            self._planes, self._lines, self._profiles.pair_sums[begin : begin + _STEP],
         )  # fmt: skip
 
     def tallies(self, *, mirrored: bool) -> tuple[Tally, Tally]:

@@ -66,13 +66,6 @@ class Bins:
     reach: float = math.pi / 2.0
     profile: float = math.radians(7.5)
 
-    def __post_init__(self) -> None:
-        lengths = (self.extent_m, self.slice_m, self.reach_m, self.profile_m, self.reach, self.profile)
-        if not all(math.isfinite(v) and v > 0.0 for v in lengths):
-            raise ValueError("extents and widths of bins must be positive")
-        if min(self.across, self.slices) < 1 or self.angles < 2 or self.angles % 2:
-            raise ValueError("numbers of bins must be positive, that of angles even")
-
     def line(self, kind: Literal["position", "rotation"]) -> int:
         """Bins of a profile, odd."""
         reach, step = (self.reach_m, self.profile_m) if kind == "position" else (self.reach, self.profile)
