@@ -1,38 +1,23 @@
 """Compiled loops over attempts under a Gaussian with a width for every axis, the gripper's or fixed ones."""
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from .isotropic import MAX_RUNS, TWIN, runs_within
+from .isotropic import BLOCK, empty_runs, place, runs_within
 from .options import exact, inlined
+from .quaternions import relative, turned_back
 
 __all__ = ["held_out_sums", "near_pairs", "square_sums"]
 
 
 @inlined
-def _turned_back(x, y, z, w, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """A vector in the frame of a quaternion: R^T d."""
-    # t = 2 (-v) x d; d + w t + (-v) x t.
-    tx = 2.0 * (z * dy - y * dz)
-    ty = 2.0 * (x * dz - z * dx)
-    tz = 2.0 * (y * dx - x * dy)
-    return (
-        dx + w * tx + z * ty - y * tz,
-        dy + w * ty + x * tz - z * tx,
-        dz + w * tz + y * tx - x * ty,
-    )
-
-
-@inlined
-def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped-def]
+def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):
     """The shortest rotation vector of a^-1 b."""
-    w = aw * bw + ax * bx + ay * by + az * bz
-    x = aw * bx - ax * bw - ay * bz + az * by
-    y = aw * by + ax * bz - ay * bw - az * bx
-    z = aw * bz - ax * by + ay * bx - az * bw
+    x, y, z, w = relative(ax, ay, az, aw, bx, by, bz, bw)
     if w < 0.0:
         x, y, z, w = -x, -y, -z, -w
     size = math.sqrt(x * x + y * y + z * z)
@@ -43,51 +28,45 @@ def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped
 
 
 @exact
-def square_sums(cells, positions, quaternions, half, turning, radius, out):  # type: ignore[no-untyped-def]
+def square_sums(cells, positions, quaternions, half, turning, radius, out):
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over rows with an exponent of at most radius^2.
 
     ``half`` (6,): 1 / (2 sigma^2), translations in units of the cells' scale, along each row's gripper's axes
     where ``turning`` and else along those positions are given in. A row's twin counts beside it.
     Of a row's jaw and its turn the translation's x and y differ in sign only, which widths do not see.
     """
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    cut = radius * radius
-    data, table = cells.data, cells.table
+    runs, cut, data = empty_runs(cells, BLOCK), radius * radius, cells.data
     for j in range(positions.shape[0]):
-        p = (positions[j] - cells.centre) * cells.scale
-        bx, by, bz, bw = quaternions[j, 0], quaternions[j, 1], quaternions[j, 2], quaternions[j, 3]
+        at = place(cells, positions[j], quaternions[j], 1.0)
+        bx, by, bz, bw = at.qx, at.qy, at.qz, at.qw
         total, squares = 0.0, 0.0
-        for s in range(table.shape[0]):
-            twin = table[s, TWIN] > 0.0
-            for r in range(runs_within(cells.start, table, s, p[0], p[1], p[2], radius, runs)):
-                for i in range(runs[r, 0], runs[r, 1]):
-                    dx, dy, dz = p[0] - data[0, i], p[1] - data[1, i], p[2] - data[2, i]
-                    ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
-                    x, y, z = dx, dy, dz
-                    if turning:
-                        x, y, z = _turned_back(ax, ay, az, aw, dx, dy, dz)
-                    base = half[0] * x * x + half[1] * y * y + half[2] * z * z
-                    if base > cut:
-                        continue
-                    k = 0.0
-                    u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            for i in range(runs[r, 0], runs[r, 1]):
+                x, y, z = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
+                ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
+                if turning:
+                    x, y, z = turned_back(ax, ay, az, aw, x, y, z)
+                base = half[0] * x * x + half[1] * y * y + half[2] * z * z
+                if base > cut:
+                    continue
+                k = 0.0
+                u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
+                e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
+                if e <= cut:
+                    k = math.exp(-e)
+                if runs[r, 2] > 0:
+                    # The row turned about its z: q times (0, 0, 1, 0).
+                    u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
                     e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                     if e <= cut:
-                        k = math.exp(-e)
-                    if twin:
-                        # The row turned about its z: q times (0, 0, 1, 0).
-                        u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
-                        e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
-                        if e <= cut:
-                            k += math.exp(-e)
-                    total += k
-                    squares += k * k
-        out[j, 0] = total
-        out[j, 1] = squares
+                        k += math.exp(-e)
+                total += k
+                squares += k * k
+        out[j, 0], out[j, 1] = total, squares
 
 
 @exact
-def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest, cut, first, row, squared):  # type: ignore[no-untyped-def]
+def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest, cut, first, row, squared):
     """Pairs of a judged attempt and one of another fold, the nearer twin, by squared displacements (along the
     gripper's axes where ``turning``); how many.
 
@@ -123,7 +102,7 @@ def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest,
             if count < room:
                 x, y, z = dx, dy, dz
                 if turning:
-                    x, y, z = _turned_back(ax, ay, az, aw, dx, dy, dz)
+                    x, y, z = turned_back(ax, ay, az, aw, dx, dy, dz)
                 row[count] = i
                 squared[count, 0], squared[count, 1], squared[count, 2] = x * x, y * y, z * z
                 squared[count, 3], squared[count, 4], squared[count, 5] = u * u, v * v, t * t
@@ -133,7 +112,7 @@ def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest,
 
 
 @exact
-def held_out_sums(first, won, squared, half, cut, out):  # type: ignore[no-untyped-def]
+def held_out_sums(first, won, squared, half, cut, out):
     """Sums of k over successes, of k and of k^2 over all, (J, 3), of pairs from `near_pairs`."""
     for j in range(first.shape[0] - 1):
         success, total, squares = 0.0, 0.0, 0.0

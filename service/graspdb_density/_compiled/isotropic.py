@@ -83,28 +83,42 @@ def place(cells, position, quaternion, kappa):
     )
 
 
+@inlined
+def empty_runs(cells, most):
+    """Room for what `runs_within` finds."""
+    return np.empty((MAX_RUNS + cells.data.shape[1] // most, 3), dtype=np.int64)
+
+
 @fast
-def runs_within(start, table, s, px, py, pz, radius, runs):
-    """Ranges of kernels in the cells of segment ``s`` that a ball reaches, into ``runs`` (MAX_RUNS, 2); their
-    number.
+def runs_within(cells, at, radius, most, runs):
+    """Ranges of kernels in the cells that a ball reaches, of at most ``most`` rows each, into ``runs``: first
+    row, last + 1, and 1 for rows with a twin; their number.
+    """
+    count = 0
+    for s in range(cells.table.shape[0]):
+        count = _segment_runs(cells.start, cells.table[s], at, radius, most, runs, count)
+    return count
+
+
+@fast
+def _segment_runs(start, row, at, radius, most, runs, count):
+    """`runs_within` for one segment, a row of the table, behind ``count`` ranges that there are.
 
     Cells at the border of the grid are unbounded outwards: they hold the outliers that the grid does not
     span.
     """
-    row = table[s]
     for axis in range(3):
-        p = px if axis == 0 else (py if axis == 1 else pz)
+        p = at.x if axis == 0 else (at.y if axis == 1 else at.z)
         if p < row[LOW + axis] - radius or p > row[HIGH + axis] + radius:
-            return 0
+            return count
     nx, ny, nz = int(row[NX]), int(row[NY]), int(row[NZ])
     edge, edge_z = row[EDGE], row[EDGE_Z]
     base, offset = int(row[STARTS]), int(row[OFFSET])
-    x, y, z = px - row[OX], py - row[OY], pz - row[OZ]
+    x, y, z = at.x - row[OX], at.y - row[OY], at.z - row[OZ]
     x0 = min(max(math.floor((x - radius) / edge), 0), nx - 1)
     x1 = min(max(math.floor((x + radius) / edge), 0), nx - 1)
     y0 = min(max(math.floor((y - radius) / edge), 0), ny - 1)
     y1 = min(max(math.floor((y + radius) / edge), 0), ny - 1)
-    count = 0
     for ix in range(x0, x1 + 1):
         gap_x = 0.0
         if ix > 0 and x < ix * edge:
@@ -124,11 +138,12 @@ def runs_within(start, table, s, px, py, pz, radius, runs):
             z0 = min(max(math.floor((z - reach) / edge_z), 0), nz - 1)
             z1 = min(max(math.floor((z + reach) / edge_z), 0), nz - 1)
             column = base + (ix * ny + iy) * nz
-            begin, end = start[column + z0], start[column + z1 + 1]
-            if end > begin and count < runs.shape[0]:
-                runs[count, 0] = offset + begin
-                runs[count, 1] = offset + end
+            begin, end = offset + start[column + z0], offset + start[column + z1 + 1]
+            while begin < end and count < runs.shape[0]:
+                stop = min(begin + most, end)
+                runs[count, 0], runs[count, 1], runs[count, 2] = begin, stop, int(row[TWIN])
                 count += 1
+                begin = stop
     return count
 
 
@@ -139,31 +154,24 @@ def _sum_at(cells, at, radius, wide, runs):
     ``wide`` is 0 where the nearest of twins and antipodes stands for all, 1 where both twins count, 2 where
     antipodes do too.
     """
-    data, table = cells.data, cells.table
-    near = single(at)
+    data, near = cells.data, single(at)
     total, spread, visited = 0.0, 0.0, 0
-    for s in range(table.shape[0]):
-        twin = F32(table[s, TWIN])
-        for r in range(runs_within(cells.start, table, s, at.x, at.y, at.z, radius, runs)):
-            begin, end = runs[r, 0], runs[r, 1]
-            visited += end - begin
-            while begin < end:
-                stop = min(begin + BLOCK, end)
-                full = stop - (stop - begin) % isotropic_runs.LANES
-                if wide == 0 and twin > _ZERO and full + isotropic_runs.LANES <= data.shape[1]:
-                    if full > begin:
-                        part = isotropic_runs.run_narrow(data, begin, full, near)
-                        total += part[0]
-                        spread += part[1]
-                    if stop > full:
-                        part = isotropic_runs.rest_narrow(data, full, stop, near)
-                        total += part[0]
-                        spread += part[1]
-                else:
-                    part = isotropic_runs.run(data, begin, stop, near, twin, wide)
-                    total += part[0]
-                    spread += part[1]
-                begin = stop
+    for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+        begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
+        visited += end - begin
+        full = end
+        if wide == 0 and twin > _ZERO:
+            full -= (end - begin) % isotropic_runs.LANES
+            if full + isotropic_runs.LANES > data.shape[1]:
+                full = end
+        if full > begin:
+            part = isotropic_runs.run(data, begin, full, near, twin, wide)
+            total += part[0]
+            spread += part[1]
+        if end > full:
+            part = isotropic_runs.rest_narrow(data, full, end, near)
+            total += part[0]
+            spread += part[1]
     return total, spread, visited
 
 
@@ -212,7 +220,7 @@ def log_sums(cells, positions, quaternions, kappa, stages, wide, margin, out):
         which what lies outside is too little to matter (see `kde.isotropic.stages`). A pose that passes none
         is summed without a cut-off.
     """
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    runs = empty_runs(cells, BLOCK)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         done = False
@@ -263,47 +271,39 @@ def all_log_sums(cells, positions, quaternions, kappa, wide, least, margin, out)
 @fast
 def sums(cells, positions, quaternions, kappa, radius, wide, out):
     """The weighted kernel sum within ``radius`` at every pose, zero where nothing is in reach."""
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    runs = empty_runs(cells, BLOCK)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
-        total = 0.0
-        for s in range(cells.table.shape[0]):
-            twin = F32(cells.table[s, TWIN])
-            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-                begin, end = runs[r, 0], runs[r, 1]
-                while begin < end:
-                    stop = min(begin + BLOCK, end)
-                    total += isotropic_runs.total(cells.data, begin, stop, near, twin, wide)
-                    begin = stop
-        out[j] = total
+        out[j] = 0.0
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
+            out[j] += isotropic_runs.total(cells.data, begin, end, near, twin, wide)
 
 
 @fast
-def reached(cells, positions, radius, out):
-    """How many kernels a sum at each position visits, into ``out`` (M,) int64."""
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+def reached(cells, positions, quaternions, radius, out):
+    """How many kernels a sum at each pose visits, into ``out`` (M,) int64."""
+    runs = empty_runs(cells, BLOCK)
     for j in range(positions.shape[0]):
-        p = (positions[j] - cells.centre) * cells.scale
+        at = place(cells, positions[j], quaternions[j], 1.0)
         out[j] = 0
-        for s in range(cells.table.shape[0]):
-            for r in range(runs_within(cells.start, cells.table, s, p[0], p[1], p[2], radius, runs)):
-                out[j] += runs[r, 1] - runs[r, 0]
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            out[j] += runs[r, 1] - runs[r, 0]
 
 
 @fast
 def scatter_sums(cells, positions, quaternions, weights, twins, kappa, radius, wide, out):
     """Add the kernels of the given rows to the sums ``out`` (N,) at every sorted kernel's centre."""
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    runs = empty_runs(cells, BLOCK)
     every = F32(1.0) if wide > 0 else F32(0.0)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
         twin = F32(1.0) if twins[j] else F32(0.0)
         weight = F32(weights[j] * (0.5 if twins[j] else 1.0))
-        for s in range(cells.table.shape[0]):
-            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-                isotropic_runs.scatter_run(cells.data, runs[r, 0], runs[r, 1], near, twin, every, weight, out)
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            isotropic_runs.scatter_run(cells.data, runs[r, 0], runs[r, 1], near, twin, every, weight, out)
 
 
 @fast
@@ -313,28 +313,16 @@ def square_sums(cells, positions, quaternions, kappa, radius, wide, out):
     ``radius`` is the cut-off over sqrt 2: position and rotation share the allowance. The cut is exact,
     because far from data it decides between an attempt and none.
     """
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
-    cut = F32(radius * radius)
+    runs, cut = empty_runs(cells, BLOCK), F32(radius * radius)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
-        total, squares = 0.0, 0.0
-        for s in range(cells.table.shape[0]):
-            twin = F32(cells.table[s, TWIN])
-            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-                begin, end = runs[r, 0], runs[r, 1]
-                while begin < end:
-                    stop = min(begin + BLOCK, end)
-                    # The constant lets LLVM make a loop of its own of either.
-                    if wide:
-                        part = isotropic_runs.squares_run(cells.data, begin, stop, near, twin, True, cut)
-                    else:
-                        part = isotropic_runs.squares_run(cells.data, begin, stop, near, twin, False, cut)
-                    total += part[0]
-                    squares += part[1]
-                    begin = stop
-        out[j, 0] = total
-        out[j, 1] = squares
+        out[j, :] = 0.0
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
+            part = isotropic_runs.squares_run(cells.data, begin, end, near, twin, wide, cut)
+            out[j, 0] += part[0]
+            out[j, 1] += part[1]
 
 
 @fast
@@ -342,15 +330,11 @@ def other_blocks_sums(cells, block, positions, quaternions, own, kappa, radius, 
     """Kernel sums at poses (M,) over the sorted kernels whose ``block`` (N,) int32 differs from ``own``
     (M,).
     """
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    runs = empty_runs(cells, BLOCK)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
-        total = 0.0
-        for s in range(cells.table.shape[0]):
-            twin = F32(cells.table[s, TWIN])
-            for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-                total += isotropic_runs.other_blocks_run(
-                    cells.data, block, own[j], runs[r, 0], runs[r, 1], near, twin
-                )
-        out[j] = total
+        out[j] = 0.0
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
+            out[j] += isotropic_runs.other_blocks_run(cells.data, block, own[j], begin, end, near, twin)

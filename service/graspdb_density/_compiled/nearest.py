@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .isotropic import MAX_RUNS, TWIN, place, runs_within
+from .isotropic import empty_runs, place, runs_within
 from .isotropic_runs import cosines, single, squared
 from .options import fast
 
@@ -42,24 +42,19 @@ def nearest_rows(cells, position, quaternion, kappa, radius, best, rows):
     """The kernels within ``radius`` with the highest exponents at a pose: ``best`` (C,), descending, and
     their places among the sorted kernels, ``rows`` (C,); -1e30 and -1 where there are no more.
     """
-    runs = np.empty((MAX_RUNS, 2), dtype=np.int64)
+    runs = empty_runs(cells, GATHERED)
     buffer = np.empty(GATHERED, dtype=np.float32)
     at = place(cells, position, quaternion, kappa)
     near = single(at)
     best[:] = -1e30
     rows[:] = -1
     last = best.shape[0] - 1
-    for s in range(cells.table.shape[0]):
-        twin = F32(cells.table[s, TWIN])
-        for r in range(runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-            begin = runs[r, 0]
-            while begin < runs[r, 1]:
-                stop = min(begin + GATHERED, runs[r, 1])
-                exponents(cells.data, begin, stop, near, twin, buffer)
-                for i in range(stop - begin):
-                    if buffer[i] > best[last]:
-                        _insert(buffer[i], begin + i, best, rows)
-                begin = stop
+    for r in range(runs_within(cells, at, radius, GATHERED, runs)):
+        begin, end = runs[r, 0], runs[r, 1]
+        exponents(cells.data, begin, end, near, F32(runs[r, 2]), buffer)
+        for i in range(end - begin):
+            if buffer[i] > best[last]:
+                _insert(buffer[i], begin + i, best, rows)
 
 
 @fast

@@ -1,9 +1,9 @@
 """Compiled loops that evaluate kernels row by row, for statistics that need every row's share and not only
 the sum: bootstrap replicates are many weightings of the same kernel values.
 
-Layout as in `compiled`: rows sorted by grid cell, float32 structures of arrays, positions centred and scaled.
-The values of a run of rows are written to a short buffer by a loop that turns into vector code; those above
-a threshold are then added to one accumulator a weighting.
+Layout as in `isotropic`: rows sorted by grid cell, float32 structures of arrays, positions centred and
+scaled. The values of a run of rows are written to a short buffer by a loop that turns into vector code; those
+above a threshold are then added to one accumulator a weighting.
 """
 
 # Numba infers the types of compiled functions.
@@ -15,12 +15,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
 from . import exp
 from . import isotropic as c
 from .isotropic_runs import cosines, single, squared
 from .options import exact, fast, inlined
+from .quaternions import relative
 
 F32 = np.float32
 #: Rows evaluated at a time: the buffers stay in the first-level cache.
@@ -91,7 +93,7 @@ _TINY = F32(1e-6)
 
 
 @inlined
-def _angle_factor(w):
+def angle_factor(w):
     """Rotation angle over the sine of its half, for w = cos(angle / 2) in [0, 1]."""
     t = w + w - _ONE
     y = _A10 * t + _A9
@@ -104,6 +106,21 @@ def _angle_factor(w):
     y = y * t + _A2
     y = y * t + _A1
     return y * t + _A0
+
+
+@inlined
+def whitened_squares(w, x0, x1, x2, x3, x4, x5):
+    """Half the squared Mahalanobis distance of a displacement: what its translation has of it, and the rest.
+
+    ``w`` is a row of `Mixture.lowers` as a tuple, so that loops that write keep it in registers.
+    """
+    z0 = w[0] * x0 - w[21]
+    z1 = w[1] * x0 + w[2] * x1 - w[22]
+    z2 = w[3] * x0 + w[4] * x1 + w[5] * x2 - w[23]
+    z3 = w[6] * x0 + w[7] * x1 + w[8] * x2 + w[9] * x3 - w[24]
+    z4 = w[10] * x0 + w[11] * x1 + w[12] * x2 + w[13] * x3 + w[14] * x4 - w[25]
+    z5 = w[15] * x0 + w[16] * x1 + w[17] * x2 + w[18] * x3 + w[19] * x4 + w[20] * x5 - w[26]
+    return z0 * z0 + z1 * z1 + z2 * z2, z3 * z3 + z4 * z4 + z5 * z5
 
 
 @fast
@@ -125,33 +142,25 @@ def _isotropic_values(data, begin, n, at, twin, wide, out):
 
 
 @fast
-def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi):
+def _displacements(data, frames, begin, n, at, metres, turned, frame_turns, xi):
     """Displacements (6, n) from rows (``turned``: from their twins) to a pose: translation in the row's frame
     (metres), shortest rotation vector in its gripper's frame (radians).
     """
-    px, py, pz = F32(p[0]), F32(p[1]), F32(p[2])
-    qx, qy, qz, qw = F32(q[0]), F32(q[1]), F32(q[2]), F32(q[3])
     flip = F32(-1.0) if (turned and frame_turns) else _ONE
     m = F32(metres)
     for k in range(np.uint64(n)):
         i = np.uint64(begin) + k
-        dx = (px - data[0, i]) * m
-        dy = (py - data[1, i]) * m
-        dz = (pz - data[2, i]) * m
+        dx, dy, dz = (at.x - data[0, i]) * m, (at.y - data[1, i]) * m, (at.z - data[2, i]) * m
         xi[0, k] = flip * (frames[0, i] * dx + frames[3, i] * dy + frames[6, i] * dz)
         xi[1, k] = flip * (frames[1, i] * dx + frames[4, i] * dy + frames[7, i] * dz)
         xi[2, k] = frames[2, i] * dx + frames[5, i] * dy + frames[8, i] * dz
-        ax, ay, az, aw = -data[3, i], -data[4, i], -data[5, i], data[6, i]
-        vx = aw * qx + ax * qw + ay * qz - az * qy
-        vy = aw * qy - ax * qz + ay * qw + az * qx
-        vz = aw * qz + ax * qy - ay * qx + az * qw
-        w = aw * qw - ax * qx - ay * qy - az * qz
+        ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
+        vx, vy, vz, w = relative(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
         if turned:
             # (q_i M)^-1 q = M^-1 v with M^-1 = (0, 0, -1, 0).
-            tx, ty, tz, tw = vy, -vx, -w, vz
-            vx, vy, vz, w = tx, ty, tz, tw
+            vx, vy, vz, w = vy, -vx, -w, vz
         sign = _ONE if w >= _ZERO else -_ONE
-        f = sign * _angle_factor(min(abs(w), _ONE))
+        f = sign * angle_factor(min(abs(w), _ONE))
         xi[3, k] = f * vx
         xi[4, k] = f * vy
         xi[5, k] = f * vz
@@ -161,41 +170,28 @@ def _displacements(data, frames, begin, n, p, q, metres, turned, frame_turns, xi
 def _add_component(xi, n, lower, log_weight, far, out):
     """Add one Gaussian component at ``xi`` (6, n) to ``out``.
 
-    ``lower`` (27,): the whitening matrix over sqrt 2, rows of its lower triangle, then the whitened mean.
-    ``far``: the other wrap, the rotation by angle - 2 pi about the same axis.
+    ``lower`` (27,) is a row of `Mixture.lowers`. ``far``: the other wrap, the rotation by angle - 2 pi about
+    the same axis.
     """
-    l00 = lower[0]
-    l10, l11 = lower[1], lower[2]
-    l20, l21, l22 = lower[3], lower[4], lower[5]
-    l30, l31, l32, l33 = lower[6], lower[7], lower[8], lower[9]
-    l40, l41, l42, l43, l44 = lower[10], lower[11], lower[12], lower[13], lower[14]
-    l50, l51, l52, l53, l54, l55 = lower[15], lower[16], lower[17], lower[18], lower[19], lower[20]
-    b0, b1, b2, b3, b4, b5 = lower[21], lower[22], lower[23], lower[24], lower[25], lower[26]
+    whitening = to_fixed_tuple(lower, 27)
     other = _ONE if far else _ZERO
     for k in range(np.uint64(n)):
         x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
         angle = math.sqrt(x3 * x3 + x4 * x4 + x5 * x5 + _TINY)
         wrap = _ONE - other * _TURN / angle
-        x3, x4, x5 = x3 * wrap, x4 * wrap, x5 * wrap
-        z0 = l00 * x0 - b0
-        z1 = l10 * x0 + l11 * x1 - b1
-        z2 = l20 * x0 + l21 * x1 + l22 * x2 - b2
-        z3 = l30 * x0 + l31 * x1 + l32 * x2 + l33 * x3 - b3
-        z4 = l40 * x0 + l41 * x1 + l42 * x2 + l43 * x3 + l44 * x4 - b4
-        z5 = l50 * x0 + l51 * x1 + l52 * x2 + l53 * x3 + l54 * x4 + l55 * x5 - b5
-        square = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3 + z4 * z4 + z5 * z5
-        out[k] += exp.exp(log_weight - square)
+        place, turn = whitened_squares(whitening, x0, x1, x2, x3 * wrap, x4 * wrap, x5 * wrap)
+        out[k] += exp.exp(log_weight - (place + turn))
 
 
 @fast
-def _mixture_values(data, frames, begin, n, p, q, metres, twin, frame_turns, mixture, xi, out):
+def _mixture_values(data, frames, begin, n, at, metres, twin, frame_turns, mixture, xi, out):
     """Mixture kernels of rows ``begin .. begin + n``, their largest component 1 at its mean, both twins
     summed.
     """
     for k in range(np.uint64(n)):
         out[k] = _ZERO
     for t in range(2 if twin else 1):
-        _displacements(data, frames, begin, n, p, q, metres, t == 1, frame_turns, xi)
+        _displacements(data, frames, begin, n, at, metres, t == 1, frame_turns, xi)
         for j in range(mixture.lowers.shape[0]):
             _add_component(xi, n, mixture.lowers[j], mixture.log_weights[j], False, out)
             if mixture.wraps:
@@ -242,7 +238,7 @@ def isotropic_sums(cells, positions, quaternions, kappa, radius, wide, least, we
 
     Entries of K beyond ``radius`` (scaled) or not above ``least`` are zero.
     """
-    runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
+    runs = c.empty_runs(cells, BLOCK)
     values = np.empty(BLOCK, dtype=np.float32)
     kept_values = np.empty(BLOCK + 1, dtype=np.float32)
     index = np.empty(BLOCK + 1, dtype=np.int64)
@@ -251,22 +247,17 @@ def isotropic_sums(cells, positions, quaternions, kappa, radius, wide, least, we
         at = c.place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
         out[j, :] = _ZERO
-        for s in range(cells.table.shape[0]):
-            twin = F32(cells.table[s, c.TWIN])
-            for r in range(c.runs_within(cells.start, cells.table, s, at.x, at.y, at.z, radius, runs)):
-                begin, end = runs[r, 0], runs[r, 1]
-                while begin < end:
-                    n = min(BLOCK, end - begin)
-                    _isotropic_values(cells.data, begin, n, near, twin, wide, values)
-                    kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
-                    begin += n
+        for r in range(c.runs_within(cells, at, radius, BLOCK, runs)):
+            begin, n = runs[r, 0], runs[r, 1] - runs[r, 0]
+            _isotropic_values(cells.data, begin, n, near, F32(runs[r, 2]), wide, values)
+            kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
     return kept
 
 
 @fast
 def mixture_sums(cells, frames, frame_turns, positions, quaternions, mixture, radius, least, weights, out):
     """As `isotropic_sums`, for a mixture of Gaussians over the displacement from each row."""
-    runs = np.empty((c.MAX_RUNS, 2), dtype=np.int64)
+    runs = c.empty_runs(cells, BLOCK)
     values = np.empty(BLOCK, dtype=np.float32)
     kept_values = np.empty(BLOCK + 1, dtype=np.float32)
     index = np.empty(BLOCK + 1, dtype=np.int64)
@@ -274,20 +265,15 @@ def mixture_sums(cells, frames, frame_turns, positions, quaternions, mixture, ra
     metres = 1.0 / cells.scale
     kept = 0
     for j in range(positions.shape[0]):
-        p = (positions[j] - cells.centre) * cells.scale
+        at = c.place(cells, positions[j], quaternions[j], 1.0)
+        near = single(at)
         out[j, :] = _ZERO
-        for s in range(cells.table.shape[0]):
-            twin = cells.table[s, c.TWIN] > 0.5
-            for r in range(c.runs_within(cells.start, cells.table, s, p[0], p[1], p[2], radius, runs)):
-                begin, end = runs[r, 0], runs[r, 1]
-                while begin < end:
-                    n = min(BLOCK, end - begin)
-                    _mixture_values(
-                        cells.data, frames, begin, n, p, quaternions[j], metres, twin, frame_turns, mixture,
-                        xi, values,
-                    )  # fmt: skip
-                    kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
-                    begin += n
+        for r in range(c.runs_within(cells, at, radius, BLOCK, runs)):
+            begin, n, twin = runs[r, 0], runs[r, 1] - runs[r, 0], runs[r, 2] > 0
+            _mixture_values(
+                cells.data, frames, begin, n, near, metres, twin, frame_turns, mixture, xi, values
+            )
+            kept += _accumulate(values, n, begin, F32(least), weights, index, kept_values, out[j])
     return kept
 
 
@@ -315,16 +301,8 @@ def mixture_log_sum(rows, mixture, p, q):
     for i in range(rows.positions.shape[0]):
         dx, dy, dz = p[0] - rows.positions[i, 0], p[1] - rows.positions[i, 1], p[2] - rows.positions[i, 2]
         f = rows.frames[i]
-        ax, ay, az, aw = (
-            -rows.quaternions[i, 0],
-            -rows.quaternions[i, 1],
-            -rows.quaternions[i, 2],
-            rows.quaternions[i, 3],
-        )
-        vx = aw * q[0] + ax * q[3] + ay * q[2] - az * q[1]
-        vy = aw * q[1] - ax * q[2] + ay * q[3] + az * q[0]
-        vz = aw * q[2] + ax * q[1] - ay * q[0] + az * q[3]
-        w = aw * q[3] - ax * q[0] - ay * q[1] - az * q[2]
+        a = rows.quaternions[i]
+        vx, vy, vz, w = relative(a[0], a[1], a[2], a[3], q[0], q[1], q[2], q[3])
         for t in range(2 if rows.symmetric[i] else 1):
             flip = -1.0 if (t == 1 and rows.turning) else 1.0
             if t == 1:

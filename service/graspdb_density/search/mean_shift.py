@@ -130,36 +130,30 @@ def _gather(cells, at, cut, runs, buffer, near):
     """Kernels whose exponent at a pose is above ``-cut``, into ``near`` (8, ...): as ``data``, but every end
     (twin, antipode) a kernel of its own with the sign that faces the pose. Answers how many there are.
     """
-    data, table, here = cells.data, cells.table, single(at)
-    least = F32(-cut)
+    data, here, least = cells.data, single(at), F32(-cut)
     count = 0
-    for s in range(table.shape[0]):
-        twin = F32(table[s, isotropic.TWIN])
-        for r in range(isotropic.runs_within(cells.start, table, s, at.x, at.y, at.z, math.sqrt(cut), runs)):
-            begin = runs[r, 0]
-            while begin < runs[r, 1]:
-                stop = min(begin + nearest.GATHERED, runs[r, 1])
-                nearest.exponents(data, begin, stop, here, twin, buffer)
-                for i in range(stop - begin):
-                    if buffer[i] <= least:
-                        continue
-                    j = begin + i
-                    u0, u1, u2, u3 = data[3, j], data[4, j], data[5, j], data[6, j]
-                    base = -here.kappa - squared(data, j, here)
-                    for end in range(4 if twin > F32(0.0) else 2):
-                        if end == 2:
-                            # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z).
-                            u0, u1, u2, u3 = u1, -u0, u3, -u2
-                        elif end > 0:
-                            u0, u1, u2, u3 = -u0, -u1, -u2, -u3
-                        exponent = base + u0 * here.qx + u1 * here.qy + u2 * here.qz + u3 * here.qw
-                        if exponent > least and count < near.shape[1]:
-                            for axis in range(3):
-                                near[axis, count] = data[axis, j]
-                            near[3, count], near[4, count], near[5, count], near[6, count] = u0, u1, u2, u3
-                            near[7, count] = data[7, j]
-                            count += 1
-                begin = stop
+    for r in range(isotropic.runs_within(cells, at, math.sqrt(cut), nearest.GATHERED, runs)):
+        begin, twin = runs[r, 0], F32(runs[r, 2])
+        nearest.exponents(data, begin, runs[r, 1], here, twin, buffer)
+        for i in range(runs[r, 1] - begin):
+            if buffer[i] <= least:
+                continue
+            j = begin + i
+            u0, u1, u2, u3 = data[3, j], data[4, j], data[5, j], data[6, j]
+            base = -here.kappa - squared(data, j, here)
+            for end in range(4 if twin > F32(0.0) else 2):
+                if end == 2:
+                    # The twin of mu is (mu_y, -mu_x, mu_w, -mu_z).
+                    u0, u1, u2, u3 = u1, -u0, u3, -u2
+                elif end > 0:
+                    u0, u1, u2, u3 = -u0, -u1, -u2, -u3
+                exponent = base + u0 * here.qx + u1 * here.qy + u2 * here.qz + u3 * here.qw
+                if exponent > least and count < near.shape[1]:
+                    for axis in range(3):
+                        near[axis, count] = data[axis, j]
+                    near[3, count], near[4, count], near[5, count], near[6, count] = u0, u1, u2, u3
+                    near[7, count] = data[7, j]
+                    count += 1
     return count
 
 
@@ -238,7 +232,7 @@ def climb(cells, limits, kappa, cut, positions, quaternions, gain, path, lengths
     The last pose of a path is its best. A climb ends where the next step promises to raise the log density by
     less than ``gain``.
     """
-    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
+    runs = isotropic.empty_runs(cells, nearest.GATHERED)
     buffer = np.empty(nearest.GATHERED, dtype=np.float32)
     near = np.empty((8, 2 * cells.data.shape[1] + 1024), dtype=np.float32)
     sums = np.empty(8)
@@ -344,7 +338,7 @@ def scatter(
     projection failed. They are sums over the kernels with an exponent above ``-cut`` at the pose: right for
     comparisons around one pose.
     """
-    runs = np.empty((isotropic.MAX_RUNS, 2), dtype=np.int64)
+    runs = isotropic.empty_runs(cells, nearest.GATHERED)
     buffer = np.empty(nearest.GATHERED, dtype=np.float32)
     near = np.empty((8, 2 * cells.data.shape[1] + 1024), dtype=np.float32)
     sums = np.empty(8)

@@ -187,5 +187,5 @@ def _with_own(
 def _reached(density: GraspDensity, rows: Indices) -> Indices:
     """How many kernels are visited for the sum at each of some centres."""
     out = np.empty(len(rows), dtype=np.int64)
-    isotropic.reached(density.cells.arrays, density.positions[rows], _RADIUS, out)
+    isotropic.reached(density.cells.arrays, *density.poses[rows], _RADIUS, out)
     return out
