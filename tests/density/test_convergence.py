@@ -202,11 +202,9 @@ def test_similarity_equals_the_reference(shell: Shell) -> None:
         _exact_similarity(rows, np.bincount(rng.integers(300, size=300), minlength=300), 2_000, rng)
         for _ in range(12)
     ]
-    error = np.std(exact, ddof=1) / math.sqrt(len(exact)) + got.deviation / math.sqrt(200)
-    assert got.value == pytest.approx(np.mean(exact), abs=4.0 * error + 1e-3)
-    assert got.replicates.shape == (200,)
-    assert got.value == pytest.approx(got.replicates.mean())
-    assert got.deviation == pytest.approx(got.replicates.std(ddof=1))
+    error = np.std(exact, ddof=1) / math.sqrt(len(exact)) + got.std(ddof=1) / math.sqrt(200)
+    assert got.shape == (200,)
+    assert got.mean() == pytest.approx(np.mean(exact), abs=4.0 * error + 1e-3)
 
 
 def test_far_apart_grasps_follow_the_multinomial() -> None:
@@ -218,7 +216,7 @@ def test_far_apart_grasps_follow_the_multinomial() -> None:
     poisson = np.exp(-1.0 - np.cumsum(np.log(np.maximum(k, 1))))
     expected = float(np.sum(np.sqrt(k) * poisson))
     got = cv.bootstrap_similarity(rows, rng, replicates=60, points=8_000)
-    assert got.value == pytest.approx(expected, abs=3e-3)
+    assert got.mean() == pytest.approx(expected, abs=3e-3)
 
 
 @pytest.mark.parametrize("points", [1_000, 4_000])
@@ -227,15 +225,15 @@ def test_the_deviation_is_that_of_replicates_not_of_points(shell: Shell, points:
     rows = KernelRows(se3.Poses.of(*shell(200, np.random.default_rng(3))), IsotropicKernel(0.03, 0.4))
     few = cv.bootstrap_similarity(rows, np.random.default_rng(1), replicates=400, points=points)
     many = cv.bootstrap_similarity(rows, np.random.default_rng(2), replicates=400, points=60_000)
-    assert few.deviation == pytest.approx(many.deviation, rel=0.15)
-    assert few.value == pytest.approx(many.value, abs=3e-3)
+    assert few.std(ddof=1) == pytest.approx(many.std(ddof=1), rel=0.15)
+    assert few.mean() == pytest.approx(many.mean(), abs=3e-3)
 
 
 def test_one_place_has_converged() -> None:
     rows = KernelRows(se3.Poses.of(np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1))), KERNEL)
     got = cv.bootstrap_similarity(rows, np.random.default_rng(0), points=200)
-    assert got.value == pytest.approx(1.0, abs=1e-6)
-    assert got.deviation < 1e-6
+    assert got.mean() == pytest.approx(1.0, abs=1e-6)
+    assert got.std(ddof=1) < 1e-6
 
 
 @given(st.integers(0, 1_000), st.floats(0.005, 0.05), st.booleans())
@@ -249,9 +247,7 @@ def test_similarity_is_a_share_and_does_not_know_units_of_weight(
     values = []
     for scale in (1.0, 1e6):
         rows = KernelRows(se3.Poses.of(p, q), IsotropicKernel(sigma, 0.3), weights=w * scale, symmetric=twins)
-        values.append(
-            cv.bootstrap_similarity(rows, np.random.default_rng(seed), points=300, replicates=8).replicates
-        )
+        values.append(cv.bootstrap_similarity(rows, np.random.default_rng(seed), points=300, replicates=8))
     assert np.all(values[0] <= 1.0 + 1e-6)
     assert np.all(values[0] > 0.0)
     np.testing.assert_allclose(values[0], values[1], rtol=1e-4)
@@ -262,7 +258,7 @@ def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
     rows = KernelRows(se3.Poses.of(*shell(3_000, rng)), KERNEL)
     one = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10)
     two = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10, threads=2)
-    np.testing.assert_array_equal(one.replicates, two.replicates)
+    np.testing.assert_array_equal(one, two)
 
     class StopError(Exception):
         pass
@@ -431,22 +427,21 @@ def test_unreachable_likelihood_gives_the_best_there_is() -> None:
     assert match.kernel.sigma_position_m == pytest.approx(0.015, rel=0.01)
 
 
-def test_success_is_matched_by_arrays_and_by_calls() -> None:
+def test_success_is_matched_by_measured_rates() -> None:
     def rate(kernel: IsotropicKernel) -> float:
         return float(math.exp(-kernel.sigma_position_m / 0.02))
 
     factors = np.geomspace(0.5, 2.0, 9)
     rates = [rate(matching.scaled(KERNEL, float(f))) for f in factors]
-    by_array = matching.match_success(0.4, KERNEL, rates, factors=list(factors))
-    by_call = matching.match_success(0.4, KERNEL, rate, factors=list(factors))
-    assert by_array == by_call
-    assert by_array.reached
-    assert rate(by_array.kernel) == pytest.approx(0.4, abs=0.01)
-    none = matching.match_success(0.9, KERNEL, rates, factors=list(factors))
+    even = np.ones(9)
+    match = matching.match_success(0.4, KERNEL, rates, factors=factors, draws=even)
+    assert match.reached
+    assert rate(match.kernel) == pytest.approx(0.4, abs=0.01)
+    none = matching.match_success(0.9, KERNEL, rates, factors=factors, draws=even)
     assert not none.reached
     assert none.achieved == pytest.approx(max(rates))
     with pytest.raises(ValueError, match="rates"):
-        matching.match_success(0.4, KERNEL, [1.2, 0.3], factors=[1.0, 2.0])
+        matching.match_success(0.4, KERNEL, [1.2, 0.3], factors=[1.0, 2.0], draws=[1, 1])
 
 
 def test_noisy_rates_are_made_monotone() -> None:
@@ -462,12 +457,14 @@ def test_few_draws_tell_less_of_the_width_that_matches() -> None:
         return float(math.exp(-kernel.sigma_position_m / 0.02))
 
     factors = np.geomspace(0.4, 1.6, 7)
-    right = matching.match_success(0.4, KERNEL, rate, factors=factors).kernel.sigma_position_m
+    rates = [rate(matching.scaled(KERNEL, f)) for f in factors]
+    match = matching.match_success(0.4, KERNEL, rates, factors=factors, draws=np.ones(7))
+    right = match.kernel.sigma_position_m
     rng = np.random.default_rng(0)
     spans, inside = [], 0
     for draws in (200, 5_000):
         for _ in range(30):
-            found = [rng.binomial(draws, rate(matching.scaled(KERNEL, f))) / draws for f in factors]
+            found = [rng.binomial(draws, r) / draws for r in rates]
             target = rng.binomial(draws, 0.4) / draws
             low, high = matching.success_ends(
                 target, KERNEL, found, factors=list(factors), draws=[draws] * 7, target_draws=draws

@@ -27,9 +27,6 @@ def test_unknown_densities_take_the_mean_of_the_rest() -> None:
     w = importance_weights([1.0, None, 3.0, math.nan])  # type: ignore[list-item]
     assert w[1] == w[3] == pytest.approx((w[0] + w[2]) / 2.0)
     np.testing.assert_allclose(importance_weights([math.nan] * 4), 0.25)
-    np.testing.assert_allclose(importance_weights(None, count=5), 0.2)
-    with pytest.raises(ValueError, match="count"):
-        importance_weights(None)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.inf])

@@ -128,8 +128,6 @@ def test_bad_input_is_refused() -> None:
     model = SuccessModel.build(Poses.of(p, q), [True, False], kernel=KERNELS[0])
     with pytest.raises(ValueError, match="level"):
         model.evaluate(Poses.of(p, q), level=1.0)
-    with pytest.raises(ValueError, match="cutoff"):
-        model.evaluate(Poses.of(p, q), cutoff=1.0)
     with pytest.raises(ValueError, match="at least one attempt"):
         SuccessModel.build(Poses.of(p[:0], q[:0]), np.zeros(0, dtype=bool), kernel=KERNELS[0]).evaluate(
             Poses.of(p, q)

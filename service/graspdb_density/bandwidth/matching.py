@@ -6,7 +6,7 @@ of held-out grasps, equal success of simulated draws (collisions are failures).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,9 @@ __all__ = [
     "success_ends",
 ]
 
-#: Factors on both widths of the base kernel that a search tries, before it refines.
-FACTORS: tuple[float, ...] = tuple(float(f) for f in np.geomspace(0.4, 2.5, 11))
+#: Factors on both widths of the base kernel that a search tries, before it refines, and how near in nats it
+#: has to come.
+_FACTORS, _TOLERANCE = tuple(float(f) for f in np.geomspace(0.4, 2.5, 11)), 0.01
 _RESAMPLES = 400
 
 
@@ -64,9 +65,6 @@ def match_likelihood(
     target: float,
     base: IsotropicKernel,
     likelihood: Callable[[IsotropicKernel], float],
-    *,
-    factors: Sequence[float] = FACTORS,
-    tolerance: float = 0.01,
 ) -> Match:
     """Scale both widths until held-out grasps are as likely as ``target`` nats.
 
@@ -77,10 +75,8 @@ def match_likelihood(
     ----------
     likelihood : callable
         Mean log density of held-out grasps under a kernel, nats of 1/(m^3 rad^3).
-    tolerance : float
-        Nats.
     """
-    tried = sorted({*map(float, factors)})
+    tried, tolerance = _FACTORS, _TOLERANCE
     values = [likelihood(scaled(base, f)) for f in tried]
     top = int(np.argmax(values))
     if values[top] < target - tolerance:
@@ -106,10 +102,10 @@ def match_likelihood(
 def match_success(
     target: float,
     base: IsotropicKernel,
-    success: Callable[[IsotropicKernel], float] | ArrayLike,
+    success: ArrayLike,
     *,
-    factors: Sequence[float] = FACTORS,
-    draws: ArrayLike | None = None,
+    factors: ArrayLike,
+    draws: ArrayLike,
 ) -> Match:
     """Scale both widths until draws from the density succeed as often as ``target``.
 
@@ -118,10 +114,10 @@ def match_success(
 
     Parameters
     ----------
-    success : callable or (K,)
-        Share of simulated draws that succeed, collisions counted as failures: a function of the kernel, or
-        the rates measured at ``scaled(base, factor)`` for each of ``factors``.
-    draws : (K,) or None
+    success : (K,)
+        Shares of simulated draws that succeed, collisions counted as failures, measured at
+        ``scaled(base, factor)`` for each of ``factors``.
+    draws : (K,)
         Draws behind each rate.
 
     Raises
@@ -129,12 +125,7 @@ def match_success(
     ValueError
         For rates outside [0, 1], or arrays that do not match.
     """
-    tried = np.array([float(f) for f in factors])
-    if callable(success):
-        rates = np.array([float(success(scaled(base, f))) for f in tried])
-    else:
-        rates = np.array(success, dtype=np.float64)
-    counts = np.ones(len(tried)) if draws is None else np.array(draws, dtype=np.float64)
+    tried, rates, counts = (np.array(column, dtype=np.float64) for column in (factors, success, draws))
     if rates.shape != tried.shape or counts.shape != tried.shape or len(tried) < 2:
         raise ValueError("factors, rates and draws are arrays of one length, at least 2")
     if not (np.all(rates >= 0.0) and np.all(rates <= 1.0) and np.all(counts > 0.0) and np.all(tried > 0.0)):
@@ -156,17 +147,16 @@ def success_ends(
     base: IsotropicKernel,
     success: ArrayLike,
     *,
-    factors: Sequence[float],
+    factors: ArrayLike,
     draws: ArrayLike,
     target_draws: int,
     level: float = 0.9,
-    seed: int = 0,
 ) -> tuple[IsotropicKernel, IsotropicKernel]:
     """The narrowest and the widest kernel that `match_success` may mean, as draws are few: quantiles over
     draws that succeed anew by chance, those of the target too. Arguments as there.
     """
     rates, counts = np.array(success, dtype=np.float64), np.array(draws, dtype=np.int64)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     widths = [
         match_success(
             float(rng.binomial(target_draws, target)) / target_draws,

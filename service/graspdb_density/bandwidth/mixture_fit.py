@@ -47,6 +47,9 @@ LEAST_SUCCESSES, LEAST_DISPLACEMENTS = 50, 200
 _TRIED_COMPONENTS, _GIVEN_UP, _WORTH = (1, 2, 3, 4, 6, 8, 12, 16), 2, 0.02
 _FACTORS = tuple(float(f) for f in np.geomspace(0.3, 1.7, 9))
 _ITERATIONS, _ENOUGH = 60, 1e-5
+#: Successes that displacements start from, and displacements from one, drawn at random and weighted for the
+#: rest.
+_STARTS_MOST, _EACH_MOST = 2_000, 200
 _FITTED_MOST, _SCALED_MOST, _JUDGED_MOST = 8_000, 5_000, 600
 #: Share of a uniform density mixed in, so that a grasp without neighbours counts as an outlier and no more.
 _UNIFORM_SHARE = 1e-3
@@ -109,8 +112,6 @@ def displacements(
     weights: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
     frame: ArrayLike | None = None,
-    max_grasps: int = 2_000,
-    per_grasp: int = 200,
 ) -> Displacements:
     """Displacements inside a window from successes to other successes, and to their twins.
 
@@ -121,8 +122,6 @@ def displacements(
         Importance (eq 1). Successes to start from are drawn by it, those arrived at count with it.
     frame : (3, 3), (N, 3, 3) or None
         Columns are the axes of translations, object frame; None: each grasp's gripper.
-    per_grasp : int
-        At most this many from one success, drawn at random and weighted for the rest.
     """
     p, q = poses.positions, poses.quaternions_xyzw
     w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
@@ -130,7 +129,7 @@ def displacements(
     reach = window.position_m * math.sqrt(3.0)
     tree = cKDTree(p)
     frames = None if frame is None else np.asarray(frame, dtype=np.float64)
-    starts = rng.choice(len(p), size=min(max_grasps, len(p)), replace=False, p=w / w.sum())
+    starts = rng.choice(len(p), size=min(_STARTS_MOST, len(p)), replace=False, p=w / w.sum())
     vectors: list[Floats] = []
     shares: list[Floats] = []
     origins: list[NDArray[np.int64]] = []
@@ -149,7 +148,7 @@ def displacements(
         inside = np.flatnonzero(window.holds(se3.Poses(shift, turn)))
         if not inside.size:
             continue
-        kept = inside if inside.size <= per_grasp else rng.choice(inside, size=per_grasp, replace=False)
+        kept = inside if inside.size <= _EACH_MOST else rng.choice(inside, size=_EACH_MOST, replace=False)
         vectors.append(np.concatenate([shift[kept], se3.to_rotation_vector(turn[kept])], axis=1))
         shares.append(w[near[kept]] * (inside.size / kept.size))
         origins.append(np.full(kept.size, a, dtype=np.int64))
@@ -170,7 +169,6 @@ def fit_kernel(
     weights: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
     frame: ArrayLike | None = None,
-    seed: int = 0,
     threads: int = 1,
     progress: Progress | None = None,
 ) -> FittedKernel:
@@ -212,7 +210,7 @@ def fit_kernel(
     frames = None if frame is None else _own_where_unknown(frame, poses.quaternions_xyzw)
     w = np.ones(len(poses)) if weights is None else np.asarray(weights, dtype=np.float64)
     flags = np.array(np.broadcast_to(np.asarray(symmetric, dtype=bool), len(poses)))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     found = displacements(poses, window=window, rng=rng, weights=w, symmetric=flags, frame=frames)
     if len(found.vectors) < LEAST_DISPLACEMENTS:
         raise ValueError(

@@ -136,24 +136,11 @@ def mirrored_displacements(displacements: Poses) -> Poses:
     )
 
 
-def sampled_kernel_rows(
-    displacements: Poses,
-    components: IsotropicKernel,
-    *,
-    window: DisplacementWindow | None = None,
-) -> KernelRows:
-    """The sampled kernel (eq 5) as a density of displacements: an isotropic component at every sample inside
-    the window and at its mirror image.
-
-    Raises
-    ------
-    ValueError
-        Where no displacement lies inside the window.
+def sampled_kernel_rows(displacements: Poses, components: IsotropicKernel) -> KernelRows:
+    """The sampled kernel (eq 5) as a density of displacements: an isotropic component at every sample and at
+    its mirror image.
     """
-    held = displacements if window is None else displacements[window.holds(displacements)]
-    if not len(held):
-        raise ValueError("no displacement lies inside the window")
-    both = Poses.concatenate([held, mirrored_displacements(held)])
+    both = Poses.concatenate([displacements, mirrored_displacements(displacements)])
     return KernelRows(both, components, symmetric=False)
 
 

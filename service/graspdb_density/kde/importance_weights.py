@@ -18,7 +18,7 @@ __all__ = [
 LOW_EFFECTIVE_SHARE = 0.1
 
 
-def importance_weights(proposal_density: ArrayLike | None, *, count: int | None = None) -> Floats:
+def importance_weights(proposal_density: ArrayLike) -> Floats:
     """Weights ``1 / g(x_i)``, summing to 1, of trials each drawn with its own proposal density.
 
     A trial without a proposal density takes the mean weight of those that have one; where none has, all are
@@ -26,22 +26,26 @@ def importance_weights(proposal_density: ArrayLike | None, *, count: int | None 
 
     Parameters
     ----------
-    proposal_density : (N,) 1/(m^3 rad^3), nan or None where unknown; or None for all unknown, with ``count``
+    proposal_density : (N,) 1/(m^3 rad^3), nan or None where unknown
 
     Raises
     ------
     ValueError
         For densities that are negative, zero or infinite.
     """
-    if proposal_density is None:
-        if count is None:
-            raise ValueError("without proposal densities the count must be given")
-        g = np.full(count, np.nan)
-    else:
-        g = np.array(proposal_density, dtype=np.float64)
+    g = np.array(proposal_density, dtype=np.float64)
     if g.ndim != 1:
         raise ValueError(f"proposal_density has shape (N,), not {g.shape}")
-    return _filled(g)
+    known: NDArray[np.bool_] = ~np.isnan(g)
+    values = g[known]
+    if not (np.isfinite(values).all() and (values > 0.0).all()):
+        raise ValueError("proposal densities must be positive and finite")
+    weights = np.ones(len(g))
+    if known.any():
+        # Scaled by the smallest density first: reciprocals of tiny ones would overflow.
+        weights[known] = values.min() / values
+        weights[~known] = weights[known].mean()
+    return np.asarray(weights / weights.sum(), dtype=np.float64)
 
 
 def pooled_density(densities: ArrayLike, counts: ArrayLike) -> Floats:
@@ -84,19 +88,3 @@ def effective_sample_size(weights: ArrayLike) -> float:
     """(sum w)^2 / sum w^2: the number of equal weights that would vary as much."""
     w = np.asarray(weights, dtype=np.float64)
     return float(w.sum() ** 2 / np.dot(w, w)) if w.size else 0.0
-
-
-def _filled(exposure: Floats) -> Floats:
-    """Normalised reciprocals, the mean where nan."""
-    known: NDArray[np.bool_] = ~np.isnan(exposure)
-    values = exposure[known]
-    if not (np.isfinite(values).all() and (values > 0.0).all()):
-        raise ValueError("proposal densities must be positive and finite")
-    if not exposure.size:
-        return exposure
-    weights = np.ones(len(exposure))
-    if known.any():
-        # Scaled by the smallest exposure first: reciprocals of tiny densities would overflow.
-        weights[known] = values.min() / values
-        weights[~known] = weights[known].mean()
-    return np.asarray(weights / weights.sum(), dtype=np.float64)

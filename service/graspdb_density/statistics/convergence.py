@@ -27,7 +27,6 @@ __all__ = [
     "ConvergenceCurve",
     "CurvePoint",
     "Needed",
-    "Similarity",
     "Verdict",
     "bootstrap_similarity",
     "coefficients",
@@ -47,25 +46,6 @@ LEAST_GRASPS = LEAST_SUBSET * 2 ** (LEAST_SIZES - 1)
 _RESAMPLES = 400
 #: Extrapolations beyond this many times the present number say nothing.
 _HORIZON = 1_000.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Similarity:
-    """Eq 9 for one set of grasps.
-
-    Attributes
-    ----------
-    value : float
-        s in [0, 1]: the mean of ``replicates``.
-    deviation : float
-        Standard deviation over the replicates: the bar of figure 14.
-    replicates : (B,)
-        BC of every bootstrap replicate with the whole.
-    """
-
-    value: float
-    deviation: float
-    replicates: Floats
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,7 +105,6 @@ class Needed:
     grasps: float
     low: float
     high: float
-    level: float
     extrapolated: bool
 
 
@@ -165,8 +144,8 @@ def bootstrap_similarity(
     points: int = 20_000,
     threads: int = 1,
     progress: Progress | None = None,
-) -> Similarity:
-    """s of eq 9 for all grasps of ``rows``.
+) -> Floats:
+    """BC of every bootstrap replicate with all grasps of ``rows``, (B,): their mean is s of eq 9.
 
     A replicate resamples the grasps with their weights uniformly with replacement and renormalises.
 
@@ -191,8 +170,7 @@ def bootstrap_similarity(
         again = rows.weights * counts
         weightings[b] = again * (rows.size / again.sum())
     sums = rows.sums(drawn, weightings.T, threads=threads, progress=progress)
-    values = coefficients(sums[:, 0], sums[:, 1:], np.ones(replicates))
-    return Similarity(float(values.mean()), float(values.std(ddof=1)), values)
+    return coefficients(sums[:, 0], sums[:, 1:], np.ones(replicates))
 
 
 def coefficients(
@@ -297,11 +275,6 @@ def _needed(sizes: Floats, similarity: Floats, target: float) -> tuple[Floats, N
     return out, outside
 
 
-def _checked_target(target: float, level: float) -> None:
-    if not 0.0 < target < 1.0 or not 0.0 < level < 1.0:
-        raise ValueError("target similarity and level lie between 0 and 1")
-
-
 def grasps_needed(
     curve: ConvergenceCurve, *, target: float = TARGET, level: float = 0.9, seed: int = 0
 ) -> Needed:
@@ -310,11 +283,10 @@ def grasps_needed(
 
     A curve that is above the target from its first point on gives that point's number: an upper bound.
     """
-    _checked_target(target, level)
     best, outside = _needed(curve.sizes, curve.similarities[None], target)
     spread, _ = _needed(curve.sizes, _resampled(curve, np.random.default_rng(seed)), target)
     low, high = _interval(spread, level)
-    return Needed(target, float(best[0]), low, high, level, bool(outside[0]))
+    return Needed(target, float(best[0]), low, high, bool(outside[0]))
 
 
 def needed_ratio(
@@ -324,7 +296,6 @@ def needed_ratio(
     ends: Sequence[ConvergenceCurve] = (),
     target: float = TARGET,
     level: float = 0.9,
-    seed: int = 0,
 ) -> tuple[float, float, float]:
     """Grasps one kernel needs over those the reference needs: value and interval; nan where neither can be
     told.
@@ -335,12 +306,13 @@ def needed_ratio(
         Curves under the reference's kernels at the ends of an interval of the same level, where its width is
         known no better: what they need widens the ratio's, independent errors adding in squares.
     """
-    _checked_target(target, level)
-    values = []
-    for number, one in enumerate((curve, reference)):
-        spread, _ = _needed(one.sizes, _resampled(one, np.random.default_rng((seed, number))), target)
-        values.append((grasps_needed(one, target=target, level=level, seed=seed).grasps, spread))
-    (best, spread), (base, base_spread) = values
+    (best, spread), (base, base_spread) = (
+        (
+            grasps_needed(one, target=target).grasps,
+            _needed(one.sizes, _resampled(one, np.random.default_rng((0, number))), target)[0],
+        )
+        for number, one in enumerate((curve, reference))
+    )
     with np.errstate(invalid="ignore"):
         ratio = np.float64(best) / np.float64(base)
         ratios = spread / base_spread
@@ -348,7 +320,7 @@ def needed_ratio(
         return float(ratio), math.nan, math.nan
     low, high = _interval(ratios, level)
     if ends:
-        others = np.array([grasps_needed(end, target=target, level=level, seed=seed).grasps for end in ends])
+        others = np.array([grasps_needed(end, target=target).grasps for end in ends])
         with np.errstate(invalid="ignore", divide="ignore"):
             shifts = np.log(base / others)
             low = float(ratio) * math.exp(-math.hypot(np.log(ratio / low), min(0.0, *shifts)))
@@ -356,13 +328,13 @@ def needed_ratio(
     return float(ratio), low, high
 
 
-def verdict(curve: ConvergenceCurve, *, target: float = TARGET, level: float = 0.9, seed: int = 0) -> Verdict:
+def verdict(curve: ConvergenceCurve, *, level: float = 0.9) -> Verdict:
     """Whether the whole of a curve's grasps suffice, and how many more are needed otherwise."""
-    needed = grasps_needed(curve, target=target, level=level, seed=seed)
-    resampled = _resampled(curve, np.random.default_rng(seed))
+    needed = grasps_needed(curve, level=level)
+    resampled = _resampled(curve, np.random.default_rng(0))
     last = curve.points[-1]
     low, high = _interval(resampled[:, -1], level)
-    state = "enough" if low >= target else "more" if high < target else "borderline"
+    state = "enough" if low >= TARGET else "more" if high < TARGET else "borderline"
     exponent, _ = _fit(curve.sizes, curve.similarities)
     least, best, most = (max(0.0, n - last.grasps) for n in (needed.low, needed.grasps, needed.high))
     return Verdict(

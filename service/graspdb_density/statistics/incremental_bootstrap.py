@@ -372,7 +372,7 @@ class _Work:
                         points=plan.per_subset,
                         threads=self.threads,
                         progress=self.steps.part(amount, 0.9),
-                    ).replicates
+                    )
                 )
                 training = rows.subset(chosen[~is_judged[chosen]])
                 likelihoods.append(training.log_density(test, threads=self.threads))

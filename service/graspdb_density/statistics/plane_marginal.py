@@ -145,7 +145,6 @@ def marginal(
     orientation: Orientation,
     *,
     level: float = 0.9,
-    seed: int = 0,
 ) -> Marginal:
     """Project a density.
 
@@ -158,7 +157,7 @@ def marginal(
     level : float
         Of the intervals, which resample rows (or draws).
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     own = density.isotropic
     if own is density:
         p, q, w = own.positions, own.quaternions_xyzw, own.weights

@@ -10,11 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import betaincinv
+
+from .calibration import jeffreys_interval
 
 __all__ = ["Share", "shares"]
 
 _RESAMPLES = 200
+#: Edge of the cubes of space that are resampled.
+_BLOCK_M = 0.02
 #: Fewer blocks than this have no spread to resample.
 _LEAST_BLOCKS = 3
 
@@ -36,9 +39,7 @@ def shares(
     positions: ArrayLike,
     *,
     groups: int,
-    block_m: float = 0.02,
     level: float = 0.9,
-    seed: int = 0,
 ) -> list[Share]:
     """The share of successes in each group.
 
@@ -48,13 +49,11 @@ def shares(
     group : (N,) int
         Below ``groups``; negative ones are left out.
     positions : (N, 3) metres
-    block_m : float
-        Edge of the cubes of space that are resampled.
 
     Raises
     ------
     ValueError
-        For wrong shapes, numbers of groups out of range, or a level or edge that is none.
+        For wrong shapes, or numbers of groups out of range.
     """
     won = np.asarray(success, dtype=bool)
     label = np.asarray(group, dtype=np.int64)
@@ -63,9 +62,7 @@ def shares(
         raise ValueError("success, group and positions have shapes (N,), (N,) and (N, 3), all finite")
     if groups < 1 or (len(label) and int(label.max()) >= groups):
         raise ValueError("groups are numbered below their count")
-    if not 0.0 < level < 1.0 or not block_m > 0.0:
-        raise ValueError("level lies between 0 and 1, block_m is positive")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     tail = 0.5 * (1.0 - level)
     found = []
     for number in range(groups):
@@ -74,8 +71,8 @@ def shares(
         if not n:
             found.append(Share(0, 0, np.nan, np.nan, np.nan))
             continue
-        low, high = betaincinv(k + 0.5, n - k + 0.5, tail), betaincinv(k + 0.5, n - k + 0.5, 1.0 - tail)
-        cell = np.floor(p[chosen] / block_m).astype(np.int64)
+        low, high = (float(end) for end in jeffreys_interval(k / n, n, level))
+        cell = np.floor(p[chosen] / _BLOCK_M).astype(np.int64)
         _, block = np.unique(cell, axis=0, return_inverse=True)
         block = block.reshape(-1)
         blocks = int(block.max()) + 1
@@ -85,6 +82,6 @@ def shares(
             again = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=_RESAMPLES)
             drawn = (again @ held) / (again @ tried)
             ends = np.quantile(drawn, [tail, 1.0 - tail])
-            low, high = min(low, ends[0]), max(high, ends[1])
-        found.append(Share(n, k, k / n, float(min(low, k / n)), float(max(high, k / n))))
+            low, high = min(low, float(ends[0])), max(high, float(ends[1]))
+        found.append(Share(n, k, k / n, low, high))
     return found

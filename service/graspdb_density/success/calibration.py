@@ -25,6 +25,7 @@ __all__ = [
     "brier_skill",
     "calibrate",
     "expected_calibration_error",
+    "jeffreys_interval",
     "reliability",
 ]
 
@@ -67,8 +68,6 @@ class Calibration:
         Expected calibration error over predictions above `ECE_ABOVE`; nan without any.
     auc : float
         Chance that a success is ranked above a failure; nan where one of them is missing.
-    level : float
-        Probability the intervals hold.
     """
 
     bins: tuple[ReliabilityBin, ...]
@@ -80,7 +79,6 @@ class Calibration:
     skill_high: float
     ece: float
     auc: float
-    level: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,14 +92,12 @@ class Blocks:
     fold : (N,) int64
         Fold of that cube.
     count, folds : int
-    edge_m : float
     """
 
     block: NDArray[np.int64]
     fold: NDArray[np.int64]
     count: int
     folds: int
-    edge_m: float
 
 
 def _checked(
@@ -187,17 +183,17 @@ def _ratio(top: Floats, bottom: Floats) -> Floats:
     return np.asarray(np.where(bottom > 0.0, top / np.where(bottom > 0.0, bottom, 1.0), np.nan))
 
 
-def _jeffreys(share: Floats, trials: Floats, level: float) -> tuple[Floats, Floats]:
+def jeffreys_interval(share: ArrayLike, trials: ArrayLike, level: float) -> tuple[Floats, Floats]:
+    """The interval of shares (n,) of independent trials (n,), which includes what was seen; nan where
+    nothing was.
+    """
+    share, trials = np.asarray(share, dtype=np.float64), np.asarray(trials, dtype=np.float64)
     known = np.isfinite(share) & (trials > 0.0)
     s, n = np.where(known, share, 0.5), np.where(known, trials, 1.0)
     tail = 0.5 * (1.0 - level)
     low = betaincinv(s * n + 0.5, (1.0 - s) * n + 0.5, tail)
     high = betaincinv(s * n + 0.5, (1.0 - s) * n + 0.5, 1.0 - tail)
-    # At the ends the interval includes what was seen.
-    return (
-        np.where(known, np.minimum(low, s), np.nan),
-        np.where(known, np.maximum(high, s), np.nan),
-    )
+    return np.where(known, np.minimum(low, s), np.nan), np.where(known, np.maximum(high, s), np.nan)
 
 
 def _bin_intervals(
@@ -213,7 +209,7 @@ def _bin_intervals(
     observed = _ratio(_tally(place, w * y, count), total)
     effective = _ratio(total**2, _tally(place, w * w, count))
     if blocks is None:
-        return _jeffreys(observed, np.nan_to_num(effective), level)
+        return jeffreys_interval(observed, np.nan_to_num(effective), level)
     group = _group(blocks, len(place))
     groups = int(group.max()) + 1
     sums = np.zeros((2, groups, count))
@@ -224,11 +220,11 @@ def _bin_intervals(
     shares = _ratio(again @ sums[1], again @ sums[0])
     tail = 0.5 * (1.0 - level)
     few = met < 3
-    low, high = _jeffreys(observed, met.astype(np.float64), level)
+    low, high = jeffreys_interval(observed, met.astype(np.float64), level)
     if not few.all():
         quantiles = np.nanquantile(shares[:, ~few], [tail, 1.0 - tail], axis=0)
         # Blocks that agree completely have no spread to resample: never narrower than independent outcomes.
-        least, most = _jeffreys(observed[~few], effective[~few], level)
+        least, most = jeffreys_interval(observed[~few], effective[~few], level)
         low[~few] = np.minimum(quantiles[0], least)
         high[~few] = np.maximum(quantiles[1], most)
     return low, high
@@ -252,19 +248,18 @@ def expected_calibration_error(
     outcomes: ArrayLike,
     *,
     weights: ArrayLike | None = None,
-    above: float = ECE_ABOVE,
-    bins: int = 10,
 ) -> float:
-    """Mean over predictions above a value of the difference between a bin's mean prediction and its share of
-    successes (Naeini et al. 2015); ``bins`` of equal width between there and 1; nan without such predictions.
+    """Mean over predictions above `ECE_ABOVE` of the difference between a bin's mean prediction and its share
+    of successes (Naeini et al. 2015); 10 bins of equal width between there and 1; nan without such
+    predictions.
     """
     p, y, w = _checked(predictions, outcomes, weights)
-    chosen = (p > above) & (w > 0.0)
+    chosen = (p > ECE_ABOVE) & (w > 0.0)
     if not chosen.any():
         return math.nan
     p, y, w = p[chosen], y[chosen], w[chosen]
-    place = np.minimum(((p - above) / (1.0 - above) * bins).astype(np.int64), bins - 1)
-    gap = _tally(place, w * (p - y), bins)
+    place = np.minimum(((p - ECE_ABOVE) / (1.0 - ECE_ABOVE) * 10).astype(np.int64), 9)
+    gap = _tally(place, w * (p - y), 10)
     return float(np.abs(gap).sum() / w.sum())
 
 
@@ -323,7 +318,6 @@ def calibrate(
         skill_high=float(high),
         ece=expected_calibration_error(p, y, weights=w),
         auc=area_under_curve(p, y, weights=w),
-        level=level,
     )
 
 
@@ -379,4 +373,4 @@ def assign_blocks(positions: ArrayLike, *, edge_m: float, folds: int = 5, seed: 
         target = int(np.argmin(filled))
         fold_of[b] = target
         filled[target] += sizes[b]
-    return Blocks(block, fold_of[block], len(sizes), made, float(edge_m))
+    return Blocks(block, fold_of[block], len(sizes), made)

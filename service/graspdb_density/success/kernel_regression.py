@@ -49,15 +49,12 @@ class SuccessEstimate:
         Success probability and the ends of its interval.
     effective_trials : (M,)
         0 where no attempt is within reach; there the probability is the share of successes of all attempts.
-    level : float
-        Probability the interval holds.
     """
 
     probability: Floats
     low: Floats
     high: Floats
     effective_trials: Floats
-    level: float
 
 
 class SuccessModel:
@@ -144,7 +141,6 @@ class SuccessModel:
         poses: Poses,
         *,
         level: float = 0.9,
-        cutoff: float = SUCCESS_CUTOFF,
         threads: int = 1,
     ) -> SuccessEstimate:
         """Success probability with its interval at M poses.
@@ -152,44 +148,37 @@ class SuccessModel:
         Raises
         ------
         ValueError
-            Without any attempt, for a level outside (0, 1) or a cut-off outside 2 to 10.
+            Without any attempt, or for a level outside (0, 1).
         """
         if not 0.0 < level < 1.0:
             raise ValueError(f"level must be between 0 and 1, not {level!r}")
-        probability, trials, alpha, beta = self._beta(poses, cutoff, threads)
+        probability, trials, alpha, beta = self._beta(poses, threads)
         tail = 0.5 * (1.0 - level)
         low = _quantiles(alpha, beta, tail, threads)
         high = _quantiles(alpha, beta, 1.0 - tail, threads)
-        return SuccessEstimate(probability, low, high, trials, level)
+        return SuccessEstimate(probability, low, high, trials)
 
-    def probability(
-        self,
-        poses: Poses,
-        *,
-        cutoff: float = SUCCESS_CUTOFF,
-        threads: int = 1,
-    ) -> Floats:
+    def probability(self, poses: Poses, *, threads: int = 1) -> Floats:
         """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""
-        return self._beta(poses, cutoff, threads)[0]
+        return self._beta(poses, threads)[0]
 
     def lower_end(
         self,
         poses: Poses,
         *,
         level: float = 0.9,
-        cutoff: float = SUCCESS_CUTOFF,
         threads: int = 1,
     ) -> Floats:
         """The lower end of `evaluate` alone, (M,)."""
-        _, _, alpha, beta = self._beta(poses, cutoff, threads)
+        _, _, alpha, beta = self._beta(poses, threads)
         return _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
 
-    def _beta(self, poses: Poses, cutoff: float, threads: int) -> tuple[Floats, Floats, Floats, Floats]:
+    def _beta(self, poses: Poses, threads: int) -> tuple[Floats, Floats, Floats, Floats]:
         """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
         if not self.size:
             raise ValueError("a success probability needs at least one attempt")
-        won = self._sums(self._succeeded, poses, cutoff, threads)
-        lost = self._sums(self._failed, poses, cutoff, threads)
+        won = self._sums(self._succeeded, poses, threads)
+        lost = self._sums(self._failed, poses, threads)
         prior = self.prior_share
         total, squares = (won + lost).T
         probability, trials, share = shrunk_share(won[:, 0], total, squares, prior)
@@ -202,9 +191,9 @@ class SuccessModel:
             alpha, beta = alpha + (softened - prior), beta - (softened - prior)
         return probability, trials, alpha, beta
 
-    def _sums(self, cells: Cells | None, poses: Poses, cutoff: float, threads: int) -> Floats:
+    def _sums(self, cells: Cells | None, poses: Poses, threads: int) -> Floats:
         """Sums of k and k^2 (M, 2)."""
-        radius, kernel = scaled_radius(cutoff), self.kernel
+        radius, kernel = scaled_radius(SUCCESS_CUTOFF), self.kernel
         if cells is None:
             return np.zeros((len(poses), 2))
         arrays = cells.arrays
