@@ -60,7 +60,7 @@ class Scene:
             raise ValueError("parts must hold at least one convex part")
         solids = [_Solid(number, np.asarray(part[0], dtype=np.float64)) for number, part in enumerate(parts)]
         self.part_count = len(solids)
-        self._model = (
+        self._model = convex.Model(
             np.concatenate([s.vertices for s in solids]),
             _starts([len(s.vertices) for s in solids]),
             np.concatenate([s.planes for s in solids]),
@@ -243,7 +243,7 @@ class Surface:
         return found
 
     @classmethod
-    def _build(cls, corners: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
+    def _build(cls, corners: FloatArray) -> surface.Tree:
         """Tree over triangles (F, 3, 3), halved at the median of the longest side of their centres."""
         low, high = corners.min(axis=1), corners.max(axis=1)
         middle = (low + high) / 2
@@ -270,7 +270,9 @@ class Surface:
             order[begin:end] = members[np.argpartition(centres[:, axis], half)]
             pending.append((begin + half, end, number, 1))
             pending.append((begin, begin + half, number, 0))
-        return np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
+        return surface.Tree(
+            np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
+        )
 
 
 class PointCloud:

@@ -1,5 +1,8 @@
 """Numba kernels of ridges: which points lie inside a solid, and the segment nearest to a point."""
 
+# Numba infers the types of compiled functions.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numba as nb
@@ -11,13 +14,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 @nb.njit(cache=True, nogil=True)
-def inside_parts(
-    points: FloatArray,
-    planes: FloatArray,
-    starts: IntArray,
-    bounds: FloatArray,
-    found: npt.NDArray[np.bool_],
-) -> None:
+def inside_parts(points, planes, starts, bounds, found):
     """Fill found: whether a point (n, 3) lies in a convex part, given by its planes (n.x <= d) and bounds."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -37,7 +34,7 @@ def inside_parts(
 
 
 @nb.njit(cache=True, inline="always")
-def _squared_distance(x: FloatArray, a: FloatArray, b: FloatArray) -> float:
+def _squared_distance(x, a, b):
     """From a point to the segment a b."""
     d0, d1, d2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     e0, e1, e2 = x[0] - a[0], x[1] - a[1], x[2] - a[2]
@@ -53,7 +50,7 @@ def _squared_distance(x: FloatArray, a: FloatArray, b: FloatArray) -> float:
 
 
 @nb.njit(cache=True, inline="always")
-def _below(x: FloatArray, box: FloatArray) -> float:
+def _below(x, box):
     """Squared distance from a point to a box (2, 3), a lower bound for what is in it."""
     total = 0.0
     for a in range(3):
@@ -64,19 +61,7 @@ def _below(x: FloatArray, box: FloatArray) -> float:
 
 
 @nb.njit(cache=True, nogil=True)
-def nearest(
-    points: FloatArray,
-    segments: FloatArray,
-    boxes: FloatArray,
-    block: int,
-    reach: float,
-    tangents: FloatArray,
-    normals: FloatArray,
-    least_cosine: float,
-    tie: float,
-    which: IntArray,
-    distances: FloatArray,
-) -> None:
+def nearest(points, segments, boxes, block, reach, tangents, normals, least_cosine, tie, which, distances):
     """Fill which: the nearest segment (S, 2, 3) of each point, -1 beyond reach, -2 at a tie; and distances.
 
     ``boxes`` bound ``block`` consecutive segments each. A tie is another segment no more than ``tie`` further
@@ -118,15 +103,7 @@ def nearest(
 
 
 @nb.njit(cache=True, nogil=True)
-def regions(
-    points: FloatArray,
-    closing: FloatArray,
-    centres: FloatArray,
-    axes: FloatArray,
-    half: FloatArray,
-    which: IntArray,
-    cosine: FloatArray,
-) -> None:
+def regions(points, closing, centres, axes, half, which, cosine):
     """Fill which: of the boxes (P) that hold a point the one whose second axis is most parallel to its
     closing axis, -1 in none; and the cosine of that angle.
     """

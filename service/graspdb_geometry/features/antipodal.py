@@ -14,8 +14,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from graspdb_geometry.features.jaw_pairs import JawPairs
-from graspdb_geometry.features.ridges import Solid
+from graspdb_geometry.features.jaw_pairs import JawPairs, spread_points
+from graspdb_geometry.features.ridges import Solid, unit
 
 __all__ = ["opposed_points"]
 
@@ -52,10 +52,10 @@ def opposed_points(corners: npt.ArrayLike, solid: Solid | None, *, opening_m: fl
         outside = ~solid(points + _OUTSIDE_M * normals)
         points, normals = points[outside], normals[outside]
     first, second = _opposite(points, normals, opening_m)
-    c = _unit(normals[first] - normals[second])
+    c = unit(normals[first] - normals[second])
     gap = np.einsum("pi,pi->p", points[first] - points[second], c)
     helper = np.eye(3)[np.argmin(np.abs(c), axis=1)]
-    e = _unit(np.cross(helper, c))
+    e = unit(np.cross(helper, c))
     half = np.zeros((len(first), 3))
     half[:, 1] = 0.5 * gap
     return JawPairs(
@@ -70,18 +70,10 @@ def _spread(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points (n, 3), evenly by area, and the normals there."""
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
-    bounds = np.cumsum(area)
-    if not len(bounds) or bounds[-1] <= 0.0:
+    if not area.sum() > 0.0:
         return np.empty((0, 3)), np.empty((0, 3))
-    rng = np.random.default_rng(0)
-    at = (np.arange(_POINTS) + rng.random(_POINTS)) / _POINTS * bounds[-1]
-    chosen = np.minimum(np.searchsorted(bounds, at, side="right"), len(corners) - 1)
-    u, v = rng.random((2, _POINTS))
-    folded = u + v > 1.0
-    u, v = np.where(folded, 1.0 - u, u), np.where(folded, 1.0 - v, v)
-    t = corners[chosen]
-    points = t[:, 0] + u[:, None] * (t[:, 1] - t[:, 0]) + v[:, None] * (t[:, 2] - t[:, 0])
-    return points, _unit(cross[chosen])
+    points, chosen = spread_points(corners, area, _POINTS, np.random.default_rng(0))
+    return points, unit(cross[chosen])
 
 
 def _opposite(
@@ -93,7 +85,7 @@ def _opposite(
         one, other = np.nonzero(normals[start : start + _BLOCK] @ normals.T <= -_OPPOSED)
         one += start
         apart = points[one] - points[other]
-        gap = np.einsum("pi,pi->p", apart, _unit(normals[one] - normals[other]))
+        gap = np.einsum("pi,pi->p", apart, unit(normals[one] - normals[other]))
         across = gap / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)
         good = (gap > _LEAST_GAP_M) & (gap <= opening_m) & (across >= _ACROSS)
         # The last one written stands.
@@ -101,7 +93,3 @@ def _opposite(
         found[one[order]] = other[order]
     first = np.flatnonzero(found >= 0)
     return first, found[first]
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))

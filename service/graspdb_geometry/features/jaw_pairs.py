@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from graspdb_geometry._compiled.ridges import regions
 from graspdb_geometry.collision import Surface
-from graspdb_geometry.features.ridges import Ridges, Solid, parts_solid
+from graspdb_geometry.features.ridges import Ridges, Solid, parts_solid, unit
 from graspdb_geometry.poses import PoseArrays, checked
 
 __all__ = ["KINDS", "MARGIN_M", "JawPairs", "Kind", "pairs_of_mesh", "pairs_of_parts"]
@@ -54,6 +54,10 @@ _SAMPLES, _LEAST_OVERLAP, _MOST_BORDERS = 160, 6, 16
 _OUTSIDE_M = 1e-4
 #: Steps of an additive sequence that fills four dimensions evenly: powers of 1 / g, where g^5 = g + 1.
 _STEPS = 1.1673039782614187 ** -np.arange(1.0, 5.0)
+
+
+#: Centres, axes and half extents; of one region or of several.
+Regions = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +94,13 @@ class JawPairs:
 
     def of(self, *kinds: Kind) -> JawPairs:
         """Those of some kinds only."""
-        chosen = np.isin(self.kinds, [KINDS.index(kind) for kind in kinds])
-        return JawPairs(self.kinds[chosen], self.centres[chosen], self.axes[chosen], self.half[chosen])
+        return self._some(np.isin(self.kinds, [KINDS.index(kind) for kind in kinds]))
 
     def within(self, opening_m: float) -> JawPairs:
         """Those whose gap is no wider than a jaw opens."""
-        chosen = self.gaps_m <= opening_m
+        return self._some(self.gaps_m <= opening_m)
+
+    def _some(self, chosen: npt.NDArray[np.bool_]) -> JawPairs:
         return JawPairs(self.kinds[chosen], self.centres[chosen], self.axes[chosen], self.half[chosen])
 
     def at(self, poses: PoseArrays) -> tuple[IntArray, FloatArray]:
@@ -203,9 +208,6 @@ def _pairs(corners: FloatArray, ridges: Ridges, solid: Solid | None, opening_m: 
     return JawPairs(kinds.astype(np.int64), centres, axes, half)
 
 
-Regions = tuple[FloatArray, FloatArray, FloatArray]
-
-
 # ---------------------------------------------------------------------------------------- surfaces
 
 
@@ -225,7 +227,7 @@ class _Face:
 
 def _surfaces(corners: FloatArray, solid: Solid | None, opening_m: float) -> Regions:
     faces = _faces(corners, solid)
-    found: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    found: list[Regions] = []
     normals = np.array([face.normal for face in faces]).reshape(-1, 3)
     middles = np.array([face.points.mean(axis=0) for face in faces]).reshape(-1, 3)
     first, second = np.nonzero(np.triu(normals @ normals.T <= -_PARALLEL, 1))
@@ -235,7 +237,7 @@ def _surfaces(corners: FloatArray, solid: Solid | None, opening_m: float) -> Reg
     for i, j in zip(first[kept].tolist(), second[kept].tolist(), strict=True):
         # The larger one's samples are too sparse to meet the smaller.
         small, large = (faces[i], faces[j]) if faces[i].area <= faces[j].area else (faces[j], faces[i])
-        c = _unit(small.normal - large.normal)
+        c = unit(small.normal - large.normal)
         depth = (small.points - large.corners[0, 0]) @ large.normal / (c @ large.normal)
         opposite = small.points - depth[:, None] * c
         over = _covered(opposite, large) & (depth > 0.0)
@@ -256,7 +258,7 @@ def _faces(corners: FloatArray, solid: Solid | None) -> list[_Face]:
     corners, cross, area = corners[area > 1e-12], cross[area > 1e-12], area[area > 1e-12]
     if not len(corners):
         return []
-    normals = _unit(cross)
+    normals = unit(cross)
     label = _coplanar(corners, normals)
     total = np.bincount(label, weights=area)
     rng = np.random.default_rng(0)
@@ -265,8 +267,8 @@ def _faces(corners: FloatArray, solid: Solid | None) -> list[_Face]:
         if total[number] < _LEAST_AREA_M2:
             break
         own = np.flatnonzero(label == number)
-        points = _spread(corners[own], area[own], rng)
-        normal = _unit(cross[own].sum(axis=0))
+        points, _ = spread_points(corners[own], area[own], _SAMPLES, rng)
+        normal = unit(cross[own].sum(axis=0))
         if solid is not None:
             free = ~solid(points + _OUTSIDE_M * normal)
             if free.sum() < _LEAST_OVERLAP:
@@ -307,18 +309,23 @@ def _borders(corners: FloatArray) -> FloatArray:
     if not len(along):
         along = ends[:, 1] - ends[:, 0]
     longest = np.argsort(-np.linalg.norm(along, axis=1), kind="stable")[:_MOST_BORDERS]
-    return _unit(along[longest])
+    return unit(along[longest])
 
 
-def _spread(corners: FloatArray, area: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Points over triangles, as many as their area takes; strata of it rather than chance."""
+def spread_points(
+    corners: FloatArray, area: FloatArray, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, npt.NDArray[np.intp]]:
+    """Points (count, 3) over triangles (F, 3, 3), as many as their area takes, and the triangle of each;
+    strata of the area rather than chance.
+    """
     bounds = np.cumsum(area)
-    at = (np.arange(_SAMPLES) + rng.random(_SAMPLES)) / _SAMPLES * bounds[-1]
-    t = corners[np.minimum(np.searchsorted(bounds, at), len(corners) - 1)]
-    u, v = rng.random((2, _SAMPLES))
+    at = (np.arange(count) + rng.random(count)) / count * bounds[-1]
+    chosen = np.minimum(np.searchsorted(bounds, at, side="right"), len(corners) - 1)
+    t = corners[chosen]
+    u, v = rng.random((2, count))
     folded = u + v > 1.0
     u, v = np.where(folded, 1.0 - u, u), np.where(folded, 1.0 - v, v)
-    return np.asarray(t[:, 0] + u[:, None] * (t[:, 1] - t[:, 0]) + v[:, None] * (t[:, 2] - t[:, 0]))
+    return t[:, 0] + u[:, None] * (t[:, 1] - t[:, 0]) + v[:, None] * (t[:, 2] - t[:, 0]), chosen
 
 
 def _covered(points: FloatArray, face: _Face) -> npt.NDArray[np.bool_]:
@@ -333,15 +340,13 @@ def _covered(points: FloatArray, face: _Face) -> npt.NDArray[np.bool_]:
     return inside
 
 
-def _region(
-    points: FloatArray, c: FloatArray, gap: float, directions: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _region(points: FloatArray, c: FloatArray, gap: float, directions: FloatArray) -> Regions:
     """Centre, axes and half extents of points between two surfaces: of the boxes along one of the directions
     (k, 3) of their borders the smallest.
     """
     centre = points.mean(axis=0)
     off = points - centre
-    e = _unit(directions - (directions @ c)[:, None] * c)
+    e = unit(directions - (directions @ c)[:, None] * c)
     f = np.cross(e, c)
     spans = np.stack([np.ptp(off @ e.T, axis=0), np.ptp(off @ f.T, axis=0)])
     best = int(np.argmin(spans[0] * spans[1]))
@@ -363,8 +368,8 @@ def _edges(ridges: Ridges, opening_m: float) -> tuple[Regions, Regions]:
     order = np.argsort(-length, kind="stable")[:_MOST_EDGES]
     order = order[length[order] >= _LEAST_LENGTH_M]
     ends, tangents, normals, sides = ends[order], tangents[order], normals[order], sides[order]
-    coplanar: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    parallel: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    coplanar: list[Regions] = []
+    parallel: list[Regions] = []
     middle = ends.mean(axis=1)
     for i in range(len(ends)):
         t = tangents[i]
@@ -379,7 +384,7 @@ def _edges(ridges: Ridges, opening_m: float) -> tuple[Regions, Regions]:
             if high - low < _LEAST_LENGTH_M:
                 continue
             c = d / g
-            e = _unit(t - (t @ c) * c)
+            e = unit(t - (t @ c) * c)
             centre = middle[i] + 0.5 * d + 0.5 * (low + high) * t
             region = (
                 centre,
@@ -432,7 +437,7 @@ def _straight(ridges: Ridges) -> tuple[FloatArray, FloatArray, FloatArray, Float
 # ------------------------------------------------------------------------------------------ shared
 
 
-def _largest(regions: list[tuple[FloatArray, FloatArray, FloatArray]]) -> Regions:
+def _largest(regions: list[Regions]) -> Regions:
     if not regions:
         return np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3))
     centres, axes, half = (np.ascontiguousarray(np.stack(column)) for column in zip(*regions, strict=True))
@@ -448,7 +453,3 @@ def _axes(poses: PoseArrays) -> tuple[FloatArray, FloatArray]:
 
 def _sign(values: FloatArray) -> FloatArray:
     return np.where(values < 0.0, -1.0, 1.0)
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))

@@ -27,7 +27,16 @@ from scipy.spatial import ConvexHull, cKDTree
 from graspdb_geometry._compiled import ridges
 from graspdb_geometry.collision import Surface
 
-__all__ = ["LEAST_BEND", "REACH_M", "Ridges", "Solid", "parts_solid", "ridges_of_mesh", "ridges_of_parts"]
+__all__ = [
+    "LEAST_BEND",
+    "REACH_M",
+    "Ridges",
+    "Solid",
+    "parts_solid",
+    "ridges_of_mesh",
+    "ridges_of_parts",
+    "unit",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -150,7 +159,7 @@ class _Bends:
 
     @property
     def tangents(self) -> FloatArray:
-        return _unit(self.ends[:, 1] - self.ends[:, 0])
+        return unit(self.ends[:, 1] - self.ends[:, 0])
 
 
 def ridges_of_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> Ridges:
@@ -312,7 +321,7 @@ def _sectors(points: FloatArray, tangents: FloatArray, sides: FloatArray, solid:
     helper = np.eye(3)[np.argmin(np.abs(tangents), axis=1)]
     lone = np.linalg.norm(mean, axis=1) < 1e-6
     mean[lone] = np.cross(tangents, helper)[lone]
-    u = -_unit(mean - np.einsum("ni,ni->n", mean, tangents)[:, None] * tangents)
+    u = -unit(mean - np.einsum("ni,ni->n", mean, tangents)[:, None] * tangents)
     v = np.cross(tangents, u)
 
     def held(angle: FloatArray) -> npt.NDArray[np.bool_]:
@@ -358,7 +367,7 @@ def _sectors(points: FloatArray, tangents: FloatArray, sides: FloatArray, solid:
 
 def _ridges(bends: _Bends) -> Ridges:
     kept = bends.take((bends.angles > LEAST_BEND) & ~_facets(bends))
-    return Ridges(kept.ends, kept.tangents, _unit(kept.sides.sum(axis=1)), kept.sides)
+    return Ridges(kept.ends, kept.tangents, unit(kept.sides.sum(axis=1)), kept.sides)
 
 
 def _facets(bends: _Bends) -> npt.NDArray[np.bool_]:
@@ -401,5 +410,6 @@ def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(a - b, axis=1), 0.0, 1.0)))
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
+def unit(vectors: FloatArray) -> FloatArray:
+    """Vectors (..., 3) of length 1."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
