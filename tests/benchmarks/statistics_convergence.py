@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
 from graspdb_density._compiled.threads import processors
+from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.weighted_sums import LEAST, KernelRows
 from graspdb_density.kernels.gaussian_mixture import Kernel
 from graspdb_density.se3 import Poses
@@ -76,7 +77,7 @@ def timed(work: Callable[[], object], rounds: int) -> tuple[float, float]:
 
 def _peak(count: int, points: int) -> float:
     """MB of this process at its peak."""
-    rows = KernelRows(se3.Poses.of(*shell(count, np.random.default_rng(0))), KERNEL)
+    rows = KernelRows(Rows.of(se3.Poses.of(*shell(count, np.random.default_rng(0)))), KERNEL)
     bootstrap_similarity(rows, np.random.default_rng(1), replicates=REPLICATES, points=points)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
@@ -91,11 +92,13 @@ def growth(count: int, added: int, rng: np.random.Generator) -> None:
     """Print what a report costs that has a curve of ``count`` grasps and gets ``added`` more."""
     p, q = shell(count + added, rng)
     for name, kernel in (("isotropic", KERNEL), ("anisotropic", GAUSSIAN)):
-        kept = IncrementalCurve.of(Poses.of(p[:count], q[:count]), kernel)
+        kept = IncrementalCurve.of(Rows.of(Poses.of(p[:count], q[:count])), kernel)
 
         def grown(known: IncrementalCurve | None, kernel: Kernel = kernel) -> tuple[IncrementalCurve, float]:
             began = time.process_time()
-            return IncrementalCurve.of(Poses.of(p, q), kernel, before=known), time.process_time() - began
+            return IncrementalCurve.of(
+                Rows.of(Poses.of(p, q)), kernel, before=known
+            ), time.process_time() - began
 
         whole, at_once = grown(None)
         more, extended = grown(kept)
@@ -124,7 +127,7 @@ def main() -> None:
         for name, kernel in (("isotropic", KERNEL), ("anisotropic", GAUSSIAN)):
             if name == "anisotropic" and points > 20_000:
                 continue
-            rows = KernelRows(se3.Poses.of(*poses), kernel)
+            rows = KernelRows(Rows.of(se3.Poses.of(*poses)), kernel)
             bootstrap_similarity(rows, np.random.default_rng(1), points=200)  # compiles
 
             def measure(threads: int = 1, rows: KernelRows = rows, points: int = points) -> float:
@@ -141,7 +144,7 @@ def main() -> None:
                 f"{one:>8.2f} {cpu:>7.2f} {both:>10.2f} {memory:>6}",
                 flush=True,
             )
-    rows = KernelRows(se3.Poses.of(*shell(20_000, rng)), KERNEL)
+    rows = KernelRows(Rows.of(se3.Poses.of(*shell(20_000, rng))), KERNEL)
     _, ours = timed(lambda: bootstrap_similarity(rows, np.random.default_rng(1), points=2_000), 3)
     _, peer = timed(lambda: peer_similarity(rows, 2_000, np.random.default_rng(1)), 3)
     print(
@@ -151,7 +154,7 @@ def main() -> None:
     growth(20_000, 500, rng)
     for count in (20_000, 160_000):
         poses = shell(count, rng)
-        wall, cpu = timed(lambda poses=poses: IncrementalCurve.of(Poses.of(*poses), KERNEL), 1)  # type: ignore[misc]
+        wall, cpu = timed(lambda poses=poses: IncrementalCurve.of(Rows.of(Poses.of(*poses)), KERNEL), 1)  # type: ignore[misc]
         print(
             f"curve to {count} grasps, 5 subsets a point, held-out likelihood: {wall:.1f} s, CPU {cpu:.1f} s"
         )

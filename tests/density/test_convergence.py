@@ -14,6 +14,7 @@ from scipy.special import logsumexp
 import brute_force
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.bandwidth import matching
+from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.weighted_sums import KernelRows
 from graspdb_density.kernels.gaussian_mixture import (
     AnisotropicKernel,
@@ -82,7 +83,7 @@ def test_isotropic_sums_equal_the_reference_under_every_weighting(shell: Shell, 
     p, q = shell(400, rng)
     kernel = IsotropicKernel(0.03, math.radians(degrees))
     symmetric = rng.random(400) < 0.7
-    rows = KernelRows(se3.Poses.of(p, q), kernel, symmetric=symmetric)
+    rows = KernelRows(Rows.of(se3.Poses.of(p, q), symmetric=symmetric), kernel)
     at = tuple(rows.sample(60, rng))
     weightings = rng.random((400, 37))
     sums = rows.sums(se3.Poses.of(*at), weightings, least=0.0)
@@ -102,7 +103,7 @@ def test_mixture_density_equals_brute_force(shell: Shell, framed: bool) -> None:
     rows = shell(150, rng)
     frames = se3.to_matrix(se3.random_quaternions(150, rng)) if framed else None
     kernel = _random_mixture(rng, frame="fixed" if framed else "gripper")
-    density = KernelRows(se3.Poses.of(*rows), kernel, frames=frames)
+    density = KernelRows(Rows.of(se3.Poses.of(*rows)), kernel, frames=frames)
     near = tuple(density.sample(80, rng))
     far = near[0] + rng.standard_normal((80, 3)) * 0.3, se3.random_quaternions(80, rng)
     for at in (near, far):
@@ -115,8 +116,8 @@ def test_a_round_gaussian_agrees_with_the_isotropic_kernel(shell: Shell) -> None
     rng = np.random.default_rng(3)
     p, q = shell(2_000, rng)
     narrow = IsotropicKernel(0.02, math.radians(6.0))
-    density = KernelRows(se3.Poses.of(p, q), narrow)
-    round_one = KernelRows(se3.Poses.of(p, q), _gaussian(*[0.02] * 3, *[math.radians(6.0)] * 3))
+    density = KernelRows(Rows.of(se3.Poses.of(p, q)), narrow)
+    round_one = KernelRows(Rows.of(se3.Poses.of(p, q)), _gaussian(*[0.02] * 3, *[math.radians(6.0)] * 3))
     at = tuple(density.sample(500, rng))
     assert (
         np.max(np.abs(density.log_density(se3.Poses.of(*at)) - round_one.log_density(se3.Poses.of(*at))))
@@ -140,7 +141,7 @@ def test_rotation_normaliser_agrees_with_its_series(degrees: list[float]) -> Non
 def test_draws_follow_the_density(kernel: Kernel) -> None:
     """Importance sampling: uniform poses weighted by the density have the moments of the draws."""
     rng = np.random.default_rng(4)
-    rows = KernelRows(se3.Poses.of(np.zeros((1, 3)), se3.random_quaternions(1, rng)), kernel)
+    rows = KernelRows(Rows.of(se3.Poses.of(np.zeros((1, 3)), se3.random_quaternions(1, rng))), kernel)
     p, q = rows.sample(40_000, rng)
     if isinstance(kernel, IsotropicKernel):
         spread = np.full(3, kernel.sigma_position_m)
@@ -169,9 +170,9 @@ def test_draws_follow_the_density(kernel: Kernel) -> None:
 def test_rows_and_their_frames_are_checked(shell: Shell) -> None:
     p, q = shell(10, np.random.default_rng(0))
     with pytest.raises(ValueError, match="orthonormal"):
-        KernelRows(se3.Poses.of(p, q), _gaussian(*[0.1] * 6, frame="fixed"), frames=2.0 * np.eye(3))
+        KernelRows(Rows.of(se3.Poses.of(p, q)), _gaussian(*[0.1] * 6, frame="fixed"), frames=2.0 * np.eye(3))
     with pytest.raises(ValueError, match="at least one"):
-        KernelRows(se3.Poses.of(p[:0], q[:0]), KERNEL)
+        KernelRows(Rows.of(se3.Poses.of(p[:0], q[:0])), KERNEL)
 
 
 # -- similarity
@@ -196,7 +197,9 @@ def _exact_similarity(rows: KernelRows, counts: Floats, points: int, rng: np.ran
 def test_similarity_equals_the_reference(shell: Shell) -> None:
     rng = np.random.default_rng(5)
     p, q = shell(300, rng)
-    rows = KernelRows(se3.Poses.of(p, q), IsotropicKernel(0.03, 0.4), weights=rng.uniform(0.2, 1.0, 300))
+    rows = KernelRows(
+        Rows.of(se3.Poses.of(p, q), weights=rng.uniform(0.2, 1.0, 300)), IsotropicKernel(0.03, 0.4)
+    )
     got = cv.bootstrap_similarity(rows, rng, replicates=200, points=4_000)
     exact = [
         _exact_similarity(rows, np.bincount(rng.integers(300, size=300), minlength=300), 2_000, rng)
@@ -211,7 +214,7 @@ def test_far_apart_grasps_follow_the_multinomial() -> None:
     """Kernels that share nothing: BC_b = mean of sqrt(c_i), and E sqrt(Poisson(1)) is .773."""
     rng = np.random.default_rng(6)
     p = np.arange(4_000)[:, None] * np.array([1.0, 0.0, 0.0])
-    rows = KernelRows(se3.Poses.of(p, se3.random_quaternions(4_000, rng)), KERNEL)
+    rows = KernelRows(Rows.of(se3.Poses.of(p, se3.random_quaternions(4_000, rng))), KERNEL)
     k = np.arange(60)
     poisson = np.exp(-1.0 - np.cumsum(np.log(np.maximum(k, 1))))
     expected = float(np.sum(np.sqrt(k) * poisson))
@@ -222,7 +225,9 @@ def test_far_apart_grasps_follow_the_multinomial() -> None:
 @pytest.mark.parametrize("points", [1_000, 4_000])
 def test_the_deviation_is_that_of_replicates_not_of_points(shell: Shell, points: int) -> None:
     """Few points tell the mean and the spread of s that many tell."""
-    rows = KernelRows(se3.Poses.of(*shell(200, np.random.default_rng(3))), IsotropicKernel(0.03, 0.4))
+    rows = KernelRows(
+        Rows.of(se3.Poses.of(*shell(200, np.random.default_rng(3)))), IsotropicKernel(0.03, 0.4)
+    )
     few = cv.bootstrap_similarity(rows, np.random.default_rng(1), replicates=400, points=points)
     many = cv.bootstrap_similarity(rows, np.random.default_rng(2), replicates=400, points=60_000)
     assert few.std(ddof=1) == pytest.approx(many.std(ddof=1), rel=0.15)
@@ -230,7 +235,7 @@ def test_the_deviation_is_that_of_replicates_not_of_points(shell: Shell, points:
 
 
 def test_one_place_has_converged() -> None:
-    rows = KernelRows(se3.Poses.of(np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1))), KERNEL)
+    rows = KernelRows(Rows.of(se3.Poses.of(np.zeros((50, 3)), np.tile(se3.IDENTITY, (50, 1)))), KERNEL)
     got = cv.bootstrap_similarity(rows, np.random.default_rng(0), points=200)
     assert got.mean() == pytest.approx(1.0, abs=1e-6)
     assert got.std(ddof=1) < 1e-6
@@ -246,7 +251,9 @@ def test_similarity_is_a_share_and_does_not_know_units_of_weight(
     w = rng.uniform(0.1, 1.0, 60)
     values = []
     for scale in (1.0, 1e6):
-        rows = KernelRows(se3.Poses.of(p, q), IsotropicKernel(sigma, 0.3), weights=w * scale, symmetric=twins)
+        rows = KernelRows(
+            Rows.of(se3.Poses.of(p, q), weights=w * scale, symmetric=twins), IsotropicKernel(sigma, 0.3)
+        )
         values.append(cv.bootstrap_similarity(rows, np.random.default_rng(seed), points=300, replicates=8))
     assert np.all(values[0] <= 1.0 + 1e-6)
     assert np.all(values[0] > 0.0)
@@ -255,7 +262,7 @@ def test_similarity_is_a_share_and_does_not_know_units_of_weight(
 
 def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
     rng = np.random.default_rng(7)
-    rows = KernelRows(se3.Poses.of(*shell(3_000, rng)), KERNEL)
+    rows = KernelRows(Rows.of(se3.Poses.of(*shell(3_000, rng))), KERNEL)
     one = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10)
     two = cv.bootstrap_similarity(rows, np.random.default_rng(1), points=2_000, replicates=10, threads=2)
     np.testing.assert_array_equal(one, two)
@@ -283,7 +290,7 @@ def test_threads_change_nothing_and_progress_can_cancel(shell: Shell) -> None:
 def curve(shell: Shell) -> cv.ConvergenceCurve:
     p, q = shell(1_600, np.random.default_rng(8))
     return IncrementalCurve.of(
-        Poses.of(p, q), IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3
+        Rows.of(Poses.of(p, q)), IsotropicKernel(0.025, 0.4), points=3_000, replicates=20, seed=3
     ).curve
 
 
@@ -301,7 +308,7 @@ def test_curve_rises_and_shows_its_parts(curve: cv.ConvergenceCurve) -> None:
 def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: cv.ConvergenceCurve) -> None:
     p, q = shell(1_600, np.random.default_rng(8))
     wide = IncrementalCurve.of(
-        Poses.of(p, q), IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3
+        Rows.of(Poses.of(p, q)), IsotropicKernel(0.05, 0.8), points=3_000, replicates=20, seed=3
     ).curve
     assert all(w.similarity > n.similarity for w, n in zip(wide.points, curve.points, strict=True))
     assert wide.points[-1].log_likelihood < curve.points[-1].log_likelihood
@@ -312,7 +319,7 @@ def test_wider_kernels_converge_sooner_and_are_less_likely(shell: Shell, curve: 
 def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
     p, q = shell(200, np.random.default_rng(9))
     one, two, other = (
-        IncrementalCurve.of(Poses.of(p, q), KERNEL, points=200, replicates=5, seed=seed).curve
+        IncrementalCurve.of(Rows.of(Poses.of(p, q)), KERNEL, points=200, replicates=5, seed=seed).curve
         for seed in (1, 1, 2)
     )
     assert [a.similarity for a in one.points] == [a.similarity for a in two.points]
@@ -323,14 +330,14 @@ def test_curve_is_the_same_for_a_seed(shell: Shell) -> None:
 def test_too_few_grasps_say_how_many_are_needed(shell: Shell) -> None:
     p, q = shell(37, np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"at least 200 .* there are 37, so 163 more"):
-        IncrementalCurve.of(Poses.of(p, q), KERNEL)
+        IncrementalCurve.of(Rows.of(Poses.of(p, q)), KERNEL)
     with pytest.raises(ValueError, match="at least 200"):
-        IncrementalCurve.of(Poses.of(p[:0], q[:0]), KERNEL)
+        IncrementalCurve.of(Rows.of(Poses.of(p[:0], q[:0])), KERNEL)
     p, q = shell(200, np.random.default_rng(0))
     with pytest.raises(ValueError, match="2 replicates and 2 points"):
-        IncrementalCurve.of(Poses.of(p, q), KERNEL, replicates=1)
+        IncrementalCurve.of(Rows.of(Poses.of(p, q)), KERNEL, replicates=1)
     with pytest.raises(ValueError, match="5 subsets"):
-        IncrementalCurve.of(Poses.of(p, q), KERNEL, subsets=4)
+        IncrementalCurve.of(Rows.of(Poses.of(p, q)), KERNEL, subsets=4)
 
 
 def _synthetic(exponent: float, scale: float, noise: float, seed: int = 0) -> cv.ConvergenceCurve:
@@ -480,7 +487,7 @@ def test_a_ratio_knows_how_well_the_reference_is_known(shell: Shell) -> None:
     p, q = shell(400, np.random.default_rng(3))
     narrow, curve, wide = (
         IncrementalCurve.of(
-            Poses.of(p, q), matching.scaled(KERNEL, factor), points=2_000, replicates=20
+            Rows.of(Poses.of(p, q)), matching.scaled(KERNEL, factor), points=2_000, replicates=20
         ).curve
         for factor in (0.8, 1.0, 1.25)
     )
@@ -502,8 +509,10 @@ def test_a_curve_under_an_anisotropic_kernel(shell: Shell, framed: bool) -> None
     frames = se3.to_matrix(se3.random_quaternions(400, rng)) if framed else None
     kernel = IsotropicKernel(0.03, math.radians(12.0))
     gaussian = _gaussian(*[0.03] * 3, *[math.radians(12.0)] * 3, frame="fixed" if framed else "gripper")
-    one = IncrementalCurve.of(Poses.of(p, q), kernel, points=2_000, replicates=20).curve
-    two = IncrementalCurve.of(Poses.of(p, q), gaussian, frames=frames, points=2_000, replicates=20).curve
+    one = IncrementalCurve.of(Rows.of(Poses.of(p, q)), kernel, points=2_000, replicates=20).curve
+    two = IncrementalCurve.of(
+        Rows.of(Poses.of(p, q)), gaussian, frames=frames, points=2_000, replicates=20
+    ).curve
     for a, b in zip(one.points, two.points, strict=True):
         assert a.similarity == pytest.approx(b.similarity, abs=0.03)
         assert a.log_likelihood == pytest.approx(b.log_likelihood, abs=0.3)

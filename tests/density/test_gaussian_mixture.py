@@ -11,6 +11,7 @@ import pytest
 import brute_force
 from graspdb_density import IsotropicKernel, Region, se3
 from graspdb_density.kde.mixture import MixtureDensity
+from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.weighted_sums import KernelRows
 from graspdb_density.kernels.gaussian_mixture import AnisotropicKernel, mirror
 from graspdb_density.search.mode_search import ModeSearch
@@ -80,7 +81,7 @@ def test_the_jaws_turn_changes_nothing(frame: str, shell: Shell, moved: Moved) -
     value = density.log_density(se3.Poses.of(p, q))
     np.testing.assert_allclose(density.log_density(se3.Poses.of(p, se3.jaw_twin(q))), value, atol=2e-3)
     np.testing.assert_allclose(density.log_density(se3.Poses.of(p, -q)), value, atol=1e-4)
-    summed = KernelRows(se3.Poses.of(*rows), kernel, frames=frames)
+    summed = KernelRows(Rows.of(se3.Poses.of(*rows)), kernel, frames=frames)
     np.testing.assert_allclose(
         summed.exact_log_density(se3.Poses.of(p, se3.jaw_twin(q))),
         summed.exact_log_density(se3.Poses.of(p, q)),
@@ -98,7 +99,7 @@ def test_fast_density_equals_float64(
     weights = None if plain else rng.uniform(0.2, 2.0, 3_000)
     flags = True if plain else rng.random(3_000) < 0.6
     density = MixtureDensity(se3.Poses.of(*rows), kernel=kernel, weights=weights, symmetric=flags)
-    summed = KernelRows(se3.Poses.of(*rows), kernel, weights=weights, symmetric=flags)
+    summed = KernelRows(Rows.of(se3.Poses.of(*rows), weights=weights, symmetric=flags), kernel)
     poses = se3.Poses.of(*moved(rows, 300, 0.012, 0.2, rng))
     error = np.abs(np.expm1(density.log_density(poses, threads=2) - summed.exact_log_density(poses)))
     assert error.max() < 2e-3
@@ -112,7 +113,7 @@ def test_reference_sums_kernels_as_defined(shell: Shell, moved: Moved) -> None:
     """The compiled float64 sum against displacements computed with `se3`."""
     rng = np.random.default_rng(3)
     rows = shell(200, rng)
-    density = KernelRows(se3.Poses.of(*rows), PAIR)
+    density = KernelRows(Rows.of(se3.Poses.of(*rows)), PAIR)
     poses = moved(rows, 20, 0.01, 0.2, rng)
     expected = np.empty(20)
     for j, (p, q) in enumerate(zip(*poses, strict=True)):

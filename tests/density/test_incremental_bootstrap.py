@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspdb_density import IsotropicKernel, se3
+from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.weighted_sums import KernelRows
 from graspdb_density.kernels.gaussian_mixture import AnisotropicKernel, Kernel
 from graspdb_density.se3 import Floats, Poses
@@ -45,11 +46,13 @@ class Grasps:
         """The curve of the first rows."""
         weights, symmetric, frames = self.weights, self.symmetric, self.frames
         return IncrementalCurve.of(
-            Poses.of(self.p[:count], self.q[:count]),
+            Rows.of(
+                Poses.of(self.p[:count], self.q[:count]),
+                weights=None if weights is None else weights[:count],
+                symmetric=True if symmetric is None else symmetric[:count],
+            ),
             kernel,
             before=before,
-            weights=None if weights is None else weights[:count],
-            symmetric=True if symmetric is None else symmetric[:count],
             frames=frames if frames is None or frames.ndim == 2 else frames[:count],
             **{"points": 600, "replicates": 8, **options},
         )
@@ -189,10 +192,10 @@ def test_poisson_counts_and_drawing_with_replacement_agree(shell: Shell, count: 
     p, q = shell(count, rng)
     weights = rng.lognormal(0.0, 0.7, count) if weighted else None
     curve = IncrementalCurve.of(
-        Poses.of(p, q), ISOTROPIC, weights=weights, replicates=200, points=20_000, threads=2
+        Rows.of(Poses.of(p, q), weights=weights), ISOTROPIC, replicates=200, points=20_000, threads=2
     )
     last = curve.curve.points[-1]
-    rows = KernelRows(se3.Poses.of(p, q), ISOTROPIC, weights=weights)
+    rows = KernelRows(Rows.of(se3.Poses.of(p, q), weights=weights), ISOTROPIC)
     # As many points as a group has: what they add to the deviation is then alike.
     points = len(curve._groups[0].poses.positions)
     drawn = [
@@ -210,8 +213,8 @@ def test_poisson_counts_and_drawing_with_replacement_agree(shell: Shell, count: 
 def test_the_first_points_of_a_group_follow_the_density(shell: Shell) -> None:
     """Draws that grow along are distributed as the density is: the mean log density is its own."""
     p, q = shell(399, np.random.default_rng(3))
-    curve = IncrementalCurve.of(Poses.of(p, q), ISOTROPIC, points=20_000, replicates=2)
-    rows = KernelRows(se3.Poses.of(p, q), ISOTROPIC)
+    curve = IncrementalCurve.of(Rows.of(Poses.of(p, q)), ISOTROPIC, points=20_000, replicates=2)
+    rows = KernelRows(Rows.of(se3.Poses.of(p, q)), ISOTROPIC)
     expected = rows.log_density(se3.Poses.of(*rows.sample(20_000, np.random.default_rng(0))))
     at = (
         np.concatenate([g.poses.positions for g in curve._groups]),
@@ -226,12 +229,14 @@ def test_the_first_points_of_a_group_follow_the_density(shell: Shell) -> None:
 def test_progress_rises_and_can_cancel(shell: Shell) -> None:
     grasps = Grasps(*shell(700, np.random.default_rng(4)))
     seen: list[float] = []
-    before = IncrementalCurve.of(Poses.of(grasps.p[:500], grasps.q[:500]), ISOTROPIC, progress=seen.append)
+    before = IncrementalCurve.of(
+        Rows.of(Poses.of(grasps.p[:500], grasps.q[:500])), ISOTROPIC, progress=seen.append
+    )
     assert seen == sorted(seen)
     assert 0.0 < seen[0] < 0.2
     assert seen[-1] == pytest.approx(1.0)
     seen.clear()
-    IncrementalCurve.of(Poses.of(grasps.p, grasps.q), ISOTROPIC, before=before, progress=seen.append)
+    IncrementalCurve.of(Rows.of(Poses.of(grasps.p, grasps.q)), ISOTROPIC, before=before, progress=seen.append)
     assert seen == sorted(seen)
     assert seen[-1] == pytest.approx(1.0)
 
@@ -243,4 +248,4 @@ def test_progress_rises_and_can_cancel(shell: Shell) -> None:
             raise StopError
 
     with pytest.raises(StopError):
-        IncrementalCurve.of(Poses.of(grasps.p, grasps.q), ISOTROPIC, before=before, progress=stop)
+        IncrementalCurve.of(Rows.of(Poses.of(grasps.p, grasps.q)), ISOTROPIC, before=before, progress=stop)

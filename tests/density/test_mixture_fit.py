@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.bandwidth.mixture_fit import displacements, fit_kernel
 from graspdb_density.kde.bhattacharyya import DisplacementWindow
+from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,7 @@ def _ridges(count: int = 1_200, seed: int = 0) -> tuple[Floats, Floats]:
 def test_displacements_are_those_of_every_pair_in_the_window() -> None:
     p, q = _ridges(60)
     w = np.random.default_rng(1).random(60) + 0.5
-    found = displacements(Poses.of(p, q), window=WINDOW, rng=np.random.default_rng(2), weights=w)
+    found = displacements(Rows.of(Poses.of(p, q), weights=w), window=WINDOW, rng=np.random.default_rng(2))
     expected = {}
     for a in range(60):
         for b in range(60):
@@ -57,33 +58,33 @@ def test_displacements_are_those_of_every_pair_in_the_window() -> None:
 
 def test_a_fitted_kernel_has_the_shape_of_the_vicinity_and_predicts_better() -> None:
     p, q = _ridges()
-    fit = fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, components=1)
+    fit = fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, components=1)
     widths = np.sqrt(np.diag(fit.kernel.overall_covariance))
     assert widths[0] > 1.7 * widths[1]
     assert widths[4] > 2.0 * max(widths[3], widths[5])
     assert fit.log_likelihood > fit.isotropic_log_likelihood + 0.5
     assert fit.similarity.value > 0.85
-    again = fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, components=1)
+    again = fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, components=1)
     np.testing.assert_array_equal(again.kernel.covariances, fit.kernel.covariances)
 
 
 def test_the_number_of_components_is_chosen_by_held_out_displacements() -> None:
     p, q = _ridges()
-    fit = fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED)
+    fit = fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED)
     assert {1, 2, 3} <= set(fit.likelihoods)
     # As few as come within what a component is worth of those with more.
     best = min(k for k, v in fit.likelihoods.items() if v > max(fit.likelihoods.values()) - 0.04)
     assert best <= len(fit.kernel.weights) <= 2 * max(fit.likelihoods)
-    one = fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, components=1)
+    one = fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, components=1)
     assert fit.similarity.value > one.similarity.value - 0.01
 
 
 def test_a_kernel_in_the_objects_axes_ignores_their_signs() -> None:
     p, q = _ridges()
     turn = se3.to_matrix(se3.random_quaternions(1, np.random.default_rng(3)))[0]
-    fit = fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, frame=turn)
+    fit = fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, frame=turn)
     flipped = fit_kernel(
-        Poses.of(p, q),
+        Rows.of(Poses.of(p, q)),
         window=WINDOW,
         widths=NARROW,
         compared=COMPARED,
@@ -92,7 +93,9 @@ def test_a_kernel_in_the_objects_axes_ignores_their_signs() -> None:
     assert fit.kernel.frame == "fixed"
     np.testing.assert_allclose(fit.kernel.covariances, flipped.kernel.covariances, atol=1e-12)
     with pytest.raises(ValueError, match="no sign"):
-        fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, components=2, frame=turn)
+        fit_kernel(
+            Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, components=2, frame=turn
+        )
 
 
 def test_a_kernel_along_edges_is_wide_along_them() -> None:
@@ -109,7 +112,9 @@ def test_a_kernel_along_edges_is_wide_along_them() -> None:
     frames = bars[which] * rng.choice([-1.0, 1.0], (900, 1, 1))
     frames[:, :, 2] = np.cross(frames[:, :, 0], frames[:, :, 1])
     along, own = (
-        fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, components=1, frame=axes)
+        fit_kernel(
+            Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, components=1, frame=axes
+        )
         for axes in (frames, None)
     )
     widths = np.sqrt(np.diag(along.kernel.overall_covariance))
@@ -117,19 +122,22 @@ def test_a_kernel_along_edges_is_wide_along_them() -> None:
     assert along.log_likelihood > own.log_likelihood + 0.3
     # Where a grasp is at no edge the gripper's axes take their place.
     frames[::2] = np.nan
-    half = fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, frame=frames)
+    half = fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, frame=frames)
     assert own.log_likelihood < half.log_likelihood < along.log_likelihood
     with pytest.raises(ValueError, match=r"\(900, 3, 3\)"):
-        fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED, frame=frames[:5])
+        fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED, frame=frames[:5])
 
 
 def test_too_little_is_said_with_numbers() -> None:
     p, q = _ridges(40)
     with pytest.raises(ValueError, match="at least 50 successes; there are 40, so 10 more"):
-        fit_kernel(Poses.of(p, q), window=WINDOW, widths=NARROW, compared=COMPARED)
+        fit_kernel(Rows.of(Poses.of(p, q)), window=WINDOW, widths=NARROW, compared=COMPARED)
     rng = np.random.default_rng(4)
     far = rng.normal(size=(60, 3)) * 10.0
     with pytest.raises(ValueError, match=r"the window holds 0 displacements.*at least 200"):
         fit_kernel(
-            Poses.of(far, se3.random_quaternions(60, rng)), window=WINDOW, widths=NARROW, compared=COMPARED
+            Rows.of(Poses.of(far, se3.random_quaternions(60, rng))),
+            window=WINDOW,
+            widths=NARROW,
+            compared=COMPARED,
         )

@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, choose_widths, se3
+from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
 from graspdb_density.statistics.convergence import verdict
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
@@ -93,8 +94,8 @@ def test_convergence_is_the_curve_of_the_maths(
 ) -> None:
     (p, q), won = trials
     body = ok(filled.get(REPORT + "convergence"))
-    kernel = choose_widths(Poses.of(p[won], q[won])).kernel
-    curve = IncrementalCurve.of(Poses.of(p[won], q[won]), kernel, threads=2).curve
+    kernel = choose_widths(Rows.of(Poses.of(p[won], q[won]))).kernel
+    curve = IncrementalCurve.of(Rows.of(Poses.of(p[won], q[won])), kernel, threads=2).curve
     judged = verdict(curve)
     (found,) = body["curves"]
     assert [point["grasps"] for point in found["points"]] == [point.grasps for point in curve.points]

@@ -20,8 +20,10 @@ from scipy.special import logsumexp
 
 from .. import se3
 from ..kde.bhattacharyya import Coefficient, DisplacementWindow, bhattacharyya, sampled_kernel_rows
+from ..kde.density import Density
 from ..kde.isotropic import GraspDensity
 from ..kde.mixture import MixtureDensity
+from ..kde.rows import Rows
 from ..kde.weighted_sums import KernelRows, Progress
 from ..kernels.gaussian_mixture import AnisotropicKernel, mirror
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
@@ -105,27 +107,22 @@ class FittedKernel:
 
 
 def displacements(
-    poses: Poses,
+    rows: Rows,
     *,
     window: DisplacementWindow,
     rng: np.random.Generator,
-    weights: ArrayLike | None = None,
-    symmetric: ArrayLike | bool = True,
     frame: ArrayLike | None = None,
 ) -> Displacements:
     """Displacements inside a window from successes to other successes, and to their twins.
 
     Parameters
     ----------
-    poses : N
-    weights : (N,) or None
-        Importance (eq 1). Successes to start from are drawn by it, those arrived at count with it.
+    rows : N
+        Successes to start from are drawn by weight, those arrived at count with it (eq 1).
     frame : (3, 3), (N, 3, 3) or None
         Columns are the axes of translations, object frame; None: each grasp's gripper.
     """
-    p, q = poses.positions, poses.quaternions_xyzw
-    w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
-    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), len(p))
+    (p, q), w, flags = rows.poses, rows.weights, rows.symmetric
     reach = window.position_m * math.sqrt(3.0)
     tree = cKDTree(p)
     frames = None if frame is None else np.asarray(frame, dtype=np.float64)
@@ -160,14 +157,12 @@ def displacements(
 
 # long: its parameters are explained one by one, and its steps are one after the other.
 def fit_kernel(
-    poses: Poses,
+    rows: Rows,
     *,
     window: DisplacementWindow,
     widths: IsotropicKernel,
     compared: IsotropicKernel,
     components: int | None = None,
-    weights: ArrayLike | None = None,
-    symmetric: ArrayLike | bool = True,
     frame: ArrayLike | None = None,
     threads: int = 1,
     progress: Progress | None = None,
@@ -176,7 +171,7 @@ def fit_kernel(
 
     Parameters
     ----------
-    poses : N
+    rows : N
     window
         Displacements looked at.
     widths
@@ -198,20 +193,18 @@ def fit_kernel(
         For too few successes or displacements (saying how many are needed), a mixture in axes that do not
         turn with the jaw, or a fit whose rotations are wider than a component may be.
     """
-    if len(poses) < LEAST_SUCCESSES:
+    if len(rows) < LEAST_SUCCESSES:
         raise ValueError(
-            f"a kernel is fitted on at least {LEAST_SUCCESSES} successes; there are {len(poses)}, so "
-            f"{LEAST_SUCCESSES - len(poses)} more are needed"
+            f"a kernel is fitted on at least {LEAST_SUCCESSES} successes; there are {len(rows)}, so "
+            f"{LEAST_SUCCESSES - len(rows)} more are needed"
         )
     if frame is not None and components not in (None, 1):
         raise ValueError(
             "axes that do not turn with the jaw have no sign: a kernel aligned with them has 1 component"
         )
-    frames = None if frame is None else _own_where_unknown(frame, poses.quaternions_xyzw)
-    w = np.ones(len(poses)) if weights is None else np.asarray(weights, dtype=np.float64)
-    flags = np.array(np.broadcast_to(np.asarray(symmetric, dtype=bool), len(poses)))
+    frames = None if frame is None else _own_where_unknown(frame, rows.poses.quaternions_xyzw)
     rng = np.random.default_rng(0)
-    found = displacements(poses, window=window, rng=rng, weights=w, symmetric=flags, frame=frames)
+    found = displacements(rows, window=window, rng=rng, frame=frames)
     if len(found.vectors) < LEAST_DISPLACEMENTS:
         raise ValueError(
             f"the window holds {len(found.vectors)} displacements between successes, and a kernel is fitted "
@@ -229,7 +222,7 @@ def fit_kernel(
     similarity = similarity_to_sampled(
         shape, sampled_rows(found.vectors[chosen], widths), rng, points=4_000, window=window, threads=threads
     )
-    judge = _Judge(poses, w, flags, frames, compared, rng, threads)
+    judge = _Judge(rows, frames, compared, rng, threads)
     # Where nothing can be held out, the size of the kernel compared with.
     fallback = compared.sigma_position_m / shape.isotropic.sigma_position_m
     candidates = [(f, k) for f in (*_FACTORS, fallback) if (k := _scaled(shape, f)) is not None]
@@ -247,7 +240,7 @@ def fit_kernel(
         kernel=candidates[best][1],
         scale=candidates[best][0],
         displacements=len(found.vectors),
-        successes=len(poses),
+        successes=len(rows),
         similarity=similarity,
         likelihoods=likelihoods,
         log_likelihood=values[best],
@@ -271,57 +264,55 @@ class _Judge:
 
     def __init__(
         self,
-        poses: Poses,
-        w: Floats,
-        flags: NDArray[np.bool_],
+        rows: Rows,
         frame: Floats | None,
         compared: IsotropicKernel,
         rng: np.random.Generator,
         threads: int,
     ) -> None:
-        rows = np.sort(rng.permutation(len(poses))[:_SCALED_MOST])
-        p, q = poses.positions, poses.quaternions_xyzw
-        self._p, self._q, self._w, self._flags = p[rows], q[rows], w[rows], flags[rows]
-        self._frame = frame if frame is None or frame.ndim == 2 else frame[rows]
+        kept = np.sort(rng.permutation(len(rows))[:_SCALED_MOST])
+        self._rows = rows[kept]
+        self._frame = frame if frame is None or frame.ndim == 2 else frame[kept]
         self._threads = threads
-        self._judged = rng.permutation(len(rows))[:_JUDGED_MOST]
+        self._judged = rng.permutation(len(kept))[:_JUDGED_MOST]
+        positions = self._rows.poses.positions
         try:
-            blocks = assign_blocks(self._p, edge_m=3.0 * compared.sigma_position_m)
+            blocks = assign_blocks(positions, edge_m=3.0 * compared.sigma_position_m)
             self._fold, self._folds = blocks.fold, blocks.folds
         except ValueError:
             self._folds = 0
-        spread = np.maximum(np.ptp(self._p, axis=0), 1e-3)
+        spread = np.maximum(np.ptp(positions, axis=0), 1e-3)
         self._uniform = 1.0 / (float(np.prod(spread)) * HAAR_VOLUME)
 
     def anisotropic(self, kernel: AnisotropicKernel) -> float:
         return self._mean(
-            lambda train, p, q: MixtureDensity(
-                se3.Poses.of(self._p[train], self._q[train]), kernel=kernel, weights=self._w[train],
-                symmetric=self._flags[train], frames=self._frames(train),
-            ).density(se3.Poses(p, q), threads=self._threads)
+            lambda rows, train: MixtureDensity(
+                rows.poses, kernel=kernel, weights=rows.weights, symmetric=rows.symmetric,
+                frames=self._frames(train),
+            )
         )  # fmt: skip
 
     def isotropic(self, kernel: IsotropicKernel) -> float:
         return self._mean(
-            lambda train, p, q: GraspDensity.build(
-                se3.Poses.of(self._p[train], self._q[train]), kernel=kernel, weights=self._w[train],
-                symmetric=self._flags[train],
-            ).density(se3.Poses(p, q), threads=self._threads)
-        )  # fmt: skip
+            lambda rows, _: GraspDensity.build(
+                rows.poses, kernel=kernel, weights=rows.weights, symmetric=rows.symmetric
+            )
+        )
 
     def _frames(self, train: NDArray[np.int64]) -> Floats | None:
         return self._frame if self._frame is None or self._frame.ndim == 2 else self._frame[train]
 
-    def _mean(self, density: Callable[[NDArray[np.int64], Floats, Floats], Floats]) -> float:
+    def _mean(self, density: Callable[[Rows, NDArray[np.int64]], Density]) -> float:
         total = weight = 0.0
         for fold in range(self._folds):
             held = self._judged[self._fold[self._judged] == fold]
             if not held.size:
                 continue
-            values = density(np.flatnonzero(self._fold != fold), self._p[held], self._q[held])
-            logs = np.log((1.0 - _UNIFORM_SHARE) * values + _UNIFORM_SHARE * self._uniform)
-            total += float(self._w[held] @ logs)
-            weight += float(self._w[held].sum())
+            train, judged = np.flatnonzero(self._fold != fold), self._rows[held]
+            log_density = density(self._rows[train], train).log_density(judged.poses, threads=self._threads)
+            mixed = (1.0 - _UNIFORM_SHARE) * np.exp(log_density) + _UNIFORM_SHARE * self._uniform
+            total += float(judged.weights @ np.log(mixed))
+            weight += float(judged.weights.sum())
         return total / weight if weight > 0.0 else math.nan
 
 
@@ -399,7 +390,8 @@ def similarity_to_sampled(
 ) -> Coefficient:
     """Bhattacharyya coefficient of a kernel with a sampled one, inside a window."""
     frames = None if kernel.frame == "gripper" else np.eye(3)
-    alone = KernelRows(Poses(np.zeros((1, 3)), se3.IDENTITY[None]), kernel, symmetric=False, frames=frames)
+    origin = Rows.of(Poses(np.zeros((1, 3)), se3.IDENTITY[None]), symmetric=False)
+    alone = KernelRows(origin, kernel, frames=frames)
     return bhattacharyya(sampled, alone, rng, points=points, window=window, threads=threads)
 
 

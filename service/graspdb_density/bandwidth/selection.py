@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .._compiled import isotropic
 from .._compiled.threads import for_blocks
@@ -23,7 +23,7 @@ from ..kde.cell_list import Cells
 from ..kde.isotropic import scaled_radius
 from ..kde.rows import Rows
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
-from ..se3 import Floats, Poses
+from ..se3 import Floats
 
 __all__ = [
     "DEFAULT_KERNEL",
@@ -79,23 +79,15 @@ def widths_prefix(count: int) -> int:
     return min(FIRST_CHOICE << doublings, MOST_ROWS)
 
 
-def choose_widths(
-    poses: Poses,
-    *,
-    weights: ArrayLike | None = None,
-    symmetric: ArrayLike | bool = True,
-    threads: int = 1,
-) -> WidthChoice:
+def choose_widths(rows: Rows, *, threads: int = 1) -> WidthChoice:
     """Choose widths for N grasps in commit order."""
-    count = widths_prefix(len(poses))
+    count = widths_prefix(len(rows))
     if count == 0:
         return WidthChoice(DEFAULT_KERNEL, "default", 0, math.nan)
-    w = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)[:count]
-    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (len(poses),))[:count]
-    w = w / w.mean()
+    first = rows[:count]
     best: tuple[float, IsotropicKernel] | None = None
-    for kernel, held, values in _scored(poses[:count], w, flags, threads):
-        value = float(np.average(values, weights=w[held])) if held.size else -math.inf
+    for kernel, held, values in _scored(first, threads):
+        value = float(np.average(values, weights=first.weights[held])) if held.size else -math.inf
         if best is None or value > best[0]:
             best = value, kernel
     assert best is not None
@@ -124,12 +116,7 @@ class WidthScore:
 
 
 def score_widths(
-    poses: Poses,
-    *,
-    weights: ArrayLike | None = None,
-    symmetric: ArrayLike | bool = True,
-    threads: int = 1,
-    progress: Callable[[float], None] | None = None,
+    rows: Rows, *, threads: int = 1, progress: Callable[[float], None] | None = None
 ) -> list[WidthScore]:
     """Every pair of widths that `choose_widths` tries, by the likelihood it chooses by.
 
@@ -140,23 +127,20 @@ def score_widths(
     ValueError
         For fewer than `LEAST_ROWS` rows, saying how many more are needed.
     """
-    count = len(poses)
+    count = len(rows)
     if count < LEAST_ROWS:
         raise ValueError(
             f"widths are told apart from {LEAST_ROWS} successes on; there are {count}, so"
             f" {LEAST_ROWS - count} more are needed"
         )
-    w = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
-    flags = np.broadcast_to(np.asarray(symmetric, dtype=bool), (count,))
-    rows = np.unique(np.linspace(0, count - 1, min(count, MOST_ROWS)).astype(np.int64))
-    poses, w, flags = poses[rows], w[rows] / w[rows].mean(), flags[rows]
-    p = poses.positions
+    rows = rows[np.unique(np.linspace(0, count - 1, min(count, MOST_ROWS)).astype(np.int64))]
+    p, w = rows.poses.positions, rows.weights / rows.weights.mean()
     # Neighbours are alike: errors count cubes as wide as the widest block, not rows.
     edge = BLOCK_WIDTHS * DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * _STEPS_POSITION[-1])
     _, cube = np.unique(np.floor((p - p.min(axis=0)) / edge).astype(np.int64), axis=0, return_inverse=True)
     cube = cube.reshape(-1)
     tables = []
-    for kernel, held, values in _scored(poses, w, flags, threads):
+    for kernel, held, values in _scored(rows, threads):
         full = np.full(len(p), np.nan)
         full[held] = values
         tables.append((kernel, full))
@@ -183,23 +167,22 @@ def _mean_and_error(values: Floats, weights: Floats, cube: NDArray[np.int64]) ->
     return mean, float(np.linalg.norm(sums) / w.sum())
 
 
-def _scored(
-    poses: Poses, w: Floats, flags: NDArray[np.bool_], threads: int
-) -> Iterator[tuple[IsotropicKernel, NDArray[np.int64], Floats]]:
+def _scored(rows: Rows, threads: int) -> Iterator[tuple[IsotropicKernel, NDArray[np.int64], Floats]]:
     """Every pair of widths with the rows left out and their log density under it."""
+    rows = rows.over(float(rows.weights.mean()))
     for step in _STEPS_POSITION:
         sigma = DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * step)
-        cells = Cells.build(Rows(poses, w, flags), sigma)
+        cells = Cells.build(rows, sigma)
         for turn in _STEPS_ROTATION:
             kernel = IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
-            yield kernel, *_held_out(kernel, cells, poses, w, threads)
+            yield kernel, *_held_out(kernel, cells, rows, threads)
 
 
 def _held_out(
-    kernel: IsotropicKernel, cells: Cells, poses: Poses, w: Floats, threads: int
+    kernel: IsotropicKernel, cells: Cells, rows: Rows, threads: int
 ) -> tuple[NDArray[np.int64], Floats]:
     """Rows, and their log density given those outside their block."""
-    p, q = poses.positions, poses.quaternions_xyzw
+    (p, q), w = rows.poses, rows.weights
     edge = BLOCK_WIDTHS * kernel.sigma_position_m
     low = p.min(axis=0)
     cell = np.floor((p - low) / edge).astype(np.int64)

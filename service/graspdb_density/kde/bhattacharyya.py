@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Poses
 from .density import Density
+from .rows import Rows
 from .weighted_sums import KernelRows
 
 __all__ = [
@@ -141,7 +142,7 @@ def sampled_kernel_rows(displacements: Poses, components: IsotropicKernel) -> Ke
     its mirror image.
     """
     both = Poses.concatenate([displacements, mirrored_displacements(displacements)])
-    return KernelRows(both, components, symmetric=False)
+    return KernelRows(Rows.of(both, symmetric=False), components)
 
 
 def sampled_kernel_curve(

@@ -123,6 +123,11 @@ class GraspDensity:
         return len(self.poses)
 
     @property
+    def rows(self) -> Rows:
+        """Poses, weights summing to 1 and symmetry, read-only use."""
+        return self._rows.over(self._total)
+
+    @property
     def poses(self) -> Poses:
         """(N), read-only use."""
         return self._rows.poses

@@ -60,7 +60,7 @@ class MixtureDensity:
         symmetric: ArrayLike | bool = True,
         frames: ArrayLike | None = None,
     ) -> None:
-        rows = KernelRows(poses, kernel, weights=weights, symmetric=symmetric, frames=frames)
+        rows = KernelRows(Rows.of(poses, weights, symmetric), kernel, frames=frames)
         # Weights are kept in the unit of those given, so that further rows can be added in it.
         self._total = float(rows.size) if weights is None else float(np.sum(weights))
         self._unit = self._total / rows.size
@@ -99,13 +99,9 @@ class MixtureDensity:
             return self
         more = Rows.of(poses, weights, symmetric, fill=self._total / self.size)
         if frames is not None:
-            frames = np.concatenate(
-                [self._rows.frames, KernelRows(poses, self._kernel, frames=frames).frames]
-            )
+            frames = np.concatenate([self._rows.frames, KernelRows(more, self._kernel, frames=frames).frames])
         both = self._rows.rows.over(1.0 / self._total).joined(more)
-        rows = KernelRows(
-            both.poses, self._kernel, weights=both.weights, symmetric=both.symmetric, frames=frames
-        )
+        rows = KernelRows(both, self._kernel, frames=frames)
         grown = copy.copy(self)
         grown.__dict__.pop("isotropic", None)
         grown._total = self._total + float(more.weights.sum())

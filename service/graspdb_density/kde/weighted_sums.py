@@ -51,12 +51,9 @@ class KernelRows:
 
     Parameters
     ----------
-    poses : (N), at least one
+    rows : (N), at least one
+        Weights in any unit.
     kernel
-    weights : (N,) or None
-        Positive, normalised here. None: equal.
-    symmetric : bool or (N,)
-        Whether a row has its twin under the jaw's turn.
     frames : (N, 3, 3) or (3, 3) or None
         Columns are the axes that translations are measured along, object frame; required by a kernel whose
         frame is ``fixed``, refused by every other.
@@ -64,25 +61,16 @@ class KernelRows:
     Raises
     ------
     ValueError
-        For wrong shapes or values, or frames that do not fit the kernel.
+        For no rows, wrong frames, or frames that do not fit the kernel.
     """
 
-    def __init__(
-        self,
-        poses: Poses,
-        kernel: Kernel,
-        *,
-        weights: ArrayLike | None = None,
-        symmetric: ArrayLike | bool = True,
-        frames: ArrayLike | None = None,
-    ) -> None:
-        if not len(poses):
+    def __init__(self, rows: Rows, kernel: Kernel, *, frames: ArrayLike | None = None) -> None:
+        if not len(rows):
             raise ValueError("statistics of a density need at least one grasp")
         self.kernel = kernel
-        rows = Rows.of(poses, weights, symmetric)
         self.rows = rows.over(float(rows.weights.sum()))
         self._own_frames = frames is None
-        self._frames = None if frames is None else _frames(frames, len(poses))
+        self._frames = None if frames is None else _frames(frames, len(rows))
         if isinstance(kernel, IsotropicKernel):
             self._reach = CUTOFF * kernel.sigma_position_m
             self.log_unit = kernel.log_peak
@@ -151,13 +139,7 @@ class KernelRows:
     def subset(self, rows: NDArray[np.int64]) -> KernelRows:
         """The rows given, weights renormalised."""
         frames = None if self._frames is None else self._frames[rows]
-        return KernelRows(
-            self.poses[rows],
-            self.kernel,
-            weights=self.weights[rows],
-            symmetric=self.symmetric[rows],
-            frames=frames,
-        )
+        return KernelRows(self.rows[rows], self.kernel, frames=frames)
 
     # -- evaluation
 

@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..kde.rows import Rows
 from ..kde.weighted_sums import TRUSTED_SUM, KernelRows, Progress
 from ..kernels.gaussian_mixture import Kernel
 from ..kernels.isotropic import IsotropicKernel
@@ -182,12 +183,10 @@ class IncrementalCurve:
     @classmethod
     def of(
         cls,
-        poses: Poses,
+        grasps: Rows,
         kernel: Kernel,
         *,
         before: IncrementalCurve | None = None,
-        weights: ArrayLike | None = None,
-        symmetric: ArrayLike | bool = True,
         frames: ArrayLike | None = None,
         subsets: int = 5,
         replicates: int = 50,
@@ -200,9 +199,9 @@ class IncrementalCurve:
 
         Parameters
         ----------
-        poses : N
-            Successful grasps in commit order, one row a physical grasp.
-        kernel, weights, symmetric, frames
+        grasps : N
+            Successful ones in commit order, one row a physical grasp.
+        kernel, frames
             As `KernelRows` takes them.
         before
             A curve of the first of these grasps. What of it still holds is kept: all of it while grasps are
@@ -220,21 +219,21 @@ class IncrementalCurve:
         ValueError
             Where there are too few grasps (saying how many are needed) or an argument is out of range.
         """
-        count = len(poses)
+        count = len(grasps)
         sizes = curve_sizes(count)
         if subsets < 5:
             raise ValueError("a point of a curve is the mean over at least 5 subsets")
         if replicates < 2 or points < 2:
             raise ValueError("a bootstrap needs at least 2 replicates and 2 points")
         plan = _Plan(subsets, replicates, points, seed)
-        rows = KernelRows(poses, kernel, weights=weights, symmetric=symmetric, frames=frames)
+        rows = KernelRows(grasps, kernel, frames=frames)
         prefix = curve_prefix(count)
         # In units of the first ones' mean, which stays.
         raw = rows.weights / rows.weights[:prefix].mean()
         # Heavy grasps that come late do not bring more points than there may be.
         thinned = 2 ** max(0, math.floor(math.log2(raw.sum() / prefix)))
         step = thinned * 2.0 * prefix / plan.per_subset
-        given = _Given(rows, poses, frames)
+        given = _Given(rows, frames)
         signature = given.signature(plan, prefix, step)
         if before is not None and not before._begins(given, signature, raw):
             before = None
@@ -279,7 +278,6 @@ class _Given:
     """What a curve was asked of, to tell whether another one is of the same."""
 
     rows: KernelRows
-    poses: Poses
     frames: ArrayLike | None
 
     def signature(self, plan: _Plan, prefix: int, step: float) -> bytes:
@@ -298,7 +296,7 @@ class _Given:
     def digest(self, count: int) -> bytes:
         """Of the first rows as they were given."""
         found = hashlib.blake2b()
-        first = self.poses[:count]
+        first = self.rows.poses[:count]
         arrays: list[NDArray[np.generic]] = [
             first.positions, first.quaternions_xyzw, self.rows.symmetric[:count]
         ]  # fmt: skip

@@ -30,6 +30,7 @@ from graspdb_density import (
     widths_prefix,
 )
 from graspdb_density.bandwidth.selection import FIRST_CHOICE
+from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.kernels import KernelRow
@@ -339,9 +340,7 @@ def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelI
         weights = importance_weights(proposal[first])
         weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
     position, quaternion, symmetric = (column[first] for column in poses)
-    found = choose_widths(
-        se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric, threads=threads
-    )
+    found = choose_widths(Rows.of(se3.Poses.of(position, quaternion), weights, symmetric), threads=threads)
     return KernelInfo(
         kind="isotropic",
         sigma_position_m=found.kernel.sigma_position_m,

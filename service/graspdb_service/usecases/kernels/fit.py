@@ -135,13 +135,11 @@ def _fit(
     assert density is not None
     assert not isinstance(count, list)
     fit = fit_kernel(
-        density.poses,
+        density.rows,
         window=_window(window),
         widths=_isotropic(widths),
         compared=density.kernel,
         components=None if count == "auto" else count or 1,
-        weights=density.weights,
-        symmetric=density.symmetric,
         frame=stored_kernel.axes_at(axes, density.poses),
         threads=threads,
         progress=progress,
@@ -164,13 +162,7 @@ def _sample(
     density, rng = built.density, np.random.default_rng(0)
     assert density is not None
     count = request.components if isinstance(request.components, int) else SAMPLED
-    found = displacements(
-        density.poses,
-        window=_window(window),
-        rng=rng,
-        weights=density.weights,
-        symmetric=density.symmetric,
-    )
+    found = displacements(density.rows, window=_window(window), rng=rng)
     if len(found.vectors) < LEAST_DISPLACEMENTS:
         raise ValueError(
             f"the window holds {len(found.vectors)} displacements between successes, and a kernel is sampled"

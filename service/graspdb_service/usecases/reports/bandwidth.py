@@ -13,7 +13,6 @@ from graspdb.wire.reports import BandwidthPoint, BandwidthReport, SimulatedDraws
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import (
@@ -41,15 +40,7 @@ def bandwidth_report(
             "too-few-trials",
             "Widths are told apart from 200 successes on; there are 0, so 200 more are needed",
         )
-    scores = enough(
-        lambda: score_widths(
-            Poses.of(density.positions, density.quaternions_xyzw),
-            weights=density.weights,
-            symmetric=density.symmetric,
-            threads=inputs.threads,
-            progress=progress,
-        )
-    )
+    scores = enough(lambda: score_widths(density.rows, threads=inputs.threads, progress=progress))
     best = max((s for s in scores if math.isfinite(s.log_likelihood)), key=lambda s: s.log_likelihood)
     near = [s.kernel for s in scores if s.below_best <= _ERRORS * s.below_best_error]
     near.append(best.kernel)

@@ -18,7 +18,6 @@ from graspdb_density.bandwidth.mixture_fit import (
 )
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import ReportInputs, head
@@ -76,13 +75,7 @@ def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
             f"The similarity of kernels needs at least {LEAST_SUCCESSES} successes; there are {count}, so"
             f" {LEAST_SUCCESSES - count} more are needed",
         )
-    found = displacements(
-        Poses.of(density.positions, density.quaternions_xyzw),
-        window=window,
-        rng=np.random.default_rng(0),
-        weights=density.weights,
-        symmetric=density.symmetric,
-    )
+    found = displacements(density.rows, window=window, rng=np.random.default_rng(0))
     if len(found.vectors) < LEAST_DISPLACEMENTS:
         raise conflict(
             "too-few-trials",

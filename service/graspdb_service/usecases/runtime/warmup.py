@@ -17,6 +17,7 @@ from graspdb_density import (
     choose_widths,
     se3,
 )
+from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import PG70
@@ -47,7 +48,7 @@ def _exercise() -> None:
     def free(asked: Poses) -> NDArray[np.bool_]:
         return ~scene.collides(asked, PG70)
 
-    choose_widths(poses)
+    choose_widths(Rows.of(poses))
     success = rng.random(300) < 0.5
     model = SuccessModel.build(poses, success, kernel=kernel)
     model.extend(poses, success).evaluate(poses[:5])
