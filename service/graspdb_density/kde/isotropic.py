@@ -10,6 +10,7 @@ Error. Against the float64 sum over every row, see `GraspDensity.log_density`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -259,13 +260,8 @@ class GraspDensity:
         # Nothing outside the ball has an exponent above that of its surface.
         if best[-1] > -radius * radius:
             return np.asarray(cells.rows[places], dtype=np.intp)
-        position, quaternion = pose
-        twin = se3.jaw_twin(quaternion)
-        cosine = np.abs(np.einsum("ij,j->i", self.poses.quaternions_xyzw, quaternion))
-        turned = np.abs(np.einsum("ij,j->i", self.poses.quaternions_xyzw, twin))
-        cosine = np.where(self._rows.symmetric, np.maximum(cosine, turned), cosine)
-        squared = np.sum((self.poses.positions - position) ** 2, axis=1) / kernel.sigma_position_m**2
-        value = kernel.kappa * cosine - 0.5 * squared
+        twins = np.where(self.symmetric, kernel.log_kernel(pose, self.poses.turned()), -np.inf)
+        value = np.maximum(kernel.log_kernel(pose, self.poses), twins)
         highest = np.argpartition(-value, count - 1)[:count]
         return np.asarray(highest[np.argsort(-value[highest], kind="stable")])
 
@@ -341,13 +337,20 @@ def stages(kernel: IsotropicKernel, cutoff: float | None) -> Floats:
     # Mean of the rotation's factor, 1 at its peak, over all rotations.
     random = math.exp(-1.5 * math.log(2.0 * math.pi * kernel.sigma_position_m**2) - kernel.log_peak)
     random /= HAAR_VOLUME
+    scaled_radius(cutoff)
+    return trusted_stages(cutoff, random, lambda reach: reach / math.sqrt(2.0))
+
+
+def trusted_stages(cutoff: float, random: float, radius: Callable[[float], float]) -> Floats:
+    """`stages` by the mean of the rotation's factor over all rotations and the scaled radius of a reach in
+    standard deviations.
+    """
     rows = []
     for reach in (cutoff, 1.4 * cutoff):
         mean_exponent = max(0.5 * reach * reach - 5.8, 2.2)
         # The kernels that one larger ball adds grow as its volume, at worst.
         least = 0.04 * random * math.exp(8.0 - 0.5 * reach * reach)
-        rows.append((reach / math.sqrt(2.0), mean_exponent, least))
-    scaled_radius(cutoff)
+        rows.append((radius(reach), mean_exponent, least))
     return np.array(rows)
 
 

@@ -20,7 +20,7 @@ from ..kernels.isotropic import HAAR_VOLUME
 from ..se3 import Floats, Poses
 from .cell_list import Cells
 from .importance_weights import effective_sample_size
-from .isotropic import GraspDensity
+from .isotropic import CUTOFF, GraspDensity, trusted_stages
 from .rows import Rows
 from .weighted_sums import KernelRows
 
@@ -28,7 +28,6 @@ __all__ = ["NARROW", "MixtureDensity"]
 
 #: Largest rotation width at which a row's nearer twin stands for both.
 NARROW = math.radians(25.0)
-_CUTOFF = 4.0
 _QUERY_BLOCK = 512
 
 
@@ -162,16 +161,12 @@ class MixtureDensity:
         return self._cells.at_poses(loop, poses, block=_QUERY_BLOCK, threads=threads) + self._log_unit
 
     def _stages(self) -> Floats:
-        """Radii and when to trust them, as `density.stages`."""
+        """Radii and when to trust them, as `isotropic.stages`."""
         _, logdet = np.linalg.slogdet(self._kernel.overall_covariance[:3, :3])
         # Mean of the rotation's factor over all rotations, relative to the peak of the largest component.
         random = math.exp(-1.5 * math.log(2.0 * math.pi) - 0.5 * logdet - self._log_unit) / HAAR_VOLUME
-        rows = []
-        for reach in (_CUTOFF, 1.4 * _CUTOFF):
-            radius = (self._offset + reach * self._spread) * self._cells.arrays.scale
-            least = 0.04 * random * math.exp(8.0 - 0.5 * reach * reach)
-            rows.append((radius, max(0.5 * reach * reach - 5.8, 2.2), least))
-        return np.array(rows)
+        scale = self._cells.arrays.scale
+        return trusted_stages(CUTOFF, random, lambda reach: (self._offset + reach * self._spread) * scale)
 
     def density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """Density at poses, 1/(m^3 rad^3)."""

@@ -69,13 +69,14 @@ class KernelRows:
             raise ValueError("statistics of a density need at least one grasp")
         self.kernel = kernel
         self.rows = rows.over(float(rows.weights.sum()))
-        self._own_frames = frames is None
+        #: Whether the axes of translations turn with the jaw: they are each row's gripper's.
+        self.turning = frames is None
         self._frames = None if frames is None else _frames(frames, len(rows))
         if isinstance(kernel, IsotropicKernel):
             self._reach = CUTOFF * kernel.sigma_position_m
             self.log_unit = kernel.log_peak
             return
-        if self._own_frames != (kernel.frame == "gripper"):
+        if self.turning != (kernel.frame == "gripper"):
             need = "takes no frames" if kernel.frame == "gripper" else "needs frames"
             raise ValueError(f"a kernel in the {kernel.frame} frame {need}")
         along, _ = kernel.widest
@@ -106,7 +107,7 @@ class KernelRows:
             np.ascontiguousarray(self.frames.reshape(-1, 9)),
             self.symmetric,
             np.log(self.rows.twin_weights),
-            self._own_frames,
+            self.turning,
         )
 
     @property
@@ -190,7 +191,7 @@ class KernelRows:
                 )  # fmt: skip
             else:
                 weighted.mixture_sums(
-                    cells.arrays, self._sorted_frames, self._own_frames, p[begin:end], q[begin:end],
+                    cells.arrays, self._sorted_frames, self.turning, p[begin:end], q[begin:end],
                     self.mixture.single(), radius, least, padded, out[begin:end],
                 )  # fmt: skip
             if progress is not None:
@@ -270,7 +271,7 @@ class KernelRows:
         moves, turns = displacements
         if not isinstance(self.kernel, IsotropicKernel):
             # The twin's own x and y axes point the other way.
-            flip = np.where((turned & self._own_frames)[:, None], np.array([-1.0, -1.0, 1.0]), 1.0)
+            flip = np.where((turned & self.turning)[:, None], np.array([-1.0, -1.0, 1.0]), 1.0)
             moves = np.einsum("nij,nj->ni", self.frames[row], moves * flip)
         return Poses(centre.positions + moves, se3.multiply(centre.quaternions_xyzw, turns))
 

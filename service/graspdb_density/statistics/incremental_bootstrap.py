@@ -164,13 +164,13 @@ class IncrementalCurve:
     _held: _HeldOut
     _groups: tuple[_Group, ...]
 
-    def _begins(self, given: _Given, signature: bytes, raw: Floats) -> bool:
+    def _begins(self, rows: KernelRows, signature: bytes, raw: Floats) -> bool:
         """Whether this is a curve of the first of some rows."""
         return (
             self._signature == signature
             and self.size <= len(raw)
             and np.allclose(self._raw, raw[: self.size], rtol=_SAME, atol=0.0)
-            and self._digest == given.digest(self.size)
+            and self._digest == _digest(rows, self.size)
         )
 
     @property
@@ -233,9 +233,8 @@ class IncrementalCurve:
         # Heavy grasps that come late do not bring more points than there may be.
         thinned = 2 ** max(0, math.floor(math.log2(raw.sum() / prefix)))
         step = thinned * 2.0 * prefix / plan.per_subset
-        given = _Given(rows, frames)
-        signature = given.signature(plan, prefix, step)
-        if before is not None and not before._begins(given, signature, raw):
+        signature = _signature(rows, plan, prefix, step)
+        if before is not None and not before._begins(rows, signature, raw):
             before = None
         if before is not None and before.size == count:
             return replace(before, kept=count)
@@ -264,48 +263,37 @@ class IncrementalCurve:
             size=count,
             prefix=prefix,
             kept=first,
-            generation=given.digest(prefix) + signature if before is None else before.generation,
+            generation=_digest(rows, prefix) + signature if before is None else before.generation,
             _signature=signature,
-            _digest=given.digest(count),
+            _digest=_digest(rows, count),
             _raw=raw,
             _held=held,
             _groups=groups,
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Given:
-    """What a curve was asked of, to tell whether another one is of the same."""
-
-    rows: KernelRows
-    frames: ArrayLike | None
-
-    def signature(self, plan: _Plan, prefix: int, step: float) -> bytes:
-        """Of all that every sum depends on."""
-        kernel = self.rows.kernel
-        if isinstance(kernel, IsotropicKernel):
-            numbers = [np.array([kernel.sigma_position_m, kernel.sigma_rotation])]
-        else:
-            numbers = [kernel.weights, kernel.means, kernel.covariances]
-        told = (plan, prefix, step, type(kernel).__name__, self.frames is None)
-        found = hashlib.blake2b(repr(told).encode())
-        for array in numbers:
-            found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
-        return found.digest()
-
-    def digest(self, count: int) -> bytes:
-        """Of the first rows as they were given."""
-        found = hashlib.blake2b()
-        first = self.rows.poses[:count]
-        arrays: list[NDArray[np.generic]] = [
-            first.positions, first.quaternions_xyzw, self.rows.symmetric[:count]
-        ]  # fmt: skip
-        if self.frames is not None:
-            frames = np.asarray(self.frames, dtype=np.float64)
-            arrays.append(frames if frames.ndim == 2 else frames[:count])
-        for array in arrays:
+def _signature(rows: KernelRows, *numbers: object) -> bytes:
+    """Of all that every sum depends on: ``numbers`` and the kernel."""
+    kernel = rows.kernel
+    found = hashlib.blake2b(repr(numbers).encode())
+    if isinstance(kernel, IsotropicKernel):
+        found.update(repr(kernel).encode())
+    else:
+        found.update(kernel.frame.encode())
+        for array in (kernel.weights, kernel.means, kernel.covariances):
             found.update(np.ascontiguousarray(array).data)
-        return found.digest()
+    return found.digest()
+
+
+def _digest(rows: KernelRows, count: int) -> bytes:
+    """Of the first rows."""
+    found = hashlib.blake2b()
+    arrays: list[NDArray[np.generic]] = [*rows.poses[:count], rows.symmetric[:count]]
+    if not rows.turning:
+        arrays.append(rows.frames[:count])
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).data)
+    return found.digest()
 
 
 @dataclass(slots=True)
