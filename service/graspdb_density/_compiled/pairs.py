@@ -58,20 +58,22 @@ class Displaced(NamedTuple):
 
 class TranslationBins(NamedTuple):
     """``across`` bins span -extent .. extent in x and y; ``slices`` slices of ``slice_m`` in z; profiles have
-    ``profile_bins`` bins of ``profile_m``, the middle one about 0, the other axes within ``off_axis_m``.
+    ``profile_bins`` bins of ``profile`` metres, the middle one about 0, the other axes within ``off_axis``.
     """
 
     extent: float
     slices: int
     slice_m: float
     across: int
-    profile_m: float
+    profile: float
     profile_bins: int
-    off_axis_m: float
+    off_axis: float
 
 
 class RotationBins(NamedTuple):
-    """``bins`` span the circle, the first centred on -pi, so that one is centred on 0; profiles as there."""
+    """``bins`` span the circle, the first centred on -pi, so that one is centred on 0; profiles as there, in
+    radians.
+    """
 
     bins: int
     profile: float

@@ -278,52 +278,33 @@ def mixture_sums(cells, frames, frame_turns, positions, quaternions, mixture, ra
 
 
 @exact
-def _component_exponent(x, lower):
-    """Half the squared Mahalanobis distance of one displacement (6,), in float64."""
-    square = 0.0
-    at = 0
-    for i in range(6):
-        z = -lower[21 + i]
-        for j in range(i + 1):
-            z += lower[at] * x[j]
-            at += 1
-        square += z * z
-    return square
-
-
-@exact
 def mixture_log_sum(rows, mixture, p, q):
     """Log of the weighted mixture sum at one pose over all rows, in float64 and without a cut-off: for poses
     so far from every row that the fast sums vanish.
     """
     top, total = -math.inf, 0.0
-    x = np.empty(6)
     for i in range(rows.positions.shape[0]):
         dx, dy, dz = p[0] - rows.positions[i, 0], p[1] - rows.positions[i, 1], p[2] - rows.positions[i, 2]
-        f = rows.frames[i]
-        a = rows.quaternions[i]
+        a, f = rows.quaternions[i], rows.frames[i]
         vx, vy, vz, w = relative(a[0], a[1], a[2], a[3], q[0], q[1], q[2], q[3])
         for t in range(2 if rows.symmetric[i] else 1):
             flip = -1.0 if (t == 1 and rows.turning) else 1.0
             if t == 1:
-                ux, uy, uz, uw = vy, -vx, -w, vz
-            else:
-                ux, uy, uz, uw = vx, vy, vz, w
-            if uw < 0.0:
-                ux, uy, uz, uw = -ux, -uy, -uz, -uw
-            sine = math.sqrt(ux * ux + uy * uy + uz * uz)
-            angle = 2.0 * math.atan2(sine, uw)
-            x[0] = flip * (f[0] * dx + f[3] * dy + f[6] * dz)
-            x[1] = flip * (f[1] * dx + f[4] * dy + f[7] * dz)
-            x[2] = f[2] * dx + f[5] * dy + f[8] * dz
+                vx, vy, vz, w = vy, -vx, -w, vz
+            sign = -1.0 if w < 0.0 else 1.0
+            sine = math.sqrt(vx * vx + vy * vy + vz * vz)
+            angle = 2.0 * math.atan2(sine, sign * w)
+            x = flip * (f[0] * dx + f[3] * dy + f[6] * dz)
+            y = flip * (f[1] * dx + f[4] * dy + f[7] * dz)
+            z = f[2] * dx + f[5] * dy + f[8] * dz
             for wrap in range(2 if mixture.wraps else 1):
                 turn = angle - 2.0 * math.pi * wrap
-                scale = turn / sine if sine > 1e-12 else 2.0
-                x[3], x[4], x[5] = scale * ux, scale * uy, scale * uz
+                scale = sign * (turn / sine if sine > 1e-12 else 2.0)
                 for j in range(mixture.lowers.shape[0]):
-                    value = (
-                        rows.log_rows[i] + mixture.log_weights[j] - _component_exponent(x, mixture.lowers[j])
+                    place, rest = whitened_squares(
+                        to_fixed_tuple(mixture.lowers[j], 27), x, y, z, scale * vx, scale * vy, scale * vz
                     )
+                    value = rows.log_rows[i] + mixture.log_weights[j] - (place + rest)
                     if value > top:
                         total = total * math.exp(top - value) + 1.0 if total > 0.0 else 1.0
                         top = value

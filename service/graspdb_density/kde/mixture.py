@@ -168,10 +168,6 @@ class MixtureDensity:
         scale = self._cells.arrays.scale
         return trusted_stages(CUTOFF, random, lambda reach: (self._offset + reach * self._spread) * scale)
 
-    def density(self, poses: Poses, *, threads: int = 1) -> Floats:
-        """Density at poses, 1/(m^3 rad^3)."""
-        return np.exp(self.log_density(poses, threads=threads))
-
     def sample(self, count: int, rng: np.random.Generator) -> Poses:
         """Draw grasps."""
         return self._rows.sample(count, rng)

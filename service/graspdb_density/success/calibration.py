@@ -158,7 +158,8 @@ def reliability(
     number = np.bincount(place, minlength=count)
     predicted = _ratio(_tally(place, w * p, count), total)
     observed = _ratio(_tally(place, w * y, count), total)
-    low, high = _bin_intervals(place, y, w, count, blocks, level, seed)
+    effective = _ratio(total**2, _tally(place, w * w, count))
+    low, high = _bin_intervals(place, y, w, observed, effective, blocks, level, seed)
     return tuple(
         ReliabilityBin(
             lower=float(edges[i]),
@@ -200,19 +201,17 @@ def _bin_intervals(
     place: NDArray[np.int64],
     y: NDArray[np.bool_],
     w: Floats,
-    count: int,
+    observed: Floats,
+    effective: Floats,
     blocks: ArrayLike | None,
     level: float,
     seed: int,
 ) -> tuple[Floats, Floats]:
-    total = _tally(place, w, count)
-    observed = _ratio(_tally(place, w * y, count), total)
-    effective = _ratio(total**2, _tally(place, w * w, count))
     if blocks is None:
         return jeffreys_interval(observed, np.nan_to_num(effective), level)
     group = _group(blocks, len(place))
     groups = int(group.max()) + 1
-    sums = np.zeros((2, groups, count))
+    sums = np.zeros((2, groups, len(observed)))
     np.add.at(sums[0], (group, place), w)
     np.add.at(sums[1], (group, place), w * y)
     met = np.count_nonzero(sums[0], axis=0)

@@ -19,6 +19,7 @@ Reference: Bodenhagen, Detry, Piater and Krueger, sections II-A and III-A, figur
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,6 +57,11 @@ _LAYOUT = Bins()
 #: How far the coordinates that a histogram or profile does not show may be off: half the usual steps of a
 #: grid.
 _OFF_AXIS_M, _OFF_AXIS = 0.005, math.radians(7.5)
+_TRANSLATIONS = TranslationBins(
+    _LAYOUT.extent_m, _LAYOUT.slices, _LAYOUT.slice_m, _LAYOUT.across,
+    _LAYOUT.profile_m, _LAYOUT.line("position"), _OFF_AXIS_M,
+)  # fmt: skip
+_ROTATIONS = RotationBins(_LAYOUT.angles, _LAYOUT.profile, _LAYOUT.line("rotation"), _OFF_AXIS)
 
 
 # long: the options of the report, explained one by one.
@@ -129,15 +135,23 @@ def empirical_anisotropy(
     axes, aligned = aligned_axes(alignment, frames, poses, grasps)
     share = bootstrap_weights(weights, grasps, len(p), rng)
     near, near_grasps = _in_order(Trials(p, q, won, shifted.order), grasps)
-    translations = _Translations(
+    translations = _Pairs(
+        translation_pairs,
         near,
         Displaced(near_grasps, axes, share, shifted.first, shifted.runs),
+        _TRANSLATIONS,
+        planes=_LAYOUT.slices * _LAYOUT.across**2,
+        limit=math.cos(0.5 * _OFF_AXIS),
         symmetric=symmetric,
         on_grid=rotation_keys is not None,
     )
-    rotations = _Rotations(
+    rotations = _Pairs(
+        rotation_pairs,
         Trials(p, q, won, turned.order),
         Displaced(grasps, axes, share, turned.first, turned.runs),
+        _ROTATIONS,
+        planes=3 * _LAYOUT.angles**2,
+        limit=_OFF_AXIS_M,
         symmetric=symmetric,
         on_grid=position_keys is not None,
     )
@@ -166,34 +180,45 @@ def empirical_anisotropy(
     )
 
 
-class _Translations:
-    """Pairs at the same rotation: histograms of x and y by z, and a profile an axis."""
+class _Pairs:
+    """Pairs of trials of one kind: histograms in planes of two displacements, and a profile an axis.
 
-    def __init__(self, trials: Trials, displaced: Displaced, *, symmetric: bool, on_grid: bool) -> None:
-        self._trials, self._displaced, self._symmetric = trials, displaced, symmetric
-        layout, line, columns = _LAYOUT, _LAYOUT.line("position"), displaced.weights.shape[1]
-        self._bins = TranslationBins(
-            layout.extent_m, layout.slices, layout.slice_m, layout.across, layout.profile_m, line, _OFF_AXIS_M
-        )
-        self._least_cosine = -1.0 if on_grid else math.cos(0.5 * _OFF_AXIS)
-        self._planes = _empty(layout.slices * layout.across**2, columns)
-        self._lines = _empty(3 * line, columns)
+    ``limit`` is what a compiled loop takes for trials off the grid, ``planes`` the bins of the histograms.
+    """
+
+    def __init__(
+        self,
+        loop: Callable[..., int],
+        trials: Trials,
+        displaced: Displaced,
+        bins: TranslationBins | RotationBins,
+        *,
+        planes: int,
+        limit: float,
+        symmetric: bool,
+        on_grid: bool,
+    ) -> None:
+        self._loop, self._trials, self._displaced, self._bins = loop, trials, displaced, bins
+        self._symmetric, self._limit = symmetric, -1.0 if on_grid else limit
+        columns = displaced.weights.shape[1]
+        self._planes, self._lines = _empty(planes, columns), _empty(3 * bins.profile_bins, columns)
         # Of trials on a grid profiles are told from each grasp's own pairs, which are at a lattice's places.
         grasps = len(displaced.rows) if on_grid else 0
-        self._profiles = LatticeProfiles(grasps, line, layout.profile_m, _OFF_AXIS_M)
+        self._profiles = LatticeProfiles(grasps, bins.profile_bins, bins.profile, bins.off_axis)
         self.used = 0
 
     def count(self, begin: int) -> None:
         """The pairs of some grasps, from ``begin`` on."""
-        self.used += translation_pairs(
-            self._trials, _some(self._displaced, begin), self._bins, self._symmetric, self._least_cosine,
+        self.used += self._loop(
+            self._trials, _some(self._displaced, begin), self._bins, self._symmetric, self._limit,
             self._planes, self._lines, self._profiles.pair_sums[begin : begin + _STEP],
         )  # fmt: skip
 
     def tallies(self, *, mirrored: bool) -> tuple[Tally, Tally]:
         """In planes and on lines; what the grasps' twins saw is added where ``mirrored``."""
         planes, lines = self._planes, self._lines
-        if mirrored:
+        # Pairs of rotations stand for their twins already, but for the profiles of a lattice.
+        if mirrored and isinstance(self._bins, TranslationBins):
             cells = np.arange(len(planes.pairs)).reshape(_LAYOUT.slices, _LAYOUT.across, _LAYOUT.across)
             planes = _mirrored(planes, cells[:, ::-1, ::-1].ravel(), np.ones(len(planes.pairs)))
             image = np.arange(len(lines.pairs)).reshape(3, -1)
@@ -201,31 +226,6 @@ class _Translations:
             image[:2], sign[:2] = image[:2, ::-1].copy(), -1.0
             lines = _mirrored(lines, image.ravel(), sign.ravel())
         return planes, _of_lattice(self._profiles, lines, self._displaced.weights, mirrored)
-
-
-class _Rotations:
-    """Pairs at the same position: a histogram a plane of two angles, and a profile an axis."""
-
-    def __init__(self, trials: Trials, displaced: Displaced, *, symmetric: bool, on_grid: bool) -> None:
-        self._trials, self._displaced, self._symmetric = trials, displaced, symmetric
-        layout, line, columns = _LAYOUT, _LAYOUT.line("rotation"), displaced.weights.shape[1]
-        self._bins = RotationBins(layout.angles, layout.profile, line, _OFF_AXIS)
-        self._reach_m = -1.0 if on_grid else _OFF_AXIS_M
-        self._planes, self._lines = _empty(3 * layout.angles**2, columns), _empty(3 * line, columns)
-        grasps = len(displaced.rows) if on_grid else 0
-        self._profiles = LatticeProfiles(grasps, line, layout.profile, _OFF_AXIS)
-        self.used = 0
-
-    def count(self, begin: int) -> None:
-        """The pairs of some grasps, from ``begin`` on."""
-        self.used += rotation_pairs(
-            self._trials, _some(self._displaced, begin), self._bins, self._symmetric, self._reach_m,
-            self._planes, self._lines, self._profiles.pair_sums[begin : begin + _STEP],
-        )  # fmt: skip
-
-    def tallies(self, *, mirrored: bool) -> tuple[Tally, Tally]:
-        """In planes and on lines; pairs stand for their twins already, but for the profiles of a lattice."""
-        return self._planes, _of_lattice(self._profiles, self._lines, self._displaced.weights, mirrored)
 
 
 def _empty(bins: int, columns: int) -> Tally:
