@@ -41,13 +41,7 @@ _QUERY_BLOCK = 1024
 class GraspDensity:
     """An immutable density. Use `build` and `extend`; every method is safe to call from several threads."""
 
-    def __init__(
-        self,
-        kernel: IsotropicKernel,
-        rows: Rows,
-        cells: Cells,
-        unit: float,
-    ) -> None:
+    def __init__(self, kernel: IsotropicKernel, rows: Rows, cells: Cells, unit: float) -> None:
         self._kernel = kernel
         self._rows = rows
         self._cells = cells
@@ -187,13 +181,7 @@ class GraspDensity:
     # -- evaluation
     # -------------------------------------------------------------------------------------------------
 
-    def log_density(
-        self,
-        poses: Poses,
-        *,
-        cutoff: float | None = CUTOFF,
-        threads: int = 1,
-    ) -> Floats:
+    def log_density(self, poses: Poses, *, cutoff: float | None = CUTOFF, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), finite and right however far from data.
 
         Parameters
@@ -229,13 +217,7 @@ class GraspDensity:
 
         return self._cells.at_poses(loop, poses, block=_QUERY_BLOCK, threads=threads) + self.log_unit
 
-    def density(
-        self,
-        poses: Poses,
-        *,
-        cutoff: float | None = CUTOFF,
-        threads: int = 1,
-    ) -> Floats:
+    def density(self, poses: Poses, *, cutoff: float | None = CUTOFF, threads: int = 1) -> Floats:
         """Density at poses, 1/(m^3 rad^3); underflows to 0 only below 1e-300."""
         return np.exp(self.log_density(poses, cutoff=cutoff, threads=threads))
 

@@ -92,12 +92,7 @@ class SuccessModel:
         """
         return cls(kernel, None, None).extend(poses, success, symmetric)
 
-    def extend(
-        self,
-        poses: Poses,
-        success: ArrayLike,
-        symmetric: ArrayLike | bool = True,
-    ) -> SuccessModel:
+    def extend(self, poses: Poses, success: ArrayLike, symmetric: ArrayLike | bool = True) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
         won, flags = checked_outcomes(success, symmetric, len(poses))
         p, q = poses.positions, poses.quaternions_xyzw
@@ -136,13 +131,7 @@ class SuccessModel:
         """Bytes of the arrays held."""
         return sum(part.nbytes for part in (self._succeeded, self._failed) if part is not None)
 
-    def evaluate(
-        self,
-        poses: Poses,
-        *,
-        level: float = 0.9,
-        threads: int = 1,
-    ) -> SuccessEstimate:
+    def evaluate(self, poses: Poses, *, level: float = 0.9, threads: int = 1) -> SuccessEstimate:
         """Success probability with its interval at M poses.
 
         Raises
@@ -162,13 +151,7 @@ class SuccessModel:
         """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""
         return self._beta(poses, threads)[0]
 
-    def lower_end(
-        self,
-        poses: Poses,
-        *,
-        level: float = 0.9,
-        threads: int = 1,
-    ) -> Floats:
+    def lower_end(self, poses: Poses, *, level: float = 0.9, threads: int = 1) -> Floats:
         """The lower end of `evaluate` alone, (M,)."""
         _, _, alpha, beta = self._beta(poses, threads)
         return _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
