@@ -109,8 +109,8 @@ def test_sampled_kernel_curve_rises_towards_one() -> None:
         counts=(30, 300, 3_000, 100_000),
         points=2_000,
     )
-    assert [point.samples for point in curve] == [30, 300, 3_000]
-    values = [point.similarity for point in curve]
+    assert list(curve) == [30, 300, 3_000]
+    values = [point.value for point in curve.values()]
     assert values == sorted(values)
     assert values[-1] > 0.97
     with pytest.raises(ValueError, match="at least 100 are needed"):

@@ -28,9 +28,9 @@ def test_one_gaussian_is_enough_for_one_and_not_for_two() -> None:
     rng = np.random.default_rng(1)
     options = {"components": COMPONENTS, "window": WINDOW, "fitted": 1_000, "reference": 4_000}
     done: list[float] = []
-    (single,) = mixture_curve(drawn([0.0], 4_000), rng=rng, counts=(1,), **options)  # type: ignore[arg-type]
-    assert single.samples == 1
-    assert single.similarity > 0.97
+    single = mixture_curve(drawn([0.0], 4_000), rng=rng, counts=(1,), **options)  # type: ignore[arg-type]
+    assert single.keys() == {1}
+    assert single[1].value > 0.97
     found = mixture_curve(
         drawn([-0.9, 0.9], 4_000, axis=4),
         rng=rng,
@@ -38,11 +38,11 @@ def test_one_gaussian_is_enough_for_one_and_not_for_two() -> None:
         progress=done.append,
         **options,  # type: ignore[arg-type]
     )
-    one, several = (item.similarity for item in found)
+    one, several = (item.value for item in found.values())
     assert one < 0.95
     assert several > one + 0.04
     assert done == [0.5, 1.0]
-    assert all(0.0 < item.standard_error < 0.05 for item in found)
+    assert all(0.0 < item.standard_error < 0.05 for item in found.values())
 
 
 def test_turns_wider_than_a_component_may_be_are_narrowed() -> None:
@@ -52,7 +52,7 @@ def test_turns_wider_than_a_component_may_be_are_narrowed() -> None:
     everywhere = Displacements(vectors, np.ones(2_000), np.arange(2_000))
     wide = DisplacementWindow(0.04, math.pi)
     found = mixture_curve(everywhere, components=COMPONENTS, window=wide, rng=rng, counts=(1, 6), fitted=800)
-    assert 0.2 < found[0].similarity < found[1].similarity + 0.05 < 1.05
+    assert 0.2 < found[1].value < found[6].value + 0.05 < 1.05
 
 
 def test_weights_decide_what_counts() -> None:
@@ -60,8 +60,8 @@ def test_weights_decide_what_counts() -> None:
     vectors = np.concatenate([near.vectors, far.vectors])
     weights = np.repeat([2.0 - 1e-6, 1e-6], 2_000)
     both = Displacements(vectors, weights, np.arange(4_000))
-    (found,) = mixture_curve(
+    found = mixture_curve(
         both, components=COMPONENTS, window=WINDOW, rng=np.random.default_rng(3), counts=(1,),
         fitted=1_000, reference=1_500,
     )  # fmt: skip
-    assert found.similarity == pytest.approx(0.985, abs=0.015)
+    assert found[1].value == pytest.approx(0.985, abs=0.015)

@@ -1,5 +1,5 @@
 """How many Gaussians a kernel needs to be like the statistics of displacements that it stands for: the
-counterpart of `similarity.sampled_kernel_curve` (figure 13) for mixtures.
+counterpart of `bhattacharyya.sampled_kernel_curve` (figure 13) for mixtures.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..kde.bhattacharyya import DisplacementWindow, SampledKernelPoint
+from ..kde.bhattacharyya import Coefficient, DisplacementWindow
 from ..kde.weighted_sums import Progress
 from ..kernels.gaussian_mixture import MOST_ROTATION, AnisotropicKernel
 from ..kernels.isotropic import IsotropicKernel
@@ -33,8 +33,8 @@ def mixture_curve(
     points: int = 4_000,
     threads: int = 1,
     progress: Progress | None = None,
-) -> list[SampledKernelPoint]:
-    """Similarity of mixtures of Gaussians to the sampled kernel of all displacements.
+) -> dict[int, Coefficient]:
+    """Similarity of mixtures of Gaussians to the sampled kernel of all displacements, by their number.
 
     A Gaussian off the jaw's plane of symmetry is a pair with its mirror image and counts as one. What turns
     farther than a component may be wide is made as wide as it may be.
@@ -47,26 +47,22 @@ def mixture_curve(
         Widths of the sampled kernel's components, which the Gaussians' covariances include.
     fitted : int
         At most this many displacements, drawn by weight, are fitted.
-
-    Returns
-    -------
-    list of SampledKernelPoint
-        ``samples`` is the number of Gaussians.
     """
     share = found.weights / found.weights.sum()
     whole_rows = rng.choice(len(share), size=min(reference, len(share)), replace=False, p=share)
     whole = sampled_rows(found.vectors[whole_rows], components)
     chosen = rng.choice(len(share), size=min(fitted, len(share)), replace=False, p=share)
     added = components.overall_covariance
-    result = []
-    for number, count in enumerate(counts):
+    likeness = {}
+    for count in counts:
         weights, means, covariances = mixture_parts(found.vectors[chosen], count)
         kernel = AnisotropicKernel.symmetrised(weights, means, _narrowed(covariances + added))
-        likeness = similarity_to_sampled(kernel, whole, rng, points=points, window=window, threads=threads)
-        result.append(SampledKernelPoint(count, likeness.value, likeness.standard_error))
+        likeness[count] = similarity_to_sampled(
+            kernel, whole, rng, points=points, window=window, threads=threads
+        )
         if progress is not None:
-            progress((number + 1) / len(counts))
-    return result
+            progress(len(likeness) / len(counts))
+    return likeness
 
 
 def _narrowed(covariances: Floats) -> Floats:

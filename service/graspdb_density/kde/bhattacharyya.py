@@ -24,7 +24,6 @@ from .weighted_sums import KernelRows
 __all__ = [
     "Coefficient",
     "DisplacementWindow",
-    "SampledKernelPoint",
     "bhattacharyya",
     "mirrored_displacements",
     "sampled_kernel_curve",
@@ -68,15 +67,6 @@ class DisplacementWindow:
         angle = 2.0 * np.arccos(np.minimum(np.abs(q[:, 3]), 1.0))
         near: NDArray[np.bool_] = np.max(np.abs(p), axis=1) <= self.position_m
         return near & (angle <= self.rotation + 1e-9)
-
-
-@dataclass(frozen=True, slots=True)
-class SampledKernelPoint:
-    """Similarity of a kernel sampled with ``samples`` displacements to the full statistics (figure 13)."""
-
-    samples: int
-    similarity: float
-    standard_error: float
 
 
 def bhattacharyya(
@@ -155,8 +145,8 @@ def sampled_kernel_curve(
     reference: int = 20_000,
     points: int = 8_000,
     threads: int = 1,
-) -> list[SampledKernelPoint]:
-    """Similarity of the sampled kernel to the full statistics against the number of samples (figure 13).
+) -> dict[int, Coefficient]:
+    """Similarity of the sampled kernel to the full statistics by the number of samples (figure 13).
 
     Parameters
     ----------
@@ -184,12 +174,11 @@ def sampled_kernel_curve(
     whole = sampled_kernel_rows(displacements[full], components)
     # Samples are drawn anew from all displacements, as a kernel would be; overlap with the reference is part
     # of comparing a sample with what it was drawn from.
-    result = []
+    found = {}
     for count in counts:
         if not 1 <= count <= len(full):
             continue
         chosen = rng.choice(full, size=count, replace=False)
         one = sampled_kernel_rows(displacements[chosen], components)
-        found = bhattacharyya(one, whole, rng, points=points, window=window, threads=threads)
-        result.append(SampledKernelPoint(count, found.value, found.standard_error))
-    return result
+        found[count] = bhattacharyya(one, whole, rng, points=points, window=window, threads=threads)
+    return found

@@ -20,9 +20,14 @@ from graspdb.wire.kernels import (
     KernelWindow,
     StoredKernel,
 )
-from graspdb_density import AnisotropicKernel, IsotropicKernel, se3
-from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacements, fit_kernel
-from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
+from graspdb_density import AnisotropicKernel, IsotropicKernel
+from graspdb_density.bandwidth.mixture_fit import (
+    LEAST_DISPLACEMENTS,
+    displacements,
+    fit_kernel,
+    sampled_rows,
+)
+from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage import kernels
@@ -171,12 +176,7 @@ def _sample(
     share = found.weights / found.weights.sum()
     chosen = found.vectors[rng.choice(len(share), size=count, p=share)]
     whole = found.vectors[rng.choice(len(share), size=min(_WHOLE, len(share)), p=share)]
-    one, every = (
-        sampled_kernel_rows(
-            se3.Poses.of(part[:, :3], se3.from_rotation_vector(part[:, 3:])), _isotropic(widths)
-        )
-        for part in (chosen, whole)
-    )
+    one, every = (sampled_rows(part, _isotropic(widths)) for part in (chosen, whole))
     similarity = bhattacharyya(one, every, rng, points=4_000, window=_window(window), threads=threads)
     return [{"weight": 1.0, "mean": vector.tolist()} for vector in chosen], {
         "successes": density.size,

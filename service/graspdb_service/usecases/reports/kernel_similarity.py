@@ -16,7 +16,7 @@ from graspdb_density.bandwidth.mixture_fit import (
     Displacements,
     displacements,
 )
-from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
+from graspdb_density.kde.bhattacharyya import Coefficient, DisplacementWindow, sampled_kernel_curve
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
@@ -60,8 +60,8 @@ def kernel_similarity_report(
         successes=built.selected.successes,
         displacements=len(found.vectors),
         reference=min(_REFERENCE, len(found.vectors)),
-        samples=[_point(item) for item in samples],
-        mixtures=[_point(item) for item in mixtures],
+        samples=[_point(*item) for item in samples.items()],
+        mixtures=[_point(*item) for item in mixtures.items()],
     )
     return report.model_copy(update={"text": _text(report, window, widths)})
 
@@ -86,8 +86,8 @@ def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
     return found
 
 
-def _point(item: SampledKernelPoint) -> SimilarityPoint:
-    return SimilarityPoint(count=item.samples, similarity=item.similarity, error=item.standard_error)
+def _point(count: int, found: Coefficient) -> SimilarityPoint:
+    return SimilarityPoint(count=count, similarity=found.value, error=found.standard_error)
 
 
 def _text(report: KernelSimilarityReport, window: DisplacementWindow, widths: IsotropicKernel) -> str:
