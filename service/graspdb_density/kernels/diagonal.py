@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..se3 import UNIT_TOLERANCE, Floats
+from ..se3 import UNIT_TOLERANCE, Poses
 
 __all__ = ["DiagonalKernel"]
 
@@ -47,8 +47,9 @@ class DiagonalKernel:
             raise ValueError("the columns of axes (3, 3) must be orthonormal")
         return cls(tuple(widths.tolist()), tuple(f.ravel().tolist()))
 
-    def along(self, positions: Floats) -> Floats:
-        """Positions (N, 3) along the fixed axes, where there are such."""
+    def along(self, poses: Poses) -> Poses:
+        """Poses with their positions along the fixed axes, where there are such."""
         if self.axes is None:
-            return positions
-        return np.ascontiguousarray(positions @ np.reshape(self.axes, (3, 3)))
+            return poses
+        turned = np.ascontiguousarray(poses.positions @ np.reshape(self.axes, (3, 3)))
+        return Poses(turned, poses.quaternions_xyzw)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import threading
+from functools import partial
 
 import numpy as np
 
@@ -136,7 +137,7 @@ class ModeSearch:
             raise ValueError(f"count must be at least 1, not {count}")
         if not all(apart >= 0.0 for apart in separation):
             raise ValueError("separations must not be negative")
-        log_density = _scored(self.density, threads)
+        log_density = partial(self.density.log_density, threads=threads)
         climbing = score is None and self.density.isotropic is self.density
         start = self if climbing else self._by_values
         common = (
@@ -285,10 +286,6 @@ class MeanShiftSearch(MultiStart):
         for_blocks(work, count, block=8, threads=self.threads)
         ends, moved = self.best_tries(at, values[:, 0], p, q, values[:, 1:])
         return ends, np.where(moved, np.minimum(step, 1.0), 0.6 * step)
-
-
-def _scored(density: SearchedDensity, threads: int) -> Score:
-    return lambda poses: density.log_density(poses, threads=threads)
 
 
 def _along(rows: Floats) -> ScoredPoses:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .._compiled import diagonal
+from ..kde.rows import Rows
 from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
@@ -92,7 +93,7 @@ def fit_axis_bandwidths(
     ValueError
         For fewer than `LEAST_OF_EACH` successes or failures, or attempts all in one place.
     """
-    won, flags = checked_outcomes(success, symmetric, len(poses))
+    won = checked_outcomes(success, len(poses))
     wins, losses = int(won.sum()), int((~won).sum())
     if min(wins, losses) < LEAST_OF_EACH:
         raise ValueError(
@@ -101,10 +102,10 @@ def fit_axis_bandwidths(
         )
     rng = np.random.default_rng(0)
     kept = np.sort(rng.permutation(len(poses))[:_TRAINED_MOST])
-    poses, won, flags = poses[kept], won[kept], flags[kept]
-    blocks = assign_blocks(poses.positions, edge_m=_BLOCK_M)
-    along = Poses(DiagonalKernel.of(_START, axes).along(poses.positions), poses.quaternions_xyzw)
-    held = _HeldOut(along, won, flags, blocks, turning=axes is None, rng=rng)
+    rows, won = Rows.of(poses, symmetric=symmetric)[kept], won[kept]
+    blocks = assign_blocks(rows.poses.positions, edge_m=_BLOCK_M)
+    along = DiagonalKernel.of(_START, axes).along(rows.poses)
+    held = _HeldOut(along, won, rows.symmetric, blocks, turning=axes is None, rng=rng)
     alike = _coordinate_descent(held, _START, ((0, 1, 2), (3, 4, 5)))
     widths = _coordinate_descent(held, alike, tuple((axis,) for axis in range(6)))
     (loss, skill), (alike_loss, alike_skill) = held.verdict(widths), held.verdict(alike)

@@ -94,16 +94,16 @@ class SuccessModel:
 
     def extend(self, poses: Poses, success: ArrayLike, symmetric: ArrayLike | bool = True) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
-        won, flags = checked_outcomes(success, symmetric, len(poses))
-        p, q = poses.positions, poses.quaternions_xyzw
+        won = checked_outcomes(success, len(poses))
         if isinstance(self.kernel, IsotropicKernel):
             widest = self.kernel.sigma_position_m
         else:
             # No width is larger than the one the cells are made for, so their runs reach far enough.
-            p, widest = self.kernel.along(p), max(self.kernel.sigmas[:3])
+            poses, widest = self.kernel.along(poses), max(self.kernel.sigmas[:3])
+        attempts = Rows.of(poses, symmetric=symmetric)
         parts: list[Cells | None] = []
         for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
-            rows = Rows.of(Poses(p[chosen], q[chosen]), symmetric=flags[chosen])
+            rows = attempts[chosen]
             if not len(rows):
                 parts.append(present)
             elif present is None:
@@ -181,7 +181,7 @@ class SuccessModel:
             return np.zeros((len(poses), 2))
         arrays = cells.arrays
         if isinstance(kernel, DiagonalKernel):
-            poses = Poses(kernel.along(poses.positions), poses.quaternions_xyzw)
+            poses = kernel.along(poses)
             half = 0.5 / np.array(kernel.sigmas) ** 2
             half[:3] /= arrays.scale**2
             turning, block = kernel.axes is None, _DIAGONAL_BLOCK
@@ -225,14 +225,9 @@ def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Float
     return out
 
 
-def checked_outcomes(
-    success: ArrayLike, symmetric: ArrayLike | bool, count: int
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether attempts (N,) succeeded and their jaws are symmetric, checked."""
+def checked_outcomes(success: ArrayLike, count: int) -> NDArray[np.bool_]:
+    """Whether attempts (N,) succeeded, checked."""
     won = np.asarray(success)
     if won.shape != (count,) or won.dtype != np.bool_:
         raise ValueError(f"success must be bools of shape ({count},), not {won.dtype} of shape {won.shape}")
-    flags = np.asarray(symmetric, dtype=bool)
-    if flags.ndim and flags.shape != (count,):
-        raise ValueError(f"symmetric is one flag or has shape ({count},), not {flags.shape}")
-    return won, np.broadcast_to(flags, (count,))
+    return won

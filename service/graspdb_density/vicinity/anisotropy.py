@@ -167,16 +167,16 @@ def empirical_anisotropy(
         )
     # The twin of A sees every translation mirrored; an edge's tangent has no sign either.
     mirrored = (symmetric and alignment in ("gripper", "surface-pair")) or alignment == "edge"
-    return summary(
-        _LAYOUT,
-        translations.tallies(mirrored=mirrored),
-        rotations.tallies(mirrored=symmetric),
-        method="empirical",
-        alignment=alignment,
+    along = translations.tallies(mirrored=mirrored)
+    return Anisotropy(
+        "empirical",
+        alignment,
+        *summary(_LAYOUT, along, rotations.tallies(mirrored=symmetric), level),
         grasps=len(grasps),
-        aligned=aligned,
-        pairs=(translations.used, rotations.used),
+        translation_pairs=translations.used,
+        rotation_pairs=rotations.used,
         level=level,
+        aligned=aligned,
     )
 
 

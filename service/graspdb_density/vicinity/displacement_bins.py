@@ -194,15 +194,11 @@ def summary(
     layout: Bins,
     along: tuple[Tally, Tally],
     about: tuple[Tally, Tally],
-    *,
-    method: str,
-    alignment: Alignment,
-    grasps: int,
-    aligned: int,
-    pairs: tuple[int, int],
     level: float,
-) -> Anisotropy:
-    """The report of tallies in planes and on lines, along translations and about rotations."""
+) -> tuple[tuple[Histogram, ...], tuple[Histogram, ...], tuple[Tolerance, ...]]:
+    """Translations, rotations and tolerances of a report by tallies in planes and on lines, along
+    translations and about rotations.
+    """
     if not 0.0 < level < 1.0:
         raise ValueError("level lies between 0 and 1")
     side, depth, circle = layout.side(), layout.depth(), layout.circle()
@@ -223,18 +219,7 @@ def summary(
         lines += tolerances(
             names, _probability(tally), tally.tried, tally.pairs, tally.moved, step=step, level=level
         )
-    return Anisotropy(
-        method=method,
-        alignment=alignment,
-        translations=translations,
-        rotations=rotations,
-        tolerances=tuple(lines),
-        grasps=grasps,
-        translation_pairs=pairs[0],
-        rotation_pairs=pairs[1],
-        level=level,
-        aligned=aligned,
-    )
+    return translations, rotations, tuple(lines)
 
 
 def _probability(tally: Tally) -> Floats:

@@ -90,16 +90,15 @@ def density_anisotropy(
     bounds = np.cumsum([len(first) for first, _ in corners])[:-1]
     parts = zip(np.split(values, bounds, axis=1), np.split(0.5 * (low + high), bounds), strict=True)
     planes, lines, turned_planes, turned_lines = (_mean_tally(part, share, middle) for part, middle in parts)
-    return summary(
-        layout,
-        (planes, lines),
-        (turned_planes, turned_lines),
-        method="density",
-        alignment=alignment,
+    return Anisotropy(
+        "density",
+        alignment,
+        *summary(layout, (planes, lines), (turned_planes, turned_lines), level),
         grasps=count,
-        aligned=aligned,
-        pairs=(0, 0),
+        translation_pairs=0,
+        rotation_pairs=0,
         level=level,
+        aligned=aligned,
     )
 
 

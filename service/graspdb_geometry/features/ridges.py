@@ -88,11 +88,6 @@ class Ridges:
         return len(self.ends)
 
     @property
-    def length_m(self) -> float:
-        """Of all segments together."""
-        return float(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1).sum())
-
-    @property
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self.ends, self.tangents, self.normals, self.sides))
 
