@@ -49,7 +49,6 @@ class GraspDensity:
         self._total = float(rows.weights.sum())
 
     # -- building
-    # ---------------------------------------------------------------------------------------------------
 
     @classmethod
     def build(
@@ -101,7 +100,6 @@ class GraspDensity:
         return GraspDensity(self._kernel, self._rows.joined(more), cells, self._unit)
 
     # -- what it holds
-    # ----------------------------------------------------------------------------------------------
 
     @property
     def kernel(self) -> IsotropicKernel:
@@ -179,7 +177,6 @@ class GraspDensity:
         return self._kernel.log_peak - math.log(self._total / self._unit)
 
     # -- evaluation
-    # -------------------------------------------------------------------------------------------------
 
     def log_density(self, poses: Poses, *, cutoff: float | None = CUTOFF, threads: int = 1) -> Floats:
         """Log density at poses, nats of 1/(m^3 rad^3), finite and right however far from data.
@@ -267,7 +264,6 @@ class GraspDensity:
         return rows, np.where(found, np.sqrt(np.maximum(-2.0 * best, 0.0)), np.inf)
 
     # -- sampling
-    # ---------------------------------------------------------------------------------------------------
 
     def sample(self, count: int, rng: np.random.Generator) -> Poses:
         """Draw grasps, both twins of symmetric rows alike."""
