@@ -24,6 +24,7 @@ from ..kde.isotropic import scaled_radius
 from ..kde.rows import Rows
 from ..kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from ..se3 import Floats
+from ..success.calibration import numbered
 
 __all__ = [
     "DEFAULT_KERNEL",
@@ -137,8 +138,7 @@ def score_widths(
     p, w = rows.poses.positions, rows.weights / rows.weights.mean()
     # Neighbours are alike: errors count cubes as wide as the widest block, not rows.
     edge = BLOCK_WIDTHS * DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * _STEPS_POSITION[-1])
-    _, cube = np.unique(np.floor((p - p.min(axis=0)) / edge).astype(np.int64), axis=0, return_inverse=True)
-    cube = cube.reshape(-1)
+    cube = numbered(np.floor((p - p.min(axis=0)) / edge))
     tables = []
     for kernel, held, values in _scored(rows, threads):
         full = np.full(len(p), np.nan)
@@ -185,9 +185,7 @@ def _held_out(
     (p, q), w = rows.poses, rows.weights
     edge = BLOCK_WIDTHS * kernel.sigma_position_m
     low = p.min(axis=0)
-    cell = np.floor((p - low) / edge).astype(np.int64)
-    _, block = np.unique(cell, axis=0, return_inverse=True)
-    block = block.reshape(-1).astype(np.int32)
+    block = numbered(np.floor((p - low) / edge)).astype(np.int32)
     outside = w.sum() - np.bincount(block, weights=w)[block]
     # Evenly spaced in commit order: no generator, so the same rows give the same widths everywhere.
     held = np.unique(np.linspace(0, len(p) - 1, min(len(p), MOST_HELD_OUT)).astype(np.int64))

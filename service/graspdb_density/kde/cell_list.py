@@ -167,7 +167,7 @@ def _with_tails(
     segments: list[_Segment], rows: Rows, first: int, centre: Floats, scale: float
 ) -> list[_Segment]:
     """Segments with further rows, numbered from ``first`` on, in the tails."""
-    found = []
+    found: list[_Segment] = []
     for twin, chosen in ((True, rows.symmetric), (False, ~rows.symmetric)):
         tail = [s for s in segments if s.header[c.TWIN] == twin]
         if not chosen.any():

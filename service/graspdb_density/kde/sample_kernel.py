@@ -63,24 +63,18 @@ class SampledKernel:
     ) -> GraspDensity:
         """The density of grasps under this kernel (eq 6), with all that a `GraspDensity` can do.
 
-        Its rows are the components; extend it by what `placed` makes of further grasps.
+        Its rows are the components; extend it by what `placed` makes of further grasps. More than
+        `MOST_COMPONENTS` are the caller's to refuse.
 
         Raises
         ------
         ValueError
-            As `GraspDensity.build`, and for more than `MOST_COMPONENTS` components.
+            As `GraspDensity.build`.
         """
         if not len(poses):
             raise ValueError("a density needs at least one grasp")
         rows = Rows.of(poses, weights, symmetric)
         flags = rows.symmetric
-        many = self.size * (len(poses) + int(flags.sum()))
-        if many > MOST_COMPONENTS:
-            raise ValueError(
-                f"{len(poses)} grasps of {self.size} components each, those of symmetric jaws twice, are "
-                f"{many}: more than {MOST_COMPONENTS}; fit a mixture of a few, or take fewer grasps or "
-                "components"
-            )
         # A symmetric row's template stands at the row and at its turn, half of the weight each.
         at, to = Poses.concatenate([poses, poses[flags].turned()])
         share = np.concatenate([rows.twin_weights, rows.twin_weights[flags]])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .calibration import jeffreys_interval
+from .calibration import jeffreys_interval, numbered
 
 __all__ = ["Share", "shares"]
 
@@ -72,9 +72,7 @@ def shares(
             found.append(Share(0, 0, np.nan, np.nan, np.nan))
             continue
         low, high = (float(end) for end in jeffreys_interval(k / n, n, level))
-        cell = np.floor(p[chosen] / _BLOCK_M).astype(np.int64)
-        _, block = np.unique(cell, axis=0, return_inverse=True)
-        block = block.reshape(-1)
+        block = numbered(np.floor(p[chosen] / _BLOCK_M))
         blocks = int(block.max()) + 1
         if blocks >= _LEAST_BLOCKS:
             tried = np.bincount(block, minlength=blocks).astype(np.float64)
