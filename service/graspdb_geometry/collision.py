@@ -60,7 +60,7 @@ class Scene:
             raise ValueError("parts must hold at least one convex part")
         solids = [_Solid(number, np.asarray(part[0], dtype=np.float64)) for number, part in enumerate(parts)]
         self.part_count = len(solids)
-        self._model = convex.Model(
+        self._model = convex.ConvexParts(
             np.concatenate([s.vertices for s in solids]),
             _starts([len(s.vertices) for s in solids]),
             np.concatenate([s.planes for s in solids]),

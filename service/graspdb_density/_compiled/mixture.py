@@ -14,14 +14,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from . import exp
 from . import isotropic as c
 from .isotropic_runs import LANES, single
 from .options import fast, inlined
 from .quaternions import relative
-from .weighted import angle_factor, mixture_log_sum, whitened_squares
+from .weighted import angle_factor, mixture_log_sum, whitened_squares, whitening_of
 
 __all__ = ["mixture_log_sums", "mixture_sums_at"]
 
@@ -81,7 +80,7 @@ def _component(data, begin, n, all_n, xi, lower, log_weight):
     """Sum over the first ``n`` of a block of ``all_n`` of weight times one component, and that sum weighted
     by the exponent.
     """
-    whitening = to_fixed_tuple(lower, 27)
+    whitening = whitening_of(lower)
     total, spread = _ZERO, _ZERO
     count, log_weight = np.int32(n), log_weight * exp.LOG2E
     for k in range(np.uint64(all_n)):

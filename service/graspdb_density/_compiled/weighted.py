@@ -109,10 +109,16 @@ def angle_factor(w):
 
 
 @inlined
+def whitening_of(lower):
+    """A row of `Mixture.lowers` as a tuple, so that loops that write keep it in registers."""
+    return to_fixed_tuple(lower, 27)  # type: ignore[call-arg]
+
+
+@inlined
 def whitened_squares(w, x0, x1, x2, x3, x4, x5):
     """Half the squared Mahalanobis distance of a displacement: what its translation has of it, and the rest.
 
-    ``w`` is a row of `Mixture.lowers` as a tuple, so that loops that write keep it in registers.
+    ``w`` is what `whitening_of` gives.
     """
     z0 = w[0] * x0 - w[21]
     z1 = w[1] * x0 + w[2] * x1 - w[22]
@@ -173,7 +179,7 @@ def _add_component(xi, n, lower, log_weight, far, out):
     ``lower`` (27,) is a row of `Mixture.lowers`. ``far``: the other wrap, the rotation by angle - 2 pi about
     the same axis.
     """
-    whitening = to_fixed_tuple(lower, 27)
+    whitening = whitening_of(lower)
     other = _ONE if far else _ZERO
     for k in range(np.uint64(n)):
         x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
@@ -302,7 +308,7 @@ def mixture_log_sum(rows, mixture, p, q):
                 scale = sign * (turn / sine if sine > 1e-12 else 2.0)
                 for j in range(mixture.lowers.shape[0]):
                     place, rest = whitened_squares(
-                        to_fixed_tuple(mixture.lowers[j], 27), x, y, z, scale * vx, scale * vy, scale * vz
+                        whitening_of(mixture.lowers[j]), x, y, z, scale * vx, scale * vy, scale * vz
                     )
                     value = rows.log_rows[i] + mixture.log_weights[j] - (place + rest)
                     if value > top:

@@ -16,18 +16,6 @@ __all__ = ["Density", "SearchedDensity"]
 class Density(Protocol):
     """A density of grasps, 1/(m^3 rad^3): `GraspDensity`, `MixtureDensity`, `KernelRows`."""
 
-    @property
-    def size(self) -> int:
-        """Rows; twins are not counted."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the arrays held."""
-
-    @property
-    def symmetric(self) -> NDArray[np.bool_]:
-        """(N,) whether a row has its twin under the jaw's turn."""
-
     def log_density(self, poses: Poses, *, threads: int = 1) -> Floats:
         """(M,) nats, right however far from every row."""
 
@@ -37,6 +25,14 @@ class Density(Protocol):
 
 class SearchedDensity(Density, Protocol):
     """A density that queries ask and searches climb: `GraspDensity`, `MixtureDensity`."""
+
+    @property
+    def size(self) -> int:
+        """Rows; twins are not counted."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays held."""
 
     def sample_rows(self, rows: NDArray[np.integer], rng: np.random.Generator) -> Poses:
         """A draw from the kernel of each of some rows, their twins left out."""

@@ -25,7 +25,7 @@ IntArray = npt.NDArray[np.int64]
 _INF = np.inf
 
 
-class Model(NamedTuple):
+class ConvexParts(NamedTuple):
     """Convex parts.
 
     Attributes
