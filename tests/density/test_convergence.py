@@ -40,7 +40,7 @@ def _random_mixture(
     rng: np.random.Generator, scale: float = 1.0, frame: Frame = "gripper"
 ) -> AnisotropicKernel:
     """Two pairs of components, each a mirror image of the other."""
-    widths = np.array([0.02, 0.01, 0.015, 0.3, 0.5, 0.2]) * scale
+    widths = np.array([0.02, 0.01, 0.015, 0.25, 0.4, 0.2]) * scale
     means, covariances = [], []
     for _ in range(2):
         root = rng.standard_normal((6, 6)) * 0.3 + np.eye(6)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.weighted_sums import KernelRows
-from graspdb_density.kernels.gaussian_mixture import AnisotropicKernel, Kernel
+from graspdb_density.kernels.gaussian_mixture import AnisotropicKernel, Frame, Kernel
 from graspdb_density.se3 import Floats, Poses
 from graspdb_density.statistics import convergence as cv
 from graspdb_density.statistics.counter_rng import CounterRng
@@ -90,7 +90,8 @@ def test_a_grown_curve_is_the_one_computed_at_once(
         rng.random(total) < 0.8,
         se3.to_matrix(se3.random_quaternions(total, rng)) if framed and shaped else None,
     )
-    kernel: Kernel = ANISOTROPIC if shaped else ISOTROPIC
+    frame: Frame = "fixed" if framed else "gripper"
+    kernel: Kernel = AnisotropicKernel.diagonal(WIDTHS, frame=frame) if shaped else ISOTROPIC
     curve = grasps.grown(200, kernel)
     for count in 200 + np.cumsum(counts):
         before = curve
@@ -198,10 +199,7 @@ def test_poisson_counts_and_drawing_with_replacement_agree(shell: Shell, count: 
     rows = KernelRows(Rows.of(se3.Poses.of(p, q), weights=weights), ISOTROPIC)
     # As many points as a group has: what they add to the deviation is then alike.
     points = len(curve._groups[0].poses.positions)
-    drawn = [
-        cv.bootstrap_similarity(rows, rng, replicates=200, points=points, threads=2).replicates
-        for _ in range(5)
-    ]
+    drawn = [cv.bootstrap_similarity(rows, rng, replicates=200, points=points, threads=2) for _ in range(5)]
     value, deviation = np.mean(drawn), math.sqrt(np.mean(np.var(drawn, axis=1, ddof=1)))
     # Monte Carlo of replicates and of the points, and the 1/N of 1 - s by which they may differ.
     error = math.hypot(*[np.std(np.mean(v, axis=1), ddof=1) / 2.2 for v in (drawn, last.replicates)])

@@ -69,7 +69,6 @@ class MixtureDensity:
         self._spread = float(along.max())
         self._hold(rows, Cells.build(rows.rows.over(1.0 / rows.size), self._spread))
         self._log_unit = rows.log_unit
-        self._mixture = rows.mixture._replace(wraps=True)
         turn, mean_turn = float(about.max()), float(np.linalg.norm(kernel.means[:, 3:], axis=1).max())
         self._narrow = turn <= NARROW and mean_turn + 2.5 * turn <= math.radians(75.0)
 
@@ -150,13 +149,12 @@ class MixtureDensity:
         """
         if not self._narrow:
             return self._rows.log_density(poses, threads=threads)
-        cells, stages, rows = self._cells.arrays, self._stages(), self._rows.exact
-        components, unit = self._mixture.single(), math.log(self._total / self._unit)
+        cells, stages, rows = self._cells.arrays, self._stages(), self._rows
+        components, unit = rows.mixture.single(), math.log(self._total / self._unit)
+        exact = rows.exact, rows.exact_mixture
 
         def loop(p: Floats, q: Floats, out: Floats) -> None:
-            mixture.mixture_log_sums(
-                cells, self._sorted_frames, p, q, components, stages, unit, rows, self._mixture, out
-            )
+            mixture.mixture_log_sums(cells, self._sorted_frames, p, q, components, stages, unit, *exact, out)
 
         return self._cells.at_poses(loop, poses, block=_QUERY_BLOCK, threads=threads) + self._log_unit
 

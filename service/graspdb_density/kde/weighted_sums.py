@@ -83,6 +83,8 @@ class KernelRows:
         self._reach = float(np.max(np.linalg.norm(kernel.means[:, :3], axis=1) + CUTOFF * along))
         self.log_unit = float(kernel.log_peaks.max())
         self.mixture = _compiled_mixture(kernel)
+        #: Far from every row a rotation by the other vector may be the nearer one.
+        self.exact_mixture = self.mixture._replace(wraps=True)
 
     @cached_property
     def frames(self) -> Floats:
@@ -242,7 +244,8 @@ class KernelRows:
         if isinstance(self.kernel, IsotropicKernel):
             return self._isotropic(self.kernel).log_density(poses, cutoff=None, threads=threads)
         values = [
-            weighted.mixture_log_sum(self.exact, self.mixture, at, to) for at, to in zip(p, q, strict=True)
+            weighted.mixture_log_sum(self.exact, self.exact_mixture, at, to)
+            for at, to in zip(p, q, strict=True)
         ]
         return self.log_unit + np.array(values)
 

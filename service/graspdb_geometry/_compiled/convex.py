@@ -26,7 +26,7 @@ _INF = np.inf
 
 
 class ConvexParts(NamedTuple):
-    """Convex parts.
+    """An object of convex parts, as the loops take it.
 
     Attributes
     ----------
