@@ -163,16 +163,17 @@ class Successes:
         isotropic = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
         kernel = key.success_kernel or isotropic
         old, sample = (None, None) if before is None else (before.model, before.sample)
-        new = self._compute.run(lambda: _Columns.of(attempts.joined(stored)))
-        size = len(new.success) + (0 if old is None else old.size)
+        new = self._compute.run(lambda: attempts.joined(stored))
+        size = len(new) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
             return self._refresh(key, selected, None)
-        model = self._compute.run(lambda: _extended(old, new, kernel))
+        every = np.ones(len(new), dtype=np.bool_)
+        model = self._compute.run(lambda: _extended(old, new, every, kernel))
         if size > _LARGE:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
-            chosen = np.random.default_rng(row.revision).random(len(new.success)) < share
-            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel))
+            chosen = np.random.default_rng(row.revision).random(len(new)) < share
+            sample = self._compute.run(lambda: _extended(sample, new, chosen, kernel))
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
@@ -186,30 +187,12 @@ def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts
     )
 
 
-def _extended(old: SuccessModel | None, new: _Columns, kernel: SuccessKernel) -> SuccessModel | None:
-    if not len(new.success):
+def _extended(
+    old: SuccessModel | None, new: AllTrials, rows: NDArray[np.bool_], kernel: SuccessKernel
+) -> SuccessModel | None:
+    """A model with some attempts more."""
+    if not rows.any():
         return old
-    columns = Poses.of(new.position, new.quaternion), new.success
-    if old is not None:
-        return old.extend(*columns, symmetric=new.symmetric)
-    return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
-
-
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """Attempts (n,): pose, whether it succeeded, whether its jaw is symmetric."""
-
-    position: Floats
-    quaternion: Floats
-    success: NDArray[np.bool_]
-    symmetric: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, found: AllTrials) -> _Columns:
-        """What a model of success needs of them."""
-        return cls(found.position, found.quaternion, found.success, found.symmetric)
-
-    def take(self, chosen: NDArray[np.bool_]) -> _Columns:
-        return _Columns(
-            self.position[chosen], self.quaternion[chosen], self.success[chosen], self.symmetric[chosen]
-        )
+    if old is None:
+        return new.success_model(kernel, rows)
+    return old.extend(new.poses[rows], new.success[rows], symmetric=new.symmetric[rows])

@@ -9,7 +9,6 @@ import numpy as np
 
 from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance, KernelWidths
 from graspdb_density import AnisotropicKernel
-from graspdb_density.se3 import Poses
 from graspdb_density.success.axis_bandwidth import fit_axis_bandwidths
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases.densities import stored_kernel
@@ -41,7 +40,7 @@ def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
         try:
             fit = ctx.compute.run(
                 lambda: fit_axis_bandwidths(
-                    Poses.of(everything.position[kept], everything.quaternion[kept]),
+                    everything.poses[kept],
                     everything.success[kept],
                     axes=axes,
                     symmetric=everything.symmetric[kept],

@@ -17,7 +17,7 @@ from graspdb.wire.reports import (
     AnisotropyTolerance,
     Method,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
+from graspdb_density import IsotropicKernel, importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
 from graspdb_density.vicinity.anisotropy import empirical_anisotropy
@@ -143,7 +143,7 @@ def _measure(
     keys = everything.keys
     symmetric = bool(everything.symmetric.all())
     return lambda alignment, frames, progress: empirical_anisotropy(
-        Poses.of(everything.position, everything.quaternion),
+        everything.poses,
         everything.success,
         rotation_keys=None if keys is None else keys[0],
         position_keys=None if keys is None else keys[1],
@@ -188,11 +188,7 @@ def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[
     rows = np.arange(len(everything))
     if len(rows) > _LOCAL_ATTEMPTS:
         rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_LOCAL_ATTEMPTS, replace=False))
-    density = GraspDensity.build(
-        se3.Poses.of(everything.position[rows], everything.quaternion[rows]),
-        kernel=kernel,
-        symmetric=everything.symmetric[rows],
-    )
+    density = everything.density(kernel, rows)
     return lambda poses: len(everything) * density.density(poses)
 
 

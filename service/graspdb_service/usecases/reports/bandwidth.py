@@ -13,7 +13,6 @@ from graspdb.wire.reports import BandwidthPoint, BandwidthReport, SimulatedDraws
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import (
@@ -43,7 +42,7 @@ def bandwidth_report(
         )
     scores = enough(
         lambda: score_widths(
-            Poses.of(density.positions, density.quaternions_xyzw),
+            density.poses,
             weights=density.weights,
             symmetric=density.symmetric,
             threads=inputs.threads,

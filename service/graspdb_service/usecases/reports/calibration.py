@@ -14,7 +14,7 @@ from graspdb.wire.reports import (
     CheckedGrasps,
     ReportRange,
 )
-from graspdb_density import GraspDensity, SuccessModel, importance_weights, se3
+from graspdb_density import importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import (
@@ -25,7 +25,6 @@ from graspdb_density.success.calibration import (
     calibrate,
     reliability,
 )
-from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
@@ -59,13 +58,6 @@ _REACH = 5.0
 _CHECKED_BINS = 5
 
 
-def _model(everything: AllTrials, rows: NDArray[np.int64], kernel: SuccessKernel) -> SuccessModel:
-    """Of some attempts."""
-    poses = Poses.of(everything.position[rows], everything.quaternion[rows])
-    symmetric = everything.symmetric[rows]
-    return SuccessModel.build(poses, everything.success[rows], kernel=kernel, symmetric=symmetric)
-
-
 def calibration_report(
     inputs: ReportInputs, built: Built, options: SelectionQuery, progress: Progress
 ) -> CalibrationReport:
@@ -84,7 +76,7 @@ def calibration_report(
     density = built.density
     assert density is not None
     edge = 3.0 * density.kernel.sigma_position_m
-    blocks = enough(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
+    blocks = enough(lambda: assign_blocks(everything.poses.positions, edge_m=edge, folds=_FOLDS))
     judged, weights = _judged(everything)
     predicted, ranked = _predictions(inputs, built, everything, test, blocks, judged, progress)
     won, collided, block = everything.success[judged], everything.collided[judged], blocks.block[judged]
@@ -132,9 +124,9 @@ def _predictions(
     """The success probability and the log density of every judged attempt, without the blocks of its fold."""
     assert built.density is not None
     kernel = built.density.kernel
-    p, q = everything.position[judged], everything.quaternion[judged]
+    poses = everything.poses[judged]
     predicted, ranked = np.zeros(len(judged)), np.full(len(judged), -np.inf)
-    free = None if test is None else test.free(Poses(p, q), threads=inputs.threads)
+    free = None if test is None else test.free(poses, threads=inputs.threads)
     learned = everything.collided if test is not None else np.zeros(len(everything), dtype=bool)
     proposal_known = not np.isnan(everything.proposal).all()
     for fold in range(blocks.folds):
@@ -143,18 +135,14 @@ def _predictions(
         progress(fold / blocks.folds)
         if not held.size or not train.size:
             continue
-        model = _model(everything, train, built.success_kernel or kernel)
+        model = everything.success_model(built.success_kernel or kernel, train)
         progress((fold + 0.5) / blocks.folds)
-        predicted[held] = model.evaluate(Poses.of(p[held], q[held]), threads=inputs.threads).probability
+        predicted[held] = model.evaluate(poses[held], threads=inputs.threads).probability
         kept = train[everything.success[train]]
         if kept.size:
-            own = GraspDensity.build(
-                se3.Poses.of(everything.position[kept], everything.quaternion[kept]),
-                kernel=kernel,
-                weights=importance_weights(everything.proposal[kept]) if proposal_known else None,
-                symmetric=everything.symmetric[kept],
-            )
-            ranked[held] = own.log_density(se3.Poses.of(p[held], q[held]), threads=inputs.threads)
+            weights = importance_weights(everything.proposal[kept]) if proposal_known else None
+            own = everything.density(kernel, kept, weights)
+            ranked[held] = own.log_density(poses[held], threads=inputs.threads)
     if free is not None:
         predicted[~free] = 0.0
     return predicted, ranked
@@ -188,26 +176,27 @@ def _checked(
     found = [item for item in read if item.plan == "poses" and len(item.codes)]
     if not found:
         return None
-    p = np.concatenate([item.position for item in found])
-    q = np.concatenate([item.quaternion for item in found])
+    poses = Poses.concatenate([item.poses for item in found])
     codes = np.concatenate([item.codes for item in found])
     assert built.density is not None
     kernel, diagonal = built.density.kernel, built.success_kernel
     reach = max([kernel.sigma_position_m, *(() if diagonal is None else diagonal.sigmas[:3])])
-    distance, _ = cKDTree(p).query(everything.position, distance_upper_bound=_REACH * reach)
+    distance, _ = cKDTree(poses.positions).query(
+        everything.poses.positions, distance_upper_bound=_REACH * reach
+    )
     near = np.isfinite(distance)
     if test is not None:
         # Those that collided tell nothing of the others.
         near &= ~everything.collided
-    predicted = np.zeros(len(p))
+    predicted = np.zeros(len(poses))
     if near.any():
-        model = _model(everything, np.flatnonzero(near), diagonal or kernel)
-        predicted = model.evaluate(Poses.of(p, q), threads=inputs.threads).probability.copy()
+        model = everything.success_model(diagonal or kernel, near)
+        predicted = model.evaluate(poses, threads=inputs.threads).probability.copy()
     if test is not None:
-        predicted[~test.free(Poses(p, q), threads=inputs.threads)] = 0.0
+        predicted[~test.free(poses, threads=inputs.threads)] = 0.0
     outcomes = verification.tally(codes)
     won = outcomes.get("success", 0)
-    success = np.isin(codes, [OUTCOME_CODES["success"]])
+    success = codes == OUTCOME_CODES["success"]
     return CheckedGrasps(
         grasps=len(codes),
         successes=won,

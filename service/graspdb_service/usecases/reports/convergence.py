@@ -19,7 +19,7 @@ from graspdb.wire.reports import (
     SimulatedDraws,
 )
 from graspdb.wire.reports import Verdict as VerdictModel
-from graspdb_density import GraspDensity, IsotropicKernel, MixtureDensity, se3
+from graspdb_density import GraspDensity, IsotropicKernel, MixtureDensity
 from graspdb_density.bandwidth.matching import (
     Match,
     match_determinants,
@@ -30,7 +30,6 @@ from graspdb_density.bandwidth.matching import (
 )
 from graspdb_density.kde.weighted_sums import KernelRows, Progress
 from graspdb_density.kernels.gaussian_mixture import Kernel
-from graspdb_density.se3 import Poses
 from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.problems import conflict
@@ -152,7 +151,7 @@ def _curve(
 
     def grow(before: IncrementalCurve | None, progress: Progress) -> IncrementalCurve:
         return IncrementalCurve.of(
-            Poses.of(density.positions, density.quaternions_xyzw),
+            density.poses,
             kernel,
             before=before,
             weights=density.raw_weights,
@@ -182,20 +181,15 @@ def _matched(
         return match
     order = np.random.default_rng(0).permutation(grown.prefix)
     held, train = np.split(order, [max(1, min(2_000, grown.prefix // 10))])
-    p, q, w = density.positions, density.quaternions_xyzw, density.weights
+    poses, w = density.poses, density.weights
     if frames is not None and frames.ndim == 3:
         frames = frames[train]
 
     def likelihood(used: Kernel) -> float:
-        rows = KernelRows(
-            se3.Poses.of(p[train], q[train]), used, weights=w[train], symmetric=density.symmetric[train],
-            frames=None if isinstance(used, IsotropicKernel) else frames,
-        )  # fmt: skip
-        return float(
-            np.average(
-                rows.log_density(se3.Poses.of(p[held], q[held]), threads=inputs.threads), weights=w[held]
-            )
-        )
+        own = None if isinstance(used, IsotropicKernel) else frames
+        symmetric = density.symmetric[train]
+        rows = KernelRows(poses[train], used, weights=w[train], symmetric=symmetric, frames=own)
+        return float(np.average(rows.log_density(poses[held], threads=inputs.threads), weights=w[held]))
 
     return inputs.curves.match(
         grown, rule, lambda: match_likelihood(likelihood(kernel), match.kernel, likelihood)

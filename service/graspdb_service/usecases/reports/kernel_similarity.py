@@ -18,7 +18,6 @@ from graspdb_density.bandwidth.mixture_fit import (
 )
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import ReportInputs, head
@@ -77,7 +76,7 @@ def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
             f" {LEAST_SUCCESSES - count} more are needed",
         )
     found = displacements(
-        Poses.of(density.positions, density.quaternions_xyzw),
+        density.poses,
         window=window,
         rng=np.random.default_rng(0),
         weights=density.weights,

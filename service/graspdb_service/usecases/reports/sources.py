@@ -17,10 +17,9 @@ from graspdb.wire.reports import (
     SourcesOptions,
     SourcesReport,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import conflict
 from graspdb_service.storage.trials import provenances
@@ -115,11 +114,11 @@ def _predictions(
     predicted = np.zeros(len(everything))
     reached = np.zeros(len(everything), dtype=bool)
     if model is not None:
-        answer = model.evaluate(Poses.of(everything.position, everything.quaternion), threads=threads)
+        answer = model.evaluate(everything.poses, threads=threads)
         predicted = answer.probability.copy()
         reached = answer.effective_trials >= _WITHIN_REACH
     if test is not None:
-        free = test.free(Poses(everything.position, everything.quaternion), threads=threads)
+        free = test.free(everything.poses, threads=threads)
         predicted[~free] = 0.0
         # Geometry tells of a collision wherever it is.
         reached |= ~free
@@ -130,20 +129,13 @@ def _model(
     simulated: AllTrials, real: list[AllTrials], kernel: IsotropicKernel, *, collisions_known: bool
 ) -> SuccessModel | None:
     """What simulation knows within reach of the real trials: of millions of attempts few are near them."""
-    tree = cKDTree(np.concatenate([item.position for item in real]))
-    distance, _ = tree.query(simulated.position, distance_upper_bound=_REACH * kernel.sigma_position_m)
+    tree = cKDTree(np.concatenate([item.poses.positions for item in real]))
+    distance, _ = tree.query(simulated.poses.positions, distance_upper_bound=_REACH * kernel.sigma_position_m)
     near = np.isfinite(distance)
     if collisions_known:
         # Those that collided tell nothing of the others.
         near &= ~simulated.collided
-    if not near.any():
-        return None
-    return SuccessModel.build(
-        Poses.of(simulated.position[near], simulated.quaternion[near]),
-        simulated.success[near],
-        kernel=kernel,
-        symmetric=simulated.symmetric[near],
-    )
+    return simulated.success_model(kernel, near) if near.any() else None
 
 
 def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | None:
@@ -243,18 +235,11 @@ def _similarity(inputs: ReportInputs, built: Built, everything: AllTrials) -> So
 
     def under(rows: NDArray[np.int64], weights: Floats | None) -> GraspDensity:
         return GraspDensity.build(
-            se3.Poses.of(density.positions[rows], density.quaternions_xyzw[rows]),
-            kernel=kernel,
-            weights=weights,
-            symmetric=density.symmetric[rows],
+            density.poses[rows], kernel=kernel, weights=weights, symmetric=density.symmetric[rows]
         )
 
     whole = under(np.arange(density.size), density.weights)
-    real = GraspDensity.build(
-        se3.Poses.of(everything.position[won], everything.quaternion[won]),
-        kernel=kernel,
-        symmetric=everything.symmetric[won],
-    )
+    real = everything.density(kernel, won)
     found = bhattacharyya(real, whole, rng, points=_POINTS, threads=inputs.threads)
     count = min(len(won), density.size)
     alone = []

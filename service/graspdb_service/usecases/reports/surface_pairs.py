@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from graspdb.wire.reports import AnisotropyRelation
 from graspdb_density.success.block_bootstrap import shares
 from graspdb_geometry.features.jaw_pairs import KINDS, JawPairs
-from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.reports.common import LEVEL, finite
 from graspdb_service.usecases.trials.attempts import AllTrials
 
@@ -32,20 +31,19 @@ def relations(everything: AllTrials, pairs: JawPairs) -> list[AnisotropyRelation
     rows = np.arange(len(everything))
     if len(rows) > _MOST_ATTEMPTS:
         rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_MOST_ATTEMPTS, replace=False))
-    p, q = everything.position[rows], everything.quaternion[rows]
-    won, hit = everything.success[rows], everything.collided[rows]
+    poses, won, hit = everything.poses[rows], everything.success[rows], everything.collided[rows]
     found: list[AnisotropyRelation] = []
     edges = np.radians(ANGLES_DEG)
     alone = np.ones(len(rows), dtype=bool)
     for kind in KINDS:
-        which, angle = pairs.of(kind).at(ToolPoses(p, q))
+        which, angle = pairs.of(kind).at(poses)
         alone &= which < 0
         if not (pairs.kinds == KINDS.index(kind)).any():
             continue
         group = np.clip(np.searchsorted(edges, np.nan_to_num(angle), side="right") - 1, 0, len(edges) - 2)
         group[which < 0] = -1
-        found += _rows(kind, won, hit, group, p)
-    return found + _rows("none", won, hit, np.where(alone, 0, -1), p)
+        found += _rows(kind, won, hit, group, poses.positions)
+    return found + _rows("none", won, hit, np.where(alone, 0, -1), poses.positions)
 
 
 def _rows(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,6 @@ from graspdb_service.usecases.runtime.runtime import Runtime
 from graspdb_service.usecases.simulation import leases
 from graspdb_service.usecases.simulation.leases import lost_lease
 from graspdb_service.usecases.trials import sweep_plan
-from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
 
 #: Sweeps over the same grid that finish chunks at the same moment make one another look again.
 _MAX_LOOKS = 50
@@ -73,7 +72,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
         outcomes = _outcomes(result, job)
         if stored is None:
             grid = sweep_plan.grid_of(sweep)
-            poses = sweep_plan.grid_poses(grid, job.start, job.stop)
+            poses = sweep_plan.grid_poses(grid, grid.pose_indices(job.start, job.stop))
             others = [(sweep_plan.grid_of(twin), ranges[twin.id]) for twin in twins.values()]
             fresh = sweep_plan.not_stored_yet(grid, job.start, job.stop, poses.pose_index, others)
         else:
@@ -183,7 +182,7 @@ def _chunk(
     sweep: SweepRow,
     result: SimulateResult,
     outcomes: npt.NDArray[np.uint8],
-    poses: ChunkPoses,
+    poses: TrialColumns,
     fresh: npt.NDArray[np.bool_],
 ) -> _Chunk:
     rows = result.rows
@@ -208,15 +207,13 @@ def _chunk(
         raise invalid("rows.pose_index", f"pose {missing} succeeded, so it must have a row")
     kept = place[fresh[place]]
     new = fresh[place]
-    columns = TrialColumns(
-        position=poses.position[kept],
-        quaternion_xyzw=poses.quaternion_xyzw[kept],
+    columns = replace(
+        poses[kept],
         outcome=outcomes[kept],
         provenance=np.full(len(kept), sweep.provenance_id, dtype=np.int64),
-        proposal_density=poses.proposal_density[kept],
-        quality=_floats(rows.quality)[new],
-        width_m=_floats(rows.width_m)[new],
-        pose_index=index[new],
+        # None becomes NaN, which stands for "none" in the columns.
+        quality=np.array(rows.quality, dtype=np.float64)[new],
+        width_m=np.array(rows.width_m, dtype=np.float64)[new],
     )
     packed = {} if sweep.purpose == "check" else _count(outcomes[fresh & ~is_row])
     counts: dict[str, dict[str, int]] = {
@@ -224,11 +221,6 @@ def _chunk(
         "packed": {str(code): number for code, number in packed.items()},
     }
     return _Chunk(outcomes, columns, packed, counts)
-
-
-def _floats(values: list[float | None]) -> npt.NDArray[np.float64]:
-    # None becomes NaN, which stands for "none" in the columns.
-    return np.array(values, dtype=np.float64)
 
 
 def _count(codes: npt.NDArray[np.uint8]) -> dict[int, int]:

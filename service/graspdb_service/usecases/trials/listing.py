@@ -34,7 +34,7 @@ def page(
     """A page of trials in commit order, and the sequence number after which the next one starts."""
     with database.read() as tx:
         found = _read(tx, require(tx, slug), chosen, after, limit + 1)
-    columns = found.columns.first(limit)
+    columns = found.columns[:limit]
     following = int(columns.seq[-1]) if len(found.columns) > limit else None
     return replace(found, columns=columns), following
 

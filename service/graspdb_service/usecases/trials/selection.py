@@ -7,6 +7,9 @@ from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspdb.wire import OUTCOMES, GripperProfile, Selection
 from graspdb_service.problems import conflict, not_found
 from graspdb_service.storage import grippers
@@ -54,6 +57,10 @@ class Selected:
     def filters(self) -> Filters:
         """The filters that select the same trials whatever else is added to the object."""
         return Filters(self.gripper, self.protocol, self.source)
+
+    def symmetric(self, provenance: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the jaw was mirror-symmetric, of trials (n,) of the selection by their provenances."""
+        return np.isin(provenance, [number for number, symmetric in self.provenances.items() if symmetric])
 
     @property
     def jaw_symmetric(self) -> bool:
