@@ -10,35 +10,11 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, delete, or_, select, update
 
 from graspdb.wire.states import RunState
-from graspdb_service.storage.database import Tx, insert_or, unix_now
+from graspdb_service.storage.database import Tx, first_as, insert_new, unix_now
 from graspdb_service.storage.tables import objects, report_runs
 
 #: The option that stands for the checks there are: another one whenever they change.
 CHECKS = "checks"
-
-
-@dataclass(frozen=True)
-class RunRow:
-    """A run as stored. ``object`` is the object's slug, ``live`` whether somebody holds its lease.
-
-    ``problem`` is a problem's members where a request was at fault; null in a failed run where the service
-    was, or where its process died.
-    """
-
-    id: str
-    object_id: int
-    object: str
-    revision: int
-    report: str
-    parameters_key: str
-    parameters: dict[str, Any]
-    state: str
-    progress: float
-    result: str | None
-    problem: dict[str, Any] | None
-    created_at: datetime
-    finished_at: datetime | None
-    live: bool
 
 
 @dataclass(frozen=True)
@@ -50,6 +26,25 @@ class RunKey:
     report: str
     parameters_key: str
     parameters: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RunRow(RunKey):
+    """A run as stored. ``object`` is the object's slug, ``live`` whether somebody holds its lease.
+
+    ``problem`` is a problem's members where a request was at fault; null in a failed run where the service
+    was, or where its process died.
+    """
+
+    id: str
+    object: str
+    state: str
+    progress: float
+    result: str | None
+    problem: dict[str, Any] | None
+    created_at: datetime
+    finished_at: datetime | None
+    live: bool
 
 
 def get(tx: Tx, id: str) -> RunRow | None:
@@ -67,24 +62,8 @@ def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str, lease_s: float) -> bool:
     request, or whose holder is gone. False where it is done or somebody else's.
     """
     lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
-    made = tx.execute(
-        insert_or(tx, report_runs)
-        .values(
-            id=id,
-            object_id=key.object_id,
-            revision=key.revision,
-            report=key.report,
-            parameters_key=key.parameters_key,
-            parameters=key.parameters,
-            state=RunState.RUNNING,
-            progress=0.0,
-            created_at=datetime.now(UTC),
-            **lease,
-        )
-        .on_conflict_do_nothing()
-        .returning(report_runs.c.id)
-    ).first()
-    if made is None:
+    fresh = {"state": RunState.RUNNING, "progress": 0.0, "created_at": datetime.now(UTC)}
+    if not insert_new(tx, report_runs, id=id, **vars(key), **fresh, **lease):
         return _take(tx, _same(key), lease)
     _delete_superseded(tx, key)
     return True
@@ -208,5 +187,4 @@ def _one(tx: Tx, which: ColumnElement[bool]) -> RunRow | None:
         .join(objects, objects.c.id == report_runs.c.object_id)
         .where(which)
     )
-    row = tx.execute(query).first()
-    return None if row is None else RunRow(**{**row._mapping, "live": bool(row.live)})
+    return first_as(tx, query, RunRow)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,9 +13,9 @@ import numpy.typing as npt
 from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
 
 from graspdb.wire.states import JobState, SweepState
-from graspdb_service.storage.database import Tx, unix_now
+from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
 from graspdb_service.storage.objects import ObjectGone
-from graspdb_service.storage.simulation.jobs import OPEN
+from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, sweeps
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
@@ -147,14 +148,12 @@ def keep_snapshot(tx: Tx, sweep_id: str, snapshot: Mapping[str, Any]) -> None:
 
 def find(tx: Tx, sweep_id: str) -> SweepRow | None:
     """The sweep with this id."""
-    row = tx.execute(_query().where(sweeps.c.id == sweep_id)).first()
-    return None if row is None else SweepRow(**row._mapping)
+    return first_as(tx, _query().where(sweeps.c.id == sweep_id), SweepRow)
 
 
 def find_many(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, SweepRow]:
     """The sweeps with these ids."""
-    rows = tx.execute(_query().where(sweeps.c.id.in_(sweep_ids)))
-    return {row.id: SweepRow(**row._mapping) for row in rows}
+    return {row.id: row for row in all_as(tx, _query().where(sweeps.c.id.in_(sweep_ids)), SweepRow)}
 
 
 def state_of(sweep: SweepRow, failed_chunks: int) -> SweepState:
@@ -190,29 +189,23 @@ def listing(
         query = query.where(_in_state(state))
     if before is not None:
         query = query.where(sweeps.c.id < before)
-    return [SweepRow(**row._mapping) for row in tx.execute(query)]
+    return all_as(tx, query, SweepRow)
 
 
 def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
     """Chunks by state, outcomes of every finished one, and how fast the last ones went."""
-    states: dict[str, int] = {}
-    poses_done = 0
     totals = (
         select(jobs.c.state, func.count(), func.sum(jobs.c.stop - jobs.c.start))
         .where(jobs.c.sweep_id == sweep.id)
         .group_by(jobs.c.state)
     )
-    for state, count, poses in tx.execute(totals):
-        states[state] = int(count)
-        if state == JobState.DONE:
-            poses_done = int(poses)
-    counts: dict[str, int] = {}
+    found = {state: (int(count), int(poses)) for state, count, poses in tx.execute(totals)}
+    counts: Counter[str] = Counter()
     done = select(jobs.c.counts).where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.DONE)
-    for (stored,) in tx.execute(done):
-        for code, count in stored["all"].items():
-            counts[code] = counts.get(code, 0) + count
+    for stored in tx.scalars(done):
+        counts.update(stored["all"])
     failed: list[tuple[int, int, str]] = []
-    if states.get(JobState.FAILED):
+    if JobState.FAILED in found:
         ended = (
             select(jobs.c.number, jobs.c.attempts, jobs.c.error)
             .where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.FAILED)
@@ -228,6 +221,8 @@ def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
     recent_poses, now = tx.execute(recent).one()
     if sweep.started_at is not None:
         window_s = min(window_s, max(now - sweep.started_at.timestamp(), 1e-3))
+    states = {state: count for state, (count, _) in found.items()}
+    _, poses_done = found.get(JobState.DONE, (0, 0))
     return Progress(states, poses_done, counts, failed, int(recent_poses or 0), window_s)
 
 
@@ -280,15 +275,7 @@ def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
     again = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]))
-        .values(
-            state=JobState.WAITING if waiting else JobState.QUEUED,
-            attempts=0,
-            lease_id=None,
-            lease_expires_at=None,
-            worker=None,
-            error=None,
-            completed_at=None,
-        )
+        .values(**AFRESH, state=JobState.WAITING if waiting else JobState.QUEUED)
     )
     if again.rowcount:
         tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=False, finished_at=None))
@@ -313,4 +300,4 @@ def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
         sweeps.c.id != sweep.id,
         batches.c.id.is_not(None),
     )
-    return [SweepRow(**row._mapping) for row in tx.execute(query.order_by(sweeps.c.id))]
+    return all_as(tx, query.order_by(sweeps.c.id), SweepRow)

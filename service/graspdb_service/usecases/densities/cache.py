@@ -170,14 +170,8 @@ class Densities:
             if before is not None and before.object_row.epoch != row.epoch:
                 before = None
             exposure = proposal_density.read(tx, selected)
-            rows = trial_rows.read(
-                tx,
-                row.id,
-                provenance_ids=list(selected.provenances),
-                successes_only=True,
-                after_seq=0 if before is None else before.object_row.last_seq,
-                batches=True,
-            )
+            after_seq = 0 if before is None else before.object_row.last_seq
+            rows = trial_rows.successes(tx, row.id, selected.provenances, after_seq=after_seq)
         # Failures of one grid change no weight, those of several do.
         if before is not None and not len(rows) and (exposure == before.exposure or not exposure.several):
             return replace(before, selected=selected, exposure=exposure)

@@ -145,26 +145,27 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
     chosen = built.selected
     with inputs.database.read() as tx:
         counts = outcome_counts(tx, built.object_row.id)
-        own = [
-            item
-            for item in provenances.of_object(tx, built.object_row.id)
-            if item.id in counts and item.source == source and item.gripper in (None, chosen.gripper)
-        ]
-    if any(item.protocol == chosen.protocol for item in own):
-        own = [item for item in own if item.protocol in (None, chosen.protocol)]
+        own = {
+            number: item
+            for number, item in provenances.of_object(tx, built.object_row.id).items()
+            if number in counts and item.source == source and item.gripper in (None, chosen.gripper)
+        }
+    if any(item.protocol == chosen.protocol for item in own.values()):
+        own = {number: item for number, item in own.items() if item.protocol in (None, chosen.protocol)}
     if not own:
         return None
-    outcomes = total([counts[item.id] for item in own])
+    outcomes = total([counts[number] for number in own])
     tells = bool(outcomes.keys() - {"success", "simulation_error"})
     return Selected(
         row=chosen.row,
         gripper=chosen.gripper,
-        protocol=", ".join(sorted({item.protocol for item in own if item.protocol is not None})) or None,
+        protocol=", ".join(sorted({item.protocol for item in own.values() if item.protocol is not None}))
+        or None,
         source=source,
         profile=chosen.profile,
-        provenances={item.id: item.gripper is None or chosen.jaw_symmetric for item in own},
+        provenances={n: item.gripper is None or chosen.jaw_symmetric for n, item in own.items()},
         outcomes=outcomes,
-        tried=frozenset(item.id for item in own) if tells else frozenset(),
+        tried=frozenset(own) if tells else frozenset(),
     )
 
 

@@ -175,7 +175,7 @@ def lost_lease(job: JobRow) -> ProblemError:
         JobState.WAITING: "it waits for convex parts",
         JobState.QUEUED: "it was given back or failed, and waits for another claim",
         JobState.LEASED: "another claim has it",
-    }[job.state]
+    }[JobState(job.state)]
     return conflict("lease-lost", f"This lease is no longer the job's: {reason}. Drop it and claim again")
 
 
@@ -183,15 +183,4 @@ def workers(ctx: Runtime, *, skip: int, limit: int) -> tuple[list[WorkerInfo], i
     """Every worker that ever asked for jobs, by name, and where the next page starts."""
     with ctx.database.read() as tx:
         rows = jobs.list_workers(tx, skip=skip, limit=limit + 1)
-    items = [
-        WorkerInfo(
-            worker=row.name,
-            capabilities=row.capabilities,
-            last_seen=_time(row.last_seen),
-            jobs_leased=row.jobs_leased,
-            jobs_done=row.jobs_done,
-            poses_done=row.poses_done,
-        )
-        for row in rows[:limit]
-    ]
-    return items, skip + limit if len(rows) > limit else None
+    return rows[:limit], skip + limit if len(rows) > limit else None

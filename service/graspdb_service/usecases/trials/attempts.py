@@ -130,13 +130,8 @@ def fetch(
     for chunk in chunks:
         sweep = known[chunk.sweep_id]
         swept.append(Swept(sweep, chunk, sweep_plan.chunk_poses(tx, sweep, chunk.start, chunk.stop)))
-    rows = trial_rows.read(
-        tx,
-        selected.row.id,
-        provenance_ids=sorted(selected.tried),
-        after_seq=after_seq,
-        swept=False,
-        without=without,
+    rows = trial_rows.posted(
+        tx, selected.row.id, sorted(selected.tried), after_seq=after_seq, without=without
     )
     return Stored(rows, swept, selected, without)
 

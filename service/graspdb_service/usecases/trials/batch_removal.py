@@ -58,7 +58,7 @@ class Inheritance:
             if share.packed:
                 outcomes.add_packed_counts(tx, share.chunk.job_id, share.packed)
                 provenances.add_packed(tx, heir.provenance_id, share.packed)
-            batches.inherit(
+            batches.grow(
                 tx,
                 heir.id,
                 first_seq=share.rows[0][0] if share.rows else None,

@@ -116,15 +116,16 @@ def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
         profiles[filters.gripper] = _profile(tx, filters.gripper)
     counts = outcome_counts(tx, row.id)
     # A provenance all of whose trials were deleted is none of the object's any more.
-    candidates = [
-        item
-        for item in provenances.of_object(tx, row.id)
-        if item.id in counts
+    candidates = {
+        number: item
+        for number, item in provenances.of_object(tx, row.id).items()
+        if number in counts
         and filters.source in (None, item.source)
         and (filters.gripper is None or item.gripper in (None, filters.gripper))
         and (filters.protocol is None or item.protocol in (None, filters.protocol))
-    ]
-    found = {name: _distinct(getattr(item, name) for item in candidates) for name in ("gripper", "protocol")}
+    }
+    items = candidates.values()
+    found = {name: _distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
     ambiguous = [name for name, values in found.items() if len(values) > 1 and getattr(filters, name) is None]
     if ambiguous:
         told = "; ".join(f"{name}: {', '.join(found[name])}" for name in ambiguous)
@@ -137,9 +138,13 @@ def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
     chosen = {
         name: getattr(filters, name) or (values[0] if values else None) for name, values in found.items()
     }
-    for name in _distinct([chosen["gripper"], *(item.gripper for item in candidates)]):
+    for name in _distinct([chosen["gripper"], *(item.gripper for item in items)]):
         profiles.setdefault(name, _profile(tx, name))
-    failing = {item.source for item in candidates if counts[item.id].keys() - {"success", "simulation_error"}}
+    failing = {
+        item.source
+        for number, item in candidates.items()
+        if counts[number].keys() - {"success", "simulation_error"}
+    }
     return Selected(
         row=row,
         gripper=chosen["gripper"],
@@ -147,10 +152,11 @@ def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
         source=filters.source,
         profile=profiles.get(chosen["gripper"] or ""),
         provenances={
-            item.id: item.gripper is None or profiles[item.gripper].symmetric for item in candidates
+            number: item.gripper is None or profiles[item.gripper].symmetric
+            for number, item in candidates.items()
         },
-        outcomes=total([counts[item.id] for item in candidates]),
-        tried=frozenset(item.id for item in candidates if item.source in failing),
+        outcomes=total([counts[number] for number in candidates]),
+        tried=frozenset(number for number, item in candidates.items() if item.source in failing),
     )
 
 
