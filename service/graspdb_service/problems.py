@@ -62,7 +62,19 @@ def not_found(what: str, name: str, way_out: str = "") -> ProblemError:
 
 def invalid(field: str, message: str, title: str = "The request is not valid") -> ProblemError:
     """422 naming one field."""
-    return ProblemError(422, "invalid-request", title, errors=[(field, message)])
+    return invalid_fields([(field, message)], title)
+
+
+def invalid_fields(
+    errors: Sequence[tuple[str, str]], title: str = "The request is not valid"
+) -> ProblemError:
+    """422 naming several fields, each with what is wrong."""
+    return ProblemError(422, "invalid-request", title, errors=errors)
+
+
+def busy(title: str, *, status: int = 503, retry_after_s: int = 1) -> ProblemError:
+    """Not now: the same request again, a little later, will do."""
+    return ProblemError(status, "busy", title, headers={"Retry-After": str(retry_after_s)})
 
 
 def conflict(kind: str, title: str, **more: object) -> ProblemError:

@@ -39,7 +39,6 @@ from graspdb_service.formats.poses import read_arrow_poses, read_poses
 from graspdb_service.usecases.densities.info import density_info
 from graspdb_service.usecases.grasps import likelihood, proposals, samples
 from graspdb_service.usecases.grasps.answer import best_grasps
-from graspdb_service.usecases.trials.selection import Filters
 
 router = APIRouter(tags=["queries"])
 
@@ -171,7 +170,7 @@ def _pinned(ctx: Context, slug: str, query: Q) -> Q:
     """With the id of the newest kernel in the place of ``anisotropic``: another answer, another ETag."""
     if query.kernel != "anisotropic":
         return query
-    selected = ctx.densities.selections.resolve(slug, Filters.of(query))
+    selected = ctx.densities.selections.resolve(slug, query)
     return query.model_copy(update={"kernel": ctx.densities.stored(selected, "anisotropic").id})
 
 
@@ -179,7 +178,7 @@ def _known(ctx: Context, slug: str, request: Request, query: Selection) -> Respo
     """304 where the client has the answer of this revision already."""
     if "if-none-match" not in request.headers:
         return None
-    row = ctx.densities.selections.resolve(slug, Filters.of(query)).row
+    row = ctx.densities.selections.resolve(slug, query).row
     return not_modified(request, _tag(row.id, row.revision, query))
 
 

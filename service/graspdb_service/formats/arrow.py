@@ -17,7 +17,7 @@ import orjson
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES
-from graspdb_service.problems import ProblemError, invalid
+from graspdb_service.problems import ProblemError, invalid, invalid_fields
 
 Floats = NDArray[np.float64]
 
@@ -76,14 +76,10 @@ class Table:
         wrong = [name for name in self.names if name not in known]
         wrong += [name for name in known if self.names.count(name) > 1]
         if wrong:
-            raise ProblemError(
-                422,
-                "invalid-request",
+            told = f"unknown or repeated; there are {', '.join(sorted(known))}"
+            raise invalid_fields(
+                [(f"{prefix}.{name[:80]}", told) for name in sorted(set(wrong))[:20]],
                 "The stream has columns that are not known, or one twice",
-                errors=[
-                    (f"{prefix}.{name[:80]}", f"unknown or repeated; there are {', '.join(sorted(known))}")
-                    for name in sorted(set(wrong))[:20]
-                ],
             )
 
     @property

@@ -20,7 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, SOURCES
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE, Metadata
 from graspdb.wire.trials import TrialDefaults
-from graspdb_service.problems import ProblemError
+from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, TrialColumns
 
 DEFAULTS = frozenset(TrialDefaults.model_fields)
@@ -47,9 +47,7 @@ class Faults:
 
     def raise_if_any(self) -> None:
         if self.found:
-            raise ProblemError(
-                422, "invalid-request", "The trials are not valid; none was stored", errors=self.found
-            )
+            raise invalid_fields(self.found, "The trials are not valid; none was stored")
 
 
 @dataclass

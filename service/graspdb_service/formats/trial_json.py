@@ -20,7 +20,7 @@ from graspdb_service.formats.trial_fields import (
     defaults_of,
     refuse_too_many,
 )
-from graspdb_service.problems import ProblemError
+from graspdb_service.problems import invalid
 from graspdb_service.trial_columns import Floats, TrialBatch, TrialPage
 
 
@@ -28,7 +28,9 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
     """Check a JSON body of trials: 413 for more than ``limit``, 422 naming the fields that are wrong."""
     document, flaw = _loads(body)
     if not isinstance(document, dict):
-        raise _body_problem(flaw or "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}")
+        raise invalid(
+            "body", flaw or "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}"
+        )
     faults = Faults()
     defaults = TrialDefaults()
     if "columns" in document or "trials" in document:
@@ -40,7 +42,7 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
         fields = _from_rows([document], faults, lambda _, name: name)
     batch = check(fields, defaults, faults)
     if flaw:
-        raise _body_problem(flaw)
+        raise invalid("body", flaw)
     return batch
 
 
@@ -55,7 +57,7 @@ def parse_lines(body: bytes, *, limit: int) -> TrialBatch:
             flaws.add(f"trials.{number}", flaw)
         rows.append({} if flaw and row is None else row)
     if not rows:
-        raise _body_problem("no trial in the body: one JSON object a line")
+        raise invalid("body", "no trial in the body: one JSON object a line")
     if any(row == {} for row in rows):
         flaws.raise_if_any()
     batch = check(_from_rows(rows, faults, lambda i, name: f"trials.{i}.{name}"), TrialDefaults(), faults)
@@ -77,10 +79,6 @@ def _loads(text: bytes) -> tuple[Any, str | None]:
         return json.loads(text), flaw
     except (ValueError, RecursionError):
         return None, flaw
-
-
-def _body_problem(message: str) -> ProblemError:
-    return ProblemError(422, "invalid-request", "The request is not valid", errors=[("body", message)])
 
 
 # --- the three forms to one list a field ----------------------------------------------------------------

@@ -75,13 +75,7 @@ def _check_shape(profile: GripperProfile) -> None:
 
 
 def _info(row: GripperRow) -> GripperInfo:
-    return GripperInfo(
-        id=row.id,
-        name=row.name,
-        profile=GripperProfile.model_validate(row.profile),
-        builtin=row.builtin,
-        created_at=row.created_at,
-    )
+    return GripperInfo.model_validate(vars(row))
 
 
 def _profile(shape: GripperShape, base_offset_m: float, **facts: float) -> GripperProfile:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from graspdb.wire import OUTCOMES, MeshInfo, ObjectCreate, ObjectInfo, ObjectPatch, PartsInfo
+from graspdb.wire import OUTCOMES, ObjectCreate, ObjectInfo, ObjectPatch
 from graspdb_service.problems import conflict, not_found
 from graspdb_service.storage import assets, objects
 from graspdb_service.storage.database import Database, Tx
@@ -82,23 +80,13 @@ def remove(database: Database, slug: str) -> None:
 
 def info(row: ObjectRow, counts: dict[int, int]) -> ObjectInfo:
     """An object as the wire has it; ``counts`` are of all its collected trials by outcome code."""
-    return ObjectInfo(
-        id=row.slug,
-        name=row.name,
-        mass_kg=row.mass_kg,
-        density_kg_m3=row.density_kg_m3,
-        friction=row.friction,
-        metadata=row.metadata,
-        revision=row.revision,
-        epoch=row.epoch,
-        mesh=_model(MeshInfo, row.mesh_info),
-        convex_parts=_model(PartsInfo, row.parts_info),
-        trials=sum(counts.values()),
-        outcomes={OUTCOMES[code]: number for code, number in sorted(counts.items())},
-        created_at=row.created_at,
-        updated_at=row.updated_at,
+    return ObjectInfo.model_validate(
+        {
+            **vars(row),
+            "id": row.slug,
+            "mesh": row.mesh_info,
+            "convex_parts": row.parts_info,
+            "trials": sum(counts.values()),
+            "outcomes": {OUTCOMES[code]: number for code, number in sorted(counts.items())},
+        }
     )
-
-
-def _model(kind: Any, document: dict[str, Any] | None) -> Any:
-    return None if document is None else kind.model_validate(document)

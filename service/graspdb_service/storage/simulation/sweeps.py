@@ -13,6 +13,7 @@ import numpy.typing as npt
 from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
 
 from graspdb.wire.states import JobState, SweepState
+from graspdb.wire.sweeps import FailedChunk
 from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
@@ -57,7 +58,7 @@ class Progress:
     states: dict[str, int]
     poses_done: int
     counts: dict[str, int]
-    failed: list[tuple[int, int, str]]
+    failed: list[FailedChunk]
     recent_poses: int
     window_s: float
 
@@ -204,15 +205,17 @@ def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
     done = select(jobs.c.counts).where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.DONE)
     for stored in tx.scalars(done):
         counts.update(stored["all"])
-    failed: list[tuple[int, int, str]] = []
+    failed: list[FailedChunk] = []
     if JobState.FAILED in found:
         ended = (
-            select(jobs.c.number, jobs.c.attempts, jobs.c.error)
+            select(
+                jobs.c.number.label("chunk"), jobs.c.attempts, func.coalesce(jobs.c.error, "").label("error")
+            )
             .where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.FAILED)
             .order_by(jobs.c.number)
             .limit(100)
         )
-        failed = [(int(number), int(attempts), error or "") for number, attempts, error in tx.execute(ended)]
+        failed = all_as(tx, ended, FailedChunk)
     recent = select(func.sum(jobs.c.stop - jobs.c.start), unix_now()).where(
         jobs.c.sweep_id == sweep.id,
         jobs.c.state == JobState.DONE,

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graspdb.wire import KernelSpec, Selection
+from graspdb.wire.queries import TrialSelection
 from graspdb_density.kde.isotropic import CUTOFF
 from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import conflict, invalid, invalid_fields, not_found
 from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
@@ -19,68 +20,42 @@ from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
-from graspdb_service.usecases.trials.selection import Filters, Selected, Selections, as_of
+from graspdb_service.usecases.trials.selection import Selected, Selections, as_of
 
-__all__ = ["Built", "Densities", "KernelChoice", "kernel_of"]
-
+_WIDTHS = {"sigma_position_m": POSITION_LIMITS_M, "sigma_rotation_deg": np.degrees(ROTATION_LIMITS)}
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
     """The kernel and the cut-off (None: exact) of a request; 422 for widths beside a stored kernel."""
-    choice, cutoff = _choice(request)
-    for name, value, (low, high) in (
-        ("sigma_position_m", choice.sigma_position_m, POSITION_LIMITS_M),
-        ("sigma_rotation_deg", choice.sigma_rotation_deg, np.degrees(ROTATION_LIMITS)),
-    ):
-        if value is not None and not low <= value <= high:
-            raise invalid(name, f"a width must be between {low:g} and {high:g}")
-    return choice, cutoff
-
-
-def _choice(request: Selection) -> tuple[KernelChoice, float | None]:
-    beside = KernelChoice(request.sigma_position_m, request.sigma_rotation_deg)
     kernel = request.kernel
-    if isinstance(kernel, KernelSpec):
-        inside = KernelChoice(kernel.sigma_position_m, kernel.sigma_rotation_deg)
-        twice = [
-            name
-            for name in ("sigma_position_m", "sigma_rotation_deg")
-            if getattr(inside, name) is not None and getattr(beside, name) is not None
-        ]
-        if twice:
-            raise ProblemError(
-                422,
-                "invalid-request",
-                "A width is given both in kernel and beside it",
-                errors=[(name, "give it once, in kernel or beside it") for name in twice],
-            )
-        choice = KernelChoice(
-            inside.sigma_position_m if beside.sigma_position_m is None else beside.sigma_position_m,
-            inside.sigma_rotation_deg if beside.sigma_rotation_deg is None else beside.sigma_rotation_deg,
-        )
-        if "cutoff" not in kernel.model_fields_set:
-            return choice, CUTOFF
-        exact = kernel.cutoff is None or kernel.cutoff > _LARGEST_CUTOFF
-        return choice, None if exact else kernel.cutoff
-    if kernel in (None, "isotropic"):
-        return beside, CUTOFF
-    given = [name for name in ("sigma_position_m", "sigma_rotation_deg") if getattr(beside, name) is not None]
-    if given:
-        raise ProblemError(
-            422,
-            "invalid-request",
-            "A stored kernel has its own widths",
-            errors=[(name, "only the isotropic kernel takes widths") for name in given],
-        )
-    return KernelChoice(stored=kernel), CUTOFF
+    beside = {name: getattr(request, name) for name in _WIDTHS}
+    given = [name for name, width in beside.items() if width is not None]
+    if isinstance(kernel, str) and kernel != "isotropic":
+        if given:
+            told = "only the isotropic kernel takes widths"
+            raise invalid_fields([(name, told) for name in given], "A stored kernel has its own widths")
+        return KernelChoice(stored=kernel), CUTOFF
+    inside = kernel if isinstance(kernel, KernelSpec) else KernelSpec()
+    twice = [name for name in given if getattr(inside, name) is not None]
+    if twice:
+        told = "give it once, in kernel or beside it"
+        title = "A width is given both in kernel and beside it"
+        raise invalid_fields([(name, told) for name in twice], title)
+    widths = {name: getattr(inside, name) if width is None else width for name, width in beside.items()}
+    for name, (low, high) in _WIDTHS.items():
+        if widths[name] is not None and not low <= widths[name] <= high:
+            raise invalid(name, f"a width must be between {low:g} and {high:g}")
+    cutoff = inside.cutoff if "cutoff" in inside.model_fields_set else CUTOFF
+    exact = cutoff is None or cutoff > _LARGEST_CUTOFF
+    return KernelChoice(**widths), None if exact else cutoff
 
 
 @dataclass(frozen=True)
 class _Key:
     object_id: int
-    filters: Filters
+    filters: TrialSelection
     kernel: KernelChoice
 
 
@@ -123,7 +98,7 @@ class Densities:
     def requested(self, slug: str, request: Selection) -> Built:
         """The density that a request is about."""
         choice, _ = kernel_of(request)
-        return self.get(self.selections.resolve(slug, Filters.of(request)), choice)
+        return self.get(self.selections.resolve(slug, request), choice)
 
     def stored(self, selected: Selected, name: str) -> KernelRow:
         """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.wire.queries import TrialSelection
 from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
@@ -23,7 +24,7 @@ from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials, Stored
-from graspdb_service.usecases.trials.selection import Filters, Selected, as_of
+from graspdb_service.usecases.trials.selection import Selected, as_of
 
 Floats = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ class Model:
 @dataclass(frozen=True)
 class _Key:
     object_id: int
-    filters: Filters
+    filters: TrialSelection
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool

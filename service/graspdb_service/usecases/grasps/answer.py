@@ -18,7 +18,6 @@ from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, question_of
 from graspdb_service.usecases.grasps.search import closest
-from graspdb_service.usecases.trials.selection import Filters
 
 _NEAREST_TRIALS = 5
 
@@ -34,7 +33,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     """
     choice, _ = kernel_of(request)
     with ctx.compute.admitted():
-        selected = ctx.densities.selections.resolve(slug, Filters.of(request))
+        selected = ctx.densities.selections.resolve(slug, request)
         limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
         built = ctx.densities.get(selected, choice)
         question = question_of(ctx, request, built, limits)

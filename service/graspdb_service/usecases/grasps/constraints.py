@@ -14,7 +14,7 @@ from graspdb.wire import BestGraspRequest, GraspConstraints, Obstacles, Pose, Po
 from graspdb_density import Region, se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import PointCloud, Scene, box_part
-from graspdb_service.problems import ProblemError
+from graspdb_service.problems import ProblemError, invalid_fields
 
 Floats = NDArray[np.float64]
 Frame = tuple[Floats, Floats]
@@ -247,9 +247,7 @@ def _objective(request: GraspConstraints) -> list[tuple[str, str]]:
 
 
 def _contradiction(errors: list[tuple[str, str]]) -> ProblemError:
-    return ProblemError(
-        422, "invalid-request", "The constraints are incomplete or contradict each other", errors=errors
-    )
+    return invalid_fields(errors, "The constraints are incomplete or contradict each other")
 
 
 def _radians(degrees: float | None) -> float | None:

@@ -23,7 +23,6 @@ from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import samples
 from graspdb_service.usecases.grasps.admissible import NearSuccesses
 from graspdb_service.usecases.grasps.samples import Draw
-from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 
@@ -96,7 +95,7 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     if choice.stored is not None:
         raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
     with ctx.compute.admitted():
-        selected = ctx.densities.selections.resolve(slug, Filters.of(request))
+        selected = ctx.densities.selections.resolve(slug, request)
         prior = ctx.priors.get(selected, choice)
         return samples.drawn_from(ctx, prior.density, selected.row, prior.kernel, request.count, request.seed)
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from scipy.special import betaincinv
 
 from graspdb.wire import KernelInfo
+from graspdb.wire.queries import TrialSelection
 from graspdb.wire.reports import ReportRange
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.matching import Match
@@ -24,7 +25,6 @@ from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-from graspdb_service.usecases.trials.selection import Filters
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -55,7 +55,9 @@ class KeptCurves:
     """
 
     def __init__(self, max_bytes: int) -> None:
-        self._curves: SingleFlightCache[tuple[int, Filters, str | None, float, float], IncrementalCurve]
+        self._curves: SingleFlightCache[
+            tuple[int, TrialSelection, str | None, float, float], IncrementalCurve
+        ]
         self._curves = SingleFlightCache(max_bytes, lambda curve: curve.nbytes)
         self._matches: SingleFlightCache[tuple[bytes, str], Match]
         self._matches = SingleFlightCache(_MATCHES_BYTES, lambda _: _MATCH_BYTES)

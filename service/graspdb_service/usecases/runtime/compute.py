@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
-from graspdb_service.problems import ProblemError
+from graspdb_service.problems import busy
 
 T = TypeVar("T")
 
@@ -28,12 +28,10 @@ class Compute:
     def admitted(self) -> Iterator[None]:
         """A query's place, from its first computation to its last; 429 where all are taken."""
         if not self._room.acquire(blocking=False):
-            raise ProblemError(
-                429,
-                "busy",
-                "All places for queries are taken: try again in a second, or ask for fewer poses at a time",
-                headers={"Retry-After": "1"},
+            title = (
+                "All places for queries are taken: try again in a second, or ask for fewer poses at a time"
             )
+            raise busy(title, status=429)
         try:
             yield
         finally:

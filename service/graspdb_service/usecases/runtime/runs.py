@@ -21,7 +21,7 @@ from typing import Any
 from graspdb.wire.reports import ReportRun
 from graspdb.wire.states import RunState
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import ProblemError, conflict, not_found
+from graspdb_service.problems import ProblemError, busy, conflict, not_found
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.report_runs import RunKey, RunRow
@@ -173,12 +173,8 @@ class Runs:
         """A lease for a run that this process is to compute; 429 where it has too many."""
         with self._lock:
             if len(self._held) >= MAX_HELD:
-                raise ProblemError(
-                    429,
-                    "busy",
-                    f"{MAX_HELD} reports are under way already: try again when some are done",
-                    headers={"Retry-After": "5"},
-                )
+                title = f"{MAX_HELD} reports are under way already: try again when some are done"
+                raise busy(title, status=429, retry_after_s=5)
         return str(uuid.uuid4())
 
     def _joined(self, key: RunKey) -> RunRow:

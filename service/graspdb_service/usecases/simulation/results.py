@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, ResultAccepted, SimulateResult
 from graspdb.wire.states import JobState
-from graspdb_service.problems import ProblemError, invalid
+from graspdb_service.problems import busy, invalid
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
@@ -85,12 +85,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             continue
         except _LostLease:
             return _replayed(ctx, job_id, lease_id, sha256, "simulate")
-    raise ProblemError(
-        503,
-        "busy",
-        "Sweeps over the same grid keep overtaking this result; send it again",
-        headers={"Retry-After": "1"},
-    )
+    raise busy("Sweeps over the same grid keep overtaking this result; send it again")
 
 
 def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import OUTCOMES, GripperProfile, Selection
+from graspdb.wire import OUTCOMES, GripperProfile
+from graspdb.wire.queries import TrialSelection
 from graspdb_service.problems import conflict, not_found
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
@@ -21,22 +22,9 @@ from graspdb_service.usecases.objects import require
 _KEPT = 4_096
 
 
-@dataclass(frozen=True)
-class Filters:
-    """What a request names; None: not named."""
-
-    gripper: str | None = None
-    protocol: str | None = None
-    source: str | None = None
-
-    @classmethod
-    def of(cls, request: Selection) -> Filters:
-        return cls(request.gripper, request.protocol, request.source)
-
-
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """What the filters mean for an object as it was when they were resolved.
+    """What a request's selection means for an object as it was when it was resolved.
 
     ``row`` is the object; ``gripper`` and ``protocol`` are the one named, else the only one among the trials,
     else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw
@@ -54,9 +42,9 @@ class Selected:
     tried: frozenset[int]
 
     @property
-    def filters(self) -> Filters:
-        """The filters that select the same trials whatever else is added to the object."""
-        return Filters(self.gripper, self.protocol, self.source)
+    def filters(self) -> TrialSelection:
+        """What selects the same trials whatever else is added to the object."""
+        return TrialSelection(gripper=self.gripper, protocol=self.protocol, source=self.source)
 
     def symmetric(self, provenance: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the jaw was mirror-symmetric, of trials (n,) of the selection by their provenances."""
@@ -76,19 +64,19 @@ class Selections:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._resolved: OrderedDict[tuple[int, Filters], Selected] = OrderedDict()
+        self._resolved: OrderedDict[tuple[object, ...], Selected] = OrderedDict()
         self._lock = threading.Lock()
 
-    def resolve(self, slug: str, filters: Filters) -> Selected:
-        """The object as it is now, and which of its trials the filters select (404, 409 where ambiguous)."""
+    def resolve(self, slug: str, asked: TrialSelection) -> Selected:
+        """The object as it is now, and which of its trials a request is about (404, 409 where ambiguous)."""
         with self._database.read() as tx:
             row = require(tx, slug)
-            key = row.id, filters
+            key = row.id, asked.gripper, asked.protocol, asked.source
             with self._lock:
                 known = self._resolved.get(key)
             if known is not None and known.row.revision == row.revision:
                 return known
-            selected = resolve(tx, row, filters)
+            selected = resolve(tx, row, asked)
         with self._lock:
             self._resolved[key] = selected
             self._resolved.move_to_end(key)
@@ -105,28 +93,28 @@ def as_of(tx: Tx, selected: Selected) -> Selected:
     return selected if row.revision == selected.row.revision else resolve(tx, row, selected.filters)
 
 
-def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
-    """Find the provenances that pass the filters.
+def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
+    """Find the provenances that a request is about.
 
     A trial without gripper or protocol fits every selection and makes none ambiguous. 404 for an unknown
     gripper; 409 ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
     profiles: dict[str, GripperProfile] = {}
-    if filters.gripper is not None:
-        profiles[filters.gripper] = _profile(tx, filters.gripper)
+    if asked.gripper is not None:
+        profiles[asked.gripper] = _profile(tx, asked.gripper)
     counts = outcome_counts(tx, row.id)
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = {
         number: item
         for number, item in provenances.of_object(tx, row.id).items()
         if number in counts
-        and filters.source in (None, item.source)
-        and (filters.gripper is None or item.gripper in (None, filters.gripper))
-        and (filters.protocol is None or item.protocol in (None, filters.protocol))
+        and asked.source in (None, item.source)
+        and (asked.gripper is None or item.gripper in (None, asked.gripper))
+        and (asked.protocol is None or item.protocol in (None, asked.protocol))
     }
     items = candidates.values()
     found = {name: _distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
-    ambiguous = [name for name, values in found.items() if len(values) > 1 and getattr(filters, name) is None]
+    ambiguous = [name for name, values in found.items() if len(values) > 1 and getattr(asked, name) is None]
     if ambiguous:
         told = "; ".join(f"{name}: {', '.join(found[name])}" for name in ambiguous)
         raise conflict(
@@ -135,9 +123,7 @@ def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
             grippers=found["gripper"],
             protocols=found["protocol"],
         )
-    chosen = {
-        name: getattr(filters, name) or (values[0] if values else None) for name, values in found.items()
-    }
+    chosen = {name: getattr(asked, name) or (values[0] if values else None) for name, values in found.items()}
     for name in _distinct([chosen["gripper"], *(item.gripper for item in items)]):
         profiles.setdefault(name, _profile(tx, name))
     failing = {
@@ -149,7 +135,7 @@ def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
         row=row,
         gripper=chosen["gripper"],
         protocol=chosen["protocol"],
-        source=filters.source,
+        source=asked.source,
         profile=profiles.get(chosen["gripper"] or ""),
         provenances={
             number: item.gripper is None or profiles[item.gripper].symmetric
