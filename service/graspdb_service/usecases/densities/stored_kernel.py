@@ -41,8 +41,20 @@ def load_sampled(row: KernelRow) -> SampledKernel:
 
 
 def _component(row: KernelRow) -> IsotropicKernel:
-    widths = KernelWidths.model_validate(row.provenance["component_widths"])
+    return isotropic(KernelWidths.model_validate(row.provenance["component_widths"]))
+
+
+def isotropic(widths: KernelWidths | KernelInfo) -> IsotropicKernel:
+    """The isotropic kernel of these widths."""
     return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
+
+
+def isotropic_info(kernel: IsotropicKernel, rule: str) -> KernelInfo:
+    """What a query says of an isotropic kernel; ``rule`` chose its widths."""
+    degrees = math.degrees(kernel.sigma_rotation)
+    return KernelInfo(
+        kind="isotropic", sigma_position_m=kernel.sigma_position_m, sigma_rotation_deg=degrees, rule=rule
+    )
 
 
 def axes(alignment: str, selected: Selected, features: Features) -> Axes:

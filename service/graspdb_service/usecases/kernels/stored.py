@@ -25,6 +25,7 @@ from graspdb_service.problems import invalid, not_found
 from graspdb_service.storage import grippers, kernels
 from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
+from graspdb_service.storage.kernels import NewKernel
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
@@ -64,7 +65,7 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | Non
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
-        row = kernels.create(tx, str(uuid.uuid4()), **made)
+        row = kernels.create(tx, str(uuid.uuid4()), made)
         return Created(fit.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
     return replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
@@ -99,7 +100,7 @@ def remove(ctx: Estimators, id: str) -> None:
         report_run_rows.remove(tx, id)
 
 
-def _given(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
+def _given(ctx: Estimators, request: KernelCreate) -> NewKernel:
     assert isinstance(request.components, list)
     if request.gripper is not None:
         with ctx.database.read() as tx:
@@ -111,14 +112,7 @@ def _given(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
     else:
         components, widths = _checked_samples(request) if sampled else (_checked_gaussians(request), None)
     provenance = KernelProvenance(origin="given", component_widths=widths)
-    return {
-        "kind": request.kind,
-        "alignment": request.alignment,
-        "gripper": request.gripper,
-        "object_id": None,
-        "components": components,
-        "provenance": provenance.model_dump(mode="json", exclude_none=True),
-    }
+    return fit.new_kernel(request, components, provenance, request.gripper)
 
 
 def _checked_gaussians(request: KernelCreate) -> list[dict[str, Any]]:
@@ -198,7 +192,7 @@ def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
         return None
 
 
-def _fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
+def _fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
     if request.kind == "probability":
         return axis_bandwidth_fit.fitted(ctx, request)
     with ctx.compute.admitted():
@@ -217,7 +211,7 @@ def _started(
 ) -> Created:
     """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
     assert request.object is not None
-    row = ctx.densities.selections.resolve(request.object, fit.filters_of(request)).row
+    row = ctx.densities.selections.resolve(request.object, fit.trials_of(request)).row
     lease = runs.place()
     id = str(uuid.uuid4())
 

@@ -15,12 +15,12 @@ from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthS
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.reports.common import (
     ReportInputs,
     as_model,
     enough,
     head,
-    isotropic_info,
     share,
 )
 from graspdb_service.usecases.simulation import verification

@@ -11,10 +11,8 @@ import numpy as np
 from pydantic import BaseModel
 from scipy.special import betaincinv
 
-from graspdb.wire import KernelInfo
 from graspdb.wire.queries import TrialSelection
 from graspdb.wire.reports import ReportRange
-from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.matching import Match
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
@@ -133,15 +131,6 @@ def share(won: float, tried: float) -> ReportRange:
     value, tail = won / tried, 0.5 * (1.0 - LEVEL)
     low, high = (float(betaincinv(won + 0.5, tried - won + 0.5, t)) for t in (tail, 1.0 - tail))
     return ReportRange(value=value, low=min(low, value), high=max(high, value))
-
-
-def isotropic_info(kernel: IsotropicKernel, rule: str) -> KernelInfo:
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
-        rule=rule,
-    )
 
 
 # -- what there has to be

@@ -24,6 +24,7 @@ from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import conflict
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
     LEVEL,
@@ -33,7 +34,6 @@ from graspdb_service.usecases.reports.common import (
     finite,
     head,
     interval,
-    isotropic_info,
     share,
 )
 from graspdb_service.usecases.trials import attempts
