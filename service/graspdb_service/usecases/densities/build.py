@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from graspdb_density import (
     DEFAULT_KERNEL,
     DiagonalKernel,
     GraspDensity,
-    IsotropicKernel,
     MixtureDensity,
     ModeSearch,
     SampledKernel,
@@ -42,8 +42,6 @@ from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Poses = tuple[Floats, Floats, Bools]
-"""Positions (n, 3), quaternions (n, 4), and whether the jaw is symmetric (n,)."""
 
 _DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
 _DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
@@ -51,6 +49,13 @@ _DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
 _LEAST_SHARE = 1e-30
 #: Weights that differ by less count as the same.
 _SAME = 1e-9
+
+
+class Grasps(NamedTuple):
+    """Poses (n,), and whether the jaw of each is symmetric (n,)."""
+
+    poses: se3.Poses
+    symmetric: Bools
 
 
 @dataclass(frozen=True)
@@ -161,8 +166,7 @@ def build(
 
     413 for more components than a density may have.
     """
-    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
-    fresh = rows.position, rows.quaternion_xyzw, symmetric
+    fresh = Grasps(rows.poses, selected.symmetric(rows.provenance))
     seq, proposal = rows.seq, rows.proposal_density
     swept = np.isin(rows.batch, sorted(exposure.batches))
     old = None if before is None else before.density
@@ -186,12 +190,12 @@ def build(
     if not len(seq):
         return built
 
-    def everything() -> Poses:
+    def everything() -> Grasps:
         if old is None:
             return fresh
-        of_old = old.positions, old.quaternions_xyzw, old.symmetric
-        position, quaternion, flags = (np.concatenate(pair) for pair in zip(of_old, fresh, strict=True))
-        return position, quaternion, flags
+        return Grasps(
+            se3.Poses.concatenate([old.poses, fresh.poses]), np.concatenate([old.symmetric, fresh.symmetric])
+        )
 
     weights = _weights(built, everything)
     added = None if old is None else _in_units_of(old, weights, len(rows))
@@ -200,8 +204,7 @@ def build(
     if before is not None and before.chosen_from == built.chosen_from:
         built = replace(built, kernel=before.kernel)
         if old is not None and added is not None:
-            longer = old.extend(se3.Poses.of(*fresh[:2]), weights=added, symmetric=symmetric)
-            return _searched(replace(built, density=longer), before)
+            return _searched(replace(built, density=old.extend(fresh.poses, added, fresh.symmetric)), before)
     elif built.chosen_from:
         chosen = _choose(everything(), proposal, built.chosen_from, threads)
         built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
@@ -216,14 +219,9 @@ def _searched(built: Built, before: Built | None) -> Built:
     return replace(built, search=before.search.extended(built.asked, built.density))
 
 
-def _isotropic(kernel: KernelInfo, poses: Poses, weights: Floats | None) -> GraspDensity:
-    position, quaternion, symmetric = poses
-    return GraspDensity.build(
-        se3.Poses.of(position, quaternion),
-        kernel=IsotropicKernel(kernel.sigma_position_m, math.radians(kernel.sigma_rotation_deg)),
-        weights=weights,
-        symmetric=symmetric,
-    )
+def _isotropic(kernel: KernelInfo, grasps: Grasps, weights: Floats | None) -> GraspDensity:
+    widths = stored_kernel.isotropic(kernel)
+    return GraspDensity.build(grasps.poses, kernel=widths, weights=weights, symmetric=grasps.symmetric)
 
 
 def _shaped(
@@ -231,47 +229,45 @@ def _shaped(
     axes: Axes,
     built: Built,
     before: Built | None,
-    everything: Callable[[], Poses],
-    fresh: Poses,
+    everything: Callable[[], Grasps],
+    fresh: Grasps,
     weights: Floats | None,
     added: Floats | None,
 ) -> Built:
     """The density under a stored kernel."""
     if stored.kind == "sampled":
         kernel = stored_kernel.load_sampled(stored)
-        position, quaternion, symmetric = everything()
-        _check_components(kernel, len(position), len(position) + int(symmetric.sum()))
+        grasps = everything()
+        _check_components(kernel, len(grasps.poses), len(grasps.poses) + int(grasps.symmetric.sum()))
         old = None if before is None else before.density
         if before is not None and old is not None and before.sampled is not None and added is not None:
-            alike = old.extend(se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2])
+            alike = old.extend(fresh.poses, added, fresh.symmetric)
             sampled = _placed(before.sampled, kernel, fresh, added)
             return _searched(replace(built, density=alike, sampled=sampled), before)
-        alike = _isotropic(built.kernel, (position, quaternion, symmetric), weights)
-        sampled = kernel.placed(se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric)
-        return _searched(replace(built, density=alike, sampled=sampled), None)
-    if before is not None and before.shaped is not None and added is not None:
-        frames = stored_kernel.axes_at(axes, se3.Poses(*fresh[:2]))
-        shaped = before.shaped.extend(
-            se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2], frames=frames
+        sampled = kernel.placed(grasps.poses, weights=weights, symmetric=grasps.symmetric)
+        return _searched(
+            replace(built, density=_isotropic(built.kernel, grasps, weights), sampled=sampled), None
         )
+    if before is not None and before.shaped is not None and added is not None:
+        frames = stored_kernel.axes_at(axes, fresh.poses)
+        shaped = before.shaped.extend(fresh.poses, weights=added, symmetric=fresh.symmetric, frames=frames)
         return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
-    position, quaternion, symmetric = everything()
-    poses = se3.Poses.of(position, quaternion)
+    grasps = everything()
     shaped = MixtureDensity(
-        poses,
+        grasps.poses,
         kernel=stored_kernel.load(stored),
         weights=weights,
-        symmetric=symmetric,
-        frames=stored_kernel.axes_at(axes, poses),
+        symmetric=grasps.symmetric,
+        frames=stored_kernel.axes_at(axes, grasps.poses),
     )
     return _searched(replace(built, density=shaped.isotropic, shaped=shaped), None)
 
 
-def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Poses, added: Floats) -> GraspDensity:
+def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Grasps, added: Floats) -> GraspDensity:
     """The density of a sampled kernel's components with those of further grasps."""
     if not len(added):
         return old
-    more = kernel.placed(se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2])
+    more = kernel.placed(fresh.poses, weights=added, symmetric=fresh.symmetric)
     total = float(added.sum())
     return old.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
 
@@ -298,11 +294,11 @@ def _check_components(kernel: SampledKernel, rows: int, placed: int) -> None:
 # -- weights -----------------------------------------------------------------------------------------------
 
 
-def _weights(built: Built, everything: Callable[[], Poses]) -> Floats | None:
+def _weights(built: Built, everything: Callable[[], Grasps]) -> Floats | None:
     """Weights (N,) of eq 1, their mean 1, no row lost to rounding; None where all are equal."""
     g, swept = built.proposal_density, built.swept
     if swept.any():
-        positions = everything()[0] if built.exposure.several else None
+        positions = everything().poses.positions if built.exposure.several else None
         g = g.copy()
         g[swept] = built.exposure.uniform if positions is None else built.exposure.density(positions[swept])
     known = g[~np.isnan(g)]
@@ -328,7 +324,7 @@ def _in_units_of(old: GraspDensity, weights: Floats | None, count: int) -> Float
     return added if np.isfinite(added).all() and (added > 0.0).all() else None
 
 
-def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelInfo:
+def _choose(grasps: Grasps, proposal: Floats, count: int, threads: int) -> KernelInfo:
     """Widths chosen from the first rows.
 
     By their own proposal densities: how much else was tried since must not change what they choose.
@@ -338,16 +334,11 @@ def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelI
     if not np.isnan(proposal[first]).all():
         weights = importance_weights(proposal[first])
         weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
-    position, quaternion, symmetric = (column[first] for column in poses)
     found = choose_widths(
-        se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric, threads=threads
+        grasps.poses[first], weights=weights, symmetric=grasps.symmetric[first], threads=threads
     )
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=found.kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(found.kernel.sigma_rotation),
-        rule=f"default: {found.rule} likelihood of the first {found.rows} successes",
-    )
+    rule = f"default: {found.rule} likelihood of the first {found.rows} successes"
+    return stored_kernel.isotropic_info(found.kernel, rule)
 
 
 def _info(choice: KernelChoice) -> KernelInfo:
