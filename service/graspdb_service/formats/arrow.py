@@ -296,6 +296,11 @@ def schema_of(fields: Sequence[tuple[str, Any]], told: Mapping[str, Any] | None 
     return library().schema(fields, metadata=metadata)
 
 
+def record_batch(columns: Mapping[str, Any], told: Mapping[str, Any]) -> Any:
+    """Columns as a record batch, with what else is said in its schema's metadata."""
+    return library().RecordBatch.from_pydict(columns, metadata={METADATA: orjson.dumps(told)})
+
+
 def vectors(values: Floats, width: int) -> Any:
     """A column of fixed-size lists from (n, width)."""
     pa = library()
