@@ -164,7 +164,8 @@ def _expanded(
 def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
     """Stored trials in columns, by the names that :class:`graspdb.wire.TrialOut` has for them.
 
-    A number is NaN, and a pose index -1, where there is none. What stood once beside a batch holds for each of its trials that did not say it itself.
+    A number is NaN, and a pose index -1, where there is none. What stood once beside a batch holds for each
+    of its trials that did not say it itself.
     """
     columns = page.columns
     batches = [page.batches[number] for number in columns.batch.tolist()]

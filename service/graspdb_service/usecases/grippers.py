@@ -10,7 +10,7 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.usecases.geometry.collision import shape_of
 from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 
 
 def seed(database: Database) -> None:
@@ -23,7 +23,7 @@ def seed(database: Database) -> None:
             grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
 
 
-def create(database: Database, request: GripperCreate, *, key: str | None, body: bytes) -> Created:
+def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
     """Store the user's gripper."""
     profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
     _check_shape(profile)
@@ -35,7 +35,7 @@ def create(database: Database, request: GripperCreate, *, key: str | None, body:
             _info(require(tx, request.id)).model_dump(mode="json"), location=f"/grippers/{request.id}"
         )
 
-    return replay_or(database, scope="POST /grippers", key=key, request=body, create=make)
+    return replay_or(database, "POST /grippers", sent, make)
 
 
 def get(database: Database, gripper: str) -> GripperInfo:

@@ -9,10 +9,10 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 
 
-def create(database: Database, request: ObjectCreate, *, key: str | None, body: bytes) -> Created:
+def create(database: Database, request: ObjectCreate, sent: Sent) -> Created:
     """Store a new object, without mesh and trials."""
 
     def make(tx: Tx) -> Created:
@@ -22,7 +22,7 @@ def create(database: Database, request: ObjectCreate, *, key: str | None, body: 
             info(require(tx, request.id), {}).model_dump(mode="json"), location=f"/objects/{request.id}"
         )
 
-    return replay_or(database, scope="POST /objects", key=key, request=body, create=make)
+    return replay_or(database, "POST /objects", sent, make)
 
 
 def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire.queries import TrialSelection
-from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
+from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessEstimate, SuccessModel
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
@@ -31,22 +31,6 @@ Floats = NDArray[np.float64]
 LEVEL = 0.9
 #: Attempts of the random sample that searches feel their way by where a model has far more of them.
 _SAMPLE, _LARGE = 100_000, 400_000
-
-
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """Columns (n,); NaN where nothing is known."""
-
-    probability: Floats
-    low: Floats
-    high: Floats
-    effective_trials: Floats
-
-    @classmethod
-    def unknown(cls, count: int) -> Estimates:
-        """Before any attempt."""
-        nothing = np.full(count, np.nan)
-        return cls(nothing, nothing.copy(), nothing.copy(), np.zeros(count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,20 +103,14 @@ class Successes:
         """Bytes of all models kept."""
         return self._cache.nbytes
 
-    def estimate(
-        self,
-        model: Model | None,
-        poses: Poses,
-        free: NDArray[np.bool_] | None,
-    ) -> Estimates:
-        """Success probability of poses (n,) under a model from :meth:`model`.
+    def estimate(self, model: Model | None, poses: Poses, free: NDArray[np.bool_] | None) -> SuccessEstimate:
+        """Success probability of poses (n,) under a model from :meth:`model`, NaN where nothing is known.
 
-        Parameters
-        ----------
-        free : (n,) bool or None
-            Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
+        ``free`` (n,) tells whether the open gripper is free of the object there; None where geometry or
+        gripper is unknown.
         """
-        estimates = Estimates.unknown(len(poses))
+        count = len(poses)
+        estimates = SuccessEstimate(*np.full((3, count), np.nan), np.zeros(count), LEVEL)
         if model is not None:
 
             def work(part: slice) -> None:
@@ -141,7 +119,7 @@ class Successes:
                 estimates.low[part], estimates.high[part] = answer.low, answer.high
                 estimates.effective_trials[part] = answer.effective_trials
 
-            self._compute.blocks(len(poses), 16_384, work)
+            self._compute.blocks(count, 16_384, work)
         if free is not None:
             for column in (estimates.probability, estimates.low, estimates.high):
                 column[~free] = 0.0

@@ -25,11 +25,8 @@ _NEAREST_TRIALS = 5
 def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
     """The best distinct grasps under the request's constraints, and the object's internal id.
 
-    Raises
-    ------
-    ProblemError
-        422 naming fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that
-        are not there, and as the selection.
+    422 names fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that are not
+    there, and as the selection.
     """
     choice, _ = kernel_of(request)
     with ctx.compute.admitted():
@@ -121,7 +118,7 @@ def _world(limits: Constraints, item: Maximum) -> WorldPose | None:
     """A grasp in the world frame, where the object's pose is known."""
     if limits.object_pose is None:
         return None
-    p, q = se3.compose(se3.Poses(*limits.object_pose), se3.Poses(item.position, item.quaternion_xyzw))
+    p, q = se3.compose(limits.object_pose, se3.Poses(item.position, item.quaternion_xyzw))
     q = se3.canonical(se3.normalise(q))
     return WorldPose(position=tuple(p.tolist()), quaternion_xyzw=tuple(q.tolist()))
 

@@ -17,7 +17,6 @@ from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError, invalid_fields
 
 Floats = NDArray[np.float64]
-Frame = tuple[Floats, Floats]
 
 _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.
@@ -32,7 +31,7 @@ class Constraints:
     Attributes
     ----------
     object_pose
-        The object frame in the world frame (position, quaternion), where it was given.
+        The object frame in the world frame, one pose, where it was given.
     obstacles
         What the gripper must not touch besides the object.
     candidates, exclude
@@ -41,7 +40,7 @@ class Constraints:
 
     region: Region
     half_space_names: tuple[str, ...]
-    object_pose: Frame | None
+    object_pose: Poses | None
     obstacles: tuple[Scene | PointCloud, ...] = ()
     candidates: Poses | None = None
     exclude: Poses | None = None
@@ -68,7 +67,7 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
     pose = None
     if request.object_pose is not None:
         values = np.array(request.object_pose)
-        pose = values[:3], values[3:]
+        pose = Poses(values[:3], values[3:])
     in_world = pose is not None and request.frame != "object"
     shift, turn = pose if in_world and pose is not None else (np.zeros(3), se3.IDENTITY)
     rotation = se3.to_matrix(turn)
@@ -98,8 +97,7 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
         # What is left to contradict after the checks above are the two cones.
         cones = ("approach_cone_deg", "closing_cone_deg")
         raise _contradiction([(name, str(error)) for name in cones]) from None
-    inwards = se3.inverse(se3.Poses(shift, turn))
-    into = inwards.positions, inwards.quaternions_xyzw
+    into = se3.inverse(Poses(shift, turn))
     posted = request if isinstance(request, BestGraspRequest) else BestGraspRequest()
     return Constraints(
         region,
@@ -132,32 +130,33 @@ def _planes(request: GraspConstraints) -> tuple[list[str], list[tuple[Floats, fl
     return names, planes
 
 
-def _obstacles(given: Obstacles | None, into: Frame) -> tuple[Scene | PointCloud, ...]:
+def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud, ...]:
     solids: list[Scene | PointCloud] = []
     if given is not None and given.boxes:
         parts = []
         for box in given.boxes:
-            p, q = se3.compose(
-                se3.Poses(*into), se3.Poses(np.array(box.position), np.array(box.quaternion_xyzw))
-            )
+            p, q = se3.compose(into, Poses(np.array(box.position), np.array(box.quaternion_xyzw)))
             parts.append(box_part(np.array(box.size_m) / 2, p, q))
         solids.append(Scene(parts))
     if given is not None and given.points:
-        points = into[0] + se3.rotate(into[1], np.array(given.points))
+        points = into.positions + se3.rotate(into.quaternions_xyzw, np.array(given.points))
         solids.append(PointCloud(points, given.point_radius_m))
     return tuple(solids)
 
 
-def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Frame) -> Poses | None:
-    if poses is None:
+def _moved(given: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | None:
+    if given is None:
         return None
-    if isinstance(poses, PoseColumns):
-        p, q = np.array(poses.position), np.array(poses.quaternion_xyzw)
-    else:
-        p = np.array([pose.position for pose in poses]).reshape(-1, 3)
-        q = np.array([pose.quaternion_xyzw for pose in poses]).reshape(-1, 4)
-    p, q = se3.compose(Poses(*into), Poses(p, q))
+    p, q = se3.compose(into, poses_of(given))
     return Poses(p, se3.normalise(q))
+
+
+def poses_of(given: Sequence[Pose] | PoseColumns) -> Poses:
+    """A request's poses in either form."""
+    if isinstance(given, PoseColumns):
+        return Poses(np.array(given.position), np.array(given.quaternion_xyzw))
+    p = np.array([pose.position for pose in given]).reshape(-1, 3)
+    return Poses(p, np.array([pose.quaternion_xyzw for pose in given]).reshape(-1, 4))
 
 
 def _apart(names: Sequence[str], planes: Floats, sphere: Floats | None) -> list[str]:

@@ -53,10 +53,7 @@ CRITERIA: dict[Strategy, str] = {
 def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw, str]:
     """Poses to try next, and how they were chosen; the same revision, request and seed give the same ones.
 
-    Raises
-    ------
-    ProblemError
-        409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
+    409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
     """
     if request.strategy == "density":
         return samples.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]

@@ -63,12 +63,8 @@ class Question:
 def question_of(
     ctx: Estimators, request: GraspConstraints, built: Built, limits: Constraints
 ) -> Question | None:
-    """What a request asks of a density; None where there is nothing to choose from.
-
-    Raises
-    ------
-    ProblemError
-        409 for what needs a mesh, a gripper or attempts that are not there.
+    """What a request asks of a density; None where there is nothing to choose from; 409 for what needs a
+    mesh, a gripper or attempts that are not there.
     """
     source = _prior(ctx, request, built) if built.search is None else built
     row, selected = built.object_row, built.selected

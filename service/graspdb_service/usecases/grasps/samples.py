@@ -35,17 +35,9 @@ class Draw:
 
 
 def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
-    """Draw grasps; the same revision, selection, kernel, count and seed give the same ones.
+    """Draw grasps; the same revision, selection, kernel, count and seed (None: made up) give the same ones.
 
-    Parameters
-    ----------
-    seed
-        None: one is made up, and answered.
-
-    Raises
-    ------
-    ProblemError
-        413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
+    413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
     """
     check_count(ctx, count)
     with ctx.compute.admitted():

@@ -30,11 +30,12 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runs import Runs, model
 
 Floats = NDArray[np.float64]
 
+_SCOPE = "POST /kernels"
 #: Axes that kernels of a kind may lie along, where not all.
 _ALIGNED = {"sampled": ("gripper",), "probability": ("gripper", "object")}
 #: Farther along an axis no displacement between grasps of one object reaches.
@@ -43,7 +44,7 @@ _MOST_SHIFT_M = 1.0
 _SAME = 1e-9
 
 
-def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
+def create(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Created:
     """Store a kernel, or with ``components=auto`` start the run that fits it (202) unless it is done at once.
 
     404 for the object, 422 for components that make no kernel, 409 where trials or geometry don't suffice.
@@ -53,22 +54,21 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | Non
         raise invalid(
             "alignment", f"a kernel of kind {request.kind} does not lie along those axes: use {ways}"
         )
-    scope = "POST /kernels"
     # A fit takes a while, and the trials may have gone since.
-    earlier = replayed(ctx.database, scope=scope, key=key, request=body)
+    earlier = replayed(ctx.database, _SCOPE, sent)
     if earlier is not None and earlier.status == 201:
         return earlier
     if not isinstance(request.components, list) and request.kind != "probability":
         fit.check(request)
         if request.components == "auto":
-            return _started(ctx, runs, request, scope=scope, key=key, body=body)
+            return _started(ctx, runs, request, sent)
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
         row = kernels.create(tx, str(uuid.uuid4()), made)
         return Created(fit.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
-    return replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
+    return replay_or(ctx.database, _SCOPE, sent, make)
 
 
 def get(ctx: Estimators, id: str) -> StoredKernel:
@@ -206,9 +206,7 @@ def _fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
         )
 
 
-def _started(
-    ctx: Estimators, runs: Runs, request: KernelCreate, *, scope: str, key: str | None, body: bytes
-) -> Created:
+def _started(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Created:
     """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
     assert request.object is not None
     row = ctx.densities.selections.resolve(request.object, fit.trials_of(request)).row
@@ -219,7 +217,7 @@ def _started(
         runs.enter(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
         return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
-    made = replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
+    made = replay_or(ctx.database, _SCOPE, sent, make)
     # The same request may have come before, even while this one did.
     run = runs.follow(made.body["id"], lease if made.body["id"] == id else None)
     if run.state == RunState.RUNNING:

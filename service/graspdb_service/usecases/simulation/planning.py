@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from graspdb.wire import (
     GridSpec,
     GripperProfile,
     KernelInfo,
+    Pose,
     PoseColumns,
     SampleSpec,
     Selection,
@@ -25,14 +27,14 @@ from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import jobs, sweeps
-from graspdb_service.storage.simulation.sweeps import POSE_COLUMNS
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.trial_columns import Provenance
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import samples
+from graspdb_service.usecases.grasps.constraints import poses_of
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.simulation import feasibility
 from graspdb_service.usecases.simulation.sweeps import require_sweep, sweep_info
 from graspdb_service.usecases.trials import sweep_plan
@@ -70,10 +72,10 @@ class _Plan:
     kernel: KernelInfo | None = None
 
 
-def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
+def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created:
     """Check and queue a sweep: 409 while its object lacks its mesh, 422 for what can't be simulated."""
     scope = f"POST /objects/{slug}/sweeps"
-    earlier = replayed(ctx.database, scope=scope, key=key, request=request)
+    earlier = replayed(ctx.database, scope, sent)
     if earlier is not None:
         return earlier
     with ctx.database.read() as tx:
@@ -123,7 +125,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, re
         info = sweep_info(tx, require_sweep(tx, sweep_id))
         return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
 
-    return replay_or(ctx.database, scope=scope, key=key, request=request, create=store)
+    return replay_or(ctx.database, scope, sent, store)
 
 
 def _request(spec: SweepCreate, plan: _Plan) -> dict[str, Any]:
@@ -221,18 +223,12 @@ def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan
     return _Plan("grid", count, grid=plan, full_count=full)
 
 
-def _given(ctx: Estimators, poses: Any) -> _Plan:
-    if isinstance(poses, PoseColumns):
-        position, quaternion = poses.position, poses.quaternion_xyzw
-    else:
-        position = [pose.position for pose in poses]
-        quaternion = [pose.quaternion_xyzw for pose in poses]
+def _given(ctx: Estimators, given: Sequence[Pose] | PoseColumns) -> _Plan:
+    poses = poses_of(given)
     limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
-    if len(position) > limit:
-        raise invalid("poses", f"{len(position)} are more than {limit}: make several sweeps of them")
-    table = np.full((len(position), POSE_COLUMNS), np.nan)
-    table[:, :3] = position
-    table[:, 3:7] = quaternion
+    if len(poses) > limit:
+        raise invalid("poses", f"{len(poses)} are more than {limit}: make several sweeps of them")
+    table = np.column_stack([*poses, np.full(len(poses), np.nan)])
     return _Plan("poses", len(table), poses=table)
 
 
