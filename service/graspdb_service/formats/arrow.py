@@ -259,35 +259,22 @@ def _u32(content: bytes, at: int) -> int:
 # -- out -----------------------------------------------------------------------------------------------------
 
 
-class _Pieces(io.RawIOBase):
-    """A file whose content is taken as it is written."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, part: Any) -> int:
-        content = bytes(part)
-        self._parts.append(content)
-        return len(content)
-
-    def take(self) -> bytes:
-        content, self._parts = b"".join(self._parts), []
-        return content
-
-
 def stream(schema: Any, batches: Iterable[Any]) -> Iterator[bytes]:
     """An IPC stream piece by piece, for however many batches."""
-    pa = library()
-    sink = _Pieces()
-    with pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schema) as writer:
-        yield sink.take()
+    sink = io.BytesIO()
+
+    def taken() -> bytes:
+        content = sink.getvalue()
+        sink.seek(0)
+        sink.truncate()
+        return content
+
+    with library().ipc.new_stream(sink, schema) as writer:
+        yield taken()
         for batch in batches:
             writer.write_batch(batch)
-            yield sink.take()
-    yield sink.take()
+            yield taken()
+    yield taken()
 
 
 def schema_of(fields: Sequence[tuple[str, Any]], told: Mapping[str, Any] | None = None) -> Any:

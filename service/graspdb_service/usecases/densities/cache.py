@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -52,13 +52,6 @@ def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
     return KernelChoice(**widths), None if exact else cutoff
 
 
-@dataclass(frozen=True)
-class _Key:
-    object_id: int
-    filters: TrialSelection
-    kernel: KernelChoice
-
-
 class Densities:
     """The densities of one service process, over a database that others may share.
 
@@ -79,7 +72,8 @@ class Densities:
         self.selections = selections
         self._compute = compute
         self._features = features
-        self._cache: SingleFlightCache[_Key, Built] = SingleFlightCache(max_bytes, lambda b: b.nbytes)
+        self._cache: SingleFlightCache[tuple[int, TrialSelection, KernelChoice], Built]
+        self._cache = SingleFlightCache(max_bytes, lambda built: built.nbytes)
 
     def get(self, selected: Selected, kernel: KernelChoice) -> Built:
         """The density of a selection, at least as new; refused as :meth:`stored`, and as the selection where
@@ -90,7 +84,7 @@ class Densities:
             stored = self.stored(selected, kernel.stored)
             kernel = KernelChoice(stored=stored.id)
         return self._cache.get(
-            _Key(selected.row.id, selected.filters, kernel),
+            (selected.row.id, selected.filters, kernel),
             lambda built: built.revision >= selected.row.revision,
             lambda before: self._refresh(selected, kernel, stored, before),
         )

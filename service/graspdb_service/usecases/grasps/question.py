@@ -19,13 +19,7 @@ from graspdb_service.usecases.grasps import objectives
 from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of
 from graspdb_service.usecases.grasps.constraints import Constraints
 from graspdb_service.usecases.grasps.objectives import success_score
-from graspdb_service.usecases.grasps.search import (
-    Bounds,
-    CandidateRanking,
-    DensityModes,
-    Engine,
-    ScoreEvolution,
-)
+from graspdb_service.usecases.grasps.search import Bounds, CandidateRanking, Engine, ScoreSearch
 
 #: Up to so many attempts a model of success probability is built at once; above, it must be asked for.
 FEW_ATTEMPTS = 500_000
@@ -88,7 +82,7 @@ def question_of(
     search, kernel, threads = source.search, source.kernel, ctx.compute.threads
     near = NearSuccesses(search.centres)
 
-    def ranked() -> tuple[DensityModes | ScoreEvolution, Ranking]:
+    def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if request.objective == "robust":
             value = None if chance is None else success_score(chance.quick, "probability", test, threads)

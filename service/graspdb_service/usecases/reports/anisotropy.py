@@ -33,12 +33,12 @@ from graspdb_service.usecases.reports.common import (
     LEVEL,
     ReportInputs,
     as_model,
-    attempts_of,
     enough,
     finite,
     head,
     need_failures,
 )
+from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
 
 Floats = NDArray[np.float64]
@@ -80,7 +80,7 @@ def anisotropy_report(
             f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
             f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
         )
-    everything = attempts_of(inputs, built)
+    everything = attempts.read(inputs.database, built.selected)
     need_failures(everything, "What a success tells about its vicinity", 1)
     measure = _measure(inputs, built, method, everything)
     # The same grasps along the gripper's axes, for what alignment changes.

@@ -21,7 +21,6 @@ from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import Built, Densities
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
-from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
 
 T = TypeVar("T")
@@ -143,10 +142,6 @@ def enough(call: Callable[[], T]) -> T:
     except ValueError as error:
         text = str(error)
         raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
-
-
-def attempts_of(inputs: ReportInputs, built: Built) -> AllTrials:
-    return attempts.read(inputs.database, built.selected)
 
 
 def need_failures(everything: AllTrials, what: str, least: int) -> None:

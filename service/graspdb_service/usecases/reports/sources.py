@@ -30,7 +30,6 @@ from graspdb_service.usecases.reports.common import (
     LEVEL,
     ReportInputs,
     as_model,
-    attempts_of,
     finite,
     head,
     interval,
@@ -59,7 +58,7 @@ def sources_report(
     inputs: ReportInputs, built: Built, options: SourcesOptions, progress: Progress
 ) -> SourcesReport:
     """Compare each source of real trials with simulation, whose trials ``built`` is of."""
-    simulated = attempts_of(inputs, built)
+    simulated = attempts.read(inputs.database, built.selected)
     real = _real(inputs, built, simulated)
     assert built.density is not None
     test = inputs.scenes.test(built.selected)
