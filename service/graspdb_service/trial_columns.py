@@ -14,6 +14,7 @@ from graspdb_density.se3 import Poses
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 def _floats() -> Floats:
@@ -63,7 +64,7 @@ class TrialColumns:
         """Where the tool was, as the maths takes it."""
         return Poses(self.position, self.quaternion_xyzw)
 
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | Ints) -> TrialColumns:
+    def __getitem__(self, rows: slice | Bools | Ints) -> TrialColumns:
         """Some of the trials: a slice of any, else of those whose columns are all arrays."""
         columns = vars(self).items()
         return TrialColumns(**{name: column[rows] if len(column) else column for name, column in columns})

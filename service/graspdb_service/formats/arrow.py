@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES
 from graspdb_service.problems import ProblemError, invalid, invalid_fields
-
-Floats = NDArray[np.float64]
+from graspdb_service.trial_columns import Bools, Floats, Ints
 
 #: Key of the schema's metadata that holds, as JSON, what else a request or an answer says.
 METADATA = b"graspdb"
@@ -154,7 +153,7 @@ class Table:
             self.fault(name, int(bad[0]), "a finite number or null")
         return np.asarray(np.where(null, np.nan, values))
 
-    def texts(self, name: str) -> tuple[list[str], NDArray[np.int64]] | None:
+    def texts(self, name: str) -> tuple[list[str], Ints] | None:
         """Distinct texts of a column, and which of them each row has (-1: null); None where it is absent."""
         pa, column = self._pa, self.column(name)
         if column is None:
@@ -187,7 +186,7 @@ class Table:
             raise invalid(f"{self._prefix}.{name}", str(error)[:200]) from None
         return found
 
-    def booleans(self, name: str) -> NDArray[np.bool_] | None:
+    def booleans(self, name: str) -> Bools | None:
         """(n,) where a column holds true and false; None where it holds something else."""
         column = self.required(name)
         if not self._pa.types.is_boolean(column.type):

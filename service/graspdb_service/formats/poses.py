@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import orjson
 from fastapi.exceptions import RequestValidationError
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from graspdb.wire import Pose
@@ -20,8 +19,8 @@ from graspdb_service.formats import arrow
 from graspdb_service.formats.json_bodies import no_json
 from graspdb_service.formats.json_pieces import LongArray
 from graspdb_service.problems import invalid, invalid_fields
+from graspdb_service.trial_columns import Floats
 
-Floats = NDArray[np.float64]
 Refuse = Callable[[str, int, str], None]
 """Told a field, a row of it and what is wrong there."""
 

@@ -9,7 +9,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
 
 from graspdb.wire.states import JobState, SweepState
@@ -18,6 +17,7 @@ from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, sweeps
+from graspdb_service.trial_columns import Floats
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
 POSE_COLUMNS = 8
@@ -101,7 +101,7 @@ def create(
     tx: Tx,
     sweep: Mapping[str, Any],
     *,
-    poses: npt.NDArray[np.float64] | None,
+    poses: Floats | None,
     capability: str,
     job_ids: Sequence[str],
     waiting: bool = False,
@@ -285,7 +285,7 @@ def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
     return again.rowcount
 
 
-def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> npt.NDArray[np.float64]:
+def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> Floats:
     """Poses ``start`` to ``stop`` of a plan that is no grid: (n, 8) float64, see :data:`POSE_COLUMNS`."""
     part = func.substr(sweeps.c.poses, start * _POSE_BYTES + 1, (stop - start) * _POSE_BYTES)
     content = tx.scalar(select(part).where(sweeps.c.id == sweep_id))

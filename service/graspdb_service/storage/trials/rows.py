@@ -20,7 +20,7 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import trials
 from graspdb_service.storage.trials import binary_copy, provenances
 from graspdb_service.storage.trials.binary_copy import json_text
-from graspdb_service.trial_columns import Floats, Ints, TrialColumns
+from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 
 SUCCESS = 1
 COPY_ROWS = 50_000
@@ -94,7 +94,7 @@ def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: i
         **dict(zip(_POSE[:3], columns.position[part].T, strict=True)),
         **dict(zip(_POSE[3:], columns.quaternion_xyzw[part].T, strict=True)),
     }
-    nulls: dict[str, NDArray[np.bool_]] = {}
+    nulls: dict[str, Bools] = {}
     for name in _NUMBERS:
         column: Floats = getattr(columns, name)[part]
         missing = np.isnan(column)

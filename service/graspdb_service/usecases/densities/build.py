@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, WeightsInfo
 from graspdb_density import (
@@ -34,14 +33,11 @@ from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.proposal_density import Exposure
 from graspdb_service.usecases.geometry.features import Axes
 from graspdb_service.usecases.trials.selection import Selected
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 _DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
 _DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
@@ -90,7 +86,7 @@ class Built:
     exposure: Exposure
     kernel: KernelInfo
     density: GraspDensity | None
-    seq: NDArray[np.int64]
+    seq: Ints
     proposal_density: Floats
     swept: Bools
     chosen_from: int = 0

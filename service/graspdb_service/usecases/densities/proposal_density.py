@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import GridPlan
 from graspdb_density import HAAR_VOLUME
@@ -22,10 +21,10 @@ from graspdb_density.kde.importance_weights import pooled_density
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import outcomes
 from graspdb_service.storage.simulation.outcomes import TriedGrid
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
 
-Floats = NDArray[np.float64]
 Corner = tuple[float, float, float]
 
 #: A trial this share of a step from the face of a region lies on it: half of its surroundings are inside.

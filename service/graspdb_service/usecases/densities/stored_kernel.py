@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, KernelWidths
 from graspdb_density import AnisotropicKernel, DiagonalKernel, IsotropicKernel, SampledKernel, se3
@@ -13,10 +12,9 @@ from graspdb_density.kernels.gaussian_mixture import mirror
 from graspdb_service.problems import conflict
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.geometry.features import Axes, Features
 from graspdb_service.usecases.trials.selection import Selected
-
-Floats = NDArray[np.float64]
 
 
 def load(row: KernelRow) -> AnisotropicKernel:

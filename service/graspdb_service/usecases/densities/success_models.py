@@ -12,21 +12,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.queries import TrialSelection
 from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessEstimate, SuccessModel
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
+from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials, Stored
 from graspdb_service.usecases.trials.selection import Selected, as_of
-
-Floats = NDArray[np.float64]
 
 LEVEL = 0.9
 #: Attempts of the random sample that searches feel their way by where a model has far more of them.
@@ -103,7 +101,7 @@ class Successes:
         """Bytes of all models kept."""
         return self._cache.nbytes
 
-    def estimate(self, model: Model | None, poses: Poses, free: NDArray[np.bool_] | None) -> SuccessEstimate:
+    def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> SuccessEstimate:
         """Success probability of poses (n,) under a model from :meth:`model`, NaN where nothing is known.
 
         ``free`` (n,) tells whether the open gripper is free of the object there; None where geometry or
@@ -167,7 +165,7 @@ def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts
 
 
 def _extended(
-    old: SuccessModel | None, new: AllTrials, rows: NDArray[np.bool_], kernel: SuccessKernel
+    old: SuccessModel | None, new: AllTrials, rows: Bools, kernel: SuccessKernel
 ) -> SuccessModel | None:
     """A model with some attempts more."""
     if not rows.any():

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from graspdb.wire import BestGraspRequest, GraspConstraints, Obstacles, Pose, PoseColumns
@@ -15,8 +14,7 @@ from graspdb_density import Region, se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError, invalid_fields
-
-Floats = NDArray[np.float64]
+from graspdb_service.trial_columns import Floats
 
 _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.

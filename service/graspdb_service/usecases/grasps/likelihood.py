@@ -7,19 +7,17 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import Selection
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
+from graspdb_service.trial_columns import Bools, Floats
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
-
-Floats = NDArray[np.float64]
 
 #: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
 _BLOCK = 16_384
@@ -94,7 +92,7 @@ def log_density(
     return logs
 
 
-def _free(ctx: Estimators, test: CollisionTest, poses: Poses) -> NDArray[np.bool_]:
+def _free(ctx: Estimators, test: CollisionTest, poses: Poses) -> Bools:
     free = np.empty(len(poses), dtype=bool)
 
     def work(part: slice) -> None:

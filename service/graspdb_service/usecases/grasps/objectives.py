@@ -7,18 +7,16 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, ModeSearch, PoseNoise, SuccessModel, expected
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.success_models import LEVEL, Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.search import ScoreSearch
-
-Floats = NDArray[np.float64]
 
 #: Draws of the noise that a mean is taken over, and while searching.
 _NOISE_DRAWS, _FEW_DRAWS = 256, 16

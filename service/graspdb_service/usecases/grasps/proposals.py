@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import ProposalsRequest
 from graspdb.wire.queries import Strategy
@@ -23,8 +22,6 @@ from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import samples
 from graspdb_service.usecases.grasps.admissible import NearSuccesses
 from graspdb_service.usecases.grasps.samples import Draw
-
-Floats = NDArray[np.float64]
 
 #: Poses whose uncertainty is asked for.
 _PLACES = 2_048

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from graspdb_density import Maximum, ModeSearch, Region, Separation, se3
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Admissible, Pull, Score, distinct_from
-
-Floats = NDArray[np.float64]
+from graspdb_service.trial_columns import Floats
 
 #: Poses shown to the collision test at a time while looking for the nearest admissible one.
 _BLOCK = 1_024

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.kernels import (
     MAX_COMPONENTS,
@@ -26,14 +25,13 @@ from graspdb_service.storage import grippers, kernels
 from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.kernels import NewKernel
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runs import Runs, model
-
-Floats = NDArray[np.float64]
 
 _SCOPE = "POST /kernels"
 #: Axes that kernels of a kind may lie along, where not all.

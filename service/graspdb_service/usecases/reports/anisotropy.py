@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.reports import (
@@ -26,6 +25,7 @@ from graspdb_density.vicinity.displacement_density import density_anisotropy
 from graspdb_density.vicinity.half_width import Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_service.problems import conflict
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports import surface_pairs
@@ -40,8 +40,6 @@ from graspdb_service.usecases.reports.common import (
 )
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-
-Floats = NDArray[np.float64]
 
 #: Attempts that stand for all where their density is asked for.
 _LOCAL_ATTEMPTS = 200_000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from graspdb.wire import OUTCOME_CODES
@@ -27,6 +26,7 @@ from graspdb_density.success.calibration import (
 )
 from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
 from graspdb_service.problems import conflict
+from graspdb_service.trial_columns import Floats, Ints
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
@@ -43,8 +43,6 @@ from graspdb_service.usecases.reports.common import (
 from graspdb_service.usecases.simulation import verification
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-
-Floats = NDArray[np.float64]
 
 #: Outcomes judged: of those that collided fewer, for nearly all are right.
 _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
@@ -118,7 +116,7 @@ def _predictions(
     everything: AllTrials,
     test: CollisionTest | None,
     blocks: Blocks,
-    judged: NDArray[np.int64],
+    judged: Ints,
     progress: Progress,
 ) -> tuple[Floats, Floats]:
     """The success probability and the log density of every judged attempt, without the blocks of its fold."""
@@ -210,7 +208,7 @@ def _checked(
     )
 
 
-def _judged(everything: AllTrials) -> tuple[NDArray[np.int64], Floats]:
+def _judged(everything: AllTrials) -> tuple[Ints, Floats]:
     """Rows to judge and what each stands for: drawn at random from those that collided and from the rest."""
     rng = np.random.default_rng(0)
     rows, weights = [], []

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo
 from graspdb.wire.reports import ConvergenceCurve as CurveModel
@@ -33,6 +32,7 @@ from graspdb_density.kernels.gaussian_mixture import Kernel
 from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.problems import conflict
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.reports.bandwidth import simulated_draws
@@ -45,8 +45,6 @@ from graspdb_service.usecases.reports.common import (
     interval,
 )
 from graspdb_service.usecases.simulation import verification
-
-Floats = NDArray[np.float64]
 
 _METHOD = (
     "eq 9: mean Bhattacharyya coefficient between the density of all grasps and bootstrap replicates of it,"

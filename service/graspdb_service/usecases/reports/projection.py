@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from graspdb.wire.base import Triple
@@ -17,10 +16,9 @@ from graspdb_service.problems import conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, interval
-
-Floats = NDArray[np.float64]
 
 #: Normals by the names of planes: towards the viewer, so that the first letter runs to the right.
 PLANES = {"xy": (0.0, 0.0, 1.0), "xz": (0.0, -1.0, 0.0), "yz": (1.0, 0.0, 0.0)}

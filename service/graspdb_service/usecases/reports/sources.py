@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from graspdb.wire.reports import (
@@ -23,6 +22,7 @@ from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import conflict
 from graspdb_service.storage.trials import provenances
+from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
@@ -38,8 +38,6 @@ from graspdb_service.usecases.reports.common import (
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
 from graspdb_service.usecases.trials.selection import Selected, outcome_counts, total
-
-Floats = NDArray[np.float64]
 
 REAL = ("robot", "human", "import")
 #: Fewest trials for a calibration and for a density's similarity, and attempts to predict from.
@@ -108,7 +106,7 @@ def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str,
 
 def _predictions(
     everything: AllTrials, model: SuccessModel | None, test: CollisionTest | None, threads: int
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """What simulation predicts at the poses of trials, and whether they are within its reach."""
     predicted = np.zeros(len(everything))
     reached = np.zeros(len(everything), dtype=bool)
@@ -180,7 +178,7 @@ def _compared(
     selected: Selected,
     everything: AllTrials,
     predicted: Floats,
-    reached: NDArray[np.bool_],
+    reached: Bools,
 ) -> SourceComparison:
     won = everything.success
     count = len(everything)
@@ -233,7 +231,7 @@ def _similarity(inputs: ReportInputs, built: Built, everything: AllTrials) -> So
     kernel = IsotropicKernel(sigma, max(density.kernel.sigma_rotation, math.radians(15.0)))
     rng = np.random.default_rng(0)
 
-    def under(rows: NDArray[np.int64], weights: Floats | None) -> GraspDensity:
+    def under(rows: Ints, weights: Floats | None) -> GraspDensity:
         return GraspDensity.build(
             density.poses[rows], kernel=kernel, weights=weights, symmetric=density.symmetric[rows]
         )

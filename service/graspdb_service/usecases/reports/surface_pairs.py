@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.reports import AnisotropyRelation
 from graspdb_density.success.block_bootstrap import shares
 from graspdb_geometry.features.jaw_pairs import KINDS, JawPairs
+from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.reports.common import LEVEL, finite
 from graspdb_service.usecases.trials.attempts import AllTrials
-
-Floats = NDArray[np.float64]
 
 #: Ends of the ranges of angles between the closing axis and the pair's, degrees.
 ANGLES_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 90.0)
@@ -48,9 +46,9 @@ def relations(everything: AllTrials, pairs: JawPairs) -> list[AnisotropyRelation
 
 def _rows(
     kind: str,
-    won: NDArray[np.bool_],
-    hit: NDArray[np.bool_],
-    group: NDArray[np.int64],
+    won: Bools,
+    hit: Bools,
+    group: Ints,
     positions: Floats,
 ) -> list[AnisotropyRelation]:
     groups = 1 if kind == "none" else len(ANGLES_DEG) - 1

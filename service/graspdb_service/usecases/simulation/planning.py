@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graspdb.wire import (
     GridPlan,
@@ -28,7 +27,7 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.trials import batches, provenances
-from graspdb_service.trial_columns import Provenance
+from graspdb_service.trial_columns import Floats, Provenance
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import samples
@@ -68,7 +67,7 @@ class _Plan:
     count: int
     grid: GridPlan | None = None
     full_count: int | None = None
-    poses: npt.NDArray[np.float64] | None = None
+    poses: Floats | None = None
     kernel: KernelInfo | None = None
 
 

@@ -19,7 +19,7 @@ from graspdb_service.storage.simulation.jobs import JobRow
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.storage.trials import rows as trial_rows
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.trial_columns import Bools, TrialColumns
 from graspdb_service.usecases.geometry import decompositions, meshes
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
@@ -178,7 +178,7 @@ def _chunk(
     result: SimulateResult,
     outcomes: npt.NDArray[np.uint8],
     poses: TrialColumns,
-    fresh: npt.NDArray[np.bool_],
+    fresh: Bools,
 ) -> _Chunk:
     rows = result.rows
     for name in ("width_m", "quality"):

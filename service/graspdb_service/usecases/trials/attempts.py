@@ -19,13 +19,9 @@ from graspdb_service.storage.simulation import outcomes, sweeps
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import rows as trial_rows
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 COLLISION, NO_ATTEMPT = OUTCOME_CODES["collision"], OUTCOME_CODES["simulation_error"]
 _SUCCESS = OUTCOME_CODES["success"]

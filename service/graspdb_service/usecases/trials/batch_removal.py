@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import outcomes, sweeps
@@ -18,9 +17,8 @@ from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.storage.trials import rows as trial_rows
 from graspdb_service.storage.trials.batches import BatchRow
+from graspdb_service.trial_columns import Ints
 from graspdb_service.usecases.trials import sweep_plan
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES, GripperProfile
 from graspdb.wire.queries import TrialSelection
@@ -17,6 +16,7 @@ from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
+from graspdb_service.trial_columns import Bools, Ints
 from graspdb_service.usecases.objects import require
 
 _KEPT = 4_096
@@ -46,7 +46,7 @@ class Selected:
         """What selects the same trials whatever else is added to the object."""
         return TrialSelection(gripper=self.gripper, protocol=self.protocol, source=self.source)
 
-    def symmetric(self, provenance: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def symmetric(self, provenance: Ints) -> Bools:
         """Whether the jaw was mirror-symmetric, of trials (n,) of the selection by their provenances."""
         return np.isin(provenance, [number for number, symmetric in self.provenances.items() if symmetric])
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graspdb.wire import GridPlan
 from graspdb_density import HAAR_VOLUME
@@ -21,9 +20,7 @@ from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import SweepRow
-from graspdb_service.trial_columns import TrialColumns
-
-IntArray = npt.NDArray[np.int64]
+from graspdb_service.trial_columns import Bools, Ints, TrialColumns
 
 
 def grid_of(sweep: SweepRow) -> PoseGrid:
@@ -61,7 +58,7 @@ def chunk_poses(tx: Tx, sweep: SweepRow, start: int, stop: int) -> TrialColumns 
     )
 
 
-def grid_poses(grid: PoseGrid, index: IntArray) -> TrialColumns:
+def grid_poses(grid: PoseGrid, index: Ints) -> TrialColumns:
     """Poses of a grid, each drawn uniformly from the grid's volume times all rotations."""
     density = np.full(len(index), 1.0 / (HAAR_VOLUME * grid.volume_m3))
     return TrialColumns(*grid.poses(index), proposal_density=density, pose_index=index)
@@ -71,9 +68,9 @@ def not_stored_yet(
     grid: PoseGrid,
     start: int,
     stop: int,
-    pose_index: IntArray,
+    pose_index: Ints,
     others: Sequence[tuple[PoseGrid, Sequence[tuple[int, int]]]],
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """Which poses (stop - start,) of a chunk no other sweep of the same repeat key has: each counts once.
 
     ``pose_index`` is ``grid.pose_indices(start, stop)``; ``others`` are their grids and
