@@ -41,29 +41,27 @@ def store(tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, out
 
 def page(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[PackedChunk]:
     """Finished chunks from ``first_number`` on, in order, until they hold at least ``poses`` poses."""
+    size = jobs.c.stop - jobs.c.start
+    before = func.sum(size).over(order_by=packed_outcomes.c.number) - size
     listed = (
-        select(jobs.c.id, jobs.c.number, jobs.c.start, jobs.c.stop)
-        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
+        select(packed_outcomes.c.job_id, jobs.c.start, jobs.c.stop, before.label("before"))
+        .join(jobs, jobs.c.id == packed_outcomes.c.job_id)
         .where(packed_outcomes.c.sweep_id == sweep_id, packed_outcomes.c.number >= first_number)
+        .subquery()
+    )
+    query = (
+        select(
+            packed_outcomes.c.sweep_id,
+            packed_outcomes.c.number,
+            listed.c.start,
+            listed.c.stop,
+            packed_outcomes.c.outcomes,
+        )
+        .join(listed, listed.c.job_id == packed_outcomes.c.job_id)
+        .where(listed.c.before < poses)
         .order_by(packed_outcomes.c.number)
     )
-    wanted: dict[str, tuple[int, int, int]] = {}
-    enough = 0
-    for job_id, number, start, stop in tx.execute(listed):
-        wanted[job_id] = (number, start, stop)
-        enough += stop - start
-        if enough >= poses:
-            break
-    chunks = []
-    ids = list(wanted)
-    for first in range(0, len(ids), 500):
-        query = select(packed_outcomes.c.job_id, packed_outcomes.c.outcomes).where(
-            packed_outcomes.c.job_id.in_(ids[first : first + 500])
-        )
-        chunks += [
-            PackedChunk(sweep_id, *wanted[job_id], bytes(content)) for job_id, content in tx.execute(query)
-        ]
-    return sorted(chunks, key=lambda chunk: chunk.number)
+    return all_as(tx, query, PackedChunk)
 
 
 def collected(

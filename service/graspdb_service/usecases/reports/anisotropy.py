@@ -183,10 +183,7 @@ def _tolerances(found: Anisotropy, built: Built) -> tuple[list[AnisotropyToleran
 
 def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Poses], Floats]:
     """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
-    rows = np.arange(len(everything))
-    if len(rows) > _LOCAL_ATTEMPTS:
-        rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_LOCAL_ATTEMPTS, replace=False))
-    density = everything.density(kernel, rows)
+    density = everything.density(kernel, everything.some(_LOCAL_ATTEMPTS))
     return lambda poses: len(everything) * density.density(poses)
 
 

@@ -26,9 +26,7 @@ _LEAST_TOLD = 20
 
 def relations(everything: AllTrials, pairs: JawPairs) -> list[AnisotropyRelation]:
     """The share of attempts that succeeded for every kind of pair and angle, and at no pair."""
-    rows = np.arange(len(everything))
-    if len(rows) > _MOST_ATTEMPTS:
-        rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_MOST_ATTEMPTS, replace=False))
+    rows = everything.some(_MOST_ATTEMPTS)
     poses, won, hit = everything.poses[rows], everything.success[rows], everything.collided[rows]
     found: list[AnisotropyRelation] = []
     edges = np.radians(ANGLES_DEG)

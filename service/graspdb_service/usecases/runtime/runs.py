@@ -115,7 +115,7 @@ class Runs:
         if run.state == RunState.CANCELLED:
             raise conflict("report-cancelled", f"The {what} was cancelled: ask again to compute it anew")
         if run.problem is not None:
-            raise _problem(run.problem)
+            raise ProblemError(**run.problem)
         if run.state == RunState.FAILED:
             raise ProblemError(
                 500, "internal-error", f"The {what} failed; the service's log says more: ask again to retry"
@@ -198,11 +198,9 @@ class Runs:
             deadline = time.monotonic() + self._wait_s
             while run.state == RunState.RUNNING and time.monotonic() < deadline and not self._closed.is_set():
                 with self._changed:
-                    if run.id in self._held:
-                        self._changed.wait(min(1.0, max(0.0, deadline - time.monotonic())))
-                    else:
-                        # Another process computes it.
-                        self._changed.wait(min(_POLL_S, max(0.0, deadline - time.monotonic())))
+                    # What another process computes is looked for again and again.
+                    most = 1.0 if run.id in self._held else _POLL_S
+                    self._changed.wait(min(most, max(0.0, deadline - time.monotonic())))
                 run = self.get(run.id)
             return run
         finally:
@@ -292,21 +290,8 @@ def _settled(run: RunRow) -> bool:
     return run.state == RunState.DONE or run.problem is not None
 
 
-def _problem(document: dict[str, Any]) -> ProblemError:
-    return ProblemError(
-        document["status"],
-        document["kind"],
-        document["title"],
-        errors=[(name, message) for name, message in document["errors"]],
-        extra=document["extra"],
-    )
-
-
 def model(run: RunRow) -> ReportRun:
     """As the wire has it, the result included."""
-    problem = None if run.problem is None else _problem(run.problem)
+    problem = None if run.problem is None else ProblemError(**run.problem).document("")
     result = None if run.result is None else json.loads(run.result)
-    fields = {name: getattr(run, name) for name in ReportRun.model_fields}
-    return ReportRun.model_validate(
-        {**fields, "result": result, "problem": None if problem is None else problem.document("")}
-    )
+    return ReportRun.model_validate({**vars(run), "result": result, "problem": problem})

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from typing import Any
 
 from graspdb.wire import (
     ClaimedJob,
     ClaimRequest,
     ClaimResponse,
     FailureReport,
-    GridPlan,
     LeaseRenewed,
-    PosePlan,
     SimulatePayload,
     WorkerInfo,
 )
@@ -79,23 +78,22 @@ def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
 
 def _payload(tx: Tx, sweep: SweepRow, job: JobRow) -> SimulatePayload:
     stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
-    world = sweep.snapshot["world"]
-    return SimulatePayload(
-        sweep=sweep.id,
-        object=sweep.object,
-        convex_parts=f"/objects/{sweep.object}/convex-parts",
-        parts_sha256=world["parts_sha256"],
-        mass_kg=world["mass_kg"],
-        friction=world["friction"],
-        gripper=world["gripper"],
-        protocol=sweep.protocol,
-        fidelity=sweep.fidelity,
-        grid=None if stored is not None else GridPlan.model_validate(sweep.snapshot["grid"]),
-        poses=None
-        if stored is None
-        else PosePlan(position=stored.position.tolist(), quaternion_xyzw=stored.quaternion_xyzw.tolist()),
-        start=job.start,
-        stop=job.stop,
+    plan: dict[str, Any] = {"grid": sweep.snapshot.get("grid")}
+    if stored is not None:
+        columns = {"position": stored.position.tolist(), "quaternion_xyzw": stored.quaternion_xyzw.tolist()}
+        plan = {"poses": columns}
+    return SimulatePayload.model_validate(
+        {
+            **sweep.snapshot["world"],
+            **plan,
+            "sweep": sweep.id,
+            "object": sweep.object,
+            "convex_parts": f"/objects/{sweep.object}/convex-parts",
+            "protocol": sweep.protocol,
+            "fidelity": sweep.fidelity,
+            "start": job.start,
+            "stop": job.stop,
+        }
     )
 
 

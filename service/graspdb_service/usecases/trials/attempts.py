@@ -52,6 +52,12 @@ class AllTrials:
         """All of them, those left out too."""
         return len(self) + self.left_out
 
+    def some(self, most: int) -> Ints:
+        """Rows of all of them, or of so many drawn at random."""
+        if len(self) <= most:
+            return np.arange(len(self))
+        return np.sort(np.random.default_rng(0).choice(len(self), size=most, replace=False))
+
     def success_model(self, kernel: SuccessKernel, rows: Bools | Ints) -> SuccessModel:
         """How likely success is by some of them."""
         return SuccessModel.build(
