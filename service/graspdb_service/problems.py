@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from http import HTTPStatus
 
 TYPE_PREFIX = "urn:graspdb:problem:"
 
@@ -82,8 +81,6 @@ def conflict(kind: str, title: str, **more: object) -> ProblemError:
     return ProblemError(409, kind, title, extra=more)
 
 
-def phrase(status: int) -> str:
-    try:
-        return HTTPStatus(status).phrase
-    except ValueError:
-        return f"HTTP {status}"
+def too_few_trials(why: str) -> ProblemError:
+    """409: the trials don't suffice; ``why`` says how many it takes."""
+    return conflict("too-few-trials", why[:1].upper() + why[1:])

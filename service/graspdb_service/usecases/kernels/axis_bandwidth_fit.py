@@ -10,7 +10,7 @@ import numpy as np
 from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelWidths
 from graspdb_density import AnisotropicKernel
 from graspdb_density.success.axis_bandwidth import fit_axis_bandwidths
-from graspdb_service.problems import conflict, invalid
+from graspdb_service.problems import invalid, too_few_trials
 from graspdb_service.storage.kernels import NewKernel
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -46,8 +46,7 @@ def fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
                 )
             )
         except ValueError as error:
-            text = str(error)
-            raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
+            raise too_few_trials(str(error)) from None
     component = KernelComponent(covariance=np.diag(np.square(found.kernel.sigmas)).tolist())
     return fit.fitted_on(
         selected,

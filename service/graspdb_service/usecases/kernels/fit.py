@@ -24,7 +24,7 @@ from graspdb_density import AnisotropicKernel, se3
 from graspdb_density.bandwidth.mixture_fit import LEAST_DISPLACEMENTS, displacements, fit_kernel
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya, sampled_kernel_rows
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import conflict, invalid
+from graspdb_service.problems import invalid, too_few_trials
 from graspdb_service.storage import kernels
 from graspdb_service.storage.kernels import KernelRow, NewKernel
 from graspdb_service.storage.objects import ObjectRow
@@ -119,8 +119,7 @@ def fitted(
     # Said first: without axes no number of trials helps.
     axes = stored_kernel.axes(request.alignment, built.selected, features)
     if built.density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "No trial of this selection succeeded, so there is nothing to fit a kernel on:"
             f" post trials (POST /objects/{request.object}/trials) or sweep a grid first",
         )
@@ -133,7 +132,7 @@ def fitted(
             )
         )
     except ValueError as error:
-        raise conflict("too-few-trials", f"No kernel can be fitted: {error}") from None
+        raise too_few_trials(f"No kernel can be fitted: {error}") from None
     return fitted_on(built.selected, request, components, window=window, component_widths=widths, **told)
 
 

@@ -24,7 +24,7 @@ from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES, Anisotro
 from graspdb_density.vicinity.displacement_density import density_anisotropy
 from graspdb_density.vicinity.half_width import Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
-from graspdb_service.problems import conflict
+from graspdb_service.problems import too_few_trials
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.cache import Built
@@ -73,8 +73,7 @@ def anisotropy_report(
     )
     successes = built.selected.successes
     if successes < LEAST_SUCCESSES:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
             f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
         )

@@ -13,7 +13,7 @@ from graspdb.wire.reports import BandwidthPoint, BandwidthReport, SimulatedDraws
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import conflict
+from graspdb_service.problems import too_few_trials
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.reports.common import (
@@ -36,8 +36,7 @@ def bandwidth_report(
 ) -> BandwidthReport:
     density = built.density
     if density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "Widths are told apart from 200 successes on; there are 0, so 200 more are needed",
         )
     scores = enough(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb.wire.queries import SelectionQuery
@@ -25,7 +24,7 @@ from graspdb_density.success.calibration import (
     reliability,
 )
 from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
-from graspdb_service.problems import conflict
+from graspdb_service.problems import too_few_trials
 from graspdb_service.trial_columns import Floats, Ints
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
@@ -37,6 +36,7 @@ from graspdb_service.usecases.reports.common import (
     finite,
     head,
     interval,
+    model_near,
     need_failures,
     share,
 )
@@ -50,8 +50,6 @@ _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
 _KEPT_COLLIDED = 100_000
 LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
-#: Kernels end at this many standard deviations of position.
-_REACH = 5.0
 #: Bins of grasps that were simulated again: there are few of them.
 _CHECKED_BINS = 5
 
@@ -65,8 +63,7 @@ def calibration_report(
     everything = attempts.read(inputs.database, built.selected, most_collided=most)
     successes = int(everything.success.sum())
     if everything.attempts < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"Calibration needs at least {LEAST_ATTEMPTS} attempts and {LEAST_SUCCESSES} successes in them,"
             f" of sources that post failures, too; there are {everything.attempts} and {successes}",
         )
@@ -135,7 +132,7 @@ def _predictions(
             continue
         model = everything.success_model(built.success_kernel or kernel, train)
         progress((fold + 0.5) / blocks.folds)
-        predicted[held] = model.evaluate(poses[held], threads=inputs.threads).probability
+        predicted[held] = model.probability(poses[held], threads=inputs.threads)
         kept = train[everything.success[train]]
         if kept.size:
             weights = importance_weights(everything.proposal[kept]) if proposal_known else None
@@ -178,18 +175,10 @@ def _checked(
     codes = np.concatenate([item.codes for item in found])
     assert built.density is not None
     kernel, diagonal = built.density.kernel, built.success_kernel
-    reach = max([kernel.sigma_position_m, *(() if diagonal is None else diagonal.sigmas[:3])])
-    distance, _ = cKDTree(poses.positions).query(
-        everything.poses.positions, distance_upper_bound=_REACH * reach
-    )
-    near = np.isfinite(distance)
-    if test is not None:
-        # Those that collided tell nothing of the others.
-        near &= ~everything.collided
-    predicted = np.zeros(len(poses))
-    if near.any():
-        model = everything.success_model(diagonal or kernel, near)
-        predicted = model.evaluate(poses, threads=inputs.threads).probability.copy()
+    widest = max([kernel.sigma_position_m, *(() if diagonal is None else diagonal.sigmas[:3])])
+    known = test is not None
+    model = model_near(everything, poses, diagonal or kernel, widest, collisions_known=known)
+    predicted = np.zeros(len(poses)) if model is None else model.probability(poses, threads=inputs.threads)
     if test is not None:
         predicted[~test.free(poses, threads=inputs.threads)] = 0.0
     outcomes = verification.tally(codes)

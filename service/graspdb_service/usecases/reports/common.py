@@ -9,14 +9,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
+from scipy.spatial import cKDTree
 from scipy.special import betaincinv
 
 from graspdb.wire.queries import TrialSelection
 from graspdb.wire.reports import ReportRange
+from graspdb_density import SuccessModel
 from graspdb_density.bandwidth.matching import Match
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.se3 import Poses
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
-from graspdb_service.problems import conflict
+from graspdb_density.success.kernel_regression import SUCCESS_CUTOFF, SuccessKernel
+from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.cache import Built, Densities
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -140,8 +144,20 @@ def enough(call: Callable[[], T]) -> T:
     try:
         return call()
     except ValueError as error:
-        text = str(error)
-        raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
+        raise too_few_trials(str(error)) from None
+
+
+def model_near(
+    everything: AllTrials, poses: Poses, kernel: SuccessKernel, sigma_m: float, *, collisions_known: bool
+) -> SuccessModel | None:
+    """What attempts tell of poses, by those within a kernel of ``sigma_m`` of one: of millions few are."""
+    tree = cKDTree(poses.positions)
+    distance, _ = tree.query(everything.poses.positions, distance_upper_bound=SUCCESS_CUTOFF * sigma_m)
+    near = np.isfinite(distance)
+    if collisions_known:
+        # Those that collided tell nothing of the others.
+        near &= ~everything.collided
+    return everything.success_model(kernel, near) if near.any() else None
 
 
 def need_failures(everything: AllTrials, what: str, least: int) -> None:

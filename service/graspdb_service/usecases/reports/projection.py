@@ -12,7 +12,7 @@ from graspdb.wire.reports import ProjectionOptions, ProjectionProfile, Projectio
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
 from graspdb_geometry import meshes
-from graspdb_service.problems import conflict
+from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
@@ -32,8 +32,7 @@ def projection_report(
     """The density on a plane; 409 without a success, or where none points the way asked for."""
     density = built.asked
     if density is None or built.density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "A projection needs at least 1 successful trial, and there is none: post trials"
             f" (POST /objects/{built.object_row.slug}/trials) or sweep a grid first",
         )

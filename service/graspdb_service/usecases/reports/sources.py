@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from graspdb.wire.reports import (
     CalibrationBin,
@@ -19,8 +18,9 @@ from graspdb.wire.reports import (
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import calibrate
-from graspdb_service.problems import conflict
+from graspdb_service.problems import too_few_trials
 from graspdb_service.storage.trials import provenances
 from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.cache import Built
@@ -33,11 +33,12 @@ from graspdb_service.usecases.reports.common import (
     finite,
     head,
     interval,
+    model_near,
     share,
 )
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-from graspdb_service.usecases.trials.selection import Selected, outcome_counts, total
+from graspdb_service.usecases.trials.selection import Selected, of_provenances, outcome_counts
 
 REAL = ("robot", "human", "import")
 #: Fewest trials for a calibration and for a density's similarity, and attempts to predict from.
@@ -45,8 +46,6 @@ LEAST_TRIALS, LEAST_SUCCESSES, LEAST_SIMULATED = 20, 20, 100
 _BINS = 5
 #: Predictions from fewer simulated attempts than this, by kernel weights, rest on next to nothing.
 _WITHIN_REACH = 1.0
-#: Kernels end at this many standard deviations of position.
-_REACH = 5.0
 #: Subsets of simulated successes that tell what chance alone would do.
 _SUBSETS = 10
 _POINTS = 8_000
@@ -63,7 +62,9 @@ def sources_report(
     trials_of = {source: _all(inputs, built, selected) for source, selected in real.items()}
     progress(0.3)
     kernel = built.density.kernel
-    model = _model(simulated, list(trials_of.values()), kernel, collisions_known=test is not None)
+    real_poses = Poses.concatenate([item.poses for item in trials_of.values()])
+    sigma_m, known = kernel.sigma_position_m, test is not None
+    model = model_near(simulated, real_poses, kernel, sigma_m, collisions_known=known)
     progress(0.5)
     compared = []
     for number, (source, selected) in enumerate(real.items()):
@@ -88,16 +89,14 @@ def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str,
     """The trials to compare with, by source; 409 says what is needed where these or simulated are too few."""
     slug = built.object_row.slug
     if len(simulated) < LEAST_SIMULATED or built.density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"A comparison needs at least {LEAST_SIMULATED} simulated attempts and 1 success in them; there"
             f" are {len(simulated)} and {built.selected.successes}: sweep a grid"
             f" (POST /objects/{slug}/sweeps)",
         )
     real = {source: found for source in REAL if (found := _selected(inputs, built, source)) is not None}
     if not real:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "There are no trials of a robot, a human or an import to compare simulation with: post at least"
             f" {LEAST_TRIALS} (POST /objects/{slug}/trials with source robot)",
         )
@@ -122,19 +121,6 @@ def _predictions(
     return predicted, reached
 
 
-def _model(
-    simulated: AllTrials, real: list[AllTrials], kernel: IsotropicKernel, *, collisions_known: bool
-) -> SuccessModel | None:
-    """What simulation knows within reach of the real trials: of millions of attempts few are near them."""
-    tree = cKDTree(np.concatenate([item.poses.positions for item in real]))
-    distance, _ = tree.query(simulated.poses.positions, distance_upper_bound=_REACH * kernel.sigma_position_m)
-    near = np.isfinite(distance)
-    if collisions_known:
-        # Those that collided tell nothing of the others.
-        near &= ~simulated.collided
-    return simulated.success_model(kernel, near) if near.any() else None
-
-
 def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | None:
     """A source's trials with the gripper of the simulated ones, of their protocol where it has any, else all;
     None without trials.
@@ -151,19 +137,9 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
         own = {number: item for number, item in own.items() if item.protocol in (None, chosen.protocol)}
     if not own:
         return None
-    outcomes = total([counts[number] for number in own])
-    tells = bool(outcomes.keys() - {"success", "simulation_error"})
-    return Selected(
-        row=chosen.row,
-        gripper=chosen.gripper,
-        protocol=", ".join(sorted({item.protocol for item in own.values() if item.protocol is not None}))
-        or None,
-        source=source,
-        profile=chosen.profile,
-        provenances={n: item.gripper is None or chosen.jaw_symmetric for n, item in own.items()},
-        outcomes=outcomes,
-        tried=frozenset(own) if tells else frozenset(),
-    )
+    protocols = sorted({item.protocol for item in own.values() if item.protocol is not None})
+    names = {"gripper": chosen.gripper, "protocol": ", ".join(protocols) or None, "source": source}
+    return of_provenances(chosen.row, own, counts, profile=chosen.profile, **names)
 
 
 def _all(inputs: ReportInputs, built: Built, selected: Selected) -> AllTrials:

@@ -16,7 +16,7 @@ from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import Bools, Ints
+from graspdb_service.trial_columns import Bools, Ints, Provenance
 from graspdb_service.usecases.objects import require
 
 _KEPT = 4_096
@@ -99,9 +99,7 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
     A trial without gripper or protocol fits every selection and makes none ambiguous. 404 for an unknown
     gripper; 409 ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
-    profiles: dict[str, GripperProfile] = {}
-    if asked.gripper is not None:
-        profiles[asked.gripper] = _profile(tx, asked.gripper)
+    profile = None if asked.gripper is None else _profile(tx, asked.gripper)
     counts = outcome_counts(tx, row.id)
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = {
@@ -123,26 +121,39 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
             grippers=found["gripper"],
             protocols=found["protocol"],
         )
-    chosen = {name: getattr(asked, name) or (values[0] if values else None) for name, values in found.items()}
-    for name in _distinct([chosen["gripper"], *(item.gripper for item in items)]):
-        profiles.setdefault(name, _profile(tx, name))
+    gripper, protocol = (getattr(asked, name) or next(iter(values), None) for name, values in found.items())
+    if gripper is not None and profile is None:
+        profile = _profile(tx, gripper)
+    names = {"gripper": gripper, "protocol": protocol, "source": asked.source}
+    return of_provenances(row, candidates, counts, profile=profile, **names)
+
+
+def of_provenances(
+    row: ObjectRow,
+    chosen: Mapping[int, Provenance],
+    counts: Mapping[int, Mapping[str, int]],
+    *,
+    gripper: str | None,
+    protocol: str | None,
+    source: str | None,
+    profile: GripperProfile | None,
+) -> Selected:
+    """The selection of provenances of no other gripper than this; ``counts`` of each are by outcome."""
     failing = {
         item.source
-        for number, item in candidates.items()
+        for number, item in chosen.items()
         if counts[number].keys() - {"success", "simulation_error"}
     }
+    symmetric = profile is None or profile.symmetric
     return Selected(
         row=row,
-        gripper=chosen["gripper"],
-        protocol=chosen["protocol"],
-        source=asked.source,
-        profile=profiles.get(chosen["gripper"] or ""),
-        provenances={
-            number: item.gripper is None or profiles[item.gripper].symmetric
-            for number, item in candidates.items()
-        },
-        outcomes=total([counts[number] for number in candidates]),
-        tried=frozenset(number for number, item in candidates.items() if item.source in failing),
+        gripper=gripper,
+        protocol=protocol,
+        source=source,
+        profile=profile,
+        provenances={number: item.gripper is None or symmetric for number, item in chosen.items()},
+        outcomes=total([counts[number] for number in chosen]),
+        tried=frozenset(number for number, item in chosen.items() if item.source in failing),
     )
 
 
