@@ -292,8 +292,8 @@ def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> Floats:
     return np.frombuffer(content or b"", dtype="<f8").reshape(-1, POSE_COLUMNS)
 
 
-def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
-    """Other collecting grid sweeps of the same object, gripper, protocol and fidelity, with their batch."""
+def siblings(tx: Tx, sweep: SweepRow) -> dict[str, SweepRow]:
+    """Other collecting grid sweeps, with their batch, in which a pose index is one and the same simulation."""
     query = _query().where(
         sweeps.c.object_id == sweep.object_id,
         sweeps.c.provenance_id == sweep.provenance_id,
@@ -303,4 +303,5 @@ def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
         sweeps.c.id != sweep.id,
         batches.c.id.is_not(None),
     )
-    return all_as(tx, query.order_by(sweeps.c.id), SweepRow)
+    found = all_as(tx, query.order_by(sweeps.c.id), SweepRow)
+    return {row.id: row for row in found if row.snapshot["repeat_key"] == sweep.snapshot["repeat_key"]}

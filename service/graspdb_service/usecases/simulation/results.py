@@ -66,7 +66,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             if sweep is None:
                 raise lost_lease(job)
             stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
-            twins = _twins(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
+            twins = sweeps.siblings(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
             ranges = packed.done_ranges(tx, list(twins))
             seen = packed.count_done(tx, list(twins))
         outcomes = _outcomes(result, job)
@@ -83,7 +83,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             return _store(ctx, job, lease_id, sha256, sweep, chunk, list(twins), seen)
         except _Overtaken:
             continue
-        except _LostLease:
+        except (_LostLease, objects.ObjectGone):
             return _replayed(ctx, job_id, lease_id, sha256, "simulate")
     raise busy("Sweeps over the same grid keep overtaking this result; send it again")
 
@@ -105,10 +105,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
     info = meshes.check_parts(ctx, row, body)
     try:
         with ctx.database.write() as tx:
-            try:
-                revision, _ = objects.advance(tx, row.id, append=False)
-            except objects.ObjectGone:
-                raise _LostLease from None
+            revision, _ = objects.advance(tx, row.id, append=False)
             locked = require(tx, row.slug)
             accepted = ResultAccepted(job=job.id, revision=revision, inserted=0)
             # The mesh can't have changed: it has sweeps.
@@ -118,7 +115,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
                 raise _LostLease
             meshes.store_parts(tx, locked, body, info)
             jobs.credit_worker(tx, job.worker, 0)
-    except _LostLease:
+    except (_LostLease, objects.ObjectGone):
         return _replayed(ctx, job_id, lease_id, sha256, "decompose")
     return accepted
 
@@ -152,11 +149,6 @@ class _Chunk:
     rows: TrialColumns
     packed: dict[int, int]
     counts: dict[str, dict[str, int]]
-
-
-def _twins(tx: Tx, sweep: SweepRow) -> dict[str, SweepRow]:
-    key = sweep.snapshot["repeat_key"]
-    return {other.id: other for other in sweeps.siblings(tx, sweep) if other.snapshot["repeat_key"] == key}
 
 
 def _outcomes(result: SimulateResult, job: JobRow) -> npt.NDArray[np.uint8]:
@@ -236,13 +228,10 @@ def _store(
     collects = sweep.purpose == "collect"
     with ctx.database.write() as tx:
         rows = len(chunk.rows) if collects else 0
-        try:
-            if collects:
-                revision, first_seq = objects.advance(tx, sweep.object_id, rows=rows, append=True)
-            else:
-                revision, first_seq = sweeps.lock_and_read_revision(tx, sweep.object_id), 0
-        except objects.ObjectGone:
-            raise _LostLease from None
+        if collects:
+            revision, first_seq = objects.advance(tx, sweep.object_id, rows=rows, append=True)
+        else:
+            revision, first_seq = sweeps.lock_and_read_revision(tx, sweep.object_id), 0
         if twins and packed.count_done(tx, twins) != seen:
             raise _Overtaken
         accepted = ResultAccepted(job=job.id, revision=revision, inserted=rows)

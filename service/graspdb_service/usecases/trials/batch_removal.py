@@ -123,8 +123,7 @@ def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
 
 def _chunks(tx: Tx, sweep: SweepRow) -> tuple[dict[str, SweepRow], list[DoneChunk]]:
     """The other sweeps over the grid, and the finished chunks of all of them in commit order."""
-    key = sweep.snapshot["repeat_key"]
-    heirs = {other.id: other for other in sweeps.siblings(tx, sweep) if other.snapshot["repeat_key"] == key}
+    heirs = sweeps.siblings(tx, sweep)
     return heirs, outcomes.done_chunks(tx, [sweep.id, *heirs]) if heirs else []
 
 
