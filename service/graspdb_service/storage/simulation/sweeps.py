@@ -293,7 +293,7 @@ def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> Floats:
 
 
 def siblings(tx: Tx, sweep: SweepRow) -> dict[str, SweepRow]:
-    """Other collecting grid sweeps, with their batch, in which a pose index is one and the same simulation."""
+    """Other collecting grid sweeps, with their batch, in which a pose index is the same simulation."""
     query = _query().where(
         sweeps.c.object_id == sweep.object_id,
         sweeps.c.provenance_id == sweep.provenance_id,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.trial_columns import Bools
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
@@ -107,21 +108,22 @@ class Successes:
         ``free`` (n,) tells whether the open gripper is free of the object there; None where geometry or
         gripper is unknown.
         """
-        count = len(poses)
-        estimates = SuccessEstimate(*np.full((3, count), np.nan), np.zeros(count), LEVEL)
+        nothing = np.full((3, len(poses)), np.nan)
+        found = SuccessEstimate(nothing[0], nothing[1], nothing[2], np.zeros(len(poses)), LEVEL)
         if model is not None:
-
-            def work(part: slice) -> None:
-                answer = model.whole.evaluate(poses[part], level=LEVEL, threads=self._compute.threads)
-                estimates.probability[part] = answer.probability
-                estimates.low[part], estimates.high[part] = answer.low, answer.high
-                estimates.effective_trials[part] = answer.effective_trials
-
-            self._compute.blocks(count, 16_384, work)
+            work = partial(model.whole.evaluate, level=LEVEL, threads=self._compute.threads)
+            parts = self._compute.blocks(poses, work)
+            found = SuccessEstimate(
+                np.concatenate([part.probability for part in parts]),
+                np.concatenate([part.low for part in parts]),
+                np.concatenate([part.high for part in parts]),
+                np.concatenate([part.effective_trials for part in parts]),
+                LEVEL,
+            )
         if free is not None:
-            for column in (estimates.probability, estimates.low, estimates.high):
+            for column in (found.probability, found.low, found.high):
                 column[~free] = 0.0
-        return estimates
+        return found
 
     def _refresh(self, key: _Key, selected: Selected, before: _Attempts | None) -> _Attempts:
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]

@@ -26,14 +26,9 @@ _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 class Constraints:
     """What bounds a grasp, in the object frame, and what its parts were called in the request.
 
-    Attributes
-    ----------
-    object_pose
-        The object frame in the world frame, one pose, where it was given.
-    obstacles
-        What the gripper must not touch besides the object.
-    candidates, exclude
-        The only ones to rank, and those to stay away from.
+    ``object_pose`` is the object frame in the world frame, one pose, where it was given; ``obstacles`` what
+    the gripper must not touch besides the object; ``candidates`` the only poses to rank, ``exclude`` those to
+    stay away from.
     """
 
     region: Region

@@ -13,14 +13,10 @@ from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
-from graspdb_service.trial_columns import Bools, Floats
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.geometry.collision import CollisionTest
-
-#: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
-_BLOCK = 16_384
 
 
 def likelihood(
@@ -51,21 +47,21 @@ def likelihood(
     with ctx.compute.admitted():
         built = ctx.densities.requested(slug, request)
         columns: dict[str, Any] = {}
-        free = None
+        free, threads = None, ctx.compute.threads
         if asked("density", "log_density", "relative"):
             search, relative = built.search, np.zeros(count)
             logs = np.full(count, -np.inf)
             if search is not None:
                 logs = log_density(ctx, search.density, poses, cutoff)
                 if asked("relative"):
-                    relative = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
+                    relative = ctx.compute.run(partial(search.relative, logs, threads))
             density = np.exp(logs) if asked("density") else None
             columns |= {"density": density, "log_density": logs, "relative": relative}
         chances = asked("success_probability", "interval", "effective_trials")
         if chances or asked("collision_free"):
             test = ctx.scenes.test(built.selected)
             if test is not None:
-                free = _free(ctx, test, poses)
+                free = np.concatenate(ctx.compute.blocks(poses, partial(test.free, threads=threads)))
         if chances:
             model = ctx.successes.model(built, collisions_known=free is not None)
             estimate = ctx.successes.estimate(model, poses, free)
@@ -76,27 +72,7 @@ def likelihood(
     return built, {name: column for name, column in columns.items() if column is not None and asked(name)}
 
 
-def log_density(
-    ctx: Estimators,
-    density: SearchedDensity,
-    poses: Poses,
-    cutoff: float | None,
-) -> Floats:
+def log_density(ctx: Estimators, density: SearchedDensity, poses: Poses, cutoff: float | None) -> Floats:
     """Log densities (n,) of poses, computed in blocks."""
-    logs = np.empty(len(poses))
-
-    def work(part: slice) -> None:
-        logs[part] = density.log_density(poses[part], cutoff=cutoff, threads=ctx.compute.threads)
-
-    ctx.compute.blocks(len(poses), _BLOCK, work)
-    return logs
-
-
-def _free(ctx: Estimators, test: CollisionTest, poses: Poses) -> Bools:
-    free = np.empty(len(poses), dtype=bool)
-
-    def work(part: slice) -> None:
-        free[part] = test.free(poses[part], threads=ctx.compute.threads)
-
-    ctx.compute.blocks(len(poses), _BLOCK, work)
-    return free
+    work = partial(density.log_density, cutoff=cutoff, threads=ctx.compute.threads)
+    return np.concatenate(ctx.compute.blocks(poses, work))

@@ -30,12 +30,8 @@ _CHANCES = frozenset({"success_probability", "interval", "effective_trials"})
 class Question:
     """A request about one density, everything looked up.
 
-    Attributes
-    ----------
-    search, kernel
-        In the density of successes, or before any in the prior of the object's edges.
-    chances, model
-        Whether grasps are told with their success probability, and by which model, where there is one.
+    ``search`` and ``kernel`` are of the density of successes, or before any of the prior of the object's
+    edges; ``chances``: whether grasps are told with their success probability, by ``model`` if there is one.
     """
 
     built: Built
