@@ -6,6 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
 
 TYPE_PREFIX = "urn:graspdb:problem:"
 
@@ -57,6 +60,13 @@ def not_found(what: str, name: str, way_out: str = "") -> ProblemError:
     return ProblemError(
         404, "not-found", f"There is no {what} {name!r}" + (f": {way_out}" if way_out else "")
     )
+
+
+def found(value: T | None, what: str, name: str, way_out: str = "") -> T:
+    """What a name stands for; 404 where that is nothing."""
+    if value is None:
+        raise not_found(what, name[:80], way_out)
+    return value
 
 
 def invalid(field: str, message: str, title: str = "The request is not valid") -> ProblemError:

@@ -107,11 +107,9 @@ class Table:
         """As :meth:`column`, without nulls; 422 where it is missing, or naming the first null."""
         column = self.column(name)
         if column is None:
-            raise invalid(f"{self._prefix}.{name}", "required")
+            raise self._wrong(name, "required")
         if column.null_count:
-            self.fault(
-                name, int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]), "required"
-            )
+            self.fault(name, int(np.flatnonzero(_numpy(column.is_null()))[0]), "required")
         return column
 
     def vectors(self, name: str, width: int) -> Floats:
@@ -121,9 +119,9 @@ class Table:
         fixed = pa.types.is_fixed_size_list(kind)
         lists = fixed or pa.types.is_list(kind) or pa.types.is_large_list(kind)
         if not lists or not (pa.types.is_floating(kind.value_type) or pa.types.is_integer(kind.value_type)):
-            raise invalid(f"{self._prefix}.{name}", f"lists of {width} numbers; this column is {kind}")
+            raise self._wrong(name, f"lists of {width} numbers; this column is {kind}")
         if fixed and kind.list_size != width:
-            raise invalid(f"{self._prefix}.{name}", f"lists of {width} numbers, not of {kind.list_size}")
+            raise self._wrong(name, f"lists of {width} numbers, not of {kind.list_size}")
         if not fixed:
             sizes = column.value_lengths().to_numpy()
             wrong = np.flatnonzero(sizes != width)
@@ -131,9 +129,9 @@ class Table:
                 self.fault(name, int(wrong[0]), f"a list of {width} numbers")
         flat = column.flatten()
         if flat.null_count:
-            null = np.flatnonzero(flat.is_null().to_numpy(zero_copy_only=False))[0]
+            null = np.flatnonzero(_numpy(flat.is_null()))[0]
             self.fault(name, int(null) // width, f"a list of {width} numbers")
-        values = flat.to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, width)
+        values = _numpy(flat).astype(np.float64).reshape(-1, width)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if bad.size:
             self.fault(name, int(bad[0]), "every number must be finite")
@@ -145,9 +143,8 @@ class Table:
         if column is None:
             return None
         if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-            raise invalid(f"{self._prefix}.{name}", f"numbers or nulls; this column is {column.type}")
-        null = column.is_null().to_numpy(zero_copy_only=False)
-        values = column.to_numpy(zero_copy_only=False).astype(np.float64)
+            raise self._wrong(name, f"numbers or nulls; this column is {column.type}")
+        null, values = _numpy(column.is_null()), _numpy(column).astype(np.float64)
         bad = np.flatnonzero(~null & ~np.isfinite(values))
         if bad.size:
             self.fault(name, int(bad[0]), "a finite number or null")
@@ -161,9 +158,9 @@ class Table:
         coded = pa.types.is_dictionary(column.type)
         kind = column.type.value_type if coded else column.type
         if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-            raise invalid(f"{self._prefix}.{name}", f"text; this column is {column.type}")
+            raise self._wrong(name, f"text; this column is {column.type}")
         encoded = column if coded else column.dictionary_encode()
-        indices = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+        indices = _numpy(encoded.indices.fill_null(-1)).astype(np.int64)
         return encoded.dictionary.to_pylist(), indices
 
     def objects(self, name: str) -> list[Any] | None:
@@ -175,15 +172,13 @@ class Table:
         if column is None:
             return None
         if not _plain(pa, column.type):
-            raise invalid(
-                f"{self._prefix}.{name}", f"plain lists, structs, text or times; it is {column.type}"
-            )
+            raise self._wrong(name, f"plain lists, structs, text or times; it is {column.type}")
         if pa.types.is_timestamp(column.type):
             column = column.cast(pa.timestamp("us", column.type.tz), safe=False)
         try:
             found: list[Any] = column.to_pylist()
         except (ValueError, OverflowError) as error:
-            raise invalid(f"{self._prefix}.{name}", str(error)[:200]) from None
+            raise self._wrong(name, str(error)[:200]) from None
         return found
 
     def booleans(self, name: str) -> Bools | None:
@@ -191,11 +186,19 @@ class Table:
         column = self.required(name)
         if not self._pa.types.is_boolean(column.type):
             return None
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.bool_)
+        return np.asarray(_numpy(column), dtype=np.bool_)
 
     def fault(self, name: str, row: int, message: str) -> None:
         """Raise a 422 that names a row of a column."""
-        raise invalid(f"{self._prefix}.{name}.{row}", message)
+        raise self._wrong(f"{name}.{row}", message)
+
+    def _wrong(self, name: str, message: str) -> ProblemError:
+        return invalid(f"{self._prefix}.{name}", message)
+
+
+def _numpy(column: Any) -> NDArray[Any]:
+    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return values
 
 
 def _plain(pa: Any, kind: Any) -> bool:

@@ -44,10 +44,10 @@ def find(tx: Tx, id: str) -> KernelRow | None:
     return first_as(tx, select(kernels).where(kernels.c.id == id), KernelRow)
 
 
-def newest(tx: Tx, object_id: int, gripper: str | None) -> str | None:
-    """Id of the anisotropic kernel fitted last on this object's trials with this gripper."""
+def newest(tx: Tx, object_id: int, gripper: str | None) -> KernelRow | None:
+    """The anisotropic kernel fitted last on this object's trials with this gripper."""
     query = (
-        select(kernels.c.id)
+        select(kernels)
         .where(
             kernels.c.object_id == object_id,
             kernels.c.gripper.is_not_distinct_from(gripper),
@@ -56,8 +56,7 @@ def newest(tx: Tx, object_id: int, gripper: str | None) -> str | None:
         .order_by(kernels.c.number.desc())
         .limit(1)
     )
-    found: str | None = tx.execute(query).scalar()
-    return found
+    return first_as(tx, query, KernelRow)
 
 
 def page(tx: Tx, *, after: int, limit: int, object_id: int | None, gripper: str | None) -> list[KernelRow]:

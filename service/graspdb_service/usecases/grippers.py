@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graspdb.wire import GripperCreate, GripperInfo, GripperProfile
 from graspdb_geometry.grippers import PANDA, PG70, GripperShape
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import ProblemError, conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
@@ -54,9 +54,7 @@ def page(database: Database, *, after: str, limit: int) -> tuple[list[GripperInf
 def require(tx: Tx, gripper: str) -> GripperRow:
     """The gripper, or a 404."""
     row = grippers.find(tx, gripper) if is_slug(gripper) else None
-    if row is None:
-        raise not_found("gripper", gripper[:80], "GET /grippers lists them, POST /grippers makes one")
-    return row
+    return found(row, "gripper", gripper, "GET /grippers lists them, POST /grippers makes one")
 
 
 def unknown(field: str, names: list[str]) -> ProblemError:

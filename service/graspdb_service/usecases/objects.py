@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, ObjectCreate, ObjectInfo, ObjectPatch
-from graspdb_service.problems import conflict, not_found
+from graspdb_service.problems import conflict, found
 from graspdb_service.storage import assets, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
@@ -27,9 +27,8 @@ def create(database: Database, request: ObjectCreate, sent: Sent) -> Created:
 
 def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:
     """The object of this slug (404), and of this internal id (409); ``lock`` holds it for the transaction."""
-    row = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
-    if row is None:
-        raise not_found("object", slug[:80], "GET /objects lists them, POST /objects makes one")
+    known = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
+    row = found(known, "object", slug, "GET /objects lists them, POST /objects makes one")
     if object_id is not None and row.id != object_id:
         raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
     return row

@@ -98,14 +98,11 @@ class Densities:
         """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""
         row = selected.row
         with self._database.read() as tx:
-            if name == "anisotropic":
-                newest = kernels.newest(tx, row.id, selected.gripper)
-                found = None if newest is None else kernels.find(tx, newest)
-            else:
-                found = kernels.find(tx, name)
+            newest = name == "anisotropic"
+            found = kernels.newest(tx, row.id, selected.gripper) if newest else kernels.find(tx, name)
             others = [] if found else kernels.page(tx, after=0, limit=20, object_id=row.id, gripper=None)
         names = ["isotropic", *(kernel.id for kernel in others)]
-        if found is None and name == "anisotropic":
+        if found is None and newest:
             gripper = f', "gripper": "{selected.gripper}"' if selected.gripper else ""
             raise conflict(
                 "kernel-not-fitted",

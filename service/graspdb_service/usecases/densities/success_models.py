@@ -49,6 +49,9 @@ class _Attempts:
         return 4_096 + sum(part.nbytes for part in (self.model, self.sample) if part is not None)
 
 
+_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None)
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """All attempts, and the ones to search by: a random sample where all would take too long."""
@@ -131,17 +134,17 @@ class Successes:
             selected = as_of(tx, selected)
             row = selected.row
             # A source whose first failure has come counts from now on with all it has posted.
-            if before is not None and (before.epoch != row.epoch or before.tried != selected.tried):
-                before = None
+            if before is None or before.epoch != row.epoch or before.tried != selected.tried:
+                before = _NONE
             stored = _fetch(tx, selected, without, before)
-            names = {**({} if before is None else before.sweeps), **stored.repeat_keys}
-            if before is not None and len(set(names.values())) < len(names):
+            names = {**before.sweeps, **stored.repeat_keys}
+            if before.sweeps and len(set(names.values())) < len(names):
                 # Two sweeps of one grid share poses, which count once: looked at together.
-                before = None
-                stored = _fetch(tx, selected, without, None)
+                before = _NONE
+                stored = _fetch(tx, selected, without, before)
         isotropic = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
         kernel = key.success_kernel or isotropic
-        old, sample = (None, None) if before is None else (before.model, before.sample)
+        old, sample = before.model, before.sample
         new = self._compute.run(lambda: attempts.joined(stored))
         size = len(new) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
@@ -156,14 +159,9 @@ class Successes:
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
-def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts | None) -> Stored:
-    return attempts.fetch(
-        tx,
-        selected,
-        without=without,
-        after_seq=0 if before is None else before.last_seq,
-        after_revision=0 if before is None else before.revision,
-    )
+def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts) -> Stored:
+    since = {"after_seq": before.last_seq, "after_revision": before.revision}
+    return attempts.fetch(tx, selected, without=without, **since)
 
 
 def _extended(

@@ -20,7 +20,7 @@ from graspdb.wire.kernels import (
 )
 from graspdb.wire.states import RunState
 from graspdb_density import AnisotropicKernel
-from graspdb_service.problems import invalid, not_found
+from graspdb_service.problems import found, invalid, not_found
 from graspdb_service.storage import grippers, kernels
 from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
@@ -73,9 +73,7 @@ def get(ctx: Estimators, id: str) -> StoredKernel:
     """One kernel."""
     with ctx.database.read() as tx:
         row = kernels.find(tx, id)
-    if row is None:
-        raise not_found("kernel", id[:80], "GET /kernels lists those there are")
-    return fit.info(row)
+    return fit.info(found(row, "kernel", id, "GET /kernels lists those there are"))
 
 
 def page(

@@ -229,10 +229,8 @@ def _by_success(
             calls=[call.model_dump(mode="json") for call in calls],
         )
     factors, aim = sorted(found), target.success.value or 0.0
-    rates, counts = (
-        [found[f].success.value or 0.0 for f in factors],
-        [found[f].draws for f in factors],
-    )
+    rates = [found[f].success.value or 0.0 for f in factors]
+    counts = [found[f].draws for f in factors]
     match = match_success(aim, base, rates, factors=factors, draws=counts)
     if not match.reached:
         return match, ()

@@ -21,7 +21,7 @@ from typing import Any
 from graspdb.wire.reports import ReportRun
 from graspdb.wire.states import RunState
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import ProblemError, busy, conflict, not_found
+from graspdb_service.problems import ProblemError, busy, conflict, found
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.report_runs import RunKey, RunRow
@@ -165,9 +165,7 @@ class Runs:
     def _row(self, id: str) -> RunRow:
         with self._database.read() as tx:
             run = report_runs.get(tx, id)
-        if run is None:
-            raise not_found("report run", id[:80], "runs of a past revision are deleted: ask for the report")
-        return run
+        return found(run, "report run", id, "runs of a past revision are deleted: ask for the report")
 
     def place(self) -> str:
         """A lease for a run that this process is to compute; 429 where it has too many."""

@@ -16,7 +16,7 @@ from graspdb.wire import (
 )
 from graspdb.wire.jobs import FailureNoted
 from graspdb.wire.states import JobState
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import ProblemError, conflict, found, invalid
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.simulation.jobs import JobRow
@@ -159,9 +159,7 @@ def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> Fai
 
 def require(job: JobRow | None, job_id: str) -> JobRow:
     """The job, or a 404."""
-    if job is None:
-        raise not_found("job", job_id[:80], "its object may have been deleted")
-    return job
+    return found(job, "job", job_id, "its object may have been deleted")
 
 
 def lost_lease(job: JobRow) -> ProblemError:

@@ -6,7 +6,7 @@ import time
 
 from graspdb.wire import OUTCOMES, SweepInfo
 from graspdb.wire.states import JobState, SweepState
-from graspdb_service.problems import conflict, not_found
+from graspdb_service.problems import conflict, found
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import Progress, SweepRow
@@ -18,9 +18,7 @@ from graspdb_service.usecases.objects import require
 def require_sweep(tx: Tx, sweep_id: str) -> SweepRow:
     """The sweep, or a 404."""
     row = sweeps.find(tx, sweep_id) if is_uuid(sweep_id) else None
-    if row is None:
-        raise not_found("sweep", sweep_id[:80], "GET /sweeps lists them")
-    return row
+    return found(row, "sweep", sweep_id, "GET /sweeps lists them")
 
 
 def get(database: Database, sweep_id: str) -> SweepInfo:

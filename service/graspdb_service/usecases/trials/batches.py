@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, BatchInfo
-from graspdb_service.problems import busy, conflict, not_found
+from graspdb_service.problems import busy, conflict, found
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.trials import batches
@@ -63,9 +63,7 @@ def remove(database: Database, slug: str, key: str) -> None:
 
 def _require(tx: Tx, object_id: int, key: str) -> BatchRow:
     batch = batches.find(tx, object_id, key) if is_uuid(key) else None
-    if batch is None:
-        raise not_found("batch", key[:80], "GET /objects/{id}/batches lists them")
-    return batch
+    return found(batch, "batch", key, "GET /objects/{id}/batches lists them")
 
 
 def _info(tx: Tx, slug: str, batch: BatchRow) -> BatchInfo:

@@ -11,7 +11,7 @@ import numpy as np
 
 from graspdb.wire import OUTCOMES, GripperProfile
 from graspdb.wire.queries import TrialSelection
-from graspdb_service.problems import conflict, not_found
+from graspdb_service.problems import conflict, found
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
@@ -111,17 +111,17 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
         and (asked.protocol is None or item.protocol in (None, asked.protocol))
     }
     items = candidates.values()
-    found = {name: _distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
-    ambiguous = [name for name, values in found.items() if len(values) > 1 and getattr(asked, name) is None]
+    named = {name: _distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
+    ambiguous = [name for name, values in named.items() if len(values) > 1 and getattr(asked, name) is None]
     if ambiguous:
-        told = "; ".join(f"{name}: {', '.join(found[name])}" for name in ambiguous)
+        told = "; ".join(f"{name}: {', '.join(named[name])}" for name in ambiguous)
         raise conflict(
             "ambiguous-selection",
             f"The trials are of several {' and '.join(name + 's' for name in ambiguous)}: name one ({told})",
-            grippers=found["gripper"],
-            protocols=found["protocol"],
+            grippers=named["gripper"],
+            protocols=named["protocol"],
         )
-    gripper, protocol = (getattr(asked, name) or next(iter(values), None) for name, values in found.items())
+    gripper, protocol = (getattr(asked, name) or next(iter(values), None) for name, values in named.items())
     if gripper is not None and profile is None:
         profile = _profile(tx, gripper)
     names = {"gripper": gripper, "protocol": protocol, "source": asked.source}
@@ -173,9 +173,7 @@ def total(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
 
 
 def _profile(tx: Tx, name: str) -> GripperProfile:
-    row = grippers.find(tx, name)
-    if row is None:
-        raise not_found("gripper", name, "GET /grippers lists those there are")
+    row = found(grippers.find(tx, name), "gripper", name, "GET /grippers lists those there are")
     return GripperProfile.model_validate(row.profile)
 
 
