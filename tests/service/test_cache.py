@@ -378,8 +378,8 @@ def test_the_cache_is_bounded_by_bytes(
         for width in widths:
             built = density_of(context, TrialSelection(), KernelChoice(width, 15.0))
             assert built.density is not None
-            assert context.densities.nbytes <= 2**21
-        assert 1 <= len(context.densities) < len(widths)
+            assert context.densities.kept.nbytes <= 2**21
+        assert 1 <= len(context.densities.kept) < len(widths)
         again = density_of(context, TrialSelection(), KernelChoice(widths[-1], 15.0))
         assert again is built
         # Models of success have a bound of their own, of the same kind.
@@ -387,6 +387,6 @@ def test_the_cache_is_bounded_by_bytes(
         for width in widths[:6]:
             built = density_of(context, TrialSelection(), KernelChoice(width, 15.0))
             assert context.successes.model(built, collisions_known=False) is not None
-            assert context.successes.nbytes <= settings.max_density_cache_bytes
+            assert context.successes.kept.nbytes <= settings.max_density_cache_bytes
     finally:
         context.close()

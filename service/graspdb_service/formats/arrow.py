@@ -208,24 +208,13 @@ def _plain(pa: Any, kind: Any) -> bool:
         return _plain(pa, kind.value_type)
     if types.is_struct(kind):
         return all(_plain(pa, field.type) for field in kind)
-    return bool(
-        types.is_string(kind)
-        or types.is_large_string(kind)
-        or types.is_floating(kind)
-        or types.is_integer(kind)
-        or types.is_boolean(kind)
-        or types.is_timestamp(kind)
-    )
+    texts, numbers = (types.is_string, types.is_large_string), (types.is_floating, types.is_integer)
+    return any(fits(kind) for fits in (*texts, *numbers, types.is_boolean, types.is_timestamp))
 
 
 def _check_messages(pa: Any, body: bytes) -> None:
     """Refuse a stream with compressed buffers (ValueError; for no stream, what pyarrow or struct say)."""
-    messages = pa.ipc.MessageReader.open_stream(pa.py_buffer(body))
-    while True:
-        try:
-            message = messages.read_next_message()
-        except StopIteration:
-            return
+    for message in pa.ipc.MessageReader.open_stream(pa.py_buffer(body)):
         if message.type in ("record batch", "dictionary") and _compressed(message.metadata.to_pybytes()):
             raise ValueError("its buffers are compressed: write it without compression")
 

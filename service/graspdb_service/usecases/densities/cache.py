@@ -72,8 +72,8 @@ class Densities:
         self.selections = selections
         self._compute = compute
         self._features = features
-        self._cache: SingleFlightCache[tuple[int, TrialSelection, KernelChoice], Built]
-        self._cache = SingleFlightCache(max_bytes, lambda built: built.nbytes)
+        self.kept: SingleFlightCache[tuple[int, TrialSelection, KernelChoice], Built]
+        self.kept = SingleFlightCache(max_bytes, lambda built: built.nbytes)
 
     def get(self, selected: Selected, kernel: KernelChoice) -> Built:
         """The density of a selection, at least as new; refused as :meth:`stored`, and as the selection where
@@ -83,7 +83,7 @@ class Densities:
         if kernel.stored is not None:
             stored = self.stored(selected, kernel.stored)
             kernel = KernelChoice(stored=stored.id)
-        return self._cache.get(
+        return self.kept.get(
             (selected.row.id, selected.filters, kernel),
             lambda built: built.revision >= selected.row.revision,
             lambda before: self._refresh(selected, kernel, stored, before),
@@ -119,13 +119,6 @@ class Densities:
                 f" {selected.gripper!r}: fit one for it with POST /kernels",
             )
         return found
-
-    @property
-    def nbytes(self) -> int:
-        return self._cache.nbytes
-
-    def __len__(self) -> int:
-        return len(self._cache)
 
     def _refresh(
         self, selected: Selected, kernel: KernelChoice, stored: KernelRow | None, before: Built | None

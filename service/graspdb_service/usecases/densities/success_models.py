@@ -76,7 +76,7 @@ class Successes:
     def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
         self._database = database
         self._compute = compute
-        self._cache: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
+        self.kept: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
     def model(self, built: Built, *, collisions_known: bool) -> Model | None:
         """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
@@ -91,7 +91,7 @@ class Successes:
             collisions_known,
             built.success_kernel,
         )
-        found = self._cache.get(
+        found = self.kept.get(
             key,
             lambda a: a.revision >= built.revision,
             lambda before: self._refresh(key, built.selected, before),
@@ -99,11 +99,6 @@ class Successes:
         if found.model is None or not found.model.size:
             return None
         return Model(found.model, found.sample or found.model)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all models kept."""
-        return self._cache.nbytes
 
     def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> SuccessEstimate:
         """Success probability of poses (n,) under a model from :meth:`model`, NaN where nothing is known.

@@ -20,11 +20,10 @@ from graspdb_density import IsotropicKernel, importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
 from graspdb_density.vicinity.anisotropy import empirical_anisotropy
-from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES, Anisotropy, Frames
+from graspdb_density.vicinity.displacement_bins import Anisotropy, Frames, check_enough
 from graspdb_density.vicinity.displacement_density import density_anisotropy
 from graspdb_density.vicinity.half_width import Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
-from graspdb_service.problems import too_few_trials
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.cache import Built
@@ -71,12 +70,7 @@ def anisotropy_report(
     frames: Frames | None = (
         (lambda poses: axes(poses.positions, poses.quaternions_xyzw)) if callable(axes) else axes
     )
-    successes = built.selected.successes
-    if successes < LEAST_SUCCESSES:
-        raise too_few_trials(
-            f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
-            f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
-        )
+    enough(lambda: check_enough(built.selected.successes))
     everything = attempts.read(inputs.database, built.selected)
     need_failures(everything, "What a success tells about its vicinity", 1)
     measure = _measure(inputs, built, method, everything)
@@ -98,20 +92,17 @@ def anisotropy_report(
             f" axes: {what}"
         )
     text = _tolerances_text(tolerances, alignment) + _hypotheses_text(expected)
-    return AnisotropyReport(
+    return as_model(
+        AnisotropyReport,
+        found,
         **{**head(built), "text": text + surface_pairs.in_words(related)},
         warnings=warnings,
-        method=method,
         alignment=alignment,
-        grasps=found.grasps,
         attempts=len(everything),
-        translation_pairs=found.translation_pairs,
-        rotation_pairs=found.rotation_pairs,
         kernel=None if method == "empirical" else built.kernel,
         tolerances=tolerances,
         translations=[as_model(AnisotropyHistogram, item) for item in found.translations],
         rotations=[as_model(AnisotropyHistogram, item) for item in found.rotations],
-        aligned=found.aligned,
         hypotheses=[as_model(AnisotropyHypothesis, item) for item in expected],
         relations=related,
     )

@@ -8,7 +8,7 @@ from graspdb.wire.reports import AnisotropyRelation
 from graspdb_density.success.block_bootstrap import shares
 from graspdb_geometry.features.jaw_pairs import KINDS, JawPairs
 from graspdb_service.trial_columns import Bools, Floats, Ints
-from graspdb_service.usecases.reports.common import LEVEL, finite
+from graspdb_service.usecases.reports.common import LEVEL, as_model, finite
 from graspdb_service.usecases.trials.attempts import AllTrials
 
 #: Ends of the ranges of angles between the closing axis and the pair's, degrees.
@@ -53,15 +53,12 @@ def _rows(
     every = shares(won, group, positions, groups=groups, level=LEVEL)
     free = shares(won, np.where(hit, -1, group), positions, groups=groups, level=LEVEL)
     return [
-        AnisotropyRelation(
+        as_model(
+            AnisotropyRelation,
+            share,
             relation=kind,
             angle_deg=None if kind == "none" else (ANGLES_DEG[number], ANGLES_DEG[number + 1]),
-            attempts=share.attempts,
             collisions=share.attempts - clear.attempts,
-            successes=share.successes,
-            probability=finite(share.probability),
-            low=finite(share.low),
-            high=finite(share.high),
             free_probability=finite(clear.probability),
             free_low=finite(clear.low),
             free_high=finite(clear.high),
