@@ -14,7 +14,6 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, 
 from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import FailedChunk
 from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
-from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, sweeps
 from graspdb_service.trial_columns import Floats
@@ -83,18 +82,11 @@ def _query() -> Select[Any]:
     )
 
 
-def lock_object(tx: Tx, object_id: int) -> None:
-    """Take the object's row lock without a new revision."""
-    tx.execute(select(objects.c.id).where(objects.c.id == object_id).with_for_update(key_share=True))
-
-
-def lock_and_read_revision(tx: Tx, object_id: int) -> int:
-    """Take the object's row lock; its revision, which stays as it is, or ObjectGone."""
+def lock_object(tx: Tx, object_id: int) -> int | None:
+    """Take the object's row lock: its revision, which stays as it is; None where it is gone."""
     query = select(objects.c.revision).where(objects.c.id == object_id).with_for_update(key_share=True)
-    revision = tx.scalar(query)
-    if revision is None:
-        raise ObjectGone(f"object {object_id} was deleted")
-    return int(revision)
+    revision: int | None = tx.scalar(query)
+    return revision
 
 
 def create(

@@ -231,7 +231,10 @@ def _store(
         if collects:
             revision, first_seq = objects.advance(tx, sweep.object_id, rows=rows, append=True)
         else:
-            revision, first_seq = sweeps.lock_and_read_revision(tx, sweep.object_id), 0
+            unchanged, first_seq = sweeps.lock_object(tx, sweep.object_id), 0
+            if unchanged is None:
+                raise _LostLease
+            revision = unchanged
         if twins and packed.count_done(tx, twins) != seen:
             raise _Overtaken
         accepted = ResultAccepted(job=job.id, revision=revision, inserted=rows)
