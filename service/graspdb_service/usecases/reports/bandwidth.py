@@ -16,13 +16,7 @@ from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import too_few_trials
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
-from graspdb_service.usecases.reports.common import (
-    ReportInputs,
-    as_model,
-    enough,
-    head,
-    share,
-)
+from graspdb_service.usecases.reports.common import ReportInputs, as_model, enough, head, share
 from graspdb_service.usecases.simulation import verification
 
 #: Widths whose draws are to be simulated, as factors on the recommended ones; 15, 30 and 45 mm in the paper.

@@ -6,12 +6,7 @@ import numpy as np
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb.wire.queries import SelectionQuery
-from graspdb.wire.reports import (
-    CalibrationBin,
-    CalibrationReport,
-    CheckedGrasps,
-    ReportRange,
-)
+from graspdb.wire.reports import CalibrationBin, CalibrationReport, CheckedGrasps, ReportRange
 from graspdb_density import importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses

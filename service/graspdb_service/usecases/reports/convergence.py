@@ -36,14 +36,7 @@ from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.cache import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.reports.bandwidth import simulated_draws
-from graspdb_service.usecases.reports.common import (
-    LEVEL,
-    ReportInputs,
-    as_model,
-    enough,
-    head,
-    interval,
-)
+from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, as_model, enough, head, interval
 from graspdb_service.usecases.simulation import verification
 
 _METHOD = (
