@@ -195,16 +195,18 @@ def build(
 
     weights = _weights(built, everything)
     added = None if old is None else _in_units_of(old, weights, len(rows))
-    if stored is not None and not for_success:
-        return _shaped(stored, axes, built, before, everything, fresh, weights, added)
-    if before is not None and before.chosen_from == built.chosen_from:
+    shaping = None if for_success else stored
+    same_widths = before is not None and before.chosen_from == built.chosen_from
+    if before is not None and same_widths:
         built = replace(built, kernel=before.kernel)
-        if old is not None and added is not None:
-            return _searched(replace(built, density=old.extend(fresh.poses, added, fresh.symmetric)), before)
     elif built.chosen_from:
         chosen = _choose(everything(), proposal, built.chosen_from, threads)
         built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
-    return _searched(replace(built, density=_isotropic(built.kernel, everything(), weights)), None)
+    if shaping is not None and shaping.kind == "sampled":
+        _check_components(stored_kernel.load_sampled(shaping), everything().symmetric)
+    if before is not None and same_widths and old is not None and added is not None:
+        return _searched(_extended(built, before, old, shaping, axes, fresh, added), before)
+    return _searched(_made(built, shaping, axes, everything(), weights), None)
 
 
 def _searched(built: Built, before: Built | None) -> Built:
@@ -215,61 +217,49 @@ def _searched(built: Built, before: Built | None) -> Built:
     return replace(built, search=before.search.extended(built.asked, built.density))
 
 
-def _isotropic(kernel: KernelInfo, grasps: Grasps, weights: Floats | None) -> GraspDensity:
-    widths = stored_kernel.isotropic(kernel)
-    return GraspDensity.build(grasps.poses, kernel=widths, weights=weights, symmetric=grasps.symmetric)
-
-
-def _shaped(
-    stored: KernelRow,
-    axes: Axes,
-    built: Built,
-    before: Built | None,
-    everything: Callable[[], Grasps],
-    fresh: Grasps,
-    weights: Floats | None,
-    added: Floats | None,
+def _made(
+    built: Built, shaping: KernelRow | None, axes: Axes, grasps: Grasps, weights: Floats | None
 ) -> Built:
-    """The density under a stored kernel."""
-    if stored.kind == "sampled":
-        kernel = stored_kernel.load_sampled(stored)
-        grasps = everything()
-        _check_components(kernel, len(grasps.poses), len(grasps.poses) + int(grasps.symmetric.sum()))
-        old = None if before is None else before.density
-        if before is not None and old is not None and before.sampled is not None and added is not None:
-            alike = old.extend(fresh.poses, added, fresh.symmetric)
-            sampled = _placed(before.sampled, kernel, fresh, added)
-            return _searched(replace(built, density=alike, sampled=sampled), before)
-        sampled = kernel.placed(grasps.poses, weights=weights, symmetric=grasps.symmetric)
-        return _searched(
-            replace(built, density=_isotropic(built.kernel, grasps, weights), sampled=sampled), None
-        )
-    if before is not None and before.shaped is not None and added is not None:
-        frames = stored_kernel.axes_at(axes, fresh.poses)
-        shaped = before.shaped.extend(fresh.poses, weights=added, symmetric=fresh.symmetric, frames=frames)
-        return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
-    grasps = everything()
-    shaped = MixtureDensity(
-        grasps.poses,
-        kernel=stored_kernel.load(stored),
-        weights=weights,
-        symmetric=grasps.symmetric,
-        frames=stored_kernel.axes_at(axes, grasps.poses),
-    )
-    return _searched(replace(built, density=shaped.isotropic, shaped=shaped), None)
+    """The density of all grasps, under the stored kernel that shapes it, if any."""
+    poses, symmetric = grasps
+    if shaping is not None and shaping.kind != "sampled":
+        kernel, frames = stored_kernel.load(shaping), stored_kernel.axes_at(axes, poses)
+        shaped = MixtureDensity(poses, kernel=kernel, weights=weights, symmetric=symmetric, frames=frames)
+        return replace(built, density=shaped.isotropic, shaped=shaped)
+    widths = stored_kernel.isotropic(built.kernel)
+    density = GraspDensity.build(poses, kernel=widths, weights=weights, symmetric=symmetric)
+    if shaping is None:
+        return replace(built, density=density)
+    sampled = stored_kernel.load_sampled(shaping).placed(poses, weights=weights, symmetric=symmetric)
+    return replace(built, density=density, sampled=sampled)
 
 
-def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Grasps, added: Floats) -> GraspDensity:
-    """The density of a sampled kernel's components with those of further grasps."""
-    if not len(added):
-        return old
-    more = kernel.placed(fresh.poses, weights=added, symmetric=fresh.symmetric)
-    total = float(added.sum())
-    return old.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
+def _extended(
+    built: Built,
+    before: Built,
+    old: GraspDensity,
+    shaping: KernelRow | None,
+    axes: Axes,
+    fresh: Grasps,
+    added: Floats,
+) -> Built:
+    """The density ``old`` of ``before`` with further grasps, weights in its unit."""
+    poses, symmetric = fresh
+    if before.shaped is not None:
+        frames = stored_kernel.axes_at(axes, poses)
+        shaped = before.shaped.extend(poses, weights=added, symmetric=symmetric, frames=frames)
+        return replace(built, density=shaped.isotropic, shaped=shaped)
+    sampled = before.sampled
+    if sampled is not None and shaping is not None and len(added):
+        more = stored_kernel.load_sampled(shaping).placed(poses, weights=added, symmetric=symmetric)
+        total = float(added.sum())
+        sampled = sampled.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
+    return replace(built, density=old.extend(poses, added, symmetric), sampled=sampled)
 
 
-def _check_components(kernel: SampledKernel, rows: int, placed: int) -> None:
-    """413 for more components than a density may have; ``placed`` counts the turns of symmetric jaws, too."""
+def _check_components(kernel: SampledKernel, symmetric: Bools) -> None:
+    """413 for more components than a density of these grasps, and of symmetric jaws' turns, may have."""
+    rows, placed = len(symmetric), len(symmetric) + int(symmetric.sum())
     many = kernel.size * placed
     if many <= MOST_COMPONENTS:
         return
