@@ -20,13 +20,13 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import trials
 from graspdb_service.storage.trials import binary_copy, provenances
 from graspdb_service.storage.trials.binary_copy import json_text
-from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
+from graspdb_service.trial_columns import Ints, TrialColumns
 
 SUCCESS = 1
 COPY_ROWS = 50_000
 
 _POSE = ("px", "py", "pz", "qx", "qy", "qz", "qw")
-_NUMBERS = ("proposal_density", "quality", "width_m")
+_OPTIONAL = ("proposal_density", "quality", "width_m", "pose_index")
 _DOCUMENTS = ("pose_covariance", "metadata")
 
 
@@ -41,7 +41,7 @@ def insert(
         _insert_tuples(tx, shared, columns, first_seq)
     else:
         for start in range(0, len(columns), COPY_ROWS):
-            _copy_in(tx, shared, columns, first_seq, slice(start, min(start + COPY_ROWS, len(columns))))
+            _copy_in(tx, shared, columns[start : start + COPY_ROWS], first_seq + start)
     pairs, counts = np.unique(
         np.stack([columns.provenance, columns.outcome.astype(np.int64)], axis=1), axis=0, return_counts=True
     )
@@ -49,24 +49,27 @@ def insert(
         provenances.add_tally(tx, provenance_id, outcome, rows=number)
 
 
+def _numbers(columns: TrialColumns, first_seq: int) -> dict[str, NDArray[Any]]:
+    """The columns of numbers that some of the trials have, NaN for null."""
+    found = {
+        "seq": np.arange(first_seq, first_seq + len(columns)),
+        "provenance_id": columns.provenance,
+        "outcome": columns.outcome,
+        **dict(zip(_POSE, (*columns.position.T, *columns.quaternion_xyzw.T), strict=True)),
+        **{name: getattr(columns, name) for name in _OPTIONAL},
+    }
+    return {name: values for name, values in found.items() if not np.isnan(values).all()}
+
+
 def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
     # What all rows share stands in the statement, and what none has is left out: binding is half the time.
-    lists: dict[str, Iterable[Any]] = {
-        "seq": range(first_seq, first_seq + len(columns)),
-        "provenance_id": columns.provenance.tolist(),
-        "outcome": columns.outcome.tolist(),
-        **dict(zip(_POSE[:3], columns.position.T.tolist(), strict=True)),
-        **dict(zip(_POSE[3:], columns.quaternion_xyzw.T.tolist(), strict=True)),
-    }
-    for name in _NUMBERS:
-        values: Floats = getattr(columns, name)
+    lists: dict[str, list[Any]] = {}
+    for name, values in _numbers(columns, first_seq).items():
         missing = np.isnan(values)
-        if not missing.all():
-            given = values.astype(object)
-            given[missing] = None
-            lists[name] = given.tolist()
-    if len(columns.pose_index):
-        lists["pose_index"] = columns.pose_index.tolist()
+        if missing.any():
+            values = values.astype(object)
+            values[missing] = None
+        lists[name] = values.tolist()
     converters: dict[str, Callable[[Any], str]] = {"measured_at": _sqlite_time}
     for name in ("measured_at", *_DOCUMENTS):
         items, convert = getattr(columns, name), converters.get(name, json_text)
@@ -84,30 +87,15 @@ def _sqlite_time(value: datetime) -> str:
     return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
 
 
-def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int, part: slice) -> None:
-    count = part.stop - part.start
-    values: dict[str, Any] = {
-        **shared,
-        "seq": np.arange(first_seq + part.start, first_seq + part.stop),
-        "provenance_id": columns.provenance[part],
-        "outcome": columns.outcome[part],
-        **dict(zip(_POSE[:3], columns.position[part].T, strict=True)),
-        **dict(zip(_POSE[3:], columns.quaternion_xyzw[part].T, strict=True)),
-    }
-    nulls: dict[str, Bools] = {}
-    for name in _NUMBERS:
-        column: Floats = getattr(columns, name)[part]
-        missing = np.isnan(column)
-        if not missing.all():
-            values[name], nulls[name] = column, missing
-    if len(columns.pose_index):
-        values["pose_index"] = columns.pose_index[part]
-    times = columns.measured_at[part]
+def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
+    values: dict[str, Any] = {**shared, **_numbers(columns, first_seq)}
+    nulls = {name: np.isnan(values[name]) for name in _OPTIONAL if name in values}
+    times = columns.measured_at
     if times:
         nulls["measured_at"] = np.array([time is None for time in times])
         values["measured_at"] = np.array([binary_copy.microseconds(time) for time in times], dtype=np.int64)
-    documents = {name: getattr(columns, name)[part] for name in _DOCUMENTS if getattr(columns, name)}
-    content = binary_copy.encode(count, values, nulls, list(documents.values()))
+    documents = {name: getattr(columns, name) for name in _DOCUMENTS if getattr(columns, name)}
+    content = binary_copy.encode(len(columns), values, nulls, list(documents.values()))
     names = ", ".join([*values, *documents])
     with (
         closing(tx.connection.cursor()) as cursor,
@@ -205,7 +193,8 @@ def _copied(tx: Tx, query: str, columns: Sequence[str]) -> Mapping[str, NDArray[
         closing(tx.connection.cursor()) as cursor,
         cursor.copy(f"COPY ({query}) TO STDOUT (FORMAT BINARY)") as copy,
     ):
-        return binary_copy.decode(b"".join(copy), columns)
+        table = binary_copy.decode(b"".join(copy), columns)
+    return {name: table[name] for name in columns}
 
 
 def read_swept(tx: Tx, object_id: int, batch_id: int, first: int, last: int) -> tuple[Ints, Ints]:
@@ -228,8 +217,8 @@ def _fetch(tx: Tx, query: str) -> list[Any]:
 # --- reading everything ---------------------------------------------------------------------------------
 
 _ALL = (
-    "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, *_NUMBERS,
-    "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS,
+    "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, "proposal_density", "quality",
+    "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS,
 )  # fmt: skip
 
 
