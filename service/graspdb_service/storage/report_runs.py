@@ -140,14 +140,13 @@ def release(tx: Tx, id: str, lease_id: str) -> None:
     tx.execute(update(report_runs).where(_held(id, lease_id)).values(lease_expires_at=0.0))
 
 
-def cancel(tx: Tx, id: str) -> bool:
-    """End a run that is still under way; False where it is not."""
-    statement = (
+def cancel(tx: Tx, id: str) -> None:
+    """End a run if it is still under way."""
+    tx.execute(
         update(report_runs)
         .where(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING)
         .values(state=RunState.CANCELLED, lease_id=None, lease_expires_at=None, finished_at=datetime.now(UTC))
     )
-    return bool(tx.execute(statement).rowcount)
 
 
 def remove(tx: Tx, id: str) -> None:

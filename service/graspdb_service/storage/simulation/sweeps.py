@@ -230,7 +230,7 @@ def note_started(tx: Tx, sweep_ids: Sequence[str]) -> None:
     )
 
 
-def note_finished(tx: Tx, sweep_id: str) -> bool:
+def note_finished(tx: Tx, sweep_id: str) -> None:
     """Set the end of a sweep if none of its jobs is open; call it under the object's lock."""
     # From the last chunk backwards: while a sweep runs, that is where the open ones are.
     still_open = (
@@ -239,33 +239,28 @@ def note_finished(tx: Tx, sweep_id: str) -> bool:
         .order_by(jobs.c.number.desc())
         .limit(1)
     )
-    if tx.scalar(still_open) is not None:
-        return False
-    tx.execute(
-        update(sweeps)
-        .where(sweeps.c.id == sweep_id, sweeps.c.finished_at.is_(None))
-        .values(finished_at=datetime.now(UTC))
-    )
-    return True
+    if tx.scalar(still_open) is None:
+        tx.execute(
+            update(sweeps)
+            .where(sweeps.c.id == sweep_id, sweeps.c.finished_at.is_(None))
+            .values(finished_at=datetime.now(UTC))
+        )
 
 
-def cancel(tx: Tx, sweep_id: str) -> bool:
-    """Cancel what is not finished; under the object's lock. False if nothing was open."""
+def cancel(tx: Tx, sweep_id: str) -> None:
+    """Cancel what is not finished; under the object's lock."""
     # The lease stays, so that its holder is told to stop rather than that the lease is lost.
     stopped = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(OPEN))
         .values(state=JobState.CANCELLED, completed_at=unix_now())
     )
-    if stopped.rowcount == 0:
-        return False
-    tx.execute(
-        update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=True, finished_at=datetime.now(UTC))
-    )
-    return True
+    if stopped.rowcount:
+        ended = {"cancelled": True, "finished_at": datetime.now(UTC)}
+        tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(ended))
 
 
-def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
+def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> None:
     """Queue failed and cancelled chunks again, with all their attempts; under the object's lock."""
     again = tx.execute(
         update(jobs)
@@ -274,7 +269,6 @@ def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
     )
     if again.rowcount:
         tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=False, finished_at=None))
-    return again.rowcount
 
 
 def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> Floats:
