@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graspdb.wire import GripperCreate, GripperInfo, GripperProfile
 from graspdb_geometry.grippers import PANDA, PG70, GripperShape
-from graspdb_service.problems import ProblemError, conflict, found, invalid
+from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
@@ -57,10 +57,13 @@ def require(tx: Tx, gripper: str) -> GripperRow:
     return found(row, "gripper", gripper, "GET /grippers lists them, POST /grippers makes one")
 
 
-def unknown(field: str, names: list[str]) -> ProblemError:
-    """422 for a request's field that names grippers which do not exist."""
-    listed = ", ".join(repr(name) for name in names)
-    return invalid(field, f"there is no gripper {listed}: GET /grippers lists them, POST /grippers makes one")
+def named(tx: Tx, gripper: str) -> GripperRow:
+    """The gripper that a request's field names, or a 422."""
+    row = grippers.find(tx, gripper)
+    if row is None:
+        told = f"there is no gripper {gripper!r}: GET /grippers lists them, POST /grippers makes one"
+        raise invalid("gripper", told)
+    return row
 
 
 def _check_shape(profile: GripperProfile) -> None:

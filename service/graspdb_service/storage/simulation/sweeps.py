@@ -22,6 +22,8 @@ from graspdb_service.trial_columns import Floats
 POSE_COLUMNS = 8
 _POSE_BYTES = 8 * POSE_COLUMNS
 _JOBS_PER_INSERT = 10_000
+#: How far back the rate looks, seconds.
+_WINDOW_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ def listing(
     return all_as(tx, query, SweepRow)
 
 
-def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
+def progress(tx: Tx, sweep: SweepRow) -> Progress:
     """Chunks by state, outcomes of every finished one, and how fast the last ones went."""
     totals = (
         select(jobs.c.state, func.count(), func.sum(jobs.c.stop - jobs.c.start))
@@ -211,9 +213,10 @@ def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
     recent = select(func.sum(jobs.c.stop - jobs.c.start), unix_now()).where(
         jobs.c.sweep_id == sweep.id,
         jobs.c.state == JobState.DONE,
-        jobs.c.completed_at > unix_now() - window_s,
+        jobs.c.completed_at > unix_now() - _WINDOW_S,
     )
     recent_poses, now = tx.execute(recent).one()
+    window_s = _WINDOW_S
     if sweep.started_at is not None:
         window_s = min(window_s, max(now - sweep.started_at.timestamp(), 1e-3))
     states = {state: count for state, (count, _) in found.items()}

@@ -65,9 +65,10 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
     shift, turn = pose if in_world and pose is not None else (np.zeros(3), se3.IDENTITY)
     rotation = se3.to_matrix(turn)
 
-    names, planes = _planes(request)
+    planes = _planes(request)
+    names = [name for name, _, _ in planes]
     # n . (R x + t) >= d is (R^T n) . x >= d - n . t.
-    rows = [[*(rotation.T @ normal), d - float(normal @ shift)] for normal, d in planes]
+    rows = [[*(rotation.T @ normal), d - float(normal @ shift)] for _, normal, d in planes]
     spheres = None
     if request.sphere is not None:
         centre = rotation.T @ (np.array(request.sphere[:3]) - shift)
@@ -102,25 +103,17 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
     )
 
 
-def _planes(request: GraspConstraints) -> tuple[list[str], list[tuple[Floats, float]]]:
-    """Half spaces n, d by the names of the fields they come from."""
-    names: list[str] = []
-    planes: list[tuple[Floats, float]] = []
-    for axis, low in zip(_AXES, request.box_min or (), strict=False):
-        names.append("box_min")
-        planes.append((axis, low))
-    for axis, high in zip(_AXES, request.box_max or (), strict=False):
-        names.append("box_max")
-        planes.append((-axis, -high))
+def _planes(request: GraspConstraints) -> list[tuple[str, Floats, float]]:
+    """Half spaces n, d, each with the name of the field it comes from."""
+    planes = [("box_min", axis, low) for axis, low in zip(_AXES, request.box_min or (), strict=False)]
+    planes += [("box_max", -axis, -high) for axis, high in zip(_AXES, request.box_max or (), strict=False)]
     given = [] if request.above_plane is None else [("above_plane", request.above_plane)]
     if isinstance(request, BestGraspRequest):
         given += [(f"half_spaces.{i}", row) for i, row in enumerate(request.half_spaces or ())]
     for name, row in given:
-        normal = np.array(row[:3])
-        length = float(np.linalg.norm(normal))
-        names.append(name)
-        planes.append((normal / length, row[3] / length))
-    return names, planes
+        length = float(np.linalg.norm(row[:3]))
+        planes.append((name, np.array(row[:3]) / length, row[3] / length))
+    return planes
 
 
 def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud, ...]:

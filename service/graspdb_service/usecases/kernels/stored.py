@@ -21,13 +21,13 @@ from graspdb.wire.kernels import (
 from graspdb.wire.states import RunState
 from graspdb_density import AnisotropicKernel
 from graspdb_service.problems import found, invalid, not_found
-from graspdb_service.storage import grippers, kernels
+from graspdb_service.storage import kernels
 from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.kernels import NewKernel
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases import grippers
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
@@ -100,8 +100,7 @@ def _given(ctx: Estimators, request: KernelCreate) -> NewKernel:
     assert isinstance(request.components, list)
     if request.gripper is not None:
         with ctx.database.read() as tx:
-            if grippers.find(tx, request.gripper) is None:
-                raise unknown("gripper", [request.gripper])
+            grippers.named(tx, request.gripper)
     sampled = request.kind == "sampled"
     if request.kind == "probability":
         components, widths = axis_bandwidth_fit.checked(request), None

@@ -22,12 +22,12 @@ from graspdb.wire import (
     SweepCreate,
 )
 from graspdb_service.problems import conflict, invalid
-from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.trial_columns import Floats, Provenance
+from graspdb_service.usecases import grippers
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import samples
@@ -79,12 +79,10 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created
         return earlier
     with ctx.database.read() as tx:
         row = require(tx, slug)
-        gripper = grippers.find(tx, spec.gripper)
+        profile = GripperProfile.model_validate(grippers.named(tx, spec.gripper).profile)
         if row.mesh_info is not None and row.parts_sha256 is None:
             decompositions.check(tx, row)
-    if gripper is None:
-        raise invalid("gripper", f"there is no gripper {spec.gripper!r}: GET /grippers lists them")
-    world = _world(row, GripperProfile.model_validate(gripper.profile))
+    world = _world(row, profile)
     plan = _plan(ctx, slug, spec, world)
     chunk = _chunk_size(ctx, spec, plan)
     # In memory and in one go, before the transaction, that it may be short.
