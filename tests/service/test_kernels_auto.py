@@ -127,7 +127,7 @@ def test_a_dead_processs_fit_is_taken_over(http: httpx.Client, database_url: str
     row = context.densities.selections.resolve("thing", TrialSelection()).row
     request = KernelCreate.model_validate(AUTO)
     with context.database.write() as tx:
-        context.runs.enter(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")
+        report_runs.ask(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")
         report_runs.release(tx, "mine", "gone")
     run = ended(http, "/report-runs/mine")
     assert run["state"] == "done"

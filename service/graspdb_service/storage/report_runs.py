@@ -15,6 +15,7 @@ from graspdb_service.storage.tables import objects, report_runs
 
 #: The option that stands for the checks there are: another one whenever they change.
 CHECKS = "checks"
+LEASE_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,11 @@ def find(tx: Tx, key: RunKey) -> RunRow | None:
     return _one(tx, _same(key))
 
 
-def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str, lease_s: float) -> bool:
+def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str) -> bool:
     """Take a key's run: make it, or start anew what was cancelled, failed through no fault of the
     request, or whose holder is gone. False where it is done or somebody else's.
     """
-    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
+    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + LEASE_S}
     fresh = {"state": RunState.RUNNING, "progress": 0.0, "created_at": datetime.now(UTC)}
     if not insert_new(tx, report_runs, id=id, **vars(key), **fresh, **lease):
         return _take(tx, _same(key), lease)
@@ -94,20 +95,20 @@ def _without_checks(parameters: dict[str, Any]) -> dict[str, Any]:
     return {**parameters, "options": {k: v for k, v in options.items() if k != CHECKS}}
 
 
-def take_over(tx: Tx, id: str, *, lease_id: str, lease_s: float) -> bool:
+def take_over(tx: Tx, id: str, *, lease_id: str) -> bool:
     """Take a run whose holder is gone."""
-    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
+    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + LEASE_S}
     return _take(tx, and_(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING), lease)
 
 
-def renew(tx: Tx, held: Mapping[str, tuple[str, float]], *, lease_s: float) -> set[str]:
+def renew(tx: Tx, held: Mapping[str, tuple[str, float]]) -> set[str]:
     """Keep runs by ``{id: (lease_id, progress)}``; those that are still held."""
     kept = set()
     for id, (lease_id, progress) in sorted(held.items()):
         statement = (
             update(report_runs)
             .where(_held(id, lease_id))
-            .values(progress=progress, lease_expires_at=unix_now() + lease_s)
+            .values(progress=progress, lease_expires_at=unix_now() + LEASE_S)
         )
         if tx.execute(statement).rowcount:
             kept.add(id)

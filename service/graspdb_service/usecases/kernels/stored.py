@@ -209,7 +209,7 @@ def _started(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> 
     id = str(uuid.uuid4())
 
     def make(tx: Tx) -> Created:
-        runs.enter(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
+        report_run_rows.ask(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
         return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
     made = replay_or(ctx.database, _SCOPE, sent, make)

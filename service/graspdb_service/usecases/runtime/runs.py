@@ -32,7 +32,6 @@ log = logging.getLogger("graspdb")
 MAX_HELD = 16
 #: Requests that may wait for a result at a time; the others are told at once where it will be.
 _MAX_WAITING = 8
-_LEASE_S = 30.0
 _TICK_S = 2.0
 _POLL_S = 0.1
 #: What the request is to blame for, and would be again: kept as the run's answer.
@@ -96,10 +95,6 @@ class Runs:
             run = self._joined(key)
         return self._answered(run)
 
-    def enter(self, tx: Tx, key: RunKey, *, id: str, lease_id: str) -> None:
-        """Enter a run of this id that is nobody else's; `follow` it once the transaction is through."""
-        report_runs.ask(tx, key, id=id, lease_id=lease_id, lease_s=_LEASE_S)
-
     def follow(self, id: str, lease_id: str | None) -> RunRow:
         """A run done, or under way after the wait; computed here where this process holds its lease."""
         run = self._row(id)
@@ -128,7 +123,7 @@ class Runs:
         if run.state == RunState.RUNNING and not run.live:
             lease = str(uuid.uuid4())
             with self._database.write() as tx:
-                taken = report_runs.take_over(tx, id, lease_id=lease, lease_s=_LEASE_S)
+                taken = report_runs.take_over(tx, id, lease_id=lease)
             if taken:
                 self._start(run, lease)
             run = self._row(id)
@@ -179,7 +174,7 @@ class Runs:
         """The key's run, taken by this process where nobody has it."""
         lease = self.place()
         with self._database.write() as tx:
-            mine = report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id=lease, lease_s=_LEASE_S)
+            mine = report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id=lease)
             run = report_runs.find(tx, key)
         if run is None:
             # A newer revision's run has swept this one away meanwhile.
@@ -268,11 +263,8 @@ class Runs:
                 continue
             try:
                 with self._database.write() as tx:
-                    kept = report_runs.renew(
-                        tx,
-                        {id: (item.lease_id, item.progress) for id, item in held.items()},
-                        lease_s=_LEASE_S,
-                    )
+                    now = {id: (item.lease_id, item.progress) for id, item in held.items()}
+                    kept = report_runs.renew(tx, now)
             except Exception:
                 log.exception("leases of report runs could not be renewed")
                 continue
