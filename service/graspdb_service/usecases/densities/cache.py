@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-
-import numpy as np
 
 from graspdb.wire import KernelSpec, Selection
 from graspdb.wire.queries import TrialSelection
@@ -22,7 +21,10 @@ from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected, Selections, as_of
 
-_WIDTHS = {"sigma_position_m": POSITION_LIMITS_M, "sigma_rotation_deg": np.degrees(ROTATION_LIMITS)}
+_WIDTHS: dict[str, tuple[float, float]] = {
+    "sigma_position_m": POSITION_LIMITS_M,
+    "sigma_rotation_deg": (math.degrees(ROTATION_LIMITS[0]), math.degrees(ROTATION_LIMITS[1])),
+}
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
 

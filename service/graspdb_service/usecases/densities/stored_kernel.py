@@ -20,22 +20,23 @@ from graspdb_service.usecases.trials.selection import Selected
 def load(row: KernelRow) -> AnisotropicKernel:
     """The kernel of a stored row, which was checked when it came."""
     return AnisotropicKernel(
-        np.array([item["weight"] for item in row.components]),
-        np.array([item["mean"] for item in row.components]),
-        np.array([item["covariance"] for item in row.components]),
+        _all(row, "weight"),
+        _all(row, "mean"),
+        _all(row, "covariance"),
         "gripper" if row.alignment == "gripper" else "fixed",
     )
 
 
+def _all(row: KernelRow, name: str) -> Floats:
+    """What all components have of this name."""
+    return np.array([item[name] for item in row.components])
+
+
 def load_sampled(row: KernelRow) -> SampledKernel:
     """The kernel of a stored row of the kind ``sampled``, which was checked when it came."""
-    means = np.array([item["mean"] for item in row.components])
-    return SampledKernel(
-        means[:, :3],
-        se3.from_rotation_vector(means[:, 3:]),
-        _component(row),
-        np.array([item["weight"] for item in row.components]),
-    )
+    means = _all(row, "mean")
+    turns = se3.from_rotation_vector(means[:, 3:])
+    return SampledKernel(means[:, :3], turns, _component(row), _all(row, "weight"))
 
 
 def _component(row: KernelRow) -> IsotropicKernel:
@@ -77,8 +78,7 @@ def covariance_of(row: KernelRow) -> Floats:
     """(6, 6) of a kernel's displacements, the spread of its components' means included."""
     if row.kind != "sampled":
         return load(row).overall_covariance
-    means = np.array([item["mean"] for item in row.components])
-    weights = np.array([item["weight"] for item in row.components])
+    means, weights = _all(row, "mean"), _all(row, "weight")
     # With the mirror images, as it is used.
     both = np.concatenate([means, means * mirror("gripper")])
     share = np.concatenate([weights, weights]) / (2.0 * weights.sum())

@@ -10,7 +10,8 @@ from graspdb_density import ModeSearch, Separation
 from graspdb_density.search.mode_search import DISTINCT
 from graspdb_density.search.scored_poses import Admissible, distinct_from
 from graspdb_service.problems import conflict
-from graspdb_service.usecases.densities.cache import Built, kernel_of
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import Model

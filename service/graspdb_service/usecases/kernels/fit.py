@@ -30,7 +30,8 @@ from graspdb_service.storage.kernels import KernelRow, NewKernel
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.report_runs import RunKey, RunRow
 from graspdb_service.usecases.densities import stored_kernel
-from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice
+from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.geometry.features import Axes, Features
 from graspdb_service.usecases.runtime.runs import Result, RunKind
 from graspdb_service.usecases.trials.selection import Selected

@@ -26,7 +26,7 @@ from graspdb_density.vicinity.half_width import Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities import stored_kernel
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports import surface_pairs
 from graspdb_service.usecases.reports.common import (
     LEVEL,

@@ -21,7 +21,7 @@ from graspdb_density.success.calibration import (
 from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
 from graspdb_service.problems import too_few_trials
 from graspdb_service.trial_columns import Floats, Ints
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
     LEVEL,

@@ -22,7 +22,8 @@ from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_density.success.kernel_regression import SUCCESS_CUTOFF, SuccessKernel
 from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases.densities.cache import Built, Densities
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.trials.attempts import AllTrials

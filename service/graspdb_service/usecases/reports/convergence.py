@@ -33,7 +33,7 @@ from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.problems import conflict
 from graspdb_service.trial_columns import Floats
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.reports.bandwidth import simulated_draws
 from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, as_model, enough, head, interval

@@ -19,7 +19,7 @@ from graspdb_density.bandwidth.mixture_fit import (
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, SampledKernelPoint, sampled_kernel_curve
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service.problems import too_few_trials
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports.common import ReportInputs, head
 
 #: Displacements that stand for the full statistics, and what the paper limits a kernel to.

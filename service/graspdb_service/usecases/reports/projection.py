@@ -17,7 +17,7 @@ from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, interval
 
 #: Normals by the names of planes: towards the viewer, so that the first letter runs to the right.

@@ -17,7 +17,8 @@ from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import RunKey, RunRow
 from graspdb_service.storage.simulation import outcomes
-from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice, kernel_of
+from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.densities.cache import Densities, kernel_of
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.reports.anisotropy import anisotropy_report
 from graspdb_service.usecases.reports.bandwidth import bandwidth_report

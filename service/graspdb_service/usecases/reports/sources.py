@@ -23,7 +23,7 @@ from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import too_few_trials
 from graspdb_service.storage.trials import provenances
 from graspdb_service.trial_columns import Bools, Floats, Ints
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (

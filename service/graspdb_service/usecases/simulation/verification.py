@@ -15,7 +15,7 @@ from graspdb_density import IsotropicKernel
 from graspdb_density.se3 import Poses
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import outcomes, sweeps
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.trials import sweep_plan
 
 #: Draws that a sweep named in a report makes: a share of .3 is then known within .04.
