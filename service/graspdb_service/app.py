@@ -9,6 +9,7 @@ import time
 import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ from graspdb_service.api.context import Context
 from graspdb_service.api.routing.document import document
 from graspdb_service.api.routing.scopes import declared_parameters, refuse_unknown_parameters
 from graspdb_service.formats.negotiation import require_json
-from graspdb_service.problems import TYPE_PREFIX, ProblemError, phrase
+from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
@@ -240,9 +241,7 @@ def _add_problems(app: FastAPI) -> None:
     def on_http(request: Request, error: HTTPException) -> Response:
         if error.status_code == 413:
             return answer(request, body_too_large())
-        kind = {404: "not-found", 405: "method-not-allowed"}.get(
-            error.status_code, phrase(error.status_code).lower().replace(" ", "-")
-        )
+        kind = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
         title = {
             404: f"There is nothing at {request.url.path}",
             405: f"{request.method} is not for {request.url.path}",
@@ -257,7 +256,7 @@ def body_too_large() -> ProblemError:
     )
 
 
-def problem_of_validation(errors: Any, title: str = "The request is not valid") -> ProblemError:
+def problem_of_validation(errors: Any) -> ProblemError:
     """A 422 that names each field and never echoes the input, which may hold NaN or megabytes."""
     listed = []
     for item in list(errors)[:20]:
@@ -269,8 +268,4 @@ def problem_of_validation(errors: Any, title: str = "The request is not valid") 
         place = [part for part in place if "[" not in part and not part[:1].isupper()]
         place = [part for part in place if part != "constrained-str"]
         listed.append((".".join(place) or "body", str(item["msg"]).removeprefix("Value error, ")))
-    unique = list(dict.fromkeys(listed))
-    return ProblemError(422, "invalid-request", title, errors=unique)
-
-
-__all__ = ["TYPE_PREFIX", "create_app", "problem_of_validation"]
+    return invalid_fields(list(dict.fromkeys(listed)))

@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from http import HTTPStatus
+from typing import TypeVar
+
+T = TypeVar("T")
 
 TYPE_PREFIX = "urn:graspdb:problem:"
 
@@ -60,9 +62,28 @@ def not_found(what: str, name: str, way_out: str = "") -> ProblemError:
     )
 
 
+def found(value: T | None, what: str, name: str, way_out: str = "") -> T:
+    """What a name stands for; 404 where that is nothing."""
+    if value is None:
+        raise not_found(what, name[:80], way_out)
+    return value
+
+
 def invalid(field: str, message: str, title: str = "The request is not valid") -> ProblemError:
     """422 naming one field."""
-    return ProblemError(422, "invalid-request", title, errors=[(field, message)])
+    return invalid_fields([(field, message)], title)
+
+
+def invalid_fields(
+    errors: Sequence[tuple[str, str]], title: str = "The request is not valid"
+) -> ProblemError:
+    """422 naming several fields, each with what is wrong."""
+    return ProblemError(422, "invalid-request", title, errors=errors)
+
+
+def busy(title: str, *, status: int = 503, retry_after_s: int = 1) -> ProblemError:
+    """Not now: the same request again, a little later, will do."""
+    return ProblemError(status, "busy", title, headers={"Retry-After": str(retry_after_s)})
 
 
 def conflict(kind: str, title: str, **more: object) -> ProblemError:
@@ -70,8 +91,6 @@ def conflict(kind: str, title: str, **more: object) -> ProblemError:
     return ProblemError(409, kind, title, extra=more)
 
 
-def phrase(status: int) -> str:
-    try:
-        return HTTPStatus(status).phrase
-    except ValueError:
-        return f"HTTP {status}"
+def too_few_trials(why: str) -> ProblemError:
+    """409: the trials don't suffice; ``why`` says how many it takes."""
+    return conflict("too-few-trials", why[:1].upper() + why[1:])

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb_density.se3 import Poses
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 def _floats() -> Floats:
@@ -20,6 +23,10 @@ def _floats() -> Floats:
 
 def _ints() -> Ints:
     return np.empty(0, dtype=np.int64)
+
+
+def _codes() -> NDArray[np.uint8]:
+    return np.empty(0, dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +43,7 @@ class TrialColumns:
 
     position: Floats
     quaternion_xyzw: Floats
-    outcome: NDArray[np.uint8]
+    outcome: NDArray[np.uint8] = field(default_factory=_codes)
     provenance: Ints = field(default_factory=_ints)
     proposal_density: Floats = field(default_factory=_floats)
     quality: Floats = field(default_factory=_floats)
@@ -52,9 +59,15 @@ class TrialColumns:
     def __len__(self) -> int:
         return len(self.position)
 
-    def first(self, count: int) -> TrialColumns:
-        """The first ``count`` trials."""
-        return TrialColumns(**{item.name: getattr(self, item.name)[:count] for item in fields(self)})
+    @property
+    def poses(self) -> Poses:
+        """Where the tool was, as the maths takes it."""
+        return Poses(self.position, self.quaternion_xyzw)
+
+    def __getitem__(self, rows: slice | Bools | Ints) -> TrialColumns:
+        """Some of the trials: a slice of any, else of those whose columns are all arrays."""
+        columns = vars(self).items()
+        return TrialColumns(**{name: column[rows] if len(column) else column for name, column in columns})
 
 
 class Provenance(NamedTuple):

@@ -88,8 +88,8 @@ def test_poses_of_two_grids_of_one_lattice_count_once_the_first_that_was_stored(
     other = np.where(inside, outcome_of(np.arange(grid.full_total), 5), NO_ATTEMPT)
     assert set(keys) == set(np.flatnonzero((expected != NO_ATTEMPT) | (other != NO_ATTEMPT)))
     position, quaternion = grid.poses(keys)
-    np.testing.assert_allclose(both.position, position)
-    np.testing.assert_allclose(both.quaternion, quaternion)
+    np.testing.assert_allclose(both.poses.positions, position)
+    np.testing.assert_allclose(both.poses.quaternions_xyzw, quaternion)
     first = np.where(expected[keys] == NO_ATTEMPT, other[keys], expected[keys])
     # Chunks took turns: where both tried, either came first, and each pose has the outcome of one of them.
     told = np.where(both.success, SUCCESS, np.where(both.collided, COLLISION, MISSED))
@@ -112,5 +112,5 @@ def test_fewer_that_collided_stand_for_all() -> None:
     posted = np.isnan(few.proposal).sum() / np.isnan(whole.proposal).sum()
     assert posted == pytest.approx(200 / whole.collided.sum(), abs=0.1)
     again = joined(given, most_collided=10**6)
-    np.testing.assert_array_equal(again.position, whole.position)
+    np.testing.assert_array_equal(again.poses.positions, whole.poses.positions)
     assert again.left_out == 0

@@ -130,7 +130,6 @@ def test_columns_are_read_as_they_were_stored(
     with database.write() as tx:
         row = objects.find(tx, "mug", lock=True)
         assert row is not None
-        revision, first = objects.advance(tx, row.id, rows=400, append=True)
         ids = np.array(
             [
                 provenances.ensure(tx, row.id, Provenance("pg70", None, None)),
@@ -138,27 +137,32 @@ def test_columns_are_read_as_they_were_stored(
             ]
         )
         assert provenances.ensure(tx, row.id, Provenance("pg70", None, None)) == ids[0]
-        batch, _ = batches.create(tx, row.id, revision=revision)
-        columns = TrialColumns(
-            position,
-            quaternion,
-            rng.integers(0, 3, 400).astype(np.uint8),
-            ids[np.arange(400) % 2],
-            proposal_density=proposal,
-            quality=quality,
-            pose_index=np.arange(400, dtype=np.int64) * 2**40,
-        )
-        rows.insert(tx, row.id, batch, columns, revision=revision, first_seq=first)
-        batches.grow(tx, batch, first_seq=first, last_seq=first + 399, inserted=400, packed=0)
+        # Posted, and once more as a sweep's.
+        for pose_index in (np.empty(0, dtype=np.int64), np.arange(400, dtype=np.int64) * 2**40):
+            revision, first = objects.advance(tx, row.id, rows=400, append=True)
+            batch, _ = batches.create(tx, row.id, revision=revision)
+            columns = TrialColumns(
+                position,
+                quaternion,
+                np.random.default_rng(1).integers(0, 3, 400).astype(np.uint8),
+                ids[np.arange(400) % 2],
+                proposal_density=proposal,
+                quality=quality,
+                pose_index=pose_index,
+            )
+            rows.insert(tx, row.id, batch, columns, revision=revision, first_seq=first)
+            batches.grow(tx, batch, first_seq=first, last_seq=first + 399, inserted=400, packed=0)
+    both = ids.tolist()
     with database.read() as tx:
-        found = rows.read(tx, row.id, provenance_ids=None, successes_only=False)
-        successes = rows.read(
-            tx, row.id, provenance_ids=[int(ids[1])], successes_only=True, after_seq=first + 99
-        )
-        nothing = rows.read(tx, row.id, provenance_ids=[], successes_only=False)
-        page = rows.page(tx, row.id, after_seq=0, limit=1000)
+        found = rows.posted(tx, row.id, both)
+        fewer = rows.posted(tx, row.id, both, after_seq=99, without=(0, 2))
+        successes = rows.successes(tx, row.id, [int(ids[1])], after_seq=first + 99)
+        nothing = rows.posted(tx, row.id, [])
+        page = rows.page(tx, row.id, after_seq=first - 1, limit=1000)
         counts = provenances.tallies(tx, row.id)
-    assert found.seq.tolist() == list(range(first, first + 400))
+    assert found.seq.tolist() == list(range(first - 400, first))
+    assert fewer.seq.tolist() == (100 + np.flatnonzero(columns.outcome[99:] == 1)).tolist()
+    assert set(successes.batch.tolist()) == {batch}
     np.testing.assert_array_equal(found.position, position)
     np.testing.assert_array_equal(found.quaternion_xyzw, quaternion)
     np.testing.assert_array_equal(found.outcome, columns.outcome)
@@ -171,5 +175,5 @@ def test_columns_are_read_as_they_were_stored(
     np.testing.assert_array_equal(page.quality, quality)
     expected = {(int(p), int(o)): 0 for p in ids for o in range(3)}
     for p, o in zip(columns.provenance, columns.outcome, strict=True):
-        expected[int(p), int(o)] += 1
+        expected[int(p), int(o)] += 2
     assert {(p, o): n for p, o, n, _ in counts} == expected

@@ -14,27 +14,27 @@ import pytest
 from numpy.typing import NDArray
 
 import brute_force
+from graspdb.wire.queries import TrialSelection
 from graspdb_density import GraspDensity, IsotropicKernel, se3
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.densities import cache as densities_module
-from graspdb_service.usecases.densities.cache import Built, KernelChoice
+from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import MAX_QUERIES, Compute
-from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
 
-PLAIN = (Filters(), KernelChoice(0.015, 15.0))
+PLAIN = (TrialSelection(), KernelChoice(0.015, 15.0))
 KERNEL = IsotropicKernel(0.015, np.deg2rad(15))
 
 
-def density_of(ctx: Context, filters: Filters, kernel: KernelChoice) -> Built:
+def density_of(ctx: Context, filters: TrialSelection, kernel: KernelChoice) -> Built:
     return ctx.densities.get(ctx.densities.selections.resolve("thing", filters), kernel)
 
 
@@ -153,7 +153,7 @@ def test_concurrent_first_requests_build_once(
     assert len(builds) == 1
     assert len({id(built) for built in found}) == 1
     # Named or not, the only gripper there is means the same density.
-    named = density_of(ctx, Filters(), KernelChoice(0.015, 15.0))
+    named = density_of(ctx, TrialSelection(), KernelChoice(0.015, 15.0))
     assert named is found[0]
 
 
@@ -168,13 +168,13 @@ def test_extension_equals_rebuild_in_any_order_of_batches(
     """Batches with and without proposal densities and grippers, failures between; one reader keeps pace."""
     make_object(http)
     reads: list[int] = []
-    read = densities_module.trial_rows.read
+    read = densities_module.trial_rows.successes
 
     def watched(*given: Any, **more: Any) -> Any:
         reads.append(more["after_seq"])
         return read(*given, **more)
 
-    monkeypatch.setattr(densities_module.trial_rows, "read", watched)
+    monkeypatch.setattr(densities_module.trial_rows, "successes", watched)
     rng = np.random.default_rng(4)
     proposals: list[Floats] = []
     done = 0
@@ -234,10 +234,10 @@ def test_default_widths_are_chosen_anew_only_when_successes_double(
     seen = {}
     for start, stop in ((0, 150), (150, 199), (199, 260), (260, 399), (399, 401), (401, 700), (700, 1000)):
         post(http, "thing", part(poses, start, stop), proposal_density=rng.uniform(1, 3, stop - start))
-        seen[stop] = density_of(ctx, Filters(), KernelChoice()).kernel
+        seen[stop] = density_of(ctx, TrialSelection(), KernelChoice()).kernel
         fresh = create_app(Settings(database_url=database_url)).state.context
         try:
-            assert density_of(fresh, Filters(), KernelChoice()).kernel == seen[stop]
+            assert density_of(fresh, TrialSelection(), KernelChoice()).kernel == seen[stop]
         finally:
             fresh.close()
     assert (seen[150].sigma_position_m, seen[150].sigma_rotation_deg) == (0.015, 15)
@@ -376,17 +376,17 @@ def test_the_cache_is_bounded_by_bytes(
     try:
         widths = [0.01 + 0.001 * i for i in range(12)]
         for width in widths:
-            built = density_of(context, Filters(), KernelChoice(width, 15.0))
+            built = density_of(context, TrialSelection(), KernelChoice(width, 15.0))
             assert built.density is not None
-            assert context.densities.nbytes <= 2**21
-        assert 1 <= len(context.densities) < len(widths)
-        again = density_of(context, Filters(), KernelChoice(widths[-1], 15.0))
+            assert context.densities.kept.nbytes <= 2**21
+        assert 1 <= len(context.densities.kept) < len(widths)
+        again = density_of(context, TrialSelection(), KernelChoice(widths[-1], 15.0))
         assert again is built
         # Models of success have a bound of their own, of the same kind.
         post(http, "thing", clusters([((0, 0, 0), (0, 0, 0, 1.0))], 2000, seed=1), "failure")
         for width in widths[:6]:
-            built = density_of(context, Filters(), KernelChoice(width, 15.0))
+            built = density_of(context, TrialSelection(), KernelChoice(width, 15.0))
             assert context.successes.model(built, collisions_known=False) is not None
-            assert context.successes.nbytes <= settings.max_density_cache_bytes
+            assert context.successes.kept.nbytes <= settings.max_density_cache_bytes
     finally:
         context.close()

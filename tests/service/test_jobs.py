@@ -37,6 +37,7 @@ from graspdb_service.storage import assets, objects, schema
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import jobs as job_rows
 from graspdb_service.usecases import grippers
+from graspdb_service.usecases.runtime.idempotency import Sent
 from graspdb_service.usecases.simulation import leases, planning, results, sweeps
 
 BOX = {"lower": [-0.02, -0.02, -0.05], "upper": [0.02, 0.02, 0.05]}
@@ -490,7 +491,7 @@ class LeaseProtocol(RuleBasedStateMachine):
         slug = f"box-{LeaseProtocol.number}-{time.time_ns()}"
         add_box(self.context.database, slug)
         spec = SweepCreate.model_validate({"grid": GRID, "chunk_poses": 500})
-        made = planning.create(self.context, slug, spec, key=None, request=b"")
+        made = planning.create(self.context, slug, spec, Sent(None, b""))
         self.slug, self.sweep_id = slug, made.body["id"]
         self.state = dict.fromkeys(range(4), "queued")
         self.attempts: Counter[int] = Counter()

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.wire.kernels import KernelCreate
+from graspdb.wire.queries import TrialSelection
 from graspdb_density import se3
 from graspdb_density.bandwidth import mixture_fit
 from graspdb_service.api.context import Context
@@ -19,7 +20,6 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.kernels import fit
-from graspdb_service.usecases.trials.selection import Filters
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -124,10 +124,10 @@ def test_what_cannot_be_fitted_is_said(http: httpx.Client, make_object: Make, po
 
 def test_a_dead_processs_fit_is_taken_over(http: httpx.Client, database_url: str) -> None:
     context = Context.create(Settings(database_url=database_url), Database(database_url))
-    row = context.densities.selections.resolve("thing", Filters()).row
+    row = context.densities.selections.resolve("thing", TrialSelection()).row
     request = KernelCreate.model_validate(AUTO)
     with context.database.write() as tx:
-        context.runs.enter(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")
+        report_runs.ask(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")
         report_runs.release(tx, "mine", "gone")
     run = ended(http, "/report-runs/mine")
     assert run["state"] == "done"

@@ -385,10 +385,10 @@ def test_a_dead_holders_run_is_taken_over_and_a_living_ones_is_not(
         assert stored is not None
         key = RunKey(row.id, row.revision, "convergence", "0" * 64, stored.parameters)
         other = str(uuid.uuid4())
-        assert report_runs.ask(tx, key, id=other, lease_id="theirs", lease_s=60)
-        assert not report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id="late", lease_s=60)
-        assert report_runs.renew(tx, {other: ("late", 0.5)}, lease_s=60) == set()
-        assert report_runs.renew(tx, {other: ("theirs", 0.5)}, lease_s=60) == {other}
+        assert report_runs.ask(tx, key, id=other, lease_id="theirs")
+        assert not report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id="late")
+        assert report_runs.renew(tx, {other: ("late", 0.5)}) == set()
+        assert report_runs.renew(tx, {other: ("theirs", 0.5)}) == {other}
     run = ok(http.get(f"/report-runs/{other}"))
     assert (run["state"], run["progress"]) == ("running", 0.5)
     with database.write() as tx:

@@ -12,26 +12,26 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES
+from graspdb.wire.queries import TrialSelection
 from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
-from graspdb_service.usecases.densities.cache import Built, KernelChoice
-from graspdb_service.usecases.trials.selection import Filters
+from graspdb_service.usecases.densities.build import Built, KernelChoice
 
 Floats = NDArray[np.float64]
 Field = Callable[[Floats], NDArray[np.bool_]]
 
 KERNEL = IsotropicKernel(0.015, np.deg2rad(40.0))
-PLAIN = (Filters(), KernelChoice(0.015, 40.0))
+PLAIN = (TrialSelection(), KernelChoice(0.015, 40.0))
 SUCCESS, FAILURE, COLLISION = (OUTCOME_CODES[name] for name in ("success", "failure", "collision"))
 COARSE = {"position_step_m": 0.01, "rotation_step_deg": 60.0, "margin_m": 0.02}
 RIGHT = {"lower": (0.0, -1.0, -1.0), "upper": (1.0, 1.0, 1.0)}
 
 
-def density_of(ctx: Context, filters: Filters, kernel: KernelChoice) -> Built:
+def density_of(ctx: Context, filters: TrialSelection, kernel: KernelChoice) -> Built:
     return ctx.densities.get(ctx.densities.selections.resolve("thing", filters), kernel)
 
 

@@ -320,7 +320,11 @@ def square_sums(cells, positions, quaternions, kappa, radius, wide, out):
         out[j, :] = 0.0
         for r in range(runs_within(cells, at, radius, BLOCK, runs)):
             begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
-            part = isotropic_runs.squares_run(cells.data, begin, end, near, twin, wide, cut)
+            # The constant lets LLVM make a loop of its own of either.
+            if wide:
+                part = isotropic_runs.squares_run(cells.data, begin, end, near, twin, True, cut)
+            else:
+                part = isotropic_runs.squares_run(cells.data, begin, end, near, twin, False, cut)
             out[j, 0] += part[0]
             out[j, 1] += part[1]
 

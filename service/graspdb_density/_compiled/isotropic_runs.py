@@ -2,7 +2,6 @@
 
 ``data`` and the scaling are those of `isotropic`; `At` is where a pose stands among the rows. ``wide`` is 0
 where the nearest of twins and antipodes stands for all, 1 where both twins count, 2 where antipodes do too.
-Where functions below take it as a constant, LLVM makes a loop of its own of every case.
 
 LLVM turns the whole loop into vector code only with unsigned indices (signed ones wrap around in Python) and
 without slices, whose reference counts would cost more than a short run; ``tests/benchmarks`` notice a loss.
@@ -24,7 +23,7 @@ from .options import fast, inlined
 F32 = np.float32
 #: Rows in the vectors that a loop takes at once, with AVX-512; a multiple of what it takes elsewhere.
 LANES = 32
-_ONE, _ZERO = F32(1.0), F32(0.0)
+_ZERO = F32(0.0)
 
 
 class At(NamedTuple):
@@ -79,35 +78,96 @@ def cosines(data, i, at):
     return own, twin
 
 
-#: ``wide`` of rows without a twin where only the nearer end of each counts.
-_ALONE = -1
-
-
 @inlined
-def _kernel(data, i, at, twin, wide):
-    """Weight times kernel of row ``i``, and the squared distance; ``at`` is to base 2, ``wide`` constant."""
-    r2 = squared(data, i, at)
+def nearest(data, i, at):
+    """The largest of a row's four cosines: of the twins and their antipodes."""
     a, b = cosines(data, i, at)
-    base = -at.kappa - r2 * LOG2E
-    if wide == 2:
-        own, other = exp2(base + a) + exp2(base - a), exp2(base + b) + exp2(base - b)
-        value = own + twin * other
-    elif wide == 1:
-        value = exp2(base + abs(a)) + twin * exp2(base + abs(b))
-    elif wide == 0:
-        value = exp2(base + max(abs(a), abs(b)))
-    else:
-        value = exp2(base + abs(a))
-    return data[7, i] * value, r2
+    return max(abs(a), abs(b))
 
 
-@inlined
-def _sums(data, begin, end, at, twin, wide):
-    """Sums of k and k r^2; ``wide`` constant."""
+@fast
+def run_narrow(data, begin, end, at):
+    """Sums of k and k r^2 over rows with a twin, where the antipode's and the farther twin's share is
+    negligible.
+    """
     at = _base2(at)
     total, spread = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        k, r2 = _kernel(data, i, at, twin, wide)
+        r2 = squared(data, i, at)
+        k = data[7, i] * exp2((nearest(data, i, at) - at.kappa) - r2 * LOG2E)
+        total += k
+        spread += k * r2
+    return total, spread
+
+
+@fast
+def rest_narrow(data, begin, end, at):
+    """`run_narrow` over fewer than ``LANES`` rows, of which there are that many from ``begin`` on: whole
+    vectors of which the end is thrown away, where LLVM would take the rest of a loop one by one.
+    """
+    at = _base2(at)
+    total, spread = _ZERO, _ZERO
+    first, count = np.uint64(begin), np.int32(end - begin)
+    for j in range(np.uint64(LANES)):
+        i = first + j
+        r2 = squared(data, i, at)
+        k = data[7, i] * exp2((nearest(data, i, at) - at.kappa) - r2 * LOG2E)
+        k = k if np.int32(j) < count else _ZERO
+        total += k
+        spread += k * r2
+    return total, spread
+
+
+@fast
+def total_narrow(data, begin, end, at):
+    """As `run_narrow` without k r^2, which only a cut-off needs to know: a sixth less work."""
+    at = _base2(at)
+    total = _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        total += data[7, i] * exp2((nearest(data, i, at) - at.kappa) - squared(data, i, at) * LOG2E)
+    return total
+
+
+@fast
+def run_single(data, begin, end, at):
+    """As `run_narrow` over rows without a twin."""
+    at = _base2(at)
+    total, spread = _ZERO, _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        r2 = squared(data, i, at)
+        k = data[7, i] * exp2((abs(cosines(data, i, at)[0]) - at.kappa) - r2 * LOG2E)
+        total += k
+        spread += k * r2
+    return total, spread
+
+
+@fast
+def run_twins(data, begin, end, at, twin):
+    """Sums of k and k r^2 over both twins, each by its nearer end."""
+    at = _base2(at)
+    total, spread = _ZERO, _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        r2 = squared(data, i, at)
+        base = -at.kappa - r2 * LOG2E
+        a, b = cosines(data, i, at)
+        k = data[7, i] * (exp2(base + abs(a)) + twin * exp2(base + abs(b)))
+        total += k
+        spread += k * r2
+    return total, spread
+
+
+@fast
+def run_wide(data, begin, end, at, twin):
+    """Sums of k and k r^2 with every term: both twins, each with its antipode."""
+    at = _base2(at)
+    total, spread = _ZERO, _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        r2 = squared(data, i, at)
+        base = -at.kappa - r2 * LOG2E
+        a, b = cosines(data, i, at)
+        own = exp2(base + a) + exp2(base - a)
+        other = exp2(base + b) + exp2(base - b)
+        k = data[7, i] * (own + twin * other)
         total += k
         spread += k * r2
     return total, spread
@@ -117,36 +177,20 @@ def _sums(data, begin, end, at, twin, wide):
 def run(data, begin, end, at, twin, wide):
     """Sums of k and k r^2 over rows that all have a twin or have none."""
     if wide == 2:
-        return _sums(data, begin, end, at, twin, 2)
+        return run_wide(data, begin, end, at, twin)
     if wide == 1:
-        return _sums(data, begin, end, at, twin, 1)
+        return run_twins(data, begin, end, at, twin)
     if twin > _ZERO:
-        return _sums(data, begin, end, at, twin, 0)
-    return _sums(data, begin, end, at, twin, _ALONE)
+        return run_narrow(data, begin, end, at)
+    return run_single(data, begin, end, at)
 
 
 @fast
 def total(data, begin, end, at, twin, wide):
-    """The first of what `run` gives: without k r^2, which only a cut-off needs to know, a sixth less work."""
+    """The first of what `run` gives."""
     if wide == 0 and twin > _ZERO:
-        return _sums(data, begin, end, at, twin, 0)[0]
+        return total_narrow(data, begin, end, at)
     return run(data, begin, end, at, twin, wide)[0]
-
-
-@fast
-def rest_narrow(data, begin, end, at):
-    """`run` over fewer than ``LANES`` rows with a twin, of which there are that many from ``begin`` on: whole
-    vectors of which the end is thrown away, where LLVM would take the rest of a loop one by one.
-    """
-    at = _base2(at)
-    total, spread = _ZERO, _ZERO
-    first, count = np.uint64(begin), np.int32(end - begin)
-    for j in range(np.uint64(LANES)):
-        k, r2 = _kernel(data, first + j, at, _ONE, 0)
-        k = k if np.int32(j) < count else _ZERO
-        total += k
-        spread += k * r2
-    return total, spread
 
 
 @inlined
@@ -193,9 +237,14 @@ def scatter_run(data, begin, end, at, twin, wide, weight, out):
         out[i] += weight * (exp(base + large) + wide * rest)
 
 
-@inlined
-def _squares(data, begin, end, at, twin, wide, cut):
-    at, cut = _base2(at), cut * LOG2E
+@fast
+def squares_run(data, begin, end, at, twin, wide, cut):
+    """Sums of k and k^2 over kernels whose exponent is above ``-cut``.
+
+    ``wide`` asks for twins and antipodes; without it, the nearest stands for all.
+    """
+    at = _base2(at)
+    cut = cut * LOG2E
     total, squares = _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
         base = -at.kappa - squared(data, i, at) * LOG2E
@@ -212,22 +261,12 @@ def _squares(data, begin, end, at, twin, wide, cut):
 
 
 @fast
-def squares_run(data, begin, end, at, twin, wide, cut):
-    """Sums of k and k^2 over kernels whose exponent is above ``-cut``.
-
-    ``wide`` asks for twins and antipodes; without it, the nearest stands for all.
-    """
-    if wide:
-        return _squares(data, begin, end, at, twin, True, cut)
-    return _squares(data, begin, end, at, twin, False, cut)
-
-
-@fast
 def other_blocks_run(data, block, own, begin, end, at, twin):
     """Sum of both twins' kernels over a run, those of block ``own`` left out."""
-    at = _base2(at)
     total = _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        k, _ = _kernel(data, i, at, twin, 1)
-        total += k if block[i] != own else _ZERO
+        base = -at.kappa - squared(data, i, at)
+        a, b = cosines(data, i, at)
+        k = exp(base + abs(a)) + twin * exp(base + abs(b))
+        total += data[7, i] * k if block[i] != own else _ZERO
     return total

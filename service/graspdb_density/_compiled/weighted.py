@@ -15,14 +15,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
 from . import exp
 from . import isotropic as c
 from .isotropic_runs import cosines, single, squared
 from .options import exact, fast, inlined
-from .quaternions import relative
 
 F32 = np.float32
 #: Rows evaluated at a time: the buffers stay in the first-level cache.
@@ -108,27 +106,6 @@ def angle_factor(w):
     return y * t + _A0
 
 
-@inlined
-def whitening_of(lower):
-    """A row of `Mixture.lowers` as a tuple, so that loops that write keep it in registers."""
-    return to_fixed_tuple(lower, 27)  # type: ignore[call-arg]
-
-
-@inlined
-def whitened_squares(w, x0, x1, x2, x3, x4, x5):
-    """Half the squared Mahalanobis distance of a displacement: what its translation has of it, and the rest.
-
-    ``w`` is what `whitening_of` gives.
-    """
-    z0 = w[0] * x0 - w[21]
-    z1 = w[1] * x0 + w[2] * x1 - w[22]
-    z2 = w[3] * x0 + w[4] * x1 + w[5] * x2 - w[23]
-    z3 = w[6] * x0 + w[7] * x1 + w[8] * x2 + w[9] * x3 - w[24]
-    z4 = w[10] * x0 + w[11] * x1 + w[12] * x2 + w[13] * x3 + w[14] * x4 - w[25]
-    z5 = w[15] * x0 + w[16] * x1 + w[17] * x2 + w[18] * x3 + w[19] * x4 + w[20] * x5 - w[26]
-    return z0 * z0 + z1 * z1 + z2 * z2, z3 * z3 + z4 * z4 + z5 * z5
-
-
 @fast
 def _isotropic_values(data, begin, n, at, twin, wide, out):
     """Kernels of rows ``begin .. begin + n``, 1 at a centre, both twins summed."""
@@ -152,19 +129,26 @@ def _displacements(data, frames, begin, n, at, metres, turned, frame_turns, xi):
     """Displacements (6, n) from rows (``turned``: from their twins) to a pose: translation in the row's frame
     (metres), shortest rotation vector in its gripper's frame (radians).
     """
+    px, py, pz, qx, qy, qz, qw = at.x, at.y, at.z, at.qx, at.qy, at.qz, at.qw
     flip = F32(-1.0) if (turned and frame_turns) else _ONE
     m = F32(metres)
     for k in range(np.uint64(n)):
         i = np.uint64(begin) + k
-        dx, dy, dz = (at.x - data[0, i]) * m, (at.y - data[1, i]) * m, (at.z - data[2, i]) * m
+        dx = (px - data[0, i]) * m
+        dy = (py - data[1, i]) * m
+        dz = (pz - data[2, i]) * m
         xi[0, k] = flip * (frames[0, i] * dx + frames[3, i] * dy + frames[6, i] * dz)
         xi[1, k] = flip * (frames[1, i] * dx + frames[4, i] * dy + frames[7, i] * dz)
         xi[2, k] = frames[2, i] * dx + frames[5, i] * dy + frames[8, i] * dz
-        ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
-        vx, vy, vz, w = relative(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
+        ax, ay, az, aw = -data[3, i], -data[4, i], -data[5, i], data[6, i]
+        vx = aw * qx + ax * qw + ay * qz - az * qy
+        vy = aw * qy - ax * qz + ay * qw + az * qx
+        vz = aw * qz + ax * qy - ay * qx + az * qw
+        w = aw * qw - ax * qx - ay * qy - az * qz
         if turned:
             # (q_i M)^-1 q = M^-1 v with M^-1 = (0, 0, -1, 0).
-            vx, vy, vz, w = vy, -vx, -w, vz
+            tx, ty, tz, tw = vy, -vx, -w, vz
+            vx, vy, vz, w = tx, ty, tz, tw
         sign = _ONE if w >= _ZERO else -_ONE
         f = sign * angle_factor(min(abs(w), _ONE))
         xi[3, k] = f * vx
@@ -176,17 +160,30 @@ def _displacements(data, frames, begin, n, at, metres, turned, frame_turns, xi):
 def _add_component(xi, n, lower, log_weight, far, out):
     """Add one Gaussian component at ``xi`` (6, n) to ``out``.
 
-    ``lower`` (27,) is a row of `Mixture.lowers`. ``far``: the other wrap, the rotation by angle - 2 pi about
-    the same axis.
+    ``lower`` (27,): the whitening matrix over sqrt 2, rows of its lower triangle, then the whitened mean.
+    ``far``: the other wrap, the rotation by angle - 2 pi about the same axis.
     """
-    whitening = whitening_of(lower)
+    l00 = lower[0]
+    l10, l11 = lower[1], lower[2]
+    l20, l21, l22 = lower[3], lower[4], lower[5]
+    l30, l31, l32, l33 = lower[6], lower[7], lower[8], lower[9]
+    l40, l41, l42, l43, l44 = lower[10], lower[11], lower[12], lower[13], lower[14]
+    l50, l51, l52, l53, l54, l55 = lower[15], lower[16], lower[17], lower[18], lower[19], lower[20]
+    b0, b1, b2, b3, b4, b5 = lower[21], lower[22], lower[23], lower[24], lower[25], lower[26]
     other = _ONE if far else _ZERO
     for k in range(np.uint64(n)):
         x0, x1, x2, x3, x4, x5 = xi[0, k], xi[1, k], xi[2, k], xi[3, k], xi[4, k], xi[5, k]
         angle = math.sqrt(x3 * x3 + x4 * x4 + x5 * x5 + _TINY)
         wrap = _ONE - other * _TURN / angle
-        place, turn = whitened_squares(whitening, x0, x1, x2, x3 * wrap, x4 * wrap, x5 * wrap)
-        out[k] += exp.exp(log_weight - (place + turn))
+        x3, x4, x5 = x3 * wrap, x4 * wrap, x5 * wrap
+        z0 = l00 * x0 - b0
+        z1 = l10 * x0 + l11 * x1 - b1
+        z2 = l20 * x0 + l21 * x1 + l22 * x2 - b2
+        z3 = l30 * x0 + l31 * x1 + l32 * x2 + l33 * x3 - b3
+        z4 = l40 * x0 + l41 * x1 + l42 * x2 + l43 * x3 + l44 * x4 - b4
+        z5 = l50 * x0 + l51 * x1 + l52 * x2 + l53 * x3 + l54 * x4 + l55 * x5 - b5
+        square = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3 + z4 * z4 + z5 * z5
+        out[k] += exp.exp(log_weight - square)
 
 
 @fast
@@ -284,33 +281,60 @@ def mixture_sums(cells, frames, frame_turns, positions, quaternions, mixture, ra
 
 
 @exact
+def _component_exponent(x, lower):
+    """Half the squared Mahalanobis distance of one displacement (6,), in float64."""
+    square = 0.0
+    at = 0
+    for i in range(6):
+        z = -lower[21 + i]
+        for j in range(i + 1):
+            z += lower[at] * x[j]
+            at += 1
+        square += z * z
+    return square
+
+
+@exact
 def mixture_log_sum(rows, mixture, p, q):
     """Log of the weighted mixture sum at one pose over all rows, in float64 and without a cut-off: for poses
     so far from every row that the fast sums vanish.
     """
     top, total = -math.inf, 0.0
+    x = np.empty(6)
     for i in range(rows.positions.shape[0]):
         dx, dy, dz = p[0] - rows.positions[i, 0], p[1] - rows.positions[i, 1], p[2] - rows.positions[i, 2]
-        a, f = rows.quaternions[i], rows.frames[i]
-        vx, vy, vz, w = relative(a[0], a[1], a[2], a[3], q[0], q[1], q[2], q[3])
+        f = rows.frames[i]
+        ax, ay, az, aw = (
+            -rows.quaternions[i, 0],
+            -rows.quaternions[i, 1],
+            -rows.quaternions[i, 2],
+            rows.quaternions[i, 3],
+        )
+        vx = aw * q[0] + ax * q[3] + ay * q[2] - az * q[1]
+        vy = aw * q[1] - ax * q[2] + ay * q[3] + az * q[0]
+        vz = aw * q[2] + ax * q[1] - ay * q[0] + az * q[3]
+        w = aw * q[3] - ax * q[0] - ay * q[1] - az * q[2]
         for t in range(2 if rows.symmetric[i] else 1):
             flip = -1.0 if (t == 1 and rows.turning) else 1.0
             if t == 1:
-                vx, vy, vz, w = vy, -vx, -w, vz
-            sign = -1.0 if w < 0.0 else 1.0
-            sine = math.sqrt(vx * vx + vy * vy + vz * vz)
-            angle = 2.0 * math.atan2(sine, sign * w)
-            x = flip * (f[0] * dx + f[3] * dy + f[6] * dz)
-            y = flip * (f[1] * dx + f[4] * dy + f[7] * dz)
-            z = f[2] * dx + f[5] * dy + f[8] * dz
+                ux, uy, uz, uw = vy, -vx, -w, vz
+            else:
+                ux, uy, uz, uw = vx, vy, vz, w
+            if uw < 0.0:
+                ux, uy, uz, uw = -ux, -uy, -uz, -uw
+            sine = math.sqrt(ux * ux + uy * uy + uz * uz)
+            angle = 2.0 * math.atan2(sine, uw)
+            x[0] = flip * (f[0] * dx + f[3] * dy + f[6] * dz)
+            x[1] = flip * (f[1] * dx + f[4] * dy + f[7] * dz)
+            x[2] = f[2] * dx + f[5] * dy + f[8] * dz
             for wrap in range(2 if mixture.wraps else 1):
                 turn = angle - 2.0 * math.pi * wrap
-                scale = sign * (turn / sine if sine > 1e-12 else 2.0)
+                scale = turn / sine if sine > 1e-12 else 2.0
+                x[3], x[4], x[5] = scale * ux, scale * uy, scale * uz
                 for j in range(mixture.lowers.shape[0]):
-                    place, rest = whitened_squares(
-                        whitening_of(mixture.lowers[j]), x, y, z, scale * vx, scale * vy, scale * vz
+                    value = (
+                        rows.log_rows[i] + mixture.log_weights[j] - _component_exponent(x, mixture.lowers[j])
                     )
-                    value = rows.log_rows[i] + mixture.log_weights[j] - (place + rest)
                     if value > top:
                         total = total * math.exp(top - value) + 1.0 if total > 0.0 else 1.0
                         top = value

@@ -49,12 +49,15 @@ class SuccessEstimate:
         Success probability and the ends of its interval.
     effective_trials : (M,)
         0 where no attempt is within reach; there the probability is the share of successes of all attempts.
+    level : float
+        Probability the interval holds.
     """
 
     probability: Floats
     low: Floats
     high: Floats
     effective_trials: Floats
+    level: float
 
 
 class SuccessModel:
@@ -145,7 +148,7 @@ class SuccessModel:
         tail = 0.5 * (1.0 - level)
         low = _quantiles(alpha, beta, tail, threads)
         high = _quantiles(alpha, beta, 1.0 - tail, threads)
-        return SuccessEstimate(probability, low, high, trials)
+        return SuccessEstimate(probability, low, high, trials, level)
 
     def probability(self, poses: Poses, *, threads: int = 1) -> Floats:
         """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from graspdb.wire import GripperCreate, GripperInfo, Page
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.parameters import Creating, Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import grippers
 
@@ -15,13 +15,9 @@ router = APIRouter(tags=["grippers"])
 
 
 @router.post("/grippers", status_code=201, response_model=GripperInfo, **scope("admin"))
-def create_gripper(
-    ctx: Ctx, request: GripperCreate, response: Response, body: RawBody, key: IdempotencyKey
-) -> object:
+def create_gripper(ctx: Ctx, request: GripperCreate, sent: Creating) -> object:
     """Store a parallel-jaw gripper's profile."""
-    made = grippers.create(ctx.database, request, key=key, body=body)
-    response.headers["Location"] = made.location
-    return made.body
+    return sent.answered(grippers.create(ctx.database, request, sent))
 
 
 @router.get("/grippers", **scope("read"))

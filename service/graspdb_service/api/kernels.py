@@ -12,7 +12,7 @@ from graspdb.wire.kernels import KernelCreate, StoredKernel
 from graspdb.wire.reports import ReportRun
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
-from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.parameters import Creating, Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases.kernels import stored
 
@@ -26,19 +26,16 @@ router = APIRouter(tags=["kernels"])
     responses={202: {"model": ReportRun, "description": "Being fitted: Location says where it will be"}},
     **scope("admin"),
 )
-def create_kernel(
-    ctx: Ctx, request: KernelCreate, response: Response, body: RawBody, key: IdempotencyKey
-) -> object:
+def create_kernel(ctx: Ctx, request: KernelCreate, sent: Creating) -> object:
     """Fit a kernel on an object's successes, or store one given by its components.
 
     With ``components: "auto"`` this may take longer than a request should: then the answer is 202 with the
     run that fits it, whose ``result`` is the kernel.
     """
-    made = stored.create(ctx, ctx.runs, request, key=key, body=body)
+    made = stored.create(ctx, ctx.runs, request, sent)
     if made.status == 202:
         return JSONResponse(made.body, 202, headers={"Location": made.location, "Retry-After": "2"})
-    response.headers["Location"] = made.location
-    return made.body
+    return sent.answered(made)
 
 
 @router.get("/kernels", **scope("read"))

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from graspdb.wire import ObjectCreate, ObjectInfo, ObjectPatch, Page
 from graspdb_service.api.routing.caching import etag, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.parameters import Creating, Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import objects
 
@@ -15,13 +15,9 @@ router = APIRouter(tags=["objects"])
 
 
 @router.post("/objects", status_code=201, response_model=ObjectInfo, **scope("admin"))
-def create_object(
-    ctx: Ctx, request: ObjectCreate, response: Response, body: RawBody, key: IdempotencyKey
-) -> object:
+def create_object(ctx: Ctx, request: ObjectCreate, sent: Creating) -> object:
     """Register an object; its mesh and its trials follow."""
-    made = objects.create(ctx.database, request, key=key, body=body)
-    response.headers["Location"] = made.location
-    return made.body
+    return sent.answered(objects.create(ctx.database, request, sent))
 
 
 @router.get("/objects", **scope("read"))

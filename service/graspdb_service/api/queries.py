@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 
@@ -12,6 +14,7 @@ from graspdb.wire import (
     BestGraspRequest,
     BestGrasps,
     DensityInfo,
+    KernelInfo,
     LikelihoodRequest,
     Likelihoods,
     Proposals,
@@ -27,6 +30,7 @@ from graspdb.wire.queries import (
     LikelihoodQuery,
     SelectionQuery,
 )
+from graspdb_density.se3 import Poses
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing.caching import etag, not_modified
@@ -39,7 +43,6 @@ from graspdb_service.formats.poses import read_arrow_poses, read_poses
 from graspdb_service.usecases.densities.info import density_info
 from graspdb_service.usecases.grasps import likelihood, proposals, samples
 from graspdb_service.usecases.grasps.answer import best_grasps
-from graspdb_service.usecases.trials.selection import Filters
 
 router = APIRouter(tags=["queries"])
 
@@ -49,12 +52,12 @@ Q = TypeVar("Q", bound=Selection)
 @router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read"))
 def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQuery, Query()]) -> Response:
     """The density of a selection of trials: kernel, widths and their rule, counts, effective sample size."""
-    query = _pinned(ctx, id, query)
-    known = _known(ctx, id, request, query)
-    if known is not None:
-        return known
-    info, object_id = density_info(ctx, id, query)
-    return _json(info, _tag(object_id, info.revision, query))
+
+    def answer(query: SelectionQuery) -> Response:
+        info, object_id = density_info(ctx, id, query)
+        return _json(info, _tag(object_id, info.revision, query))
+
+    return _unless_known(ctx, id, request, query, answer)
 
 
 @router.get("/objects/{id}/likelihood", response_model=Likelihoods, **scope("read"))
@@ -62,13 +65,14 @@ def get_likelihood(
     ctx: Ctx, id: str, request: Request, query: Annotated[LikelihoodQuery, Query()]
 ) -> Response:
     """How likely one grasp is; columns of length one."""
-    query = _pinned(ctx, id, query)
-    known = _known(ctx, id, request, query)
-    if known is not None:
-        return known
-    poses = read_poses({"position": [list(query.position)], "quaternion_xyzw": [list(query.quaternion_xyzw)]})
-    answer = likelihood.likelihood(ctx, id, query, poses, query.include)
-    return _likelihoods(answer, {"ETag": _tag(answer.object_id, answer.revision, query)})
+    pose = Poses(np.array([query.position]), np.array([query.quaternion_xyzw]))
+
+    def answer(query: LikelihoodQuery) -> Response:
+        built, columns = likelihood.likelihood(ctx, id, query, pose, query.include)
+        tag = _tag(built.object_row.id, built.revision, query)
+        return columns_json(_head(built.revision, built.kernel), columns, {"ETag": tag})
+
+    return _unless_known(ctx, id, request, query, answer)
 
 
 @router.post(
@@ -93,8 +97,9 @@ def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
         given = content.pop("poses", None)
         options = validated(content, LikelihoodOptions)
         poses = read_poses(given)
-    answer = likelihood.likelihood(ctx, id, options, poses, options.include)
-    return _likelihoods(answer, {"Vary": "Accept"}, arrow=kind == ARROW)
+    built, columns = likelihood.likelihood(ctx, id, options, poses, options.include)
+    form = columns_arrow if kind == ARROW else columns_json
+    return form(_head(built.revision, built.kernel), columns, {"Vary": "Accept"})
 
 
 @router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
@@ -102,12 +107,12 @@ def get_best_grasp(
     ctx: Ctx, id: str, request: Request, query: Annotated[BestGraspQuery, Query()]
 ) -> Response:
     """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
-    query = _pinned(ctx, id, query)
-    known = _known(ctx, id, request, query)
-    if known is not None:
-        return known
-    answer, object_id = best_grasps(ctx, id, query)
-    return _json(answer, _tag(object_id, answer.revision, query))
+
+    def answer(query: BestGraspQuery) -> Response:
+        best, object_id = best_grasps(ctx, id, query)
+        return _json(best, _tag(object_id, best.revision, query))
+
+    return _unless_known(ctx, id, request, query, answer)
 
 
 @router.post(
@@ -145,7 +150,7 @@ def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
 
 def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
     return columns_json(
-        {"revision": drawn.revision, "kernel": drawn.kernel.model_dump(), "seed": drawn.seed, **more},
+        {**_head(drawn.revision, drawn.kernel), "seed": drawn.seed, **more},
         {
             "position": drawn.position,
             "quaternion_xyzw": drawn.quaternion_xyzw,
@@ -154,11 +159,8 @@ def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
     )
 
 
-def _likelihoods(
-    answer: likelihood.LikelihoodAnswer, headers: dict[str, str] | None = None, *, arrow: bool = False
-) -> Response:
-    head = {"revision": answer.revision, "kernel": answer.kernel.model_dump()}
-    return (columns_arrow if arrow else columns_json)(head, answer.columns(), headers)
+def _head(revision: int, kernel: KernelInfo) -> dict[str, Any]:
+    return {"revision": revision, "kernel": kernel.model_dump()}
 
 
 def _json(answer: BaseModel, tag: str | None = None) -> Response:
@@ -167,20 +169,20 @@ def _json(answer: BaseModel, tag: str | None = None) -> Response:
     )
 
 
-def _pinned(ctx: Context, slug: str, query: Q) -> Q:
-    """With the id of the newest kernel in the place of ``anisotropic``: another answer, another ETag."""
-    if query.kernel != "anisotropic":
-        return query
-    selected = ctx.densities.selections.resolve(slug, Filters.of(query))
-    return query.model_copy(update={"kernel": ctx.densities.stored(selected, "anisotropic").id})
-
-
-def _known(ctx: Context, slug: str, request: Request, query: Selection) -> Response | None:
-    """304 where the client has the answer of this revision already."""
-    if "if-none-match" not in request.headers:
-        return None
-    row = ctx.densities.selections.resolve(slug, Filters.of(query)).row
-    return not_modified(request, _tag(row.id, row.revision, query))
+def _unless_known(
+    ctx: Context, slug: str, request: Request, query: Q, answer: Callable[[Q], Response]
+) -> Response:
+    """The answer to a query, or 304 where the client has that of this revision already."""
+    selections = ctx.densities.selections
+    if query.kernel == "anisotropic":
+        # Pinned to the newest kernel, by its id: another kernel makes another answer and another ETag.
+        newest = ctx.densities.stored(selections.resolve(slug, query), "anisotropic")
+        query = query.model_copy(update={"kernel": newest.id})
+    seen = None
+    if "if-none-match" in request.headers:
+        row = selections.resolve(slug, query).row
+        seen = not_modified(request, _tag(row.id, row.revision, query))
+    return answer(query) if seen is None else seen
 
 
 def _tag(object_id: int, revision: int, query: Selection) -> str:

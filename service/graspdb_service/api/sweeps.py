@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.states import AnySweepState
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.parameters import Creating, Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
@@ -30,15 +30,11 @@ PosesLimit = Annotated[
     response_model=SweepInfo,
     **scope("admin", body={"application/json": SweepCreate}),
 )
-def create_sweep(
-    ctx: Ctx, id: str, request: Request, response: Response, body: RawBody, key: IdempotencyKey
-) -> object:
+def create_sweep(ctx: Ctx, id: str, request: Request, sent: Creating) -> object:
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
     draws from its density. Workers take its chunks."""
-    spec = read_model(request, body or b"{}", SweepCreate)
-    made = planning.create(ctx, id, spec, key=key, request=body)
-    response.headers["Location"] = made.location
-    return made.body
+    spec = read_model(request, sent.body or b"{}", SweepCreate)
+    return sent.answered(planning.create(ctx, id, spec, sent))
 
 
 @router.get("/sweeps", **scope("read"))

@@ -10,7 +10,7 @@ from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, T
 from graspdb.wire.trials import TrialColumnsIn
 from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
-from graspdb_service.api.routing.parameters import Ctx, IdempotencyKey, RawBody
+from graspdb_service.api.routing.parameters import Creating, Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
 from graspdb_service.formats.trials import page_response, stream_response
@@ -32,13 +32,9 @@ BODY = {
     response_model=BatchReceipt,
     **scope("trials:write", body=BODY),
 )
-def add_trials(
-    ctx: Ctx, id: str, request: Request, response: Response, body: RawBody, key: IdempotencyKey
-) -> object:
+def add_trials(ctx: Ctx, id: str, request: Request, sent: Creating) -> object:
     """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all."""
-    made = posting.add(ctx, id, body=body, media=media_type(request), key=key)
-    response.headers["Location"] = made.location
-    return made.body
+    return sent.answered(posting.add(ctx, id, sent, media_type(request)))
 
 
 @router.get(

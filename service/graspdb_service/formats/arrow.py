@@ -17,9 +17,8 @@ import orjson
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES
-from graspdb_service.problems import ProblemError, invalid
-
-Floats = NDArray[np.float64]
+from graspdb_service.problems import ProblemError, invalid, invalid_fields
+from graspdb_service.trial_columns import Bools, Floats, Ints
 
 #: Key of the schema's metadata that holds, as JSON, what else a request or an answer says.
 METADATA = b"graspdb"
@@ -76,14 +75,10 @@ class Table:
         wrong = [name for name in self.names if name not in known]
         wrong += [name for name in known if self.names.count(name) > 1]
         if wrong:
-            raise ProblemError(
-                422,
-                "invalid-request",
+            told = f"unknown or repeated; there are {', '.join(sorted(known))}"
+            raise invalid_fields(
+                [(f"{prefix}.{name[:80]}", told) for name in sorted(set(wrong))[:20]],
                 "The stream has columns that are not known, or one twice",
-                errors=[
-                    (f"{prefix}.{name[:80]}", f"unknown or repeated; there are {', '.join(sorted(known))}")
-                    for name in sorted(set(wrong))[:20]
-                ],
             )
 
     @property
@@ -112,11 +107,9 @@ class Table:
         """As :meth:`column`, without nulls; 422 where it is missing, or naming the first null."""
         column = self.column(name)
         if column is None:
-            raise invalid(f"{self._prefix}.{name}", "required")
+            raise self._wrong(name, "required")
         if column.null_count:
-            self.fault(
-                name, int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0]), "required"
-            )
+            self.fault(name, int(np.flatnonzero(_numpy(column.is_null()))[0]), "required")
         return column
 
     def vectors(self, name: str, width: int) -> Floats:
@@ -126,9 +119,9 @@ class Table:
         fixed = pa.types.is_fixed_size_list(kind)
         lists = fixed or pa.types.is_list(kind) or pa.types.is_large_list(kind)
         if not lists or not (pa.types.is_floating(kind.value_type) or pa.types.is_integer(kind.value_type)):
-            raise invalid(f"{self._prefix}.{name}", f"lists of {width} numbers; this column is {kind}")
+            raise self._wrong(name, f"lists of {width} numbers; this column is {kind}")
         if fixed and kind.list_size != width:
-            raise invalid(f"{self._prefix}.{name}", f"lists of {width} numbers, not of {kind.list_size}")
+            raise self._wrong(name, f"lists of {width} numbers, not of {kind.list_size}")
         if not fixed:
             sizes = column.value_lengths().to_numpy()
             wrong = np.flatnonzero(sizes != width)
@@ -136,9 +129,9 @@ class Table:
                 self.fault(name, int(wrong[0]), f"a list of {width} numbers")
         flat = column.flatten()
         if flat.null_count:
-            null = np.flatnonzero(flat.is_null().to_numpy(zero_copy_only=False))[0]
+            null = np.flatnonzero(_numpy(flat.is_null()))[0]
             self.fault(name, int(null) // width, f"a list of {width} numbers")
-        values = flat.to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, width)
+        values = _numpy(flat).astype(np.float64).reshape(-1, width)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if bad.size:
             self.fault(name, int(bad[0]), "every number must be finite")
@@ -150,15 +143,14 @@ class Table:
         if column is None:
             return None
         if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-            raise invalid(f"{self._prefix}.{name}", f"numbers or nulls; this column is {column.type}")
-        null = column.is_null().to_numpy(zero_copy_only=False)
-        values = column.to_numpy(zero_copy_only=False).astype(np.float64)
+            raise self._wrong(name, f"numbers or nulls; this column is {column.type}")
+        null, values = _numpy(column.is_null()), _numpy(column).astype(np.float64)
         bad = np.flatnonzero(~null & ~np.isfinite(values))
         if bad.size:
             self.fault(name, int(bad[0]), "a finite number or null")
         return np.asarray(np.where(null, np.nan, values))
 
-    def texts(self, name: str) -> tuple[list[str], NDArray[np.int64]] | None:
+    def texts(self, name: str) -> tuple[list[str], Ints] | None:
         """Distinct texts of a column, and which of them each row has (-1: null); None where it is absent."""
         pa, column = self._pa, self.column(name)
         if column is None:
@@ -166,9 +158,9 @@ class Table:
         coded = pa.types.is_dictionary(column.type)
         kind = column.type.value_type if coded else column.type
         if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-            raise invalid(f"{self._prefix}.{name}", f"text; this column is {column.type}")
+            raise self._wrong(name, f"text; this column is {column.type}")
         encoded = column if coded else column.dictionary_encode()
-        indices = encoded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+        indices = _numpy(encoded.indices.fill_null(-1)).astype(np.int64)
         return encoded.dictionary.to_pylist(), indices
 
     def objects(self, name: str) -> list[Any] | None:
@@ -180,27 +172,33 @@ class Table:
         if column is None:
             return None
         if not _plain(pa, column.type):
-            raise invalid(
-                f"{self._prefix}.{name}", f"plain lists, structs, text or times; it is {column.type}"
-            )
+            raise self._wrong(name, f"plain lists, structs, text or times; it is {column.type}")
         if pa.types.is_timestamp(column.type):
             column = column.cast(pa.timestamp("us", column.type.tz), safe=False)
         try:
             found: list[Any] = column.to_pylist()
         except (ValueError, OverflowError) as error:
-            raise invalid(f"{self._prefix}.{name}", str(error)[:200]) from None
+            raise self._wrong(name, str(error)[:200]) from None
         return found
 
-    def booleans(self, name: str) -> NDArray[np.bool_] | None:
+    def booleans(self, name: str) -> Bools | None:
         """(n,) where a column holds true and false; None where it holds something else."""
         column = self.required(name)
         if not self._pa.types.is_boolean(column.type):
             return None
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.bool_)
+        return np.asarray(_numpy(column), dtype=np.bool_)
 
     def fault(self, name: str, row: int, message: str) -> None:
         """Raise a 422 that names a row of a column."""
-        raise invalid(f"{self._prefix}.{name}.{row}", message)
+        raise self._wrong(f"{name}.{row}", message)
+
+    def _wrong(self, name: str, message: str) -> ProblemError:
+        return invalid(f"{self._prefix}.{name}", message)
+
+
+def _numpy(column: Any) -> NDArray[Any]:
+    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return values
 
 
 def _plain(pa: Any, kind: Any) -> bool:
@@ -210,24 +208,13 @@ def _plain(pa: Any, kind: Any) -> bool:
         return _plain(pa, kind.value_type)
     if types.is_struct(kind):
         return all(_plain(pa, field.type) for field in kind)
-    return bool(
-        types.is_string(kind)
-        or types.is_large_string(kind)
-        or types.is_floating(kind)
-        or types.is_integer(kind)
-        or types.is_boolean(kind)
-        or types.is_timestamp(kind)
-    )
+    texts, numbers = (types.is_string, types.is_large_string), (types.is_floating, types.is_integer)
+    return any(fits(kind) for fits in (*texts, *numbers, types.is_boolean, types.is_timestamp))
 
 
 def _check_messages(pa: Any, body: bytes) -> None:
     """Refuse a stream with compressed buffers (ValueError; for no stream, what pyarrow or struct say)."""
-    messages = pa.ipc.MessageReader.open_stream(pa.py_buffer(body))
-    while True:
-        try:
-            message = messages.read_next_message()
-        except StopIteration:
-            return
+    for message in pa.ipc.MessageReader.open_stream(pa.py_buffer(body)):
         if message.type in ("record batch", "dictionary") and _compressed(message.metadata.to_pybytes()):
             raise ValueError("its buffers are compressed: write it without compression")
 
@@ -263,41 +250,33 @@ def _u32(content: bytes, at: int) -> int:
 # -- out -----------------------------------------------------------------------------------------------------
 
 
-class _Pieces(io.RawIOBase):
-    """A file whose content is taken as it is written."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, part: Any) -> int:
-        content = bytes(part)
-        self._parts.append(content)
-        return len(content)
-
-    def take(self) -> bytes:
-        content, self._parts = b"".join(self._parts), []
-        return content
-
-
 def stream(schema: Any, batches: Iterable[Any]) -> Iterator[bytes]:
     """An IPC stream piece by piece, for however many batches."""
-    pa = library()
-    sink = _Pieces()
-    with pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), schema) as writer:
-        yield sink.take()
+    sink = io.BytesIO()
+
+    def taken() -> bytes:
+        content = sink.getvalue()
+        sink.seek(0)
+        sink.truncate()
+        return content
+
+    with library().ipc.new_stream(sink, schema) as writer:
+        yield taken()
         for batch in batches:
             writer.write_batch(batch)
-            yield sink.take()
-    yield sink.take()
+            yield taken()
+    yield taken()
 
 
 def schema_of(fields: Sequence[tuple[str, Any]], told: Mapping[str, Any] | None = None) -> Any:
     """A schema of named types, with what else is said in its metadata."""
     metadata = None if told is None else {METADATA: orjson.dumps(told)}
     return library().schema(fields, metadata=metadata)
+
+
+def record_batch(columns: Mapping[str, Any], told: Mapping[str, Any]) -> Any:
+    """Columns as a record batch, with what else is said in its schema's metadata."""
+    return library().RecordBatch.from_pydict(columns, metadata={METADATA: orjson.dumps(told)})
 
 
 def vectors(values: Floats, width: int) -> Any:

@@ -55,7 +55,7 @@ def columns_arrow(
     Members of a mapping become columns of their own, ``interval_low`` of ``interval.low``; those that are no
     arrays join the head.
     """
-    pa, arrays, told = arrow.library(), {}, dict(head)
+    arrays, told = {}, dict(head)
     for name, value in columns.items():
         parts = value.items() if isinstance(value, Mapping) else [(None, value)]
         for part, column in parts:
@@ -63,8 +63,7 @@ def columns_arrow(
             if not isinstance(column, np.ndarray):
                 told[full] = column
             else:
-                arrays[full] = pa.array(column) if column.dtype == np.bool_ else arrow.numbers(column)
-    schema = arrow.schema_of([(name, array.type) for name, array in arrays.items()], told)
-    batch = pa.record_batch(list(arrays.values()), schema=schema)
-    content = b"".join(arrow.stream(schema, [batch]))
+                arrays[full] = column if column.dtype == np.bool_ else arrow.numbers(column)
+    batch = arrow.record_batch(arrays, told)
+    content = b"".join(arrow.stream(batch.schema, [batch]))
     return Response(content, media_type=ARROW, headers=dict(headers or {}))

@@ -1,14 +1,14 @@
-"""Poses of a request's body, JSON or Arrow, as arrays."""
+"""Poses of a request's body, JSON or Arrow, as arrays; and what numbers of a pose are refused for."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import orjson
 from fastapi.exceptions import RequestValidationError
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from graspdb.wire import Pose
@@ -18,11 +18,97 @@ from graspdb_density.se3 import Poses
 from graspdb_service.formats import arrow
 from graspdb_service.formats.json_bodies import no_json
 from graspdb_service.formats.json_pieces import LongArray
-from graspdb_service.problems import ProblemError, invalid
+from graspdb_service.problems import invalid, invalid_fields
+from graspdb_service.trial_columns import Floats
 
-Floats = NDArray[np.float64]
+Refuse = Callable[[str, int, str], None]
+"""Told a field, a row of it and what is wrong there."""
 
 _ROWS = 16_384
+_FIELDS = ("position", "quaternion_xyzw")
+_FINITE = "every number must be finite"
+
+
+# -- numbers, wherever they come from ------------------------------------------------------------------------
+
+
+def vectors(rows: Sequence[Any], width: int) -> Floats:
+    """Lists of ``width`` finite numbers as an array (n, width); ValueError says what one of them is not."""
+    if not rows:
+        return np.empty((0, width))
+    lists = set(map(type, rows)) == {list} and set(map(len, rows)) == {width}
+    if not lists or not set(map(type, chain.from_iterable(rows))) <= {int, float}:
+        raise ValueError(f"a list of {width} numbers")
+    try:
+        table = np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * width)
+    except OverflowError:  # an integer beyond all floats
+        raise ValueError(_FINITE) from None
+    if not np.isfinite(table).all():
+        raise ValueError(_FINITE)
+    return table.reshape(-1, width)
+
+
+def no_vectors(rows: Sequence[Any], width: int) -> Iterator[tuple[int, str]]:
+    """The rows that :func:`vectors` refuses, and why."""
+    for i, row in enumerate(rows):
+        try:
+            vectors([row], width)
+        except ValueError as error:
+            yield i, str(error)
+
+
+def near(position: Floats, refuse: Refuse) -> Floats:
+    """Positions (n, 3), those refused that no object can be meant to have."""
+    for row in np.flatnonzero((np.abs(position) > MAX_COORDINATE_M).any(axis=1)):
+        told = f"coordinates are metres and at most {MAX_COORDINATE_M:g} from the origin: is the unit right?"
+        refuse("position", int(row), told)
+    return position
+
+
+def unit(quaternion: Floats, refuse: Refuse) -> Floats:
+    """Quaternions (n, 4) scaled to length 1, those refused that are farther from it than rounding."""
+    with np.errstate(over="ignore"):  # an infinite norm is far enough from 1
+        norm = np.linalg.norm(quaternion, axis=1)
+    for row in np.flatnonzero(~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)):
+        told = f"a quaternion (x, y, z, w) must have norm 1 within {UNIT_TOLERANCE:g};"
+        refuse("quaternion_xyzw", int(row), f"{told} this one has {norm[row]:.6g}")
+    return np.asarray(quaternion / np.where(norm > 0, norm, 1.0)[:, None])
+
+
+# -- a request's poses ---------------------------------------------------------------------------------------
+
+
+def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Poses]:
+    """What an Arrow stream says beside its poses, and these."""
+    table = arrow.Table(body, _FIELDS, prefix="poses")
+    if not table.count:
+        raise invalid("poses", "at least one pose")
+    poses = table.vectors("position", 3), table.vectors("quaternion_xyzw", 4)
+    return table.options, _checked(*poses, "poses.{field}.{row}")
+
+
+def read_poses(value: Any) -> Poses:
+    """Those of a list of poses or of pose columns.
+
+    422 names the first bad field, as the wire's models would.
+    """
+    if isinstance(value, dict):
+        errors = [(f"poses.{name}", "unknown field") for name in value if name not in _FIELDS]
+        errors += [(f"poses.{name}", "is missing") for name in _FIELDS if name not in value]
+        if errors:
+            raise invalid_fields(errors[:20])
+        position, quaternion = _column(value, "position", 3), _column(value, "quaternion_xyzw", 4)
+        if len(position) != len(quaternion):
+            told = f"has {len(quaternion)} rows and position {len(position)}"
+            raise invalid("poses.quaternion_xyzw", told)
+        return _checked(position, quaternion, "poses.{field}.{row}")
+    if not isinstance(value, list | LongArray):
+        raise invalid("poses", "a list of poses, or columns {position, quaternion_xyzw}")
+    rows = [_rows(items, first) for first, items in _pieces(value)]
+    if not rows:
+        raise invalid("poses", "at least one pose")
+    position, quaternion = (np.concatenate(part) for part in zip(*rows, strict=True))
+    return _checked(position, quaternion, "poses.{row}.{field}")
 
 
 def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:
@@ -40,78 +126,36 @@ def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:
         raise no_json(error) from None
 
 
-def read_arrow_poses(body: bytes) -> tuple[dict[str, Any], Poses]:
-    """What an Arrow stream says beside its poses, and these."""
-    table = arrow.Table(body, ("position", "quaternion_xyzw"), prefix="poses")
-    if not table.count:
-        raise invalid("poses", "at least one pose")
-    names = ("poses.position.{}", "poses.quaternion_xyzw.{}")
-    poses = table.vectors("position", 3), table.vectors("quaternion_xyzw", 4)
-    return table.options, _checked(*poses, names)
-
-
-def read_poses(value: Any, field: str = "poses") -> Poses:
-    """Those of a list of poses or of pose columns.
-
-    422 names the first bad field, as the wire's models would.
-    """
-    if isinstance(value, dict):
-        _check_keys(value, {"position", "quaternion_xyzw"}, field)
-        position = _matrix(value["position"], 3, f"{field}.position")
-        quaternion = _matrix(value["quaternion_xyzw"], 4, f"{field}.quaternion_xyzw")
-        if len(position) != len(quaternion):
-            raise invalid(
-                f"{field}.quaternion_xyzw", f"has {len(quaternion)} rows and position {len(position)}"
-            )
-        names = (f"{field}.position.{{}}", f"{field}.quaternion_xyzw.{{}}")
-    elif isinstance(value, list | LongArray):
-        rows = [_rows(items, field, first) for first, items in _pieces(value)]
-        if not rows:
-            raise invalid(field, "at least one pose")
-        position, quaternion = (np.concatenate(part) for part in zip(*rows, strict=True))
-        names = (f"{field}.{{}}.position", f"{field}.{{}}.quaternion_xyzw")
-    else:
-        raise invalid(field, "a list of poses, or columns {position, quaternion_xyzw}")
+def _checked(position: Floats, quaternion: Floats, place: str) -> Poses:
+    """Poses with unit quaternions; ``place`` is what a field of a row is called."""
     if not len(position):
-        raise invalid(field, "at least one pose")
-    return _checked(position, quaternion, names)
+        raise invalid("poses", "at least one pose")
+
+    def refuse(field: str, row: int, message: str) -> None:
+        raise invalid(place.format(field=field, row=row), message)
+
+    return Poses(near(position, refuse), unit(quaternion, refuse))
 
 
-def _checked(position: Floats, quaternion: Floats, names: tuple[str, str]) -> Poses:
-    """Poses with unit quaternions, near enough; ``names`` are those of a row's fields."""
-    far = np.flatnonzero(~(np.abs(position) <= MAX_COORDINATE_M).all(axis=1))
-    if far.size:
-        raise invalid(
-            names[0].format(far[0]),
-            f"finite metres, at most {MAX_COORDINATE_M:g} from the origin: is the unit right?",
-        )
-    norm = np.linalg.norm(quaternion, axis=1)
-    wrong = np.flatnonzero(~(np.abs(norm - 1.0) <= UNIT_TOLERANCE))
-    if wrong.size:
-        raise invalid(
-            names[1].format(wrong[0]),
-            f"a quaternion (x, y, z, w) must have norm 1 within {UNIT_TOLERANCE:g};"
-            f" this one has {norm[wrong[0]]:.6g}",
-        )
-    return Poses(position, quaternion / norm[:, None])
+def _column(columns: dict[str, Any], name: str, width: int) -> Floats:
+    if not isinstance(columns[name], list | LongArray):
+        raise invalid(f"poses.{name}", f"a list of rows of {width} numbers")
+    parts = [np.empty((0, width))]
+    for first, items in _pieces(columns[name]):
+        try:
+            parts.append(vectors(items, width))
+        except ValueError:
+            row, told = next(no_vectors(items, width))
+            raise invalid(f"poses.{name}.{first + row}", told) from None
+    return np.concatenate(parts)
 
 
-def _check_keys(value: dict[str, Any], wanted: set[str], field: str) -> None:
-    errors = [(f"{field}.{name}", "unknown field") for name in value if name not in wanted]
-    errors += [(f"{field}.{name}", "is missing") for name in sorted(wanted) if name not in value]
-    if errors:
-        raise ProblemError(422, "invalid-request", "The request is not valid", errors=errors[:20])
-
-
-def _rows(items: list[Any], field: str, first: int) -> tuple[Floats, Floats]:
+def _rows(items: list[Any], first: int) -> tuple[Floats, Floats]:
     """Poses as rows: the fast way where all have the plain form, else each by its model."""
-    plain = {"position", "quaternion_xyzw"}
     try:
-        if all(item.keys() == plain for item in items):
-            return (
-                _numbers([item["position"] for item in items], 3),
-                _numbers([item["quaternion_xyzw"] for item in items], 4),
-            )
+        if all(item.keys() == set(_FIELDS) for item in items):
+            position = vectors([item["position"] for item in items], 3)
+            return position, vectors([item["quaternion_xyzw"] for item in items], 4)
         if all(item.keys() == {"matrix"} for item in items):
             return _from_matrices([item["matrix"] for item in items])
     except (AttributeError, TypeError, ValueError):
@@ -122,44 +166,16 @@ def _rows(items: list[Any], field: str, first: int) -> tuple[Floats, Floats]:
             pose = Pose.model_validate(item)
         except ValidationError as error:
             raise RequestValidationError(
-                [{**e, "loc": (field, first + i, *e["loc"])} for e in error.errors(include_input=False)]
+                [{**e, "loc": ("poses", first + i, *e["loc"])} for e in error.errors(include_input=False)]
             ) from None
         position[i], quaternion[i] = pose.position, pose.quaternion_xyzw
     return position, quaternion
 
 
 def _from_matrices(values: list[Any]) -> tuple[Floats, Floats]:
-    matrices = _numbers([row for matrix in values for row in matrix], 4).reshape(-1, 4, 4)
+    matrices = vectors(list(chain.from_iterable(values)), 4).reshape(-1, 4, 4)
     if len(matrices) != len(values) or not all(len(matrix) == 4 for matrix in values):
         raise ValueError("shape")
     if np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
         raise ValueError("last row")
     return matrices[:, :3, 3].copy(), se3.from_matrix(matrices[:, :3, :3])
-
-
-def _matrix(value: Any, width: int, field: str) -> Floats:
-    if not isinstance(value, list | LongArray):
-        raise invalid(field, f"a list of rows of {width} numbers")
-    parts = [np.empty((0, width))]
-    for first, items in _pieces(value):
-        try:
-            parts.append(_numbers(items, width))
-        except (TypeError, ValueError):
-            for i, row in enumerate(items):
-                try:
-                    _numbers([row], width)
-                except (TypeError, ValueError):
-                    raise invalid(f"{field}.{first + i}", f"must be {width} finite numbers") from None
-            raise invalid(field, f"a list of rows of {width} numbers") from None
-    return np.concatenate(parts)
-
-
-def _numbers(rows: list[Any], width: int) -> Floats:
-    """Rows of numbers as an array; ValueError or TypeError where they are none."""
-    values = np.array(rows)
-    # Not "O" (null, ragged rows), "U" (text), "b" (true).
-    if values.dtype.kind not in "iuf" or values.shape[1:] != (width,):
-        raise ValueError("not numbers")
-    if not np.isfinite(values).all():
-        raise ValueError("not finite")
-    return values.astype(np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -36,24 +37,17 @@ def page_response(sweep: str, page: TrialColumns, following: str | None, kind: s
 
 
 def _stream(told: dict[str, Any], pages: Iterator[TrialColumns]) -> Iterator[bytes]:
-    pa = arrow.library()
-    fields = [
-        ("pose_index", pa.int64()),
-        ("position", arrow.vector_type(3)),
-        ("quaternion_xyzw", arrow.vector_type(4)),
-        ("outcome", arrow.outcome_type()),
-    ]
     batches = (
-        pa.record_batch(
-            [
-                pa.array(page.pose_index),
-                arrow.vectors(page.position, 3),
-                arrow.vectors(page.quaternion_xyzw, 4),
-                arrow.outcome_names(page.outcome),
-            ],
-            schema=arrow.schema_of(fields, {}),
+        arrow.record_batch(
+            {
+                "pose_index": page.pose_index,
+                "position": arrow.vectors(page.position, 3),
+                "quaternion_xyzw": arrow.vectors(page.quaternion_xyzw, 4),
+                "outcome": arrow.outcome_names(page.outcome),
+            },
+            told,
         )
         for page in pages
-        if len(page)
     )
-    return arrow.stream(arrow.schema_of(fields, told), batches)
+    first = next(batches)
+    return arrow.stream(first.schema, chain([first], batches))

@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES
 from graspdb_service.formats import arrow
-from graspdb_service.formats.trial_fields import NAMES, Faults, Fields, check, defaults_of, refuse_too_many
-from graspdb_service.formats.trial_json import metadata_of
+from graspdb_service.formats.trial_fields import (
+    NAMES,
+    SCALARS,
+    Faults,
+    Fields,
+    check,
+    defaults_of,
+    refuse_too_many,
+)
+from graspdb_service.formats.trial_json import columns_of
 from graspdb_service.problems import invalid
-from graspdb_service.trial_columns import TrialBatch, TrialPage
-
-_SCALARS = ("proposal_density", "quality", "width_m")
-_TEXTS = ("gripper", "source", "protocol")
+from graspdb_service.trial_columns import Provenance, TrialBatch, TrialPage
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
@@ -37,11 +42,11 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
         "quaternion_xyzw": table.vectors("quaternion_xyzw", 4),
         "outcome": _outcomes(table),
     }
-    for name in _SCALARS:
+    for name in SCALARS:
         values = table.scalars(name)
         if values is not None:
             lists[name] = values
-    for name in _TEXTS:
+    for name in Provenance._fields:
         found = table.texts(name)
         if found is not None:
             texts, which = found
@@ -53,7 +58,7 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
             lists[name] = items if convert is None else [None if x is None else convert(x) for x in items]
     faults = Faults()
     defaults = defaults_of(table.options, faults, "columns")
-    return check(Fields(lists, table.count, lambda i, name: f"columns.{name}.{i}"), defaults, faults)
+    return check(Fields(lists, table.count, lambda i, name: f"columns.{name}.{i}", faults), defaults)
 
 
 def _outcomes(table: arrow.Table) -> NDArray[np.uint8]:
@@ -106,8 +111,8 @@ def _schema(told: dict[str, Any] | None = None) -> Any:
             ("position", arrow.vector_type(3)),
             ("quaternion_xyzw", arrow.vector_type(4)),
             ("outcome", arrow.outcome_type()),
-            *((name, pa.string()) for name in _TEXTS),
-            *((name, pa.float64()) for name in _SCALARS),
+            *((name, pa.string()) for name in Provenance._fields),
+            *((name, pa.float64()) for name in SCALARS),
             ("pose_covariance", pa.list_(pa.list_(pa.float64()))),
             ("measured_at", pa.timestamp("us", "UTC")),
             ("metadata", pa.string()),
@@ -119,27 +124,18 @@ def _schema(told: dict[str, Any] | None = None) -> Any:
 
 
 def _record_batch(page: TrialPage) -> Any:
-    pa, columns = arrow.library(), page.columns
-    schema = _schema()
-    batches = [page.batches[number] for number in columns.batch.tolist()]
-    provenances = [page.provenances[number] for number in columns.provenance.tolist()]
-    arrays: dict[str, Any] = {
-        "seq": columns.seq,
-        "revision": columns.revision,
-        "batch": [batch.key for batch in batches],
-        "position": arrow.vectors(columns.position, 3),
-        "quaternion_xyzw": arrow.vectors(columns.quaternion_xyzw, 4),
-        "outcome": arrow.outcome_names(columns.outcome),
-        **{name: [getattr(item, name) for item in provenances] for name in _TEXTS},
-        **{name: arrow.numbers(getattr(columns, name)) for name in _SCALARS},
-        "pose_covariance": columns.pose_covariance,
-        "measured_at": columns.measured_at,
-        "metadata": [None if value is None else orjson.dumps(value).decode() for value in metadata_of(page)],
-        "sweep": [batch.sweep for batch in batches],
-        "pose_index": pa.array(columns.pose_index, mask=columns.pose_index < 0),
+    pa, schema, columns = arrow.library(), _schema(), dict[str, Any](columns_of(page))
+    texts = [None if value is None else orjson.dumps(value).decode() for value in columns["metadata"]]
+    columns |= {
+        "position": arrow.vectors(columns["position"], 3),
+        "quaternion_xyzw": arrow.vectors(columns["quaternion_xyzw"], 4),
+        "outcome": arrow.outcome_names(columns["outcome"]),
+        **{name: arrow.numbers(columns[name]) for name in SCALARS},
+        "metadata": texts,
+        "pose_index": pa.array(columns["pose_index"], mask=columns["pose_index"] < 0),
     }
     filled = [
         column if isinstance(column, pa.Array) else pa.array(column, schema.field(name).type)
-        for name, column in arrays.items()
+        for name, column in columns.items()
     ]
     return pa.record_batch(filled, schema=schema)

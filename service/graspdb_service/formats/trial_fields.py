@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,15 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, SOURCES
-from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE, Metadata
+from graspdb.wire.base import Metadata
 from graspdb.wire.trials import TrialDefaults
-from graspdb_service.problems import ProblemError
+from graspdb_service.formats.poses import near, no_vectors, unit, vectors
+from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, TrialColumns
 
 DEFAULTS = frozenset(TrialDefaults.model_fields)
 REQUIRED = ("position", "quaternion_xyzw", "outcome")
+SCALARS = ("proposal_density", "quality", "width_m")
 _OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at")
 NAMES = frozenset(REQUIRED) | frozenset(_OPTIONAL) | DEFAULTS
 _SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -47,14 +48,12 @@ class Faults:
 
     def raise_if_any(self) -> None:
         if self.found:
-            raise ProblemError(
-                422, "invalid-request", "The trials are not valid; none was stored", errors=self.found
-            )
+            raise invalid_fields(self.found, "The trials are not valid; none was stored")
 
 
 @dataclass
 class Fields:
-    """Trials as one list a field, and how a field of a trial is called in the request.
+    """Trials as one list a field, how a field of a trial is called in the request, and what is wrong with it.
 
     Numbers and outcome codes may be arrays already, finite, with NaN for null.
     """
@@ -62,6 +61,16 @@ class Fields:
     lists: Mapping[str, Sequence[Any] | NDArray[Any]]
     count: int
     place: Callable[[int, str], str]
+    faults: Faults
+
+    def fault(self, name: str, row: int, message: str) -> None:
+        self.faults.add(self.place(row, name), message)
+
+    def refuse(self, name: str, good: Callable[[Any], bool], message: str) -> None:
+        """Name the trials whose value of a field is not good."""
+        for row, value in enumerate(self.lists[name]):
+            if not good(value):
+                self.fault(name, row, message)
 
 
 def refuse_too_many(count: int, limit: int) -> None:
@@ -88,94 +97,46 @@ def defaults_of(beside: Mapping[str, Any], faults: Faults, form: str) -> TrialDe
     return TrialDefaults()
 
 
-def check(fields: Fields, defaults: TrialDefaults, faults: Faults) -> TrialBatch:
-    """Checked trials, or 422 naming the fields that are wrong, those in ``faults`` included."""
-    position = _positions(fields, faults)
-    quaternion = _quaternions(fields, faults)
-    outcome = _outcomes(fields, faults)
-    provenances, provenance = _provenances(fields, defaults, faults)
-    proposal = _scalars(fields, "proposal_density", faults, 0.0, 1e15, above=True)
-    if defaults.proposal_density is not None:
-        if not len(proposal):
-            proposal = np.full(fields.count, np.nan)
-        proposal[np.isnan(proposal)] = defaults.proposal_density
-    quality = _scalars(fields, "quality", faults, -1e9, 1e9)
-    width_m = _scalars(fields, "width_m", faults, 0.0, 10.0)
-    measured_at = _each(fields, "measured_at", faults, _time)
-    covariance = _each(fields, "pose_covariance", faults, _covariance)
-    metadata = _each(fields, "metadata", faults, _METADATA.validate_python)
-    faults.raise_if_any()
-    assert position is not None
-    assert quaternion is not None
-    assert outcome is not None
+def check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
+    """Checked trials, or 422 naming the fields that are wrong, those found before included."""
+    position, quaternion = _vectors(fields, "position", 3), _vectors(fields, "quaternion_xyzw", 4)
+    refuse = fields.fault
     columns = TrialColumns(
-        position=position,
-        quaternion_xyzw=quaternion,
-        outcome=outcome,
-        provenance=provenance,
-        proposal_density=proposal,
-        quality=quality,
-        width_m=width_m,
-        measured_at=measured_at,
-        pose_covariance=covariance,
-        metadata=metadata,
+        position=near(position, refuse),
+        quaternion_xyzw=unit(quaternion, refuse),
+        outcome=_outcomes(fields),
+        proposal_density=_scalars(fields, "proposal_density", 0.0, 1e15, above=True),
+        quality=_scalars(fields, "quality", -1e9, 1e9),
+        width_m=_scalars(fields, "width_m", 0.0, 10.0),
+        measured_at=_each(fields, "measured_at", _time),
+        pose_covariance=_each(fields, "pose_covariance", _covariance),
+        metadata=_each(fields, "metadata", _METADATA.validate_python),
     )
+    provenances, provenance = _provenances(fields, defaults)
+    fields.faults.raise_if_any()
+    proposal = columns.proposal_density
+    if defaults.proposal_density is not None:
+        proposal = proposal if len(proposal) else np.full(fields.count, np.nan)
+        proposal = np.where(np.isnan(proposal), defaults.proposal_density, proposal)
     return TrialBatch(
-        columns, provenances, defaults.metadata, lambda gripper: _field_of_gripper(fields, gripper)
+        replace(columns, provenance=provenance, proposal_density=proposal),
+        provenances,
+        defaults.metadata,
+        lambda gripper: _field_of_gripper(fields, gripper),
     )
 
 
-def _positions(fields: Fields, faults: Faults) -> Floats | None:
-    position = _vectors(fields, "position", 3, faults)
-    if position is not None:
-        for i in np.flatnonzero((np.abs(position) > MAX_COORDINATE_M).any(axis=1)):
-            faults.add(
-                fields.place(int(i), "position"),
-                f"coordinates are metres and at most {MAX_COORDINATE_M:g} from the origin:"
-                " is the unit right?",
-            )
-    return position
-
-
-def _quaternions(fields: Fields, faults: Faults) -> Floats | None:
-    quaternion = _vectors(fields, "quaternion_xyzw", 4, faults)
-    if quaternion is None:
-        return None
-    with np.errstate(over="ignore"):  # an infinite norm is far enough from 1
-        norm = np.sqrt((quaternion**2).sum(axis=1))
-    for i in np.flatnonzero(~(np.abs(norm - 1.0) <= UNIT_TOLERANCE)):
-        faults.add(
-            fields.place(int(i), "quaternion_xyzw"),
-            f"a quaternion (x, y, z, w) must have norm 1 within {UNIT_TOLERANCE:g};"
-            f" this one has {norm[i]:.6g}",
-        )
-    return np.asarray(quaternion / np.where(norm > 0, norm, 1.0)[:, None])
-
-
-def _vectors(fields: Fields, name: str, width: int, faults: Faults) -> Floats | None:
-    """(n, width) finite numbers, or None with the faults."""
+def _vectors(fields: Fields, name: str, width: int) -> Floats:
+    """(n, width) finite numbers; none of them with the faults."""
     values = fields.lists[name]
     if isinstance(values, np.ndarray):
         return values
-    if set(map(type, values)) == {list} and set(map(len, values)) == {width}:
-        flat = chain.from_iterable(values)
-        if set(map(type, flat)) <= {int, float}:
-            try:
-                table = np.fromiter(chain.from_iterable(values), np.float64, len(values) * width)
-            except OverflowError:
-                table = np.array([_float(x) for x in chain.from_iterable(values)])
-            table = table.reshape(-1, width)
-            finite = np.isfinite(table).all(axis=1)
-            if finite.all():
-                return table
-            for row in np.flatnonzero(~finite):
-                faults.add(fields.place(int(row), name), "every number must be finite")
-            return None
-    for i, value in enumerate(values):
-        numbers = isinstance(value, list) and all(type(x) in (int, float) for x in value)
-        if not numbers or len(value) != width:
-            faults.add(fields.place(i, name), f"a list of {width} numbers")
-    return None
+    try:
+        return vectors(values, width)
+    except ValueError:
+        for row, told in no_vectors(values, width):
+            fields.fault(name, row, told)
+    return np.empty((0, width))
 
 
 def _float(number: float) -> float:
@@ -185,34 +146,28 @@ def _float(number: float) -> float:
         return np.inf
 
 
-def _scalars(
-    fields: Fields, name: str, faults: Faults, lower: float, upper: float, *, above: bool = False
-) -> Floats:
-    """(n,) numbers between the bounds with NaN for null; empty where the field is absent throughout."""
+def _scalars(fields: Fields, name: str, lower: float, upper: float, *, above: bool = False) -> Floats:
+    """(n,) numbers between the bounds with NaN for null; empty where the field is absent."""
     values = fields.lists.get(name)
     if values is None:
         return np.empty(0)
     if isinstance(values, np.ndarray):
-        table, given = values.copy(), ~np.isnan(values)
-    else:
-        kinds = set(map(type, values))
-        if kinds <= {type(None)}:
-            return np.empty(0)
-        if not kinds <= {int, float, type(None)}:
-            for i, value in enumerate(values):
-                if type(value) not in (int, float, type(None)):
-                    faults.add(fields.place(i, name), "a number or null")
-            return np.empty(0)
+        table, given = values, ~np.isnan(values)
+    elif set(map(type, values)) <= {int, float, type(None)}:
         given = np.array([value is not None for value in values])
         table = np.array([np.nan if value is None else _float(value) for value in values])
+    else:
+        fields.refuse(name, lambda value: type(value) in (int, float, type(None)), "a number or null")
+        return np.empty(0)
     inside = (table > lower if above else table >= lower) & (table <= upper)
     bounds = f"above {lower:g} and at most {upper:g}" if above else f"from {lower:g} to {upper:g}"
     for row in np.flatnonzero(given & ~inside):
-        faults.add(fields.place(int(row), name), f"a finite number {bounds}")
+        fields.fault(name, int(row), f"a finite number {bounds}")
     return table
 
 
-def _outcomes(fields: Fields, faults: Faults) -> NDArray[np.uint8] | None:
+def _outcomes(fields: Fields) -> NDArray[np.uint8]:
+    """(n,) codes; none of them with the faults."""
     values = fields.lists["outcome"]
     if isinstance(values, np.ndarray):
         return values
@@ -220,44 +175,41 @@ def _outcomes(fields: Fields, faults: Faults) -> NDArray[np.uint8] | None:
         codes = [int(v) if v is True or v is False else OUTCOME_CODES.get(v, -1) for v in values]
         if min(codes) >= 0:
             return np.array(codes, dtype=np.uint8)
-    for i, value in enumerate(values):
-        if not isinstance(value, bool) and not (isinstance(value, str) and value in OUTCOME_CODES):
-            faults.add(fields.place(i, "outcome"), f"one of {', '.join(OUTCOMES)}, true or false")
-    return None
+    names = {*OUTCOMES, True, False}
+    told = f"one of {', '.join(OUTCOMES)}, true or false"
+    fields.refuse("outcome", lambda value: isinstance(value, str | bool) and value in names, told)
+    return np.empty(0, dtype=np.uint8)
 
 
-def _provenances(fields: Fields, defaults: TrialDefaults, faults: Faults) -> tuple[list[Provenance], Ints]:
-    columns: list[list[str | None]] = []
-    for name in ("gripper", "source", "protocol"):
-        default = getattr(defaults, name)
-        values = fields.lists.get(name)
-        if values is None:
-            columns.append([default])
-            continue
-        if set(map(type, values)) <= {str, type(None)}:
-            wrong = {value for value in set(values) if value is not None and not _named(name, value)}
-        else:
-            wrong = None
-        if wrong is None or wrong:
-            rule = f"one of {', '.join(SOURCES)}" if name == "source" else _SLUG_RULE
-            for i, value in enumerate(values):
-                if value is not None and not (isinstance(value, str) and _named(name, value)):
-                    faults.add(fields.place(i, name), rule)
-            columns.append([default])
-            continue
-        columns.append([default if value is None else value for value in values])
-    if all(len(column) == 1 for column in columns):
-        return [Provenance(columns[0][0], columns[1][0], columns[2][0])], np.zeros(
-            fields.count, dtype=np.int64
-        )
-    full = [column if len(column) == fields.count else column * fields.count for column in columns]
-    rows = list(zip(*full, strict=True))
+def _provenances(fields: Fields, defaults: TrialDefaults) -> tuple[list[Provenance], Ints]:
+    """The combinations of names that the trials have, and which of them each has (n,)."""
+    shared = {name: getattr(defaults, name) for name in Provenance._fields}
+    columns = {name: _names(fields, name, default) for name, default in shared.items()}
+    own = {name: names for name, names in columns.items() if names is not None}
+    if not own:
+        return [Provenance(**shared)], np.zeros(fields.count, dtype=np.int64)
+    rows = list(zip(*own.values(), strict=True))
     number = {names: i for i, names in enumerate(dict.fromkeys(rows))}
-    return [Provenance(*names) for names in number], np.array([number[row] for row in rows], dtype=np.int64)
+    found = [Provenance(**{**shared, **dict(zip(own, names, strict=True))}) for names in number]
+    return found, np.array([number[row] for row in rows], dtype=np.int64)
 
 
-def _named(name: str, value: str) -> bool:
-    return value in SOURCES if name == "source" else _SLUG.fullmatch(value) is not None
+def _names(fields: Fields, name: str, default: str | None) -> list[str | None] | None:
+    """A name or None a trial; None where all have the default."""
+    values = fields.lists.get(name)
+    if values is None:
+        return None
+    known = SOURCES if name == "source" else None
+
+    def good(value: Any) -> bool:
+        if value is None or not isinstance(value, str):
+            return value is None
+        return _SLUG.fullmatch(value) is not None if known is None else value in known
+
+    if not set(map(type, values)) <= {str, type(None)} or not all(map(good, set(values))):
+        fields.refuse(name, good, _SLUG_RULE if known is None else f"one of {', '.join(known)}")
+        return None
+    return [default if value is None else value for value in values]
 
 
 def _field_of_gripper(fields: Fields, gripper: str) -> str:
@@ -267,10 +219,10 @@ def _field_of_gripper(fields: Fields, gripper: str) -> str:
     return "gripper"
 
 
-def _each(fields: Fields, name: str, faults: Faults, check: Callable[[Any], Any]) -> list[Any]:
+def _each(fields: Fields, name: str, check: Callable[[Any], Any]) -> list[Any]:
     """Values of a field that has no array form, each checked; empty where it is absent throughout."""
-    values = fields.lists.get(name)
-    if values is None or set(map(type, values)) <= {type(None)}:
+    values = fields.lists.get(name, ())
+    if set(map(type, values)) <= {type(None)}:
         return []
     checked: list[Any] = []
     for i, value in enumerate(values):
@@ -278,9 +230,9 @@ def _each(fields: Fields, name: str, faults: Faults, check: Callable[[Any], Any]
             checked.append(None if value is None else check(value))
         except ValidationError as error:
             first = error.errors(include_input=False, include_context=False)[0]
-            faults.add(fields.place(i, name), first["msg"].removeprefix("Value error, "))
+            fields.fault(name, i, first["msg"].removeprefix("Value error, "))
         except (ValueError, OverflowError) as error:
-            faults.add(fields.place(i, name), str(error))
+            fields.fault(name, i, str(error))
     return checked
 
 
@@ -294,15 +246,10 @@ def _time(value: Any) -> datetime:
 
 
 def _covariance(value: Any) -> list[list[float]]:
-    rows = (
-        isinstance(value, list)
-        and len(value) == 6
-        and all(isinstance(r, list) and len(r) == 6 for r in value)
-    )
-    if not rows or not set(map(type, chain.from_iterable(value))) <= {int, float}:
+    if not isinstance(value, list) or len(value) != 6:
         raise ValueError("a 6x6 list of numbers, translation first")
-    matrix = np.array([[_float(x) for x in row] for row in value])
-    if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e6:
+    matrix = vectors(value, 6)
+    if np.abs(matrix).max() > 1e6:
         raise ValueError("every number must be finite, at most 1e6 (m^2, m rad, rad^2)")
     scale = max(float(np.abs(matrix).max()), 1e-300)
     if np.abs(matrix - matrix.T).max() > 1e-6 * scale:

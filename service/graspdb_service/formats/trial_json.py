@@ -6,7 +6,9 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES
 from graspdb.wire.base import expand_matrix
@@ -14,21 +16,24 @@ from graspdb.wire.trials import TrialDefaults
 from graspdb_service.formats.trial_fields import (
     NAMES,
     REQUIRED,
+    SCALARS,
     Faults,
     Fields,
     check,
     defaults_of,
     refuse_too_many,
 )
-from graspdb_service.problems import ProblemError
-from graspdb_service.trial_columns import Floats, TrialBatch, TrialPage
+from graspdb_service.problems import invalid
+from graspdb_service.trial_columns import Provenance, TrialBatch, TrialPage
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
     """Check a JSON body of trials: 413 for more than ``limit``, 422 naming the fields that are wrong."""
     document, flaw = _loads(body)
     if not isinstance(document, dict):
-        raise _body_problem(flaw or "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}")
+        raise invalid(
+            "body", flaw or "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}"
+        )
     faults = Faults()
     defaults = TrialDefaults()
     if "columns" in document or "trials" in document:
@@ -38,9 +43,9 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
         fields = (_from_columns if form == "columns" else _from_trials)(given, faults, limit)
     else:
         fields = _from_rows([document], faults, lambda _, name: name)
-    batch = check(fields, defaults, faults)
+    batch = check(fields, defaults)
     if flaw:
-        raise _body_problem(flaw)
+        raise invalid("body", flaw)
     return batch
 
 
@@ -55,10 +60,10 @@ def parse_lines(body: bytes, *, limit: int) -> TrialBatch:
             flaws.add(f"trials.{number}", flaw)
         rows.append({} if flaw and row is None else row)
     if not rows:
-        raise _body_problem("no trial in the body: one JSON object a line")
+        raise invalid("body", "no trial in the body: one JSON object a line")
     if any(row == {} for row in rows):
         flaws.raise_if_any()
-    batch = check(_from_rows(rows, faults, lambda i, name: f"trials.{i}.{name}"), TrialDefaults(), faults)
+    batch = check(_from_rows(rows, faults, lambda i, name: f"trials.{i}.{name}"), TrialDefaults())
     flaws.raise_if_any()
     return batch
 
@@ -77,10 +82,6 @@ def _loads(text: bytes) -> tuple[Any, str | None]:
         return json.loads(text), flaw
     except (ValueError, RecursionError):
         return None, flaw
-
-
-def _body_problem(message: str) -> ProblemError:
-    return ProblemError(422, "invalid-request", "The request is not valid", errors=[("body", message)])
 
 
 # --- the three forms to one list a field ----------------------------------------------------------------
@@ -110,7 +111,7 @@ def _from_columns(columns: Any, faults: Faults, limit: int) -> Fields:
     if count == 0:
         faults.add("columns.position", "at least one trial")
     faults.raise_if_any()
-    return Fields(lists, count, lambda i, name: f"columns.{name}.{i}")
+    return Fields(lists, count, lambda i, name: f"columns.{name}.{i}", faults)
 
 
 def _from_trials(trials: Any, faults: Faults, limit: int) -> Fields:
@@ -142,7 +143,7 @@ def _from_rows(rows: list[Any], faults: Faults, place: Callable[[int, str], str]
             faults.add(place(i, name), "required")
     faults.raise_if_any()
     lists = {name: [row.get(name) for row in rows] for name in sorted(names & NAMES)}
-    return Fields(lists, len(rows), place)
+    return Fields(lists, len(rows), place, faults)
 
 
 def _expanded(
@@ -160,46 +161,44 @@ def _expanded(
 # --- stored trials --------------------------------------------------------------------------------------
 
 
-def documents(page: TrialPage) -> list[dict[str, Any]]:
-    """Stored trials as :class:`graspdb.wire.TrialOut` has them."""
+def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
+    """Stored trials in columns, by the names that :class:`graspdb.wire.TrialOut` has for them.
+
+    A number is NaN, and a pose index -1, where there is none. What stood once beside a batch holds for each
+    of its trials that did not say it itself.
+    """
     columns = page.columns
-    names = (
-        "seq", "revision", "batch", "position", "quaternion_xyzw", "outcome", "gripper", "source", "protocol",
-        "proposal_density", "quality", "width_m", "pose_covariance", "measured_at", "metadata", "sweep",
-        "pose_index",
-    )  # fmt: skip
     batches = [page.batches[number] for number in columns.batch.tolist()]
     provenances = [page.provenances[number] for number in columns.provenance.tolist()]
-    values: tuple[Sequence[Any], ...] = (
-        columns.seq.tolist(),
-        columns.revision.tolist(),
-        [batch.key for batch in batches],
-        columns.position.tolist(),
-        columns.quaternion_xyzw.tolist(),
-        [OUTCOMES[code] for code in columns.outcome.tolist()],
-        [provenance.gripper for provenance in provenances],
-        [provenance.source for provenance in provenances],
-        [provenance.protocol for provenance in provenances],
-        *(_or_none(column) for column in (columns.proposal_density, columns.quality, columns.width_m)),
-        columns.pose_covariance,
-        columns.measured_at,
-        metadata_of(page),
-        [batch.sweep for batch in batches],
-        [None if index < 0 else index for index in columns.pose_index.tolist()],
-    )
-    return [dict(zip(names, row, strict=True)) for row in zip(*values, strict=True)]
+    own = zip(columns.metadata, batches, strict=True)
+    return {
+        "seq": columns.seq,
+        "revision": columns.revision,
+        "batch": [batch.key for batch in batches],
+        "position": columns.position,
+        "quaternion_xyzw": columns.quaternion_xyzw,
+        "outcome": columns.outcome,
+        **{name: [getattr(item, name) for item in provenances] for name in Provenance._fields},
+        "proposal_density": columns.proposal_density,
+        "quality": columns.quality,
+        "width_m": columns.width_m,
+        "pose_covariance": columns.pose_covariance,
+        "measured_at": columns.measured_at,
+        "metadata": [batch.metadata if value is None else value for value, batch in own],
+        "sweep": [batch.sweep for batch in batches],
+        "pose_index": columns.pose_index,
+    }
 
 
-def metadata_of(page: TrialPage) -> list[dict[str, Any] | None]:
-    """What stood once beside a batch holds for each of its trials that did not say it itself."""
-    return [
-        page.batches[batch].metadata if own is None else own
-        for own, batch in zip(page.columns.metadata, page.columns.batch.tolist(), strict=True)
-    ]
-
-
-def _or_none(column: Floats) -> list[float | None]:
-    return [None if value != value else value for value in column.tolist()]
+def documents(page: TrialPage) -> list[dict[str, Any]]:
+    """Stored trials as :class:`graspdb.wire.TrialOut` has them."""
+    columns = columns_of(page)
+    values = {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in columns.items()}
+    values["outcome"] = [OUTCOMES[code] for code in values["outcome"]]
+    values["pose_index"] = [None if index < 0 else index for index in values["pose_index"]]
+    for name in SCALARS:
+        values[name] = [None if value != value else value for value in values[name]]
+    return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
 
 
 def lines(page: TrialPage) -> bytes:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
-from sqlalchemy import Connection, Double, Engine, Table, create_engine, event, make_url, text
+from sqlalchemy import Connection, Double, Engine, Executable, Table, create_engine, event, make_url, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
 
+T = TypeVar("T")
 Tx: TypeAlias = Connection
 """An open transaction, as the use cases pass it on."""
 
@@ -42,6 +43,23 @@ def insert_or(tx: Tx, table: Table) -> postgresql.Insert:
         # The same methods under another type.
         return sqlite.insert(table)  # type: ignore[return-value]
     return postgresql.insert(table)
+
+
+def insert_new(tx: Tx, table: Table, **values: Any) -> bool:
+    """Insert a row; False where one of the same key is there already."""
+    statement = insert_or(tx, table).values(values).on_conflict_do_nothing()
+    return tx.execute(statement.returning(*table.primary_key)).first() is not None
+
+
+def first_as(tx: Tx, query: Executable, kind: Callable[..., T]) -> T | None:
+    """The first row of a query as a value whose fields have its columns' names; None without any."""
+    row = tx.execute(query).first()
+    return None if row is None else kind(**row._mapping)
+
+
+def all_as(tx: Tx, query: Executable, kind: Callable[..., T]) -> list[T]:
+    """The rows of a query as values whose fields have its columns' names."""
+    return [kind(**row._mapping) for row in tx.execute(query)]
 
 
 class UnsupportedDatabase(ValueError):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Row, select
+from sqlalchemy import select
 
-from graspdb_service.storage.database import Tx, insert_or
+from graspdb_service.storage.database import Tx, all_as, first_as, insert_new
 from graspdb_service.storage.tables import grippers
 
 
@@ -26,8 +26,7 @@ class GripperRow:
 
 def find(tx: Tx, gripper: str) -> GripperRow | None:
     """The gripper with this id."""
-    row = tx.execute(select(grippers).where(grippers.c.id == gripper)).first()
-    return None if row is None else _gripper(row)
+    return first_as(tx, select(grippers).where(grippers.c.id == gripper), GripperRow)
 
 
 def missing(tx: Tx, names: Iterable[str]) -> list[str]:
@@ -42,19 +41,10 @@ def missing(tx: Tx, names: Iterable[str]) -> list[str]:
 def page(tx: Tx, *, after: str, limit: int) -> list[GripperRow]:
     """Up to ``limit`` grippers in the order of their ids, from the one after ``after``."""
     query = select(grippers).where(grippers.c.id > after).order_by(grippers.c.id).limit(limit)
-    return [_gripper(row) for row in tx.execute(query)]
+    return all_as(tx, query, GripperRow)
 
 
 def create(tx: Tx, gripper: str, name: str | None, profile: dict[str, Any], *, builtin: bool = False) -> bool:
     """Insert a gripper; False where the id is taken."""
-    statement = (
-        insert_or(tx, grippers)
-        .values(id=gripper, name=name, profile=profile, builtin=builtin, created_at=datetime.now(UTC))
-        .on_conflict_do_nothing()
-        .returning(grippers.c.id)
-    )
-    return tx.execute(statement).first() is not None
-
-
-def _gripper(row: Row[Any]) -> GripperRow:
-    return GripperRow(**row._mapping)
+    now = datetime.now(UTC)
+    return insert_new(tx, grippers, id=gripper, name=name, profile=profile, builtin=builtin, created_at=now)

@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import select, update
 
-from graspdb_service.storage.database import Tx, insert_or
+from graspdb_service.storage.database import Tx, first_as, insert_new
 from graspdb_service.storage.tables import idempotency_keys
 
 
@@ -29,21 +29,8 @@ def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | Non
     Of two transactions claiming the same key at once the second waits here until the first has ended:
     PostgreSQL at the unique index, SQLite at BEGIN IMMEDIATE.
     """
-    statement = (
-        insert_or(tx, idempotency_keys)
-        .values(
-            scope=scope,
-            key=key,
-            request_sha256=request_sha256,
-            status=0,
-            answer=None,
-            revoked=False,
-            created_at=datetime.now(UTC),
-        )
-        .on_conflict_do_nothing()
-        .returning(idempotency_keys.c.key)
-    )
-    if tx.execute(statement).first() is not None:
+    fresh = {"request_sha256": request_sha256, "status": 0, "answer": None, "revoked": False}
+    if insert_new(tx, idempotency_keys, scope=scope, key=key, **fresh, created_at=datetime.now(UTC)):
         return None
     found = find(tx, scope, key)
     assert found is not None
@@ -52,15 +39,9 @@ def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | Non
 
 def find(tx: Tx, scope: str, key: str) -> Remembered | None:
     """The request that has a key."""
-    query = select(
-        idempotency_keys.c.request_sha256,
-        idempotency_keys.c.status,
-        idempotency_keys.c.location,
-        idempotency_keys.c.answer,
-        idempotency_keys.c.revoked,
-    ).where(idempotency_keys.c.scope == scope, idempotency_keys.c.key == key)
-    row = tx.execute(query).first()
-    return None if row is None else Remembered(**row._mapping)
+    columns = (idempotency_keys.c[name] for name in Remembered.__dataclass_fields__)
+    query = select(*columns).where(idempotency_keys.c.scope == scope, idempotency_keys.c.key == key)
+    return first_as(tx, query, Remembered)
 
 
 def remember(

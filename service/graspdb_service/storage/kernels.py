@@ -6,66 +6,48 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Row, delete, insert, select
+from sqlalchemy import delete, insert, select
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, all_as, first_as
 from graspdb_service.storage.tables import kernels
 
 
-@dataclass(frozen=True)
-class KernelRow:
-    """A kernel as stored: components and provenance as :mod:`graspdb.wire.kernels` has them."""
+@dataclass(frozen=True, kw_only=True)
+class NewKernel:
+    """A kernel to store: components and provenance as :mod:`graspdb.wire.kernels` has them."""
 
-    number: int
-    id: str
     kind: str
     alignment: str
     gripper: str | None
     object_id: int | None
     components: list[dict[str, Any]]
     provenance: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KernelRow(NewKernel):
+    """A kernel as stored."""
+
+    number: int
+    id: str
     created_at: datetime
 
 
-def create(
-    tx: Tx,
-    id: str,
-    *,
-    kind: str,
-    alignment: str,
-    gripper: str | None,
-    object_id: int | None,
-    components: list[dict[str, Any]],
-    provenance: dict[str, Any],
-) -> KernelRow:
+def create(tx: Tx, id: str, kernel: NewKernel) -> KernelRow:
     """Insert a kernel."""
-    statement = (
-        insert(kernels)
-        .values(
-            id=id,
-            kind=kind,
-            alignment=alignment,
-            gripper=gripper,
-            object_id=object_id,
-            components=components,
-            provenance=provenance,
-            created_at=datetime.now(UTC),
-        )
-        .returning(*kernels.c)
-    )
-    return _kernel(tx.execute(statement).one())
+    statement = insert(kernels).values(id=id, **vars(kernel), created_at=datetime.now(UTC))
+    return KernelRow(**tx.execute(statement.returning(*kernels.c)).one()._mapping)
 
 
 def find(tx: Tx, id: str) -> KernelRow | None:
     """The kernel with this id."""
-    row = tx.execute(select(kernels).where(kernels.c.id == id)).first()
-    return None if row is None else _kernel(row)
+    return first_as(tx, select(kernels).where(kernels.c.id == id), KernelRow)
 
 
-def newest(tx: Tx, object_id: int, gripper: str | None) -> str | None:
-    """Id of the anisotropic kernel fitted last on this object's trials with this gripper."""
+def newest(tx: Tx, object_id: int, gripper: str | None) -> KernelRow | None:
+    """The anisotropic kernel fitted last on this object's trials with this gripper."""
     query = (
-        select(kernels.c.id)
+        select(kernels)
         .where(
             kernels.c.object_id == object_id,
             kernels.c.gripper.is_not_distinct_from(gripper),
@@ -74,8 +56,7 @@ def newest(tx: Tx, object_id: int, gripper: str | None) -> str | None:
         .order_by(kernels.c.number.desc())
         .limit(1)
     )
-    found: str | None = tx.execute(query).scalar()
-    return found
+    return first_as(tx, query, KernelRow)
 
 
 def page(tx: Tx, *, after: int, limit: int, object_id: int | None, gripper: str | None) -> list[KernelRow]:
@@ -85,13 +66,9 @@ def page(tx: Tx, *, after: int, limit: int, object_id: int | None, gripper: str 
         query = query.where(kernels.c.object_id == object_id)
     if gripper is not None:
         query = query.where(kernels.c.gripper == gripper)
-    return [_kernel(row) for row in tx.execute(query)]
+    return all_as(tx, query, KernelRow)
 
 
 def remove(tx: Tx, id: str) -> bool:
     """Delete a kernel; False where there is none."""
     return bool(tx.execute(delete(kernels).where(kernels.c.id == id)).rowcount)
-
-
-def _kernel(row: Row[Any]) -> KernelRow:
-    return KernelRow(**row._mapping)

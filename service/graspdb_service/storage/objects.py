@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Row, and_, delete, exists, or_, select, update
+from sqlalchemy import and_, delete, exists, or_, select, update
 
-from graspdb_service.storage.database import Tx, insert_or
+from graspdb_service.storage.database import Tx, all_as, first_as, insert_new
 from graspdb_service.storage.simulation.jobs import OPEN
 from graspdb_service.storage.tables import batches, idempotency_keys, jobs, objects, sweeps, trials
 
@@ -44,21 +44,19 @@ def create(tx: Tx, slug: str, properties: Mapping[str, Any]) -> bool:
     """Insert an object with these column values; False where the slug is taken."""
     now = datetime.now(UTC)
     values = {"slug": slug, "revision": 0, "epoch": 0, "last_seq": 0, "created_at": now, "updated_at": now}
-    statement = insert_or(tx, objects).values({**properties, **values}).on_conflict_do_nothing()
-    return tx.execute(statement.returning(objects.c.id)).first() is not None
+    return insert_new(tx, objects, **{**properties, **values})
 
 
 def find(tx: Tx, slug: str, *, lock: bool = False) -> ObjectRow | None:
     """The object with this slug; ``lock`` holds its row until the transaction ends."""
     query = select(objects).where(objects.c.slug == slug)
-    row = tx.execute(query.with_for_update() if lock else query).first()
-    return None if row is None else _object(row)
+    return first_as(tx, query.with_for_update() if lock else query, ObjectRow)
 
 
 def page(tx: Tx, *, after: str, limit: int) -> list[ObjectRow]:
     """Up to ``limit`` objects in the order of their slugs, from the one after ``after``."""
     query = select(objects).where(objects.c.slug > after).order_by(objects.c.slug).limit(limit)
-    return [_object(row) for row in tx.execute(query)]
+    return all_as(tx, query, ObjectRow)
 
 
 def advance(tx: Tx, object_id: int, *, rows: int = 0, append: bool) -> tuple[int, int]:
@@ -93,13 +91,9 @@ def change(tx: Tx, object_id: int, values: Mapping[str, Any]) -> None:
 
 def has_running_sweep(tx: Tx, object_id: int, *, sweep_id: str | None = None) -> bool:
     """Whether a sweep of the object (or the one named) still has chunks to simulate."""
-    open_jobs = and_(
-        jobs.c.sweep_id == sweeps.c.id,
-        jobs.c.state.in_(OPEN),
-    )
-    query = select(exists().where(sweeps.c.object_id == object_id, sweeps.c.cancelled.is_(False), open_jobs))
-    if sweep_id is not None:
-        query = select(exists().where(sweeps.c.id == sweep_id, sweeps.c.cancelled.is_(False), open_jobs))
+    which = sweeps.c.object_id == object_id if sweep_id is None else sweeps.c.id == sweep_id
+    open_jobs = and_(jobs.c.sweep_id == sweeps.c.id, jobs.c.state.in_(OPEN))
+    query = select(exists().where(which, sweeps.c.cancelled.is_(False), open_jobs))
     return bool(tx.execute(query).scalar_one())
 
 
@@ -120,7 +114,3 @@ def remove(tx: Tx, row: ObjectRow) -> None:
     tx.execute(update(idempotency_keys).where(owned).values(revoked=True))
     tx.execute(delete(trials).where(trials.c.object_id == row.id))
     tx.execute(delete(objects).where(objects.c.id == row.id))
-
-
-def _object(row: Row[Any]) -> ObjectRow:
-    return ObjectRow(**row._mapping)

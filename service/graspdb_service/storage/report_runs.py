@@ -10,35 +10,12 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, delete, or_, select, update
 
 from graspdb.wire.states import RunState
-from graspdb_service.storage.database import Tx, insert_or, unix_now
+from graspdb_service.storage.database import Tx, first_as, insert_new, unix_now
 from graspdb_service.storage.tables import objects, report_runs
 
 #: The option that stands for the checks there are: another one whenever they change.
 CHECKS = "checks"
-
-
-@dataclass(frozen=True)
-class RunRow:
-    """A run as stored. ``object`` is the object's slug, ``live`` whether somebody holds its lease.
-
-    ``problem`` is a problem's members where a request was at fault; null in a failed run where the service
-    was, or where its process died.
-    """
-
-    id: str
-    object_id: int
-    object: str
-    revision: int
-    report: str
-    parameters_key: str
-    parameters: dict[str, Any]
-    state: str
-    progress: float
-    result: str | None
-    problem: dict[str, Any] | None
-    created_at: datetime
-    finished_at: datetime | None
-    live: bool
+LEASE_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +29,25 @@ class RunKey:
     parameters: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class RunRow(RunKey):
+    """A run as stored. ``object`` is the object's slug, ``live`` whether somebody holds its lease.
+
+    ``problem`` is a problem's members where a request was at fault; null in a failed run where the service
+    was, or where its process died.
+    """
+
+    id: str
+    object: str
+    state: str
+    progress: float
+    result: str | None
+    problem: dict[str, Any] | None
+    created_at: datetime
+    finished_at: datetime | None
+    live: bool
+
+
 def get(tx: Tx, id: str) -> RunRow | None:
     """The run with this id."""
     return _one(tx, report_runs.c.id == id)
@@ -62,29 +58,13 @@ def find(tx: Tx, key: RunKey) -> RunRow | None:
     return _one(tx, _same(key))
 
 
-def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str, lease_s: float) -> bool:
+def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str) -> bool:
     """Take a key's run: make it, or start anew what was cancelled, failed through no fault of the
     request, or whose holder is gone. False where it is done or somebody else's.
     """
-    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
-    made = tx.execute(
-        insert_or(tx, report_runs)
-        .values(
-            id=id,
-            object_id=key.object_id,
-            revision=key.revision,
-            report=key.report,
-            parameters_key=key.parameters_key,
-            parameters=key.parameters,
-            state=RunState.RUNNING,
-            progress=0.0,
-            created_at=datetime.now(UTC),
-            **lease,
-        )
-        .on_conflict_do_nothing()
-        .returning(report_runs.c.id)
-    ).first()
-    if made is None:
+    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + LEASE_S}
+    fresh = {"state": RunState.RUNNING, "progress": 0.0, "created_at": datetime.now(UTC)}
+    if not insert_new(tx, report_runs, id=id, **vars(key), **fresh, **lease):
         return _take(tx, _same(key), lease)
     _delete_superseded(tx, key)
     return True
@@ -115,20 +95,20 @@ def _without_checks(parameters: dict[str, Any]) -> dict[str, Any]:
     return {**parameters, "options": {k: v for k, v in options.items() if k != CHECKS}}
 
 
-def take_over(tx: Tx, id: str, *, lease_id: str, lease_s: float) -> bool:
+def take_over(tx: Tx, id: str, *, lease_id: str) -> bool:
     """Take a run whose holder is gone."""
-    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + lease_s}
+    lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + LEASE_S}
     return _take(tx, and_(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING), lease)
 
 
-def renew(tx: Tx, held: Mapping[str, tuple[str, float]], *, lease_s: float) -> set[str]:
+def renew(tx: Tx, held: Mapping[str, tuple[str, float]]) -> set[str]:
     """Keep runs by ``{id: (lease_id, progress)}``; those that are still held."""
     kept = set()
     for id, (lease_id, progress) in sorted(held.items()):
         statement = (
             update(report_runs)
             .where(_held(id, lease_id))
-            .values(progress=progress, lease_expires_at=unix_now() + lease_s)
+            .values(progress=progress, lease_expires_at=unix_now() + LEASE_S)
         )
         if tx.execute(statement).rowcount:
             kept.add(id)
@@ -161,14 +141,13 @@ def release(tx: Tx, id: str, lease_id: str) -> None:
     tx.execute(update(report_runs).where(_held(id, lease_id)).values(lease_expires_at=0.0))
 
 
-def cancel(tx: Tx, id: str) -> bool:
-    """End a run that is still under way; False where it is not."""
-    statement = (
+def cancel(tx: Tx, id: str) -> None:
+    """End a run if it is still under way."""
+    tx.execute(
         update(report_runs)
         .where(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING)
         .values(state=RunState.CANCELLED, lease_id=None, lease_expires_at=None, finished_at=datetime.now(UTC))
     )
-    return bool(tx.execute(statement).rowcount)
 
 
 def remove(tx: Tx, id: str) -> None:
@@ -208,5 +187,4 @@ def _one(tx: Tx, which: ColumnElement[bool]) -> RunRow | None:
         .join(objects, objects.c.id == report_runs.c.object_id)
         .where(which)
     )
-    row = tx.execute(query).first()
-    return None if row is None else RunRow(**{**row._mapping, "live": bool(row.live)})
+    return first_as(tx, query, RunRow)

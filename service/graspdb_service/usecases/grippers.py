@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from graspdb.wire import GripperCreate, GripperInfo, GripperProfile
 from graspdb_geometry.grippers import PANDA, PG70, GripperShape
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.usecases.geometry.collision import shape_of
 from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 
 
 def seed(database: Database) -> None:
@@ -23,7 +23,7 @@ def seed(database: Database) -> None:
             grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
 
 
-def create(database: Database, request: GripperCreate, *, key: str | None, body: bytes) -> Created:
+def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
     """Store the user's gripper."""
     profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
     _check_shape(profile)
@@ -35,7 +35,7 @@ def create(database: Database, request: GripperCreate, *, key: str | None, body:
             _info(require(tx, request.id)).model_dump(mode="json"), location=f"/grippers/{request.id}"
         )
 
-    return replay_or(database, scope="POST /grippers", key=key, request=body, create=make)
+    return replay_or(database, "POST /grippers", sent, make)
 
 
 def get(database: Database, gripper: str) -> GripperInfo:
@@ -54,15 +54,16 @@ def page(database: Database, *, after: str, limit: int) -> tuple[list[GripperInf
 def require(tx: Tx, gripper: str) -> GripperRow:
     """The gripper, or a 404."""
     row = grippers.find(tx, gripper) if is_slug(gripper) else None
+    return found(row, "gripper", gripper, "GET /grippers lists them, POST /grippers makes one")
+
+
+def named(tx: Tx, gripper: str) -> GripperRow:
+    """The gripper that a request's field names, or a 422."""
+    row = grippers.find(tx, gripper)
     if row is None:
-        raise not_found("gripper", gripper[:80], "GET /grippers lists them, POST /grippers makes one")
+        told = f"there is no gripper {gripper!r}: GET /grippers lists them, POST /grippers makes one"
+        raise invalid("gripper", told)
     return row
-
-
-def unknown(field: str, names: list[str]) -> ProblemError:
-    """422 for a request's field that names grippers which do not exist."""
-    listed = ", ".join(repr(name) for name in names)
-    return invalid(field, f"there is no gripper {listed}: GET /grippers lists them, POST /grippers makes one")
 
 
 def _check_shape(profile: GripperProfile) -> None:
@@ -75,13 +76,7 @@ def _check_shape(profile: GripperProfile) -> None:
 
 
 def _info(row: GripperRow) -> GripperInfo:
-    return GripperInfo(
-        id=row.id,
-        name=row.name,
-        profile=GripperProfile.model_validate(row.profile),
-        builtin=row.builtin,
-        created_at=row.created_at,
-    )
+    return GripperInfo.model_validate(vars(row))
 
 
 def _profile(shape: GripperShape, base_offset_m: float, **facts: float) -> GripperProfile:

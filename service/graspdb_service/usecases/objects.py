@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from graspdb.wire import OUTCOMES, MeshInfo, ObjectCreate, ObjectInfo, ObjectPatch, PartsInfo
-from graspdb_service.problems import conflict, not_found
+from graspdb.wire import OUTCOMES, ObjectCreate, ObjectInfo, ObjectPatch
+from graspdb_service.problems import conflict, found
 from graspdb_service.storage import assets, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.identifiers import is_slug
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 
 
-def create(database: Database, request: ObjectCreate, *, key: str | None, body: bytes) -> Created:
+def create(database: Database, request: ObjectCreate, sent: Sent) -> Created:
     """Store a new object, without mesh and trials."""
 
     def make(tx: Tx) -> Created:
@@ -24,14 +22,13 @@ def create(database: Database, request: ObjectCreate, *, key: str | None, body: 
             info(require(tx, request.id), {}).model_dump(mode="json"), location=f"/objects/{request.id}"
         )
 
-    return replay_or(database, scope="POST /objects", key=key, request=body, create=make)
+    return replay_or(database, "POST /objects", sent, make)
 
 
 def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:
     """The object of this slug (404), and of this internal id (409); ``lock`` holds it for the transaction."""
-    row = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
-    if row is None:
-        raise not_found("object", slug[:80], "GET /objects lists them, POST /objects makes one")
+    known = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
+    row = found(known, "object", slug, "GET /objects lists them, POST /objects makes one")
     if object_id is not None and row.id != object_id:
         raise conflict("object-replaced", f"Object {slug!r} was deleted and created anew: ask again")
     return row
@@ -82,23 +79,13 @@ def remove(database: Database, slug: str) -> None:
 
 def info(row: ObjectRow, counts: dict[int, int]) -> ObjectInfo:
     """An object as the wire has it; ``counts`` are of all its collected trials by outcome code."""
-    return ObjectInfo(
-        id=row.slug,
-        name=row.name,
-        mass_kg=row.mass_kg,
-        density_kg_m3=row.density_kg_m3,
-        friction=row.friction,
-        metadata=row.metadata,
-        revision=row.revision,
-        epoch=row.epoch,
-        mesh=_model(MeshInfo, row.mesh_info),
-        convex_parts=_model(PartsInfo, row.parts_info),
-        trials=sum(counts.values()),
-        outcomes={OUTCOMES[code]: number for code, number in sorted(counts.items())},
-        created_at=row.created_at,
-        updated_at=row.updated_at,
+    return ObjectInfo.model_validate(
+        {
+            **vars(row),
+            "id": row.slug,
+            "mesh": row.mesh_info,
+            "convex_parts": row.parts_info,
+            "trials": sum(counts.values()),
+            "outcomes": {OUTCOMES[code]: number for code, number in sorted(counts.items())},
+        }
     )
-
-
-def _model(kind: Any, document: dict[str, Any] | None) -> Any:
-    return None if document is None else kind.model_validate(document)

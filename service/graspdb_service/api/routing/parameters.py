@@ -1,14 +1,16 @@
-"""What routes take beside their own parameters: the context, a body's bytes, the Idempotency-Key."""
+"""What routes take beside their own parameters: the context, a body's bytes, what a creation takes."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import Depends, Header, Request
+from fastapi import Depends, Header, Request, Response
 
 from graspdb_service.api.context import Context
 from graspdb_service.problems import invalid
+from graspdb_service.usecases.runtime.idempotency import Created, Sent
 
 
 def context(request: Request) -> Context:
@@ -26,12 +28,27 @@ def _key(idempotency_key: Annotated[str | None, Header()] = None) -> str | None:
     return idempotency_key
 
 
-IdempotencyKey = Annotated[str | None, Depends(_key)]
-
-
 async def _raw_body(request: Request) -> bytes:
     return await request.body()
 
 
 RawBody = Annotated[bytes, Depends(_raw_body)]
 """The body's bytes. A large body must never be a FastAPI parameter, which would validate it row by row."""
+
+
+@dataclass(frozen=True)
+class Creation(Sent):
+    """A creating request, and the response that tells where the new thing is."""
+
+    response: Response
+
+    def answered(self, made: Created) -> object:
+        self.response.headers["Location"] = made.location
+        return made.body
+
+
+def _creation(response: Response, body: RawBody, key: Annotated[str | None, Depends(_key)]) -> Creation:
+    return Creation(key, body, response)
+
+
+Creating = Annotated[Creation, Depends(_creation)]

@@ -11,8 +11,8 @@ from typing import Any
 from sqlalchemy import and_, insert, select, update
 
 from graspdb.wire.states import JobState
-from graspdb_service.storage.database import Tx, unix_now
-from graspdb_service.storage.simulation.jobs import COLUMNS, JobRow, job_row
+from graspdb_service.storage.database import Tx, first_as, unix_now
+from graspdb_service.storage.simulation.jobs import AFRESH, COLUMNS, JobRow
 from graspdb_service.storage.tables import jobs, objects
 
 
@@ -27,29 +27,18 @@ class Source:
 def find(tx: Tx, object_id: int) -> JobRow | None:
     """The object's decomposition, whatever became of it."""
     query = select(*COLUMNS).where(jobs.c.object_id == object_id, jobs.c.kind == "decompose")
-    row = tx.execute(query).first()
-    return None if row is None else job_row(row)
+    return first_as(tx, query, JobRow)
 
 
 def source_of(tx: Tx, object_id: int) -> Source | None:
     """What a decomposition is made from."""
-    row = tx.execute(select(objects.c.slug, objects.c.mesh_info).where(objects.c.id == object_id)).first()
-    return None if row is None else Source(row.slug, row.mesh_info)
+    return first_as(tx, select(objects.c.slug, objects.c.mesh_info).where(objects.c.id == object_id), Source)
 
 
 def ask(tx: Tx, object_id: int, job_id: str) -> None:
     """Queue the object's decomposition, anew where it failed or was cancelled; an open one is left alone."""
     found = find(tx, object_id)
-    fresh = {
-        "state": JobState.QUEUED,
-        "attempts": 0,
-        "lease_id": None,
-        "lease_expires_at": None,
-        "worker": None,
-        "progress": None,
-        "error": None,
-        "completed_at": None,
-    }
+    fresh = {**AFRESH, "state": JobState.QUEUED}
     if found is None:
         fixed = {"kind": "decompose", "capability": "decompose", "number": 0, "start": 0, "stop": 0}
         tx.execute(insert(jobs).values(id=job_id, object_id=object_id, **fixed, **fresh))

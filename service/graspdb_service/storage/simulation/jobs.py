@@ -19,8 +19,9 @@ from sqlalchemy import ColumnElement, Select, String, and_, exists, func, or_, s
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
 
+from graspdb.wire import WorkerInfo
 from graspdb.wire.states import JobState
-from graspdb_service.storage.database import Tx, insert_or, unix_now
+from graspdb_service.storage.database import Tx, all_as, first_as, insert_or, unix_now
 from graspdb_service.storage.tables import jobs, workers
 
 OPEN = (JobState.WAITING, JobState.QUEUED, JobState.LEASED)
@@ -60,7 +61,7 @@ class JobRow:
     number: int
     start: int
     stop: int
-    state: JobState
+    state: str
     attempts: int
     lease_id: str | None
     lease_expires_at: float | None
@@ -71,22 +72,10 @@ class JobRow:
     error: str | None
 
 
-@dataclass(frozen=True)
-class WorkerRow:
-    name: str
-    capabilities: list[str]
-    last_seen: float
-    jobs_leased: int
-    jobs_done: int
-    poses_done: int
-
-
 COLUMNS = [jobs.c[name] for name in JobRow.__dataclass_fields__]
-
-
-def job_row(row: Any) -> JobRow:
-    """A row of :data:`COLUMNS`."""
-    return JobRow(**{**row._mapping, "state": JobState(row.state)})
+UNLEASED = {"lease_id": None, "lease_expires_at": None, "worker": None}
+AFRESH = {**UNLEASED, "attempts": 0, "progress": None, "error": None, "completed_at": None}
+"""A job to be done with all its attempts, whatever became of it before."""
 
 
 def job_ids(created_ms: int, count: int, *, urgent: bool) -> list[str]:
@@ -106,8 +95,12 @@ def job_ids(created_ms: int, count: int, *, urgent: bool) -> list[str]:
 
 def find(tx: Tx, job_id: str) -> JobRow | None:
     """The job with this id."""
-    row = tx.execute(select(*COLUMNS).where(jobs.c.id == job_id)).first()
-    return None if row is None else job_row(row)
+    return first_as(tx, select(*COLUMNS).where(jobs.c.id == job_id), JobRow)
+
+
+def _held(job_id: str, lease_id: str | None) -> ColumnElement[bool]:
+    """Whether the lease is still its job's, run out or not."""
+    return and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
 
 
 def _claimable(capabilities: Sequence[str], max_attempts: int) -> ColumnElement[bool]:
@@ -157,7 +150,7 @@ def claim(
         )
         .returning(*COLUMNS)
     )
-    return sorted((job_row(row) for row in tx.execute(statement)), key=lambda job: job.id)
+    return sorted(all_as(tx, statement, JobRow), key=lambda job: job.id)
 
 
 def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str | None = None) -> float | None:
@@ -165,7 +158,7 @@ def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str |
     news = {} if progress is None else {"progress": progress}
     statement = (
         update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
+        .where(_held(job_id, lease_id))
         .values(lease_expires_at=unix_now() + lease_s, **news)
         .returning(jobs.c.lease_expires_at)
     )
@@ -175,18 +168,8 @@ def renew(tx: Tx, job_id: str, lease_id: str, lease_s: float, *, progress: str |
 
 def release(tx: Tx, job_id: str, lease_id: str) -> bool:
     """Give a leased job back; a worker's orderly end counts as no lease. False if the lease is lost."""
-    statement = (
-        update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
-        .values(
-            state=JobState.QUEUED,
-            attempts=jobs.c.attempts - 1,
-            lease_id=None,
-            lease_expires_at=None,
-            worker=None,
-        )
-    )
-    return tx.execute(statement).rowcount == 1
+    values = {**UNLEASED, "state": JobState.QUEUED, "attempts": jobs.c.attempts - 1}
+    return tx.execute(update(jobs).where(_held(job_id, lease_id)).values(values)).rowcount == 1
 
 
 def complete(
@@ -195,7 +178,7 @@ def complete(
     """Mark a job done if the lease is still its own, run out or not. False if it is lost."""
     statement = (
         update(jobs)
-        .where(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
+        .where(_held(job_id, lease_id))
         .values(
             state=JobState.DONE,
             result_sha256=sha256,
@@ -213,7 +196,7 @@ def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -
 
     The job keeps the lease id, so that the same report sent again is recognised.
     """
-    held = and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
+    held = _held(job_id, lease_id)
     ended = tx.execute(
         update(jobs)
         .where(held, jobs.c.attempts >= max_attempts)
@@ -232,19 +215,14 @@ def exhausted(tx: Tx, max_attempts: int) -> list[JobRow]:
     query = select(*COLUMNS).where(
         jobs.c.state == JobState.LEASED, jobs.c.lease_expires_at < unix_now(), jobs.c.attempts >= max_attempts
     )
-    return [job_row(row) for row in tx.execute(query)]
+    return all_as(tx, query, JobRow)
 
 
 def expire(tx: Tx, job: JobRow) -> bool:
     """Fail a job found by :func:`exhausted`, unless its worker came back meanwhile."""
     statement = (
         update(jobs)
-        .where(
-            jobs.c.id == job.id,
-            jobs.c.lease_id == job.lease_id,
-            jobs.c.state == JobState.LEASED,
-            jobs.c.lease_expires_at < unix_now(),
-        )
+        .where(_held(job.id, job.lease_id), jobs.c.lease_expires_at < unix_now())
         .values(
             state=JobState.FAILED,
             error=job.error or STALE_LEASE_ERROR.format(attempts=job.attempts),
@@ -269,9 +247,7 @@ def credit_worker(tx: Tx, name: str | None, poses: int) -> None:
         update(workers)
         .where(workers.c.name == name)
         .values(
-            jobs_done=workers.c.jobs_done + 1,
-            poses_done=workers.c.poses_done + poses,
-            last_seen=unix_now(),
+            jobs_done=workers.c.jobs_done + 1, poses_done=workers.c.poses_done + poses, last_seen=unix_now()
         )
     )
 
@@ -281,7 +257,7 @@ def worker_age(tx: Tx, name: str) -> float | None:
     return tx.scalar(select(unix_now() - workers.c.last_seen).where(workers.c.name == name))
 
 
-def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerRow]:
+def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerInfo]:
     """Workers by name."""
     leased = (
         select(func.count())
@@ -291,7 +267,7 @@ def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerRow]:
     )
     query = (
         select(
-            workers.c.name,
+            workers.c.name.label("worker"),
             workers.c.capabilities,
             workers.c.last_seen,
             leased.label("jobs_leased"),
@@ -302,4 +278,4 @@ def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerRow]:
         .limit(limit)
         .offset(skip)
     )
-    return [WorkerRow(**row._mapping) for row in tx.execute(query)]
+    return all_as(tx, query, WorkerInfo)

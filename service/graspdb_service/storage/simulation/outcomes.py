@@ -7,6 +7,7 @@ sweep without its batch is one whose outcomes were deleted.
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 from sqlalchemy import Select, func, insert, select, update
 
 from graspdb.wire.states import JobState
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, all_as
 from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
 
 
@@ -40,29 +41,27 @@ def store(tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, out
 
 def page(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[PackedChunk]:
     """Finished chunks from ``first_number`` on, in order, until they hold at least ``poses`` poses."""
+    size = jobs.c.stop - jobs.c.start
+    before = func.sum(size).over(order_by=packed_outcomes.c.number) - size
     listed = (
-        select(jobs.c.id, jobs.c.number, jobs.c.start, jobs.c.stop)
-        .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
+        select(packed_outcomes.c.job_id, jobs.c.start, jobs.c.stop, before.label("before"))
+        .join(jobs, jobs.c.id == packed_outcomes.c.job_id)
         .where(packed_outcomes.c.sweep_id == sweep_id, packed_outcomes.c.number >= first_number)
+        .subquery()
+    )
+    query = (
+        select(
+            packed_outcomes.c.sweep_id,
+            packed_outcomes.c.number,
+            listed.c.start,
+            listed.c.stop,
+            packed_outcomes.c.outcomes,
+        )
+        .join(listed, listed.c.job_id == packed_outcomes.c.job_id)
+        .where(listed.c.before < poses)
         .order_by(packed_outcomes.c.number)
     )
-    wanted: dict[str, tuple[int, int, int]] = {}
-    enough = 0
-    for job_id, number, start, stop in tx.execute(listed):
-        wanted[job_id] = (number, start, stop)
-        enough += stop - start
-        if enough >= poses:
-            break
-    chunks = []
-    ids = list(wanted)
-    for first in range(0, len(ids), 500):
-        query = select(packed_outcomes.c.job_id, packed_outcomes.c.outcomes).where(
-            packed_outcomes.c.job_id.in_(ids[first : first + 500])
-        )
-        chunks += [
-            PackedChunk(sweep_id, *wanted[job_id], bytes(content)) for job_id, content in tx.execute(query)
-        ]
-    return sorted(chunks, key=lambda chunk: chunk.number)
+    return all_as(tx, query, PackedChunk)
 
 
 def collected(
@@ -72,7 +71,8 @@ def collected(
     query = _of_object(object_id, "collect").where(
         sweeps.c.provenance_id.in_(sorted(provenance_ids)), packed_outcomes.c.revision > after_revision
     )
-    return _read(tx, query.order_by(packed_outcomes.c.revision, packed_outcomes.c.number))
+    ordered = query.order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
+    return all_as(tx, ordered, PackedChunk)
 
 
 def checked(tx: Tx, object_id: int, *, gripper: str | None, protocol: str | None) -> list[PackedChunk]:
@@ -82,7 +82,7 @@ def checked(tx: Tx, object_id: int, *, gripper: str | None, protocol: str | None
         query = query.where(sweeps.c.gripper == gripper)
     if protocol is not None:
         query = query.where(sweeps.c.protocol == protocol)
-    return _read(tx, query.order_by(sweeps.c.id, packed_outcomes.c.number))
+    return all_as(tx, query.order_by(sweeps.c.id, packed_outcomes.c.number), PackedChunk)
 
 
 def _of_object(object_id: int, purpose: str) -> Select[Any]:
@@ -99,10 +99,6 @@ def _of_object(object_id: int, purpose: str) -> Select[Any]:
         .join(batches, batches.c.sweep_id == sweeps.c.id)
         .where(sweeps.c.object_id == object_id, sweeps.c.purpose == purpose)
     )
-
-
-def _read(tx: Tx, query: Select[Any]) -> list[PackedChunk]:
-    return [PackedChunk(s, int(n), int(a), int(b), bytes(o)) for s, n, a, b, o in tx.execute(query)]
 
 
 def checks_stamp(tx: Tx, object_id: int) -> str:
@@ -135,12 +131,18 @@ class DoneChunk:
 def done_chunks(tx: Tx, sweep_ids: Collection[str]) -> list[DoneChunk]:
     """Finished chunks of these sweeps in commit order, their outcomes left unread."""
     query = (
-        select(jobs.c.id, jobs.c.sweep_id, jobs.c.start, jobs.c.stop, packed_outcomes.c.revision)
+        select(
+            jobs.c.id.label("job_id"),
+            jobs.c.sweep_id,
+            jobs.c.start,
+            jobs.c.stop,
+            packed_outcomes.c.revision,
+        )
         .join(packed_outcomes, packed_outcomes.c.job_id == jobs.c.id)
         .where(jobs.c.sweep_id.in_(sorted(sweep_ids)), jobs.c.state == JobState.DONE)
         .order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
     )
-    return [DoneChunk(i, s, int(a), int(b), int(r)) for i, s, a, b, r in tx.execute(query)]
+    return all_as(tx, query, DoneChunk)
 
 
 def outcomes_of(tx: Tx, job_id: str) -> bytes:
@@ -183,20 +185,13 @@ def add_packed_counts(tx: Tx, job_id: str, counts: Mapping[int, int]) -> None:
     tx.execute(update(jobs).where(jobs.c.id == job_id).values(counts={**stored, "packed": packed}))
 
 
-def packed_counts(tx: Tx, sweep_id: str) -> tuple[int, dict[int, int]]:
-    """The provenance and, by outcome code, the packed outcomes that this sweep added to its tallies.
-
-    Empty for a check, whose outcomes are counted nowhere.
-    """
-    provenance_id = tx.scalar(select(sweeps.c.provenance_id).where(sweeps.c.id == sweep_id))
-    if provenance_id is None:
-        raise LookupError(sweep_id)
-    counts: dict[int, int] = {}
+def packed_counts(tx: Tx, sweep_id: str) -> dict[int, int]:
+    """The packed outcomes by code that a sweep added to its tallies; none for a check, counted nowhere."""
+    counts: Counter[int] = Counter()
     query = select(jobs.c.counts).where(jobs.c.sweep_id == sweep_id, jobs.c.state == JobState.DONE)
-    for (stored,) in tx.execute(query):
-        for code, count in stored["packed"].items():
-            counts[int(code)] = counts.get(int(code), 0) + count
-    return provenance_id, counts
+    for stored in tx.scalars(query):
+        counts.update({int(code): count for code, count in stored["packed"].items()})
+    return counts
 
 
 @dataclass(frozen=True)

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, select, update
 
 from graspdb.wire.states import JobState, SweepState
-from graspdb_service.storage.database import Tx, unix_now
-from graspdb_service.storage.objects import ObjectGone
-from graspdb_service.storage.simulation.jobs import OPEN
+from graspdb.wire.sweeps import FailedChunk
+from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
+from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, sweeps
+from graspdb_service.trial_columns import Floats
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
 POSE_COLUMNS = 8
 _POSE_BYTES = 8 * POSE_COLUMNS
 _JOBS_PER_INSERT = 10_000
+#: How far back the rate looks, seconds.
+_WINDOW_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Progress:
     states: dict[str, int]
     poses_done: int
     counts: dict[str, int]
-    failed: list[tuple[int, int, str]]
+    failed: list[FailedChunk]
     recent_poses: int
     window_s: float
 
@@ -81,25 +84,18 @@ def _query() -> Select[Any]:
     )
 
 
-def lock_object(tx: Tx, object_id: int) -> None:
-    """Take the object's row lock without a new revision."""
-    tx.execute(select(objects.c.id).where(objects.c.id == object_id).with_for_update(key_share=True))
-
-
-def lock_and_read_revision(tx: Tx, object_id: int) -> int:
-    """Take the object's row lock; its revision, which stays as it is, or ObjectGone."""
+def lock_object(tx: Tx, object_id: int) -> int | None:
+    """Take the object's row lock: its revision, which stays as it is; None where it is gone."""
     query = select(objects.c.revision).where(objects.c.id == object_id).with_for_update(key_share=True)
-    revision = tx.scalar(query)
-    if revision is None:
-        raise ObjectGone(f"object {object_id} was deleted")
-    return int(revision)
+    revision: int | None = tx.scalar(query)
+    return revision
 
 
 def create(
     tx: Tx,
     sweep: Mapping[str, Any],
     *,
-    poses: npt.NDArray[np.float64] | None,
+    poses: Floats | None,
     capability: str,
     job_ids: Sequence[str],
     waiting: bool = False,
@@ -147,14 +143,12 @@ def keep_snapshot(tx: Tx, sweep_id: str, snapshot: Mapping[str, Any]) -> None:
 
 def find(tx: Tx, sweep_id: str) -> SweepRow | None:
     """The sweep with this id."""
-    row = tx.execute(_query().where(sweeps.c.id == sweep_id)).first()
-    return None if row is None else SweepRow(**row._mapping)
+    return first_as(tx, _query().where(sweeps.c.id == sweep_id), SweepRow)
 
 
 def find_many(tx: Tx, sweep_ids: Sequence[str]) -> dict[str, SweepRow]:
     """The sweeps with these ids."""
-    rows = tx.execute(_query().where(sweeps.c.id.in_(sweep_ids)))
-    return {row.id: SweepRow(**row._mapping) for row in rows}
+    return {row.id: row for row in all_as(tx, _query().where(sweeps.c.id.in_(sweep_ids)), SweepRow)}
 
 
 def state_of(sweep: SweepRow, failed_chunks: int) -> SweepState:
@@ -190,44 +184,43 @@ def listing(
         query = query.where(_in_state(state))
     if before is not None:
         query = query.where(sweeps.c.id < before)
-    return [SweepRow(**row._mapping) for row in tx.execute(query)]
+    return all_as(tx, query, SweepRow)
 
 
-def progress(tx: Tx, sweep: SweepRow, *, window_s: float = 120.0) -> Progress:
+def progress(tx: Tx, sweep: SweepRow) -> Progress:
     """Chunks by state, outcomes of every finished one, and how fast the last ones went."""
-    states: dict[str, int] = {}
-    poses_done = 0
     totals = (
         select(jobs.c.state, func.count(), func.sum(jobs.c.stop - jobs.c.start))
         .where(jobs.c.sweep_id == sweep.id)
         .group_by(jobs.c.state)
     )
-    for state, count, poses in tx.execute(totals):
-        states[state] = int(count)
-        if state == JobState.DONE:
-            poses_done = int(poses)
-    counts: dict[str, int] = {}
+    found = {state: (int(count), int(poses)) for state, count, poses in tx.execute(totals)}
+    counts: Counter[str] = Counter()
     done = select(jobs.c.counts).where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.DONE)
-    for (stored,) in tx.execute(done):
-        for code, count in stored["all"].items():
-            counts[code] = counts.get(code, 0) + count
-    failed: list[tuple[int, int, str]] = []
-    if states.get(JobState.FAILED):
+    for stored in tx.scalars(done):
+        counts.update(stored["all"])
+    failed: list[FailedChunk] = []
+    if JobState.FAILED in found:
         ended = (
-            select(jobs.c.number, jobs.c.attempts, jobs.c.error)
+            select(
+                jobs.c.number.label("chunk"), jobs.c.attempts, func.coalesce(jobs.c.error, "").label("error")
+            )
             .where(jobs.c.sweep_id == sweep.id, jobs.c.state == JobState.FAILED)
             .order_by(jobs.c.number)
             .limit(100)
         )
-        failed = [(int(number), int(attempts), error or "") for number, attempts, error in tx.execute(ended)]
+        failed = all_as(tx, ended, FailedChunk)
     recent = select(func.sum(jobs.c.stop - jobs.c.start), unix_now()).where(
         jobs.c.sweep_id == sweep.id,
         jobs.c.state == JobState.DONE,
-        jobs.c.completed_at > unix_now() - window_s,
+        jobs.c.completed_at > unix_now() - _WINDOW_S,
     )
     recent_poses, now = tx.execute(recent).one()
+    window_s = _WINDOW_S
     if sweep.started_at is not None:
         window_s = min(window_s, max(now - sweep.started_at.timestamp(), 1e-3))
+    states = {state: count for state, (count, _) in found.items()}
+    _, poses_done = found.get(JobState.DONE, (0, 0))
     return Progress(states, poses_done, counts, failed, int(recent_poses or 0), window_s)
 
 
@@ -240,7 +233,7 @@ def note_started(tx: Tx, sweep_ids: Sequence[str]) -> None:
     )
 
 
-def note_finished(tx: Tx, sweep_id: str) -> bool:
+def note_finished(tx: Tx, sweep_id: str) -> None:
     """Set the end of a sweep if none of its jobs is open; call it under the object's lock."""
     # From the last chunk backwards: while a sweep runs, that is where the open ones are.
     still_open = (
@@ -249,61 +242,47 @@ def note_finished(tx: Tx, sweep_id: str) -> bool:
         .order_by(jobs.c.number.desc())
         .limit(1)
     )
-    if tx.scalar(still_open) is not None:
-        return False
-    tx.execute(
-        update(sweeps)
-        .where(sweeps.c.id == sweep_id, sweeps.c.finished_at.is_(None))
-        .values(finished_at=datetime.now(UTC))
-    )
-    return True
+    if tx.scalar(still_open) is None:
+        tx.execute(
+            update(sweeps)
+            .where(sweeps.c.id == sweep_id, sweeps.c.finished_at.is_(None))
+            .values(finished_at=datetime.now(UTC))
+        )
 
 
-def cancel(tx: Tx, sweep_id: str) -> bool:
-    """Cancel what is not finished; under the object's lock. False if nothing was open."""
+def cancel(tx: Tx, sweep_id: str) -> None:
+    """Cancel what is not finished; under the object's lock."""
     # The lease stays, so that its holder is told to stop rather than that the lease is lost.
     stopped = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_(OPEN))
         .values(state=JobState.CANCELLED, completed_at=unix_now())
     )
-    if stopped.rowcount == 0:
-        return False
-    tx.execute(
-        update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=True, finished_at=datetime.now(UTC))
-    )
-    return True
+    if stopped.rowcount:
+        ended = {"cancelled": True, "finished_at": datetime.now(UTC)}
+        tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(ended))
 
 
-def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> int:
+def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> None:
     """Queue failed and cancelled chunks again, with all their attempts; under the object's lock."""
     again = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]))
-        .values(
-            state=JobState.WAITING if waiting else JobState.QUEUED,
-            attempts=0,
-            lease_id=None,
-            lease_expires_at=None,
-            worker=None,
-            error=None,
-            completed_at=None,
-        )
+        .values(**AFRESH, state=JobState.WAITING if waiting else JobState.QUEUED)
     )
     if again.rowcount:
         tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=False, finished_at=None))
-    return again.rowcount
 
 
-def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> npt.NDArray[np.float64]:
+def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> Floats:
     """Poses ``start`` to ``stop`` of a plan that is no grid: (n, 8) float64, see :data:`POSE_COLUMNS`."""
     part = func.substr(sweeps.c.poses, start * _POSE_BYTES + 1, (stop - start) * _POSE_BYTES)
     content = tx.scalar(select(part).where(sweeps.c.id == sweep_id))
     return np.frombuffer(content or b"", dtype="<f8").reshape(-1, POSE_COLUMNS)
 
 
-def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
-    """Other collecting grid sweeps of the same object, gripper, protocol and fidelity, with their batch."""
+def siblings(tx: Tx, sweep: SweepRow) -> dict[str, SweepRow]:
+    """Other collecting grid sweeps, with their batch, in which a pose index is the same simulation."""
     query = _query().where(
         sweeps.c.object_id == sweep.object_id,
         sweeps.c.provenance_id == sweep.provenance_id,
@@ -313,4 +292,5 @@ def siblings(tx: Tx, sweep: SweepRow) -> list[SweepRow]:
         sweeps.c.id != sweep.id,
         batches.c.id.is_not(None),
     )
-    return [SweepRow(**row._mapping) for row in tx.execute(query.order_by(sweeps.c.id))]
+    found = all_as(tx, query.order_by(sweeps.c.id), SweepRow)
+    return {row.id: row for row in found if row.snapshot["repeat_key"] == sweep.snapshot["repeat_key"]}

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import uuid
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Row, Select, case, delete, func, insert, or_, select, update
+from sqlalchemy import Select, case, delete, func, insert, or_, select, update
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, all_as, first_as
 from graspdb_service.storage.simulation import outcomes
 from graspdb_service.storage.tables import batches, idempotency_keys, packed_outcomes, sweeps, trials
 from graspdb_service.storage.trials import provenances
@@ -74,51 +75,31 @@ def grow(
     packed: int,
     revision: int | None = None,
 ) -> None:
-    """Count rows and packed outcomes that were just written; the range is None where there are no rows."""
-    values: dict[str, Any] = {
-        "inserted": batches.c.inserted + inserted,
-        "packed": batches.c.packed + packed,
-    }
-    if first_seq is not None and last_seq is not None and inserted:
-        # Sequence numbers only rise, so a first one stays the first.
-        values["first_seq"] = func.coalesce(batches.c.first_seq, first_seq)
-        values["last_seq"] = last_seq
+    """Count rows, wherever they lie, and packed outcomes as the batch's; the range is None without rows."""
+    values: dict[str, Any] = {"inserted": batches.c.inserted + inserted, "packed": batches.c.packed + packed}
+    if first_seq is not None and last_seq is not None:
+        first, last = batches.c.first_seq, batches.c.last_seq
+        values["first_seq"] = case((or_(first.is_(None), first > first_seq), first_seq), else_=first)
+        values["last_seq"] = case((or_(last.is_(None), last < last_seq), last_seq), else_=last)
     if revision is not None:
         values["revision"] = revision
     tx.execute(update(batches).where(batches.c.id == batch_id).values(values))
 
 
-def inherit(
-    tx: Tx, batch_id: int, *, first_seq: int | None, last_seq: int | None, inserted: int, packed: int
-) -> None:
-    """Count rows, wherever they lie, and packed outcomes that another batch had stored before."""
-    values: dict[str, Any] = {"inserted": batches.c.inserted + inserted, "packed": batches.c.packed + packed}
-    if first_seq is not None and last_seq is not None:
-        for name, given, better in (
-            ("first_seq", first_seq, batches.c.first_seq > first_seq),
-            ("last_seq", last_seq, batches.c.last_seq < last_seq),
-        ):
-            column = batches.c[name]
-            values[name] = case((or_(column.is_(None), better), given), else_=column)
-    tx.execute(update(batches).where(batches.c.id == batch_id).values(values))
-
-
 def find(tx: Tx, object_id: int, key: str) -> BatchRow | None:
     """The object's batch with this key."""
-    row = tx.execute(_query().where(batches.c.object_id == object_id, batches.c.key == key)).first()
-    return None if row is None else _batch(row)
+    return first_as(tx, _query().where(batches.c.object_id == object_id, batches.c.key == key), BatchRow)
 
 
 def of_sweep(tx: Tx, sweep_id: str) -> BatchRow | None:
     """The batch a sweep writes; None once it was deleted."""
-    row = tx.execute(_query().where(batches.c.sweep_id == sweep_id)).first()
-    return None if row is None else _batch(row)
+    return first_as(tx, _query().where(batches.c.sweep_id == sweep_id), BatchRow)
 
 
 def page(tx: Tx, object_id: int, *, after: int, limit: int) -> list[BatchRow]:
     """Up to ``limit`` batches in the order of their making, from the one after the internal id ``after``."""
     query = _query().where(batches.c.object_id == object_id, batches.c.id > after)
-    return [_batch(row) for row in tx.execute(query.order_by(batches.c.id).limit(limit))]
+    return all_as(tx, query.order_by(batches.c.id).limit(limit), BatchRow)
 
 
 def origins(tx: Tx, ids: Iterable[int]) -> dict[int, BatchOrigin]:
@@ -142,14 +123,14 @@ def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
 
 def outcome_counts(tx: Tx, batch: BatchRow) -> dict[int, int]:
     """Everything a batch holds by outcome code: rows, and the packed outcomes of its sweep."""
-    counts: dict[int, int] = {}
+    counts: Counter[int] = Counter()
     if batch.sweep_id is not None:
         if batch.purpose == "check":
             return _packed_codes(tx, batch.sweep_id)
         # Not every code of the packed outcomes: poses that another sweep had stored before count there.
-        _, counts = outcomes.packed_counts(tx, batch.sweep_id)
+        counts.update(outcomes.packed_counts(tx, batch.sweep_id))
     for (_, outcome), number in row_counts(tx, batch).items():
-        counts[outcome] = counts.get(outcome, 0) + number
+        counts[outcome] += number
     return counts
 
 
@@ -162,7 +143,7 @@ def remove(tx: Tx, batch: BatchRow) -> None:
     rows = row_counts(tx, batch)
     if batch.sweep_id is not None:
         if batch.purpose == "collect" and batch.provenance_id is not None:
-            _, packed = outcomes.packed_counts(tx, batch.sweep_id)
+            packed = outcomes.packed_counts(tx, batch.sweep_id)
             provenances.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items()})
         tx.execute(delete(packed_outcomes).where(packed_outcomes.c.sweep_id == batch.sweep_id))
     if batch.first_seq is not None:
@@ -193,7 +174,3 @@ def _query() -> Select[Any]:
     return select(batches, sweeps.c.provenance_id, sweeps.c.purpose).select_from(
         batches.outerjoin(sweeps, sweeps.c.id == batches.c.sweep_id)
     )
-
-
-def _batch(row: Row[Any]) -> BatchRow:
-    return BatchRow(**row._mapping)

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb_service.trial_columns import Bools
+
 HEADER = b"PGCOPY\n\xff\r\n\x00" + struct.pack(">ii", 0, 0)
 END = struct.pack(">h", -1)
 
@@ -29,7 +31,7 @@ def _kind(name: str) -> str:
 def encode(
     count: int,
     values: dict[str, Any],
-    nulls: dict[str, NDArray[np.bool_]],
+    nulls: dict[str, Bools],
     documents: Sequence[Sequence[Any]],
 ) -> bytes:
     """``count`` rows of the columns ``values``, null where ``nulls`` says so, and of JSON ``documents``."""
@@ -40,7 +42,7 @@ def encode(
     table = np.zeros(count, dtype=dtype)
     table["fields"] = len(values) + len(documents)
     # Which bytes to keep (None: all): a null's value has none.
-    kept: NDArray[np.bool_] | None = None
+    kept: Bools | None = None
     for name, value in values.items():
         table[name] = value
         table[f"{name}_bytes"] = dtype[name].itemsize
@@ -60,9 +62,7 @@ def encode(
     return HEADER + body + END
 
 
-def _with_documents(
-    rows: NDArray[np.uint8], kept: NDArray[np.bool_] | None, documents: Sequence[Sequence[Any]]
-) -> bytes:
+def _with_documents(rows: NDArray[np.uint8], kept: Bools | None, documents: Sequence[Sequence[Any]]) -> bytes:
     pieces = []
     for number, row in enumerate(rows):
         pieces.append((row if kept is None else row[kept[number]]).tobytes())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from sqlalchemy import and_, func, insert, select
 
@@ -11,15 +10,6 @@ from graspdb_service.storage.database import Tx, insert_or
 from graspdb_service.storage.tables import provenances
 from graspdb_service.storage.tables import tallies as tallied
 from graspdb_service.trial_columns import Provenance
-
-
-class ProvenanceRow(NamedTuple):
-    """A :class:`Provenance` as stored."""
-
-    id: int
-    gripper: str | None
-    source: str | None
-    protocol: str | None
 
 
 def ensure(tx: Tx, object_id: int, provenance: Provenance) -> int:
@@ -35,11 +25,11 @@ def ensure(tx: Tx, object_id: int, provenance: Provenance) -> int:
     return int(tx.execute(statement).scalar_one())
 
 
-def of_object(tx: Tx, object_id: int) -> list[ProvenanceRow]:
-    """Every combination the object's trials (or planned sweeps) have."""
-    columns = (provenances.c[name] for name in ProvenanceRow._fields)
+def of_object(tx: Tx, object_id: int) -> dict[int, Provenance]:
+    """Every combination the object's trials (or planned sweeps) have, by id."""
+    columns = (provenances.c[name] for name in ("id", *Provenance._fields))
     query = select(*columns).where(provenances.c.object_id == object_id).order_by(provenances.c.id)
-    return [ProvenanceRow(*row) for row in tx.execute(query)]
+    return {number: Provenance(*names) for number, *names in tx.execute(query)}
 
 
 def add_tally(tx: Tx, provenance_id: int, outcome: int, *, rows: int = 0, packed: int = 0) -> None:

@@ -6,7 +6,8 @@ SQLAlchemy builds no statement a row here: SQLite takes tuples by ``executemany`
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import closing
 from datetime import UTC, datetime
 from itertools import chain
 from typing import Any, cast
@@ -19,13 +20,13 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import trials
 from graspdb_service.storage.trials import binary_copy, provenances
 from graspdb_service.storage.trials.binary_copy import json_text
-from graspdb_service.trial_columns import Floats, Ints, TrialColumns
+from graspdb_service.trial_columns import Ints, TrialColumns
 
 SUCCESS = 1
 COPY_ROWS = 50_000
 
 _POSE = ("px", "py", "pz", "qx", "qy", "qz", "qw")
-_NUMBERS = ("proposal_density", "quality", "width_m")
+_OPTIONAL = ("proposal_density", "quality", "width_m", "pose_index")
 _DOCUMENTS = ("pose_covariance", "metadata")
 
 
@@ -40,7 +41,7 @@ def insert(
         _insert_tuples(tx, shared, columns, first_seq)
     else:
         for start in range(0, len(columns), COPY_ROWS):
-            _copy_in(tx, shared, columns, first_seq, slice(start, min(start + COPY_ROWS, len(columns))))
+            _copy_in(tx, shared, columns[start : start + COPY_ROWS], first_seq + start)
     pairs, counts = np.unique(
         np.stack([columns.provenance, columns.outcome.astype(np.int64)], axis=1), axis=0, return_counts=True
     )
@@ -48,24 +49,27 @@ def insert(
         provenances.add_tally(tx, provenance_id, outcome, rows=number)
 
 
+def _numbers(columns: TrialColumns, first_seq: int) -> dict[str, NDArray[Any]]:
+    """The columns of numbers that some of the trials have, NaN for null."""
+    found = {
+        "seq": np.arange(first_seq, first_seq + len(columns)),
+        "provenance_id": columns.provenance,
+        "outcome": columns.outcome,
+        **dict(zip(_POSE, (*columns.position.T, *columns.quaternion_xyzw.T), strict=True)),
+        **{name: getattr(columns, name) for name in _OPTIONAL},
+    }
+    return {name: values for name, values in found.items() if not np.isnan(values).all()}
+
+
 def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
     # What all rows share stands in the statement, and what none has is left out: binding is half the time.
-    lists: dict[str, Iterable[Any]] = {
-        "seq": range(first_seq, first_seq + len(columns)),
-        "provenance_id": columns.provenance.tolist(),
-        "outcome": columns.outcome.tolist(),
-        **dict(zip(_POSE[:3], columns.position.T.tolist(), strict=True)),
-        **dict(zip(_POSE[3:], columns.quaternion_xyzw.T.tolist(), strict=True)),
-    }
-    for name in _NUMBERS:
-        values: Floats = getattr(columns, name)
+    lists: dict[str, list[Any]] = {}
+    for name, values in _numbers(columns, first_seq).items():
         missing = np.isnan(values)
-        if not missing.all():
-            given = values.astype(object)
-            given[missing] = None
-            lists[name] = given.tolist()
-    if len(columns.pose_index):
-        lists["pose_index"] = columns.pose_index.tolist()
+        if missing.any():
+            values = values.astype(object)
+            values[missing] = None
+        lists[name] = values.tolist()
     converters: dict[str, Callable[[Any], str]] = {"measured_at": _sqlite_time}
     for name in ("measured_at", *_DOCUMENTS):
         items, convert = getattr(columns, name), converters.get(name, json_text)
@@ -74,49 +78,30 @@ def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_
     names = ", ".join([*shared, *lists])
     places = ", ".join([str(int(value)) for value in shared.values()] + ["?"] * len(lists))
     rows = zip(*lists.values(), strict=True)
-    cursor = tx.connection.cursor()
-    try:
+    with closing(tx.connection.cursor()) as cursor:
         # The driver takes any iterator: no list of tuples is built.
         cursor.executemany(f"INSERT INTO trials ({names}) VALUES ({places})", rows)  # type: ignore[arg-type]
-    finally:
-        cursor.close()
 
 
 def _sqlite_time(value: datetime) -> str:
     return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
 
 
-def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int, part: slice) -> None:
-    count = part.stop - part.start
-    values: dict[str, Any] = {
-        **shared,
-        "seq": np.arange(first_seq + part.start, first_seq + part.stop),
-        "provenance_id": columns.provenance[part],
-        "outcome": columns.outcome[part],
-        **dict(zip(_POSE[:3], columns.position[part].T, strict=True)),
-        **dict(zip(_POSE[3:], columns.quaternion_xyzw[part].T, strict=True)),
-    }
-    nulls: dict[str, NDArray[np.bool_]] = {}
-    for name in _NUMBERS:
-        column: Floats = getattr(columns, name)[part]
-        missing = np.isnan(column)
-        if not missing.all():
-            values[name], nulls[name] = column, missing
-    if len(columns.pose_index):
-        values["pose_index"] = columns.pose_index[part]
-    times = columns.measured_at[part]
+def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
+    values: dict[str, Any] = {**shared, **_numbers(columns, first_seq)}
+    nulls = {name: np.isnan(values[name]) for name in _OPTIONAL if name in values}
+    times = columns.measured_at
     if times:
         nulls["measured_at"] = np.array([time is None for time in times])
         values["measured_at"] = np.array([binary_copy.microseconds(time) for time in times], dtype=np.int64)
-    documents = {name: getattr(columns, name)[part] for name in _DOCUMENTS if getattr(columns, name)}
-    content = binary_copy.encode(count, values, nulls, list(documents.values()))
-    cursor = tx.connection.cursor()
-    try:
-        names = ", ".join([*values, *documents])
-        with cursor.copy(f"COPY trials ({names}) FROM STDIN (FORMAT BINARY)") as copy:
-            copy.write(content)
-    finally:
-        cursor.close()
+    documents = {name: getattr(columns, name) for name in _DOCUMENTS if getattr(columns, name)}
+    content = binary_copy.encode(len(columns), values, nulls, list(documents.values()))
+    names = ", ".join([*values, *documents])
+    with (
+        closing(tx.connection.cursor()) as cursor,
+        cursor.copy(f"COPY trials ({names}) FROM STDIN (FORMAT BINARY)") as copy,
+    ):
+        copy.write(content)
 
 
 def move(
@@ -140,86 +125,76 @@ def move(
 _READ = ("seq", *_POSE, "proposal_density", "provenance_id", "outcome")
 
 
-def read(
+def successes(tx: Tx, object_id: int, provenance_ids: Collection[int], *, after_seq: int = 0) -> TrialColumns:
+    """Successes after a sequence number, ascending ``seq``, with the batch each came in."""
+    # Said literally, as the partial index has it.
+    return _read(tx, object_id, provenance_ids, after_seq, (*_READ, "batch_id"), f"outcome = {SUCCESS}")
+
+
+def posted(
     tx: Tx,
     object_id: int,
+    provenance_ids: Collection[int],
     *,
-    provenance_ids: Sequence[int] | None,
-    successes_only: bool,
     after_seq: int = 0,
-    swept: bool = True,
-    without: Sequence[int] = (),
-    batches: bool = False,
+    without: Collection[int] = (),
 ) -> TrialColumns:
-    """What the maths needs of an object's trials, ascending ``seq``, those after ``after_seq``.
-
-    ``swept=False`` leaves out those that a sweep stored, ``without`` those with these outcome codes;
-    ``batches`` reads which batch each is of.
-    """
-    columns = (*_READ, "batch_id") if batches else _READ
-    where = [f"object_id = {int(object_id)}", f"seq > {int(after_seq)}"]
-    if not swept:
-        # Only a sweep's trials have a place in a plan.
-        where.append("pose_index IS NULL")
-    if without:
-        where.append(f"outcome NOT IN ({', '.join(str(int(code)) for code in without)})")
-    if successes_only:
-        # Said literally, as the partial index has it.
-        where.append(f"outcome = {SUCCESS}")
-    where += _of_provenances(provenance_ids)
-    condition = " AND ".join(where)
-    return (_read_tuples if tx.dialect.name == "sqlite" else _copy_out)(tx, columns, condition)
+    """Trials that no sweep stored, ascending ``seq``, but for those with the outcome codes ``without``."""
+    codes = ", ".join(str(int(code)) for code in without)
+    # Only a sweep's trials have a place in a plan.
+    conditions = ["pose_index IS NULL", *([f"outcome NOT IN ({codes})"] if codes else [])]
+    return _read(tx, object_id, provenance_ids, after_seq, _READ, *conditions)
 
 
-def _of_provenances(ids: Sequence[int] | None) -> list[str]:
-    if ids is None:
-        return []
-    return [f"provenance_id IN ({', '.join(str(int(number)) for number in ids) or 'NULL'})"]
-
-
-def _read_tuples(tx: Tx, columns: Sequence[str], where: str) -> TrialColumns:
+def _read(
+    tx: Tx,
+    object_id: int,
+    provenance_ids: Collection[int],
+    after_seq: int,
+    columns: Sequence[str],
+    *conditions: str,
+) -> TrialColumns:
+    where = [*_after(object_id, after_seq), *conditions, _of_provenances(provenance_ids)]
     # NULL would make an array of Python objects; no proposal density is negative.
     names = ", ".join(f"coalesce({name}, -1.0)" if name == "proposal_density" else name for name in columns)
-    cursor = tx.connection.cursor()
-    try:
-        cursor.execute(f"SELECT {names} FROM trials WHERE {where} ORDER BY seq")
-        # Straight into an array: lists of rows would take longer, and much more memory.
-        rows = cast("Iterable[Sequence[float]]", cursor)
-        table = np.fromiter(chain.from_iterable(rows), dtype=np.float64).reshape(-1, len(columns))
-    finally:
-        cursor.close()
-    return TrialColumns(
-        seq=table[:, 0].astype(np.int64),
-        position=np.ascontiguousarray(table[:, 1:4]),
-        quaternion_xyzw=np.ascontiguousarray(table[:, 4:8]),
-        proposal_density=np.where(table[:, 8] < 0, np.nan, table[:, 8]),
-        provenance=table[:, 9].astype(np.int64),
-        outcome=table[:, 10].astype(np.uint8),
-        # Empty where it was not read.
-        batch=table[:, 11:].ravel().astype(np.int64),
-    )
-
-
-def _copy_out(tx: Tx, columns: Sequence[str], where: str) -> TrialColumns:
-    names = ", ".join(
-        f"coalesce({name}, 'NaN'::float8)" if name == "proposal_density" else name for name in columns
-    )
-    cursor = tx.connection.cursor()
-    try:
-        query = f"COPY (SELECT {names} FROM trials WHERE {where} ORDER BY seq) TO STDOUT (FORMAT BINARY)"
-        with cursor.copy(query) as copy:
-            table = binary_copy.decode(b"".join(copy), columns)
-    finally:
-        cursor.close()
+    query = f"SELECT {names} FROM trials WHERE {' AND '.join(where)} ORDER BY seq"
+    table = (_tuples if tx.dialect.name == "sqlite" else _copied)(tx, query, columns)
+    proposal = table["proposal_density"].astype(np.float64)
     return TrialColumns(
         seq=table["seq"].astype(np.int64),
         position=np.stack([table[name].astype(np.float64) for name in _POSE[:3]], axis=1),
         quaternion_xyzw=np.stack([table[name].astype(np.float64) for name in _POSE[3:]], axis=1),
-        proposal_density=table["proposal_density"].astype(np.float64),
+        proposal_density=np.where(proposal < 0, np.nan, proposal),
         provenance=table["provenance_id"].astype(np.int64),
         outcome=table["outcome"].astype(np.uint8),
         batch=table["batch_id"].astype(np.int64) if "batch_id" in columns else np.empty(0, dtype=np.int64),
     )
+
+
+def _after(object_id: int, after_seq: int) -> list[str]:
+    return [f"object_id = {int(object_id)}", f"seq > {int(after_seq)}"]
+
+
+def _of_provenances(ids: Collection[int]) -> str:
+    return f"provenance_id IN ({', '.join(str(int(number)) for number in ids) or 'NULL'})"
+
+
+def _tuples(tx: Tx, query: str, columns: Sequence[str]) -> Mapping[str, NDArray[Any]]:
+    with closing(tx.connection.cursor()) as cursor:
+        cursor.execute(query)
+        # Straight into an array: lists of rows would take longer, and much more memory.
+        rows = cast("Iterable[Sequence[float]]", cursor)
+        table = np.fromiter(chain.from_iterable(rows), dtype=np.float64).reshape(-1, len(columns))
+    return dict(zip(columns, table.T, strict=True))
+
+
+def _copied(tx: Tx, query: str, columns: Sequence[str]) -> Mapping[str, NDArray[Any]]:
+    with (
+        closing(tx.connection.cursor()) as cursor,
+        cursor.copy(f"COPY ({query}) TO STDOUT (FORMAT BINARY)") as copy,
+    ):
+        table = binary_copy.decode(b"".join(copy), columns)
+    return {name: table[name] for name in columns}
 
 
 def read_swept(tx: Tx, object_id: int, batch_id: int, first: int, last: int) -> tuple[Ints, Ints]:
@@ -234,19 +209,16 @@ def read_swept(tx: Tx, object_id: int, batch_id: int, first: int, last: int) -> 
 
 
 def _fetch(tx: Tx, query: str) -> list[Any]:
-    cursor = tx.connection.cursor()
-    try:
+    with closing(tx.connection.cursor()) as cursor:
         cursor.execute(query)
         return list(cursor.fetchall())
-    finally:
-        cursor.close()
 
 
 # --- reading everything ---------------------------------------------------------------------------------
 
 _ALL = (
-    "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, *_NUMBERS,
-    "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS,
+    "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, "proposal_density", "quality",
+    "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS,
 )  # fmt: skip
 
 
@@ -263,7 +235,9 @@ def page(
     since_revision: int | None = None,
 ) -> TrialColumns:
     """Up to ``limit`` trials after a sequence number; ``since_revision`` keeps what was stored after it."""
-    where = [f"object_id = {int(object_id)}", f"seq > {int(after_seq)}", *_of_provenances(provenance_ids)]
+    where = _after(object_id, after_seq)
+    if provenance_ids is not None:
+        where.append(_of_provenances(provenance_ids))
     for condition, value in (
         ("seq <=", up_to_seq),
         # Said literally, as the partial index has it.

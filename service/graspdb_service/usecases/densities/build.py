@@ -11,16 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, WeightsInfo
 from graspdb_density import (
     DEFAULT_KERNEL,
     DiagonalKernel,
     GraspDensity,
-    IsotropicKernel,
     MixtureDensity,
     ModeSearch,
     SampledKernel,
@@ -35,16 +34,11 @@ from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.proposal_density import Exposure
 from graspdb_service.usecases.geometry.features import Axes
 from graspdb_service.usecases.trials.selection import Selected
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Poses = tuple[Floats, Floats, Bools]
-"""Positions (n, 3), quaternions (n, 4), and whether the jaw is symmetric (n,)."""
 
 _DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
 _DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
@@ -52,6 +46,13 @@ _DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
 _LEAST_SHARE = 1e-30
 #: Weights that differ by less count as the same.
 _SAME = 1e-9
+
+
+class Grasps(NamedTuple):
+    """Poses (n,), and whether the jaw of each is symmetric (n,)."""
+
+    poses: se3.Poses
+    symmetric: Bools
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Built:
     exposure: Exposure
     kernel: KernelInfo
     density: GraspDensity | None
-    seq: NDArray[np.int64]
+    seq: Ints
     proposal_density: Floats
     swept: Bools
     chosen_from: int = 0
@@ -162,8 +163,7 @@ def build(
 
     413 for more components than a density may have.
     """
-    symmetric = np.array([selected.provenances[int(p)] for p in rows.provenance], dtype=bool)
-    fresh = rows.position, rows.quaternion_xyzw, symmetric
+    fresh = Grasps(rows.poses, selected.symmetric(rows.provenance))
     seq, proposal = rows.seq, rows.proposal_density
     swept = np.isin(rows.batch, sorted(exposure.batches))
     old = None if before is None else before.density
@@ -187,26 +187,27 @@ def build(
     if not len(seq):
         return built
 
-    def everything() -> Poses:
+    def everything() -> Grasps:
         if old is None:
             return fresh
-        of_old = old.positions, old.quaternions_xyzw, old.symmetric
-        position, quaternion, flags = (np.concatenate(pair) for pair in zip(of_old, fresh, strict=True))
-        return position, quaternion, flags
+        return Grasps(
+            se3.Poses.concatenate([old.poses, fresh.poses]), np.concatenate([old.symmetric, fresh.symmetric])
+        )
 
     weights = _weights(built, everything)
     added = None if old is None else _in_units_of(old, weights, len(rows))
-    if stored is not None and not for_success:
-        return _shaped(stored, axes, built, before, everything, fresh, weights, added)
-    if before is not None and before.chosen_from == built.chosen_from:
+    shaping = None if for_success else stored
+    same_widths = before is not None and before.chosen_from == built.chosen_from
+    if before is not None and same_widths:
         built = replace(built, kernel=before.kernel)
-        if old is not None and added is not None:
-            longer = old.extend(se3.Poses.of(*fresh[:2]), weights=added, symmetric=symmetric)
-            return _searched(replace(built, density=longer), before)
     elif built.chosen_from:
         chosen = _choose(everything(), proposal, built.chosen_from, threads)
         built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
-    return _searched(replace(built, density=_isotropic(built.kernel, everything(), weights)), None)
+    if shaping is not None and shaping.kind == "sampled":
+        _check_components(stored_kernel.load_sampled(shaping), everything().symmetric)
+    if before is not None and same_widths and old is not None and added is not None:
+        return _searched(_extended(built, before, old, shaping, axes, fresh, added), before)
+    return _searched(_made(built, shaping, axes, everything(), weights), None)
 
 
 def _searched(built: Built, before: Built | None) -> Built:
@@ -217,68 +218,49 @@ def _searched(built: Built, before: Built | None) -> Built:
     return replace(built, search=before.search.extended(built.asked, built.density))
 
 
-def _isotropic(kernel: KernelInfo, poses: Poses, weights: Floats | None) -> GraspDensity:
-    position, quaternion, symmetric = poses
-    return GraspDensity.build(
-        se3.Poses.of(position, quaternion),
-        kernel=IsotropicKernel(kernel.sigma_position_m, math.radians(kernel.sigma_rotation_deg)),
-        weights=weights,
-        symmetric=symmetric,
-    )
-
-
-def _shaped(
-    stored: KernelRow,
-    axes: Axes,
-    built: Built,
-    before: Built | None,
-    everything: Callable[[], Poses],
-    fresh: Poses,
-    weights: Floats | None,
-    added: Floats | None,
+def _made(
+    built: Built, shaping: KernelRow | None, axes: Axes, grasps: Grasps, weights: Floats | None
 ) -> Built:
-    """The density under a stored kernel."""
-    if stored.kind == "sampled":
-        kernel = stored_kernel.load_sampled(stored)
-        position, quaternion, symmetric = everything()
-        _check_components(kernel, len(position), len(position) + int(symmetric.sum()))
-        old = None if before is None else before.density
-        if before is not None and old is not None and before.sampled is not None and added is not None:
-            alike = old.extend(se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2])
-            sampled = _placed(before.sampled, kernel, fresh, added)
-            return _searched(replace(built, density=alike, sampled=sampled), before)
-        alike = _isotropic(built.kernel, (position, quaternion, symmetric), weights)
-        sampled = kernel.placed(se3.Poses.of(position, quaternion), weights=weights, symmetric=symmetric)
-        return _searched(replace(built, density=alike, sampled=sampled), None)
-    if before is not None and before.shaped is not None and added is not None:
-        frames = stored_kernel.axes_at(axes, se3.Poses(*fresh[:2]))
-        shaped = before.shaped.extend(
-            se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2], frames=frames
-        )
-        return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
-    position, quaternion, symmetric = everything()
-    poses = se3.Poses.of(position, quaternion)
-    shaped = MixtureDensity(
-        poses,
-        kernel=stored_kernel.load(stored),
-        weights=weights,
-        symmetric=symmetric,
-        frames=stored_kernel.axes_at(axes, poses),
-    )
-    return _searched(replace(built, density=shaped.isotropic, shaped=shaped), None)
+    """The density of all grasps, under the stored kernel that shapes it, if any."""
+    poses, symmetric = grasps
+    if shaping is not None and shaping.kind != "sampled":
+        kernel, frames = stored_kernel.load(shaping), stored_kernel.axes_at(axes, poses)
+        shaped = MixtureDensity(poses, kernel=kernel, weights=weights, symmetric=symmetric, frames=frames)
+        return replace(built, density=shaped.isotropic, shaped=shaped)
+    widths = stored_kernel.isotropic(built.kernel)
+    density = GraspDensity.build(poses, kernel=widths, weights=weights, symmetric=symmetric)
+    if shaping is None:
+        return replace(built, density=density)
+    sampled = stored_kernel.load_sampled(shaping).placed(poses, weights=weights, symmetric=symmetric)
+    return replace(built, density=density, sampled=sampled)
 
 
-def _placed(old: GraspDensity, kernel: SampledKernel, fresh: Poses, added: Floats) -> GraspDensity:
-    """The density of a sampled kernel's components with those of further grasps."""
-    if not len(added):
-        return old
-    more = kernel.placed(se3.Poses.of(*fresh[:2]), weights=added, symmetric=fresh[2])
-    total = float(added.sum())
-    return old.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
+def _extended(
+    built: Built,
+    before: Built,
+    old: GraspDensity,
+    shaping: KernelRow | None,
+    axes: Axes,
+    fresh: Grasps,
+    added: Floats,
+) -> Built:
+    """The density ``old`` of ``before`` with further grasps, weights in its unit."""
+    poses, symmetric = fresh
+    if before.shaped is not None:
+        frames = stored_kernel.axes_at(axes, poses)
+        shaped = before.shaped.extend(poses, weights=added, symmetric=symmetric, frames=frames)
+        return replace(built, density=shaped.isotropic, shaped=shaped)
+    sampled = before.sampled
+    if sampled is not None and shaping is not None and len(added):
+        more = stored_kernel.load_sampled(shaping).placed(poses, weights=added, symmetric=symmetric)
+        total = float(added.sum())
+        sampled = sampled.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
+    return replace(built, density=old.extend(poses, added, symmetric), sampled=sampled)
 
 
-def _check_components(kernel: SampledKernel, rows: int, placed: int) -> None:
-    """413 for more components than a density may have; ``placed`` counts the turns of symmetric jaws, too."""
+def _check_components(kernel: SampledKernel, symmetric: Bools) -> None:
+    """413 for more components than a density of these grasps, and of symmetric jaws' turns, may have."""
+    rows, placed = len(symmetric), len(symmetric) + int(symmetric.sum())
     many = kernel.size * placed
     if many <= MOST_COMPONENTS:
         return
@@ -299,11 +281,11 @@ def _check_components(kernel: SampledKernel, rows: int, placed: int) -> None:
 # -- weights -----------------------------------------------------------------------------------------------
 
 
-def _weights(built: Built, everything: Callable[[], Poses]) -> Floats | None:
+def _weights(built: Built, everything: Callable[[], Grasps]) -> Floats | None:
     """Weights (N,) of eq 1, their mean 1, no row lost to rounding; None where all are equal."""
     g, swept = built.proposal_density, built.swept
     if swept.any():
-        positions = everything()[0] if built.exposure.several else None
+        positions = everything().poses.positions if built.exposure.several else None
         g = g.copy()
         g[swept] = built.exposure.uniform if positions is None else built.exposure.density(positions[swept])
     known = g[~np.isnan(g)]
@@ -329,7 +311,7 @@ def _in_units_of(old: GraspDensity, weights: Floats | None, count: int) -> Float
     return added if np.isfinite(added).all() and (added > 0.0).all() else None
 
 
-def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelInfo:
+def _choose(grasps: Grasps, proposal: Floats, count: int, threads: int) -> KernelInfo:
     """Widths chosen from the first rows.
 
     By their own proposal densities: how much else was tried since must not change what they choose.
@@ -339,14 +321,10 @@ def _choose(poses: Poses, proposal: Floats, count: int, threads: int) -> KernelI
     if not np.isnan(proposal[first]).all():
         weights = importance_weights(proposal[first])
         weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
-    position, quaternion, symmetric = (column[first] for column in poses)
-    found = choose_widths(Rows.of(se3.Poses.of(position, quaternion), weights, symmetric), threads=threads)
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=found.kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(found.kernel.sigma_rotation),
-        rule=f"default: {found.rule} likelihood of the first {found.rows} successes",
-    )
+    rows = Rows.of(grasps.poses[first], weights, grasps.symmetric[first])
+    found = choose_widths(rows, threads=threads)
+    rule = f"default: {found.rule} likelihood of the first {found.rows} successes"
+    return stored_kernel.isotropic_info(found.kernel, rule)
 
 
 def _info(choice: KernelChoice) -> KernelInfo:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
-import numpy as np
+import math
+from dataclasses import replace
 
 from graspdb.wire import KernelSpec, Selection
+from graspdb.wire.queries import TrialSelection
 from graspdb_density.kde.isotropic import CUTOFF
 from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import conflict, invalid, invalid_fields, not_found
 from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
@@ -19,69 +19,39 @@ from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
-from graspdb_service.usecases.trials.selection import Filters, Selected, Selections, as_of
+from graspdb_service.usecases.trials.selection import Selected, Selections, as_of
 
-__all__ = ["Built", "Densities", "KernelChoice", "kernel_of"]
-
+_WIDTHS: dict[str, tuple[float, float]] = {
+    "sigma_position_m": POSITION_LIMITS_M,
+    "sigma_rotation_deg": (math.degrees(ROTATION_LIMITS[0]), math.degrees(ROTATION_LIMITS[1])),
+}
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
     """The kernel and the cut-off (None: exact) of a request; 422 for widths beside a stored kernel."""
-    choice, cutoff = _choice(request)
-    for name, value, (low, high) in (
-        ("sigma_position_m", choice.sigma_position_m, POSITION_LIMITS_M),
-        ("sigma_rotation_deg", choice.sigma_rotation_deg, np.degrees(ROTATION_LIMITS)),
-    ):
-        if value is not None and not low <= value <= high:
-            raise invalid(name, f"a width must be between {low:g} and {high:g}")
-    return choice, cutoff
-
-
-def _choice(request: Selection) -> tuple[KernelChoice, float | None]:
-    beside = KernelChoice(request.sigma_position_m, request.sigma_rotation_deg)
     kernel = request.kernel
-    if isinstance(kernel, KernelSpec):
-        inside = KernelChoice(kernel.sigma_position_m, kernel.sigma_rotation_deg)
-        twice = [
-            name
-            for name in ("sigma_position_m", "sigma_rotation_deg")
-            if getattr(inside, name) is not None and getattr(beside, name) is not None
-        ]
-        if twice:
-            raise ProblemError(
-                422,
-                "invalid-request",
-                "A width is given both in kernel and beside it",
-                errors=[(name, "give it once, in kernel or beside it") for name in twice],
-            )
-        choice = KernelChoice(
-            inside.sigma_position_m if beside.sigma_position_m is None else beside.sigma_position_m,
-            inside.sigma_rotation_deg if beside.sigma_rotation_deg is None else beside.sigma_rotation_deg,
-        )
-        if "cutoff" not in kernel.model_fields_set:
-            return choice, CUTOFF
-        exact = kernel.cutoff is None or kernel.cutoff > _LARGEST_CUTOFF
-        return choice, None if exact else kernel.cutoff
-    if kernel in (None, "isotropic"):
-        return beside, CUTOFF
-    given = [name for name in ("sigma_position_m", "sigma_rotation_deg") if getattr(beside, name) is not None]
-    if given:
-        raise ProblemError(
-            422,
-            "invalid-request",
-            "A stored kernel has its own widths",
-            errors=[(name, "only the isotropic kernel takes widths") for name in given],
-        )
-    return KernelChoice(stored=kernel), CUTOFF
-
-
-@dataclass(frozen=True)
-class _Key:
-    object_id: int
-    filters: Filters
-    kernel: KernelChoice
+    beside = {name: getattr(request, name) for name in _WIDTHS}
+    given = [name for name, width in beside.items() if width is not None]
+    if isinstance(kernel, str) and kernel != "isotropic":
+        if given:
+            told = "only the isotropic kernel takes widths"
+            raise invalid_fields([(name, told) for name in given], "A stored kernel has its own widths")
+        return KernelChoice(stored=kernel), CUTOFF
+    inside = kernel if isinstance(kernel, KernelSpec) else KernelSpec()
+    twice = [name for name in given if getattr(inside, name) is not None]
+    if twice:
+        told = "give it once, in kernel or beside it"
+        title = "A width is given both in kernel and beside it"
+        raise invalid_fields([(name, told) for name in twice], title)
+    widths = {name: getattr(inside, name) if width is None else width for name, width in beside.items()}
+    for name, (low, high) in _WIDTHS.items():
+        if widths[name] is not None and not low <= widths[name] <= high:
+            raise invalid(name, f"a width must be between {low:g} and {high:g}")
+    cutoff = inside.cutoff if "cutoff" in inside.model_fields_set else CUTOFF
+    exact = cutoff is None or cutoff > _LARGEST_CUTOFF
+    return KernelChoice(**widths), None if exact else cutoff
 
 
 class Densities:
@@ -104,7 +74,8 @@ class Densities:
         self.selections = selections
         self._compute = compute
         self._features = features
-        self._cache: SingleFlightCache[_Key, Built] = SingleFlightCache(max_bytes, lambda b: b.nbytes)
+        self.kept: SingleFlightCache[tuple[int, TrialSelection, KernelChoice], Built]
+        self.kept = SingleFlightCache(max_bytes, lambda built: built.nbytes)
 
     def get(self, selected: Selected, kernel: KernelChoice) -> Built:
         """The density of a selection, at least as new; refused as :meth:`stored`, and as the selection where
@@ -114,8 +85,8 @@ class Densities:
         if kernel.stored is not None:
             stored = self.stored(selected, kernel.stored)
             kernel = KernelChoice(stored=stored.id)
-        return self._cache.get(
-            _Key(selected.row.id, selected.filters, kernel),
+        return self.kept.get(
+            (selected.row.id, selected.filters, kernel),
             lambda built: built.revision >= selected.row.revision,
             lambda before: self._refresh(selected, kernel, stored, before),
         )
@@ -123,20 +94,17 @@ class Densities:
     def requested(self, slug: str, request: Selection) -> Built:
         """The density that a request is about."""
         choice, _ = kernel_of(request)
-        return self.get(self.selections.resolve(slug, Filters.of(request)), choice)
+        return self.get(self.selections.resolve(slug, request), choice)
 
     def stored(self, selected: Selected, name: str) -> KernelRow:
         """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""
         row = selected.row
         with self._database.read() as tx:
-            if name == "anisotropic":
-                newest = kernels.newest(tx, row.id, selected.gripper)
-                found = None if newest is None else kernels.find(tx, newest)
-            else:
-                found = kernels.find(tx, name)
+            newest = name == "anisotropic"
+            found = kernels.newest(tx, row.id, selected.gripper) if newest else kernels.find(tx, name)
             others = [] if found else kernels.page(tx, after=0, limit=20, object_id=row.id, gripper=None)
         names = ["isotropic", *(kernel.id for kernel in others)]
-        if found is None and name == "anisotropic":
+        if found is None and newest:
             gripper = f', "gripper": "{selected.gripper}"' if selected.gripper else ""
             raise conflict(
                 "kernel-not-fitted",
@@ -154,13 +122,6 @@ class Densities:
             )
         return found
 
-    @property
-    def nbytes(self) -> int:
-        return self._cache.nbytes
-
-    def __len__(self) -> int:
-        return len(self._cache)
-
     def _refresh(
         self, selected: Selected, kernel: KernelChoice, stored: KernelRow | None, before: Built | None
     ) -> Built:
@@ -170,14 +131,8 @@ class Densities:
             if before is not None and before.object_row.epoch != row.epoch:
                 before = None
             exposure = proposal_density.read(tx, selected)
-            rows = trial_rows.read(
-                tx,
-                row.id,
-                provenance_ids=list(selected.provenances),
-                successes_only=True,
-                after_seq=0 if before is None else before.object_row.last_seq,
-                batches=True,
-            )
+            after_seq = 0 if before is None else before.object_row.last_seq
+            rows = trial_rows.successes(tx, row.id, selected.provenances, after_seq=after_seq)
         # Failures of one grid change no weight, those of several do.
         if before is not None and not len(rows) and (exposure == before.exposure or not exposure.several):
             return replace(before, selected=selected, exposure=exposure)

@@ -25,8 +25,6 @@ from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected
 
-__all__ = ["Prior", "Priors"]
-
 _POSITION_M, _ROTATION_DEG = 0.01, 15.0
 #: Grasps looked at; more where too few of them are free, as on an object that hardly fits the jaw.
 _LOOKED_AT, _MOST, _ENOUGH = 16_384, 131_072, 1_024
@@ -57,22 +55,14 @@ class _Made:
         return 4_096 + (0 if self.search is None else self.search.density.nbytes + self.search.nbytes)
 
 
-@dataclass(frozen=True)
-class _Key:
-    mesh: str | None
-    unit: str
-    parts: str | None
-    profile: str
-    kernel: IsotropicKernel
-
-
 class Priors:
     """The priors of one service process, by the content of geometry and gripper."""
 
     def __init__(self, compute: Compute, scenes: Scenes) -> None:
         self._compute = compute
         self._scenes = scenes
-        self._cache: SingleFlightCache[_Key, _Made] = SingleFlightCache(_MAX_BYTES, lambda m: m.nbytes)
+        self._cache: SingleFlightCache[tuple[object, ...], _Made]
+        self._cache = SingleFlightCache(_MAX_BYTES, lambda made: made.nbytes)
 
     def get(self, selected: Selected, choice: KernelChoice) -> Prior:
         """The prior of an object for a gripper; ``choice`` may name other widths than 10 mm and 15 degrees.
@@ -94,13 +84,8 @@ class Priors:
                 f" {1e3 * selected.profile.max_opening_m:.0f} mm, as far as the jaw opens: name a wider"
                 " gripper",
             )
-        key = _Key(
-            row.mesh_sha256,
-            "" if row.mesh_info is None else str(row.mesh_info["unit"]),
-            row.parts_sha256,
-            selected.profile.model_dump_json(),
-            kernel,
-        )
+        unit = None if row.mesh_info is None else row.mesh_info["unit"]
+        key = (row.mesh_sha256, unit, row.parts_sha256, selected.profile.model_dump_json(), kernel)
         symmetric = selected.jaw_symmetric
 
         def make(_: _Made | None) -> _Made:
@@ -116,13 +101,12 @@ class Priors:
                 f"The open gripper collides wherever it could close on two surfaces or edges of {row.slug!r}:"
                 " name another gripper, or sweep a grid",
             )
-        rule = (
-            f"about {made.search.density.size:,} grasps on {made.pairs:,} pairs of surfaces, edges and points"
+        on = f"{made.pairs:,} pairs of surfaces, edges and points"
+        rule = f"edges: about {made.search.density.size:,} grasps on {on}"
+        return Prior(
+            made.search,
+            KernelInfo(kind="isotropic", sigma_position_m=metres, sigma_rotation_deg=degrees, rule=rule),
         )
-        info = KernelInfo(
-            kind="isotropic", sigma_position_m=metres, sigma_rotation_deg=degrees, rule=f"edges: {rule}"
-        )
-        return Prior(made.search, info)
 
     def known(self, selected: Selected, choice: KernelChoice) -> Prior | None:
         """As :meth:`get`, None where there is none or it can't be known."""

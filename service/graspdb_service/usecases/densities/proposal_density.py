@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import GridPlan
+from graspdb_density import HAAR_VOLUME
 from graspdb_density.kde.importance_weights import pooled_density
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import outcomes
 from graspdb_service.storage.simulation.outcomes import TriedGrid
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
 
-Floats = NDArray[np.float64]
 Corner = tuple[float, float, float]
 
 #: A trial this share of a step from the face of a region lies on it: half of its surroundings are inside.
@@ -125,7 +125,7 @@ def _lattice(
     density = step = 0.0
     for grids in alike:
         plan = GridPlan.model_validate({**grids[0].grid, "max_poses": None})
-        box = _box(plan)
+        box = _box(plan.model_dump_json())
         density, step = box.density, plan.position_step_m
         places = grids[0].kept
         if grids[0].sweep_id in ranges:
@@ -144,12 +144,8 @@ class _Box:
     density: float
 
 
-def _box(plan: GridPlan) -> _Box:
-    return _box_of(plan.model_dump_json())
-
-
 @lru_cache(maxsize=256)
-def _box_of(plan: str) -> _Box:
+def _box(plan: str) -> _Box:
     """The cubes of one step about a grid's positions, and its poses without ``max_poses``."""
     grid = sweep_plan.pose_grid(GridPlan.model_validate_json(plan))
     ends = np.array([grid.pose_indices(0, 1)[0], grid.pose_indices(grid.total - 1, grid.total)[0]])
@@ -159,7 +155,7 @@ def _box_of(plan: str) -> _Box:
         tuple((corners[0] - half).tolist()),
         tuple((corners[1] + half).tolist()),
         grid.total,
-        grid.total / (sweep_plan.ROTATION_VOLUME * grid.volume_m3),
+        grid.total / (HAAR_VOLUME * grid.volume_m3),
     )
 
 

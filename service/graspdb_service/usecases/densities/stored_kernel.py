@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, KernelWidths
 from graspdb_density import AnisotropicKernel, DiagonalKernel, IsotropicKernel, SampledKernel, se3
@@ -13,35 +12,48 @@ from graspdb_density.kernels.gaussian_mixture import mirror
 from graspdb_service.problems import conflict
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.geometry.features import Axes, Features
 from graspdb_service.usecases.trials.selection import Selected
-
-Floats = NDArray[np.float64]
 
 
 def load(row: KernelRow) -> AnisotropicKernel:
     """The kernel of a stored row, which was checked when it came."""
     return AnisotropicKernel(
-        np.array([item["weight"] for item in row.components]),
-        np.array([item["mean"] for item in row.components]),
-        np.array([item["covariance"] for item in row.components]),
+        _all(row, "weight"),
+        _all(row, "mean"),
+        _all(row, "covariance"),
         "gripper" if row.alignment == "gripper" else "fixed",
     )
 
 
+def _all(row: KernelRow, name: str) -> Floats:
+    """What all components have of this name."""
+    return np.array([item[name] for item in row.components])
+
+
 def load_sampled(row: KernelRow) -> SampledKernel:
     """The kernel of a stored row of the kind ``sampled``, which was checked when it came."""
-    means = np.array([item["mean"] for item in row.components])
-    return SampledKernel(
-        se3.Poses.of(means[:, :3], se3.from_rotation_vector(means[:, 3:])),
-        _component(row),
-        np.array([item["weight"] for item in row.components]),
-    )
+    means = _all(row, "mean")
+    displacements = se3.Poses.of(means[:, :3], se3.from_rotation_vector(means[:, 3:]))
+    return SampledKernel(displacements, _component(row), _all(row, "weight"))
 
 
 def _component(row: KernelRow) -> IsotropicKernel:
-    widths = KernelWidths.model_validate(row.provenance["component_widths"])
+    return isotropic(KernelWidths.model_validate(row.provenance["component_widths"]))
+
+
+def isotropic(widths: KernelWidths | KernelInfo) -> IsotropicKernel:
+    """The isotropic kernel of these widths."""
     return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
+
+
+def isotropic_info(kernel: IsotropicKernel, rule: str) -> KernelInfo:
+    """What a query says of an isotropic kernel; ``rule`` chose its widths."""
+    degrees = math.degrees(kernel.sigma_rotation)
+    return KernelInfo(
+        kind="isotropic", sigma_position_m=kernel.sigma_position_m, sigma_rotation_deg=degrees, rule=rule
+    )
 
 
 def axes(alignment: str, selected: Selected, features: Features) -> Axes:
@@ -66,8 +78,7 @@ def covariance_of(row: KernelRow) -> Floats:
     """(6, 6) of a kernel's displacements, the spread of its components' means included."""
     if row.kind != "sampled":
         return load(row).overall_covariance
-    means = np.array([item["mean"] for item in row.components])
-    weights = np.array([item["weight"] for item in row.components])
+    means, weights = _all(row, "mean"), _all(row, "weight")
     # With the mirror images, as it is used.
     both = np.concatenate([means, means * mirror("gripper")])
     share = np.concatenate([weights, weights]) / (2.0 * weights.sum())

@@ -10,42 +10,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel
+from graspdb.wire.queries import TrialSelection
+from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessEstimate, SuccessModel
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.trial_columns import Bools
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials, Stored
-from graspdb_service.usecases.trials.selection import Filters, Selected, as_of
-
-Floats = NDArray[np.float64]
+from graspdb_service.usecases.trials.selection import Selected, as_of
 
 LEVEL = 0.9
 #: Attempts of the random sample that searches feel their way by where a model has far more of them.
 _SAMPLE, _LARGE = 100_000, 400_000
-
-
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """Columns (n,); NaN where nothing is known."""
-
-    probability: Floats
-    low: Floats
-    high: Floats
-    effective_trials: Floats
-
-    @classmethod
-    def unknown(cls, count: int) -> Estimates:
-        """Before any attempt."""
-        nothing = np.full(count, np.nan)
-        return cls(nothing, nothing.copy(), nothing.copy(), np.zeros(count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +49,9 @@ class _Attempts:
         return 4_096 + sum(part.nbytes for part in (self.model, self.sample) if part is not None)
 
 
+_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None)
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """All attempts, and the ones to search by: a random sample where all would take too long."""
@@ -76,7 +63,7 @@ class Model:
 @dataclass(frozen=True)
 class _Key:
     object_id: int
-    filters: Filters
+    filters: TrialSelection
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool
@@ -89,7 +76,7 @@ class Successes:
     def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
         self._database = database
         self._compute = compute
-        self._cache: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
+        self.kept: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
     def model(self, built: Built, *, collisions_known: bool) -> Model | None:
         """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
@@ -104,7 +91,7 @@ class Successes:
             collisions_known,
             built.success_kernel,
         )
-        found = self._cache.get(
+        found = self.kept.get(
             key,
             lambda a: a.revision >= built.revision,
             lambda before: self._refresh(key, built.selected, before),
@@ -113,38 +100,28 @@ class Successes:
             return None
         return Model(found.model, found.sample or found.model)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all models kept."""
-        return self._cache.nbytes
+    def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> SuccessEstimate:
+        """Success probability of poses (n,) under a model from :meth:`model`, NaN where nothing is known.
 
-    def estimate(
-        self,
-        model: Model | None,
-        poses: Poses,
-        free: NDArray[np.bool_] | None,
-    ) -> Estimates:
-        """Success probability of poses (n,) under a model from :meth:`model`.
-
-        Parameters
-        ----------
-        free : (n,) bool or None
-            Whether the open gripper is free of the object there; None where geometry or gripper is unknown.
+        ``free`` (n,) tells whether the open gripper is free of the object there; None where geometry or
+        gripper is unknown.
         """
-        estimates = Estimates.unknown(len(poses))
+        nothing = np.full((3, len(poses)), np.nan)
+        found = SuccessEstimate(nothing[0], nothing[1], nothing[2], np.zeros(len(poses)), LEVEL)
         if model is not None:
-
-            def work(part: slice) -> None:
-                answer = model.whole.evaluate(poses[part], level=LEVEL, threads=self._compute.threads)
-                estimates.probability[part] = answer.probability
-                estimates.low[part], estimates.high[part] = answer.low, answer.high
-                estimates.effective_trials[part] = answer.effective_trials
-
-            self._compute.blocks(len(poses), 16_384, work)
+            work = partial(model.whole.evaluate, level=LEVEL, threads=self._compute.threads)
+            parts = self._compute.blocks(poses, work)
+            found = SuccessEstimate(
+                np.concatenate([part.probability for part in parts]),
+                np.concatenate([part.low for part in parts]),
+                np.concatenate([part.high for part in parts]),
+                np.concatenate([part.effective_trials for part in parts]),
+                LEVEL,
+            )
         if free is not None:
-            for column in (estimates.probability, estimates.low, estimates.high):
+            for column in (found.probability, found.low, found.high):
                 column[~free] = 0.0
-        return estimates
+        return found
 
     def _refresh(self, key: _Key, selected: Selected, before: _Attempts | None) -> _Attempts:
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]
@@ -152,64 +129,42 @@ class Successes:
             selected = as_of(tx, selected)
             row = selected.row
             # A source whose first failure has come counts from now on with all it has posted.
-            if before is not None and (before.epoch != row.epoch or before.tried != selected.tried):
-                before = None
+            if before is None or before.epoch != row.epoch or before.tried != selected.tried:
+                before = _NONE
             stored = _fetch(tx, selected, without, before)
-            names = {**({} if before is None else before.sweeps), **stored.repeat_keys}
-            if before is not None and len(set(names.values())) < len(names):
+            names = {**before.sweeps, **stored.repeat_keys}
+            if before.sweeps and len(set(names.values())) < len(names):
                 # Two sweeps of one grid share poses, which count once: looked at together.
-                before = None
-                stored = _fetch(tx, selected, without, None)
+                before = _NONE
+                stored = _fetch(tx, selected, without, before)
         isotropic = IsotropicKernel(key.sigma_position_m, math.radians(key.sigma_rotation_deg))
         kernel = key.success_kernel or isotropic
-        old, sample = (None, None) if before is None else (before.model, before.sample)
-        new = self._compute.run(lambda: _Columns.of(attempts.joined(stored)))
-        size = len(new.success) + (0 if old is None else old.size)
+        old, sample = before.model, before.sample
+        new = self._compute.run(lambda: attempts.joined(stored))
+        size = len(new) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
             return self._refresh(key, selected, None)
-        model = self._compute.run(lambda: _extended(old, new, kernel))
+        every = np.ones(len(new), dtype=np.bool_)
+        model = self._compute.run(lambda: _extended(old, new, every, kernel))
         if size > _LARGE:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
-            chosen = np.random.default_rng(row.revision).random(len(new.success)) < share
-            sample = self._compute.run(lambda: _extended(sample, new.take(chosen), kernel))
+            chosen = np.random.default_rng(row.revision).random(len(new)) < share
+            sample = self._compute.run(lambda: _extended(sample, new, chosen, kernel))
         return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
 
 
-def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts | None) -> Stored:
-    return attempts.fetch(
-        tx,
-        selected,
-        without=without,
-        after_seq=0 if before is None else before.last_seq,
-        after_revision=0 if before is None else before.revision,
-    )
+def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts) -> Stored:
+    since = {"after_seq": before.last_seq, "after_revision": before.revision}
+    return attempts.fetch(tx, selected, without=without, **since)
 
 
-def _extended(old: SuccessModel | None, new: _Columns, kernel: SuccessKernel) -> SuccessModel | None:
-    if not len(new.success):
+def _extended(
+    old: SuccessModel | None, new: AllTrials, rows: Bools, kernel: SuccessKernel
+) -> SuccessModel | None:
+    """A model with some attempts more."""
+    if not rows.any():
         return old
-    columns = Poses.of(new.position, new.quaternion), new.success
-    if old is not None:
-        return old.extend(*columns, symmetric=new.symmetric)
-    return SuccessModel.build(*columns, kernel=kernel, symmetric=new.symmetric)
-
-
-@dataclass(frozen=True, eq=False)
-class _Columns:
-    """Attempts (n,): pose, whether it succeeded, whether its jaw is symmetric."""
-
-    position: Floats
-    quaternion: Floats
-    success: NDArray[np.bool_]
-    symmetric: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, found: AllTrials) -> _Columns:
-        """What a model of success needs of them."""
-        return cls(found.position, found.quaternion, found.success, found.symmetric)
-
-    def take(self, chosen: NDArray[np.bool_]) -> _Columns:
-        return _Columns(
-            self.position[chosen], self.quaternion[chosen], self.success[chosen], self.symmetric[chosen]
-        )
+    if old is None:
+        return new.success_model(kernel, rows)
+    return old.extend(new.poses[rows], new.success[rows], symmetric=new.symmetric[rows])

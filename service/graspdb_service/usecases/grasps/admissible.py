@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb_density import GraspDensity, se3
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Admissible
 from graspdb_geometry.grippers import GripperShape
+from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.grasps.constraints import Constraints
-
-Bools = NDArray[np.bool_]
 
 #: A chance is told within so many standard deviations of a success, position and rotation together. Farther
 #: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.

@@ -18,7 +18,6 @@ from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, question_of
 from graspdb_service.usecases.grasps.search import closest
-from graspdb_service.usecases.trials.selection import Filters
 
 _NEAREST_TRIALS = 5
 
@@ -26,15 +25,12 @@ _NEAREST_TRIALS = 5
 def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
     """The best distinct grasps under the request's constraints, and the object's internal id.
 
-    Raises
-    ------
-    ProblemError
-        422 naming fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that
-        are not there, and as the selection.
+    422 names fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that are not
+    there, and as the selection.
     """
     choice, _ = kernel_of(request)
     with ctx.compute.admitted():
-        selected = ctx.densities.selections.resolve(slug, Filters.of(request))
+        selected = ctx.densities.selections.resolve(slug, request)
         limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
         built = ctx.densities.get(selected, choice)
         question = question_of(ctx, request, built, limits)
@@ -122,7 +118,7 @@ def _world(limits: Constraints, item: Maximum) -> WorldPose | None:
     """A grasp in the world frame, where the object's pose is known."""
     if limits.object_pose is None:
         return None
-    p, q = se3.compose(se3.Poses(*limits.object_pose), se3.Poses(item.position, item.quaternion_xyzw))
+    p, q = se3.compose(limits.object_pose, se3.Poses(item.position, item.quaternion_xyzw))
     q = se3.canonical(se3.normalise(q))
     return WorldPose(position=tuple(p.tolist()), quaternion_xyzw=tuple(q.tolist()))
 

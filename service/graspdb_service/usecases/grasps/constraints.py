@@ -7,17 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from graspdb.wire import BestGraspRequest, GraspConstraints, Obstacles, Pose, PoseColumns
 from graspdb_density import Region, se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import PointCloud, Scene, box_part
-from graspdb_service.problems import ProblemError
-
-Floats = NDArray[np.float64]
-Frame = tuple[Floats, Floats]
+from graspdb_service.problems import ProblemError, invalid_fields
+from graspdb_service.trial_columns import Floats
 
 _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.
@@ -29,19 +26,14 @@ _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 class Constraints:
     """What bounds a grasp, in the object frame, and what its parts were called in the request.
 
-    Attributes
-    ----------
-    object_pose
-        The object frame in the world frame (position, quaternion), where it was given.
-    obstacles
-        What the gripper must not touch besides the object.
-    candidates, exclude
-        The only ones to rank, and those to stay away from.
+    ``object_pose`` is the object frame in the world frame, one pose, where it was given; ``obstacles`` what
+    the gripper must not touch besides the object; ``candidates`` the only poses to rank, ``exclude`` those to
+    stay away from.
     """
 
     region: Region
     half_space_names: tuple[str, ...]
-    object_pose: Frame | None
+    object_pose: Poses | None
     obstacles: tuple[Scene | PointCloud, ...] = ()
     candidates: Poses | None = None
     exclude: Poses | None = None
@@ -68,14 +60,15 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
     pose = None
     if request.object_pose is not None:
         values = np.array(request.object_pose)
-        pose = values[:3], values[3:]
+        pose = Poses(values[:3], values[3:])
     in_world = pose is not None and request.frame != "object"
     shift, turn = pose if in_world and pose is not None else (np.zeros(3), se3.IDENTITY)
     rotation = se3.to_matrix(turn)
 
-    names, planes = _planes(request)
+    planes = _planes(request)
+    names = [name for name, _, _ in planes]
     # n . (R x + t) >= d is (R^T n) . x >= d - n . t.
-    rows = [[*(rotation.T @ normal), d - float(normal @ shift)] for normal, d in planes]
+    rows = [[*(rotation.T @ normal), d - float(normal @ shift)] for _, normal, d in planes]
     spheres = None
     if request.sphere is not None:
         centre = rotation.T @ (np.array(request.sphere[:3]) - shift)
@@ -98,8 +91,7 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
         # What is left to contradict after the checks above are the two cones.
         cones = ("approach_cone_deg", "closing_cone_deg")
         raise _contradiction([(name, str(error)) for name in cones]) from None
-    inwards = se3.inverse(se3.Poses(shift, turn))
-    into = inwards.positions, inwards.quaternions_xyzw
+    into = se3.inverse(Poses(shift, turn))
     posted = request if isinstance(request, BestGraspRequest) else BestGraspRequest()
     return Constraints(
         region,
@@ -111,53 +103,46 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
     )
 
 
-def _planes(request: GraspConstraints) -> tuple[list[str], list[tuple[Floats, float]]]:
-    """Half spaces n, d by the names of the fields they come from."""
-    names: list[str] = []
-    planes: list[tuple[Floats, float]] = []
-    for axis, low in zip(_AXES, request.box_min or (), strict=False):
-        names.append("box_min")
-        planes.append((axis, low))
-    for axis, high in zip(_AXES, request.box_max or (), strict=False):
-        names.append("box_max")
-        planes.append((-axis, -high))
+def _planes(request: GraspConstraints) -> list[tuple[str, Floats, float]]:
+    """Half spaces n, d, each with the name of the field it comes from."""
+    planes = [("box_min", axis, low) for axis, low in zip(_AXES, request.box_min or (), strict=False)]
+    planes += [("box_max", -axis, -high) for axis, high in zip(_AXES, request.box_max or (), strict=False)]
     given = [] if request.above_plane is None else [("above_plane", request.above_plane)]
     if isinstance(request, BestGraspRequest):
         given += [(f"half_spaces.{i}", row) for i, row in enumerate(request.half_spaces or ())]
     for name, row in given:
-        normal = np.array(row[:3])
-        length = float(np.linalg.norm(normal))
-        names.append(name)
-        planes.append((normal / length, row[3] / length))
-    return names, planes
+        length = float(np.linalg.norm(row[:3]))
+        planes.append((name, np.array(row[:3]) / length, row[3] / length))
+    return planes
 
 
-def _obstacles(given: Obstacles | None, into: Frame) -> tuple[Scene | PointCloud, ...]:
+def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud, ...]:
     solids: list[Scene | PointCloud] = []
     if given is not None and given.boxes:
         parts = []
         for box in given.boxes:
-            p, q = se3.compose(
-                se3.Poses(*into), se3.Poses(np.array(box.position), np.array(box.quaternion_xyzw))
-            )
+            p, q = se3.compose(into, Poses(np.array(box.position), np.array(box.quaternion_xyzw)))
             parts.append(box_part(np.array(box.size_m) / 2, p, q))
         solids.append(Scene(parts))
     if given is not None and given.points:
-        points = into[0] + se3.rotate(into[1], np.array(given.points))
+        points = into.positions + se3.rotate(into.quaternions_xyzw, np.array(given.points))
         solids.append(PointCloud(points, given.point_radius_m))
     return tuple(solids)
 
 
-def _moved(poses: Sequence[Pose] | PoseColumns | None, into: Frame) -> Poses | None:
-    if poses is None:
+def _moved(given: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | None:
+    if given is None:
         return None
-    if isinstance(poses, PoseColumns):
-        p, q = np.array(poses.position), np.array(poses.quaternion_xyzw)
-    else:
-        p = np.array([pose.position for pose in poses]).reshape(-1, 3)
-        q = np.array([pose.quaternion_xyzw for pose in poses]).reshape(-1, 4)
-    p, q = se3.compose(Poses(*into), Poses(p, q))
+    p, q = se3.compose(into, poses_of(given))
     return Poses(p, se3.normalise(q))
+
+
+def poses_of(given: Sequence[Pose] | PoseColumns) -> Poses:
+    """A request's poses in either form."""
+    if isinstance(given, PoseColumns):
+        return Poses(np.array(given.position), np.array(given.quaternion_xyzw))
+    p = np.array([pose.position for pose in given]).reshape(-1, 3)
+    return Poses(p, np.array([pose.quaternion_xyzw for pose in given]).reshape(-1, 4))
 
 
 def _apart(names: Sequence[str], planes: Floats, sphere: Floats | None) -> list[str]:
@@ -247,9 +232,7 @@ def _objective(request: GraspConstraints) -> list[tuple[str, str]]:
 
 
 def _contradiction(errors: list[tuple[str, str]]) -> ProblemError:
-    return ProblemError(
-        422, "invalid-request", "The constraints are incomplete or contradict each other", errors=errors
-    )
+    return invalid_fields(errors, "The constraints are incomplete or contradict each other")
 
 
 def _radians(degrees: float | None) -> float | None:

@@ -3,61 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graspdb.wire import KernelInfo, Selection
+from graspdb.wire import Selection
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
+from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.densities.success_models import LEVEL
-from graspdb_service.usecases.geometry.collision import CollisionTest
-
-Floats = NDArray[np.float64]
-
-#: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
-_BLOCK = 16_384
-
-
-@dataclass(frozen=True, eq=False)
-class LikelihoodAnswer:
-    """Columns (n,) in the poses' order, None where not asked for or not known.
-
-    ``log_density`` is minus infinity where the density is exactly zero; NaN stands for not known.
-    """
-
-    object_id: int
-    revision: int
-    kernel: KernelInfo
-    density: Floats | None = None
-    log_density: Floats | None = None
-    relative: Floats | None = None
-    collision_free: NDArray[np.bool_] | None = None
-    success_probability: Floats | None = None
-    interval: tuple[Floats, Floats] | None = None
-    effective_trials: Floats | None = None
-
-    def columns(self) -> dict[str, Any]:
-        """Those there are, by their names in an answer."""
-        names = (
-            "density",
-            "log_density",
-            "relative",
-            "success_probability",
-            "effective_trials",
-            "collision_free",
-        )
-        columns = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        if self.interval is not None:
-            columns["interval"] = {"level": LEVEL, "low": self.interval[0], "high": self.interval[1]}
-        return columns
 
 
 def likelihood(
@@ -66,8 +25,12 @@ def likelihood(
     request: Selection,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> LikelihoodAnswer:
-    """How likely poses (n,) in the object frame are under the density of the successes."""
+) -> tuple[Built, dict[str, Any]]:
+    """How likely poses (n,) in the object frame are under the density of the successes, and that density.
+
+    Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
+    is minus infinity where the density is exactly zero; NaN stands for not known.
+    """
     count = len(poses)
     if count > ctx.settings.max_query_poses:
         raise ProblemError(
@@ -78,64 +41,38 @@ def likelihood(
         )
     _, cutoff = kernel_of(request)
 
-    def asked(*names: LikelihoodColumn) -> bool:
+    def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
 
     with ctx.compute.admitted():
         built = ctx.densities.requested(slug, request)
-        logs = relative = free = None
+        columns: dict[str, Any] = {}
+        free, threads = None, ctx.compute.threads
         if asked("density", "log_density", "relative"):
-            search = built.search
-            if search is None:
-                logs, relative = np.full(count, -np.inf), np.zeros(count)
-            else:
+            search, relative = built.search, np.zeros(count)
+            logs = np.full(count, -np.inf)
+            if search is not None:
                 logs = log_density(ctx, search.density, poses, cutoff)
                 if asked("relative"):
-                    relative = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
+                    relative = ctx.compute.run(partial(search.relative, logs, threads))
+            density = np.exp(logs) if asked("density") else None
+            columns |= {"density": density, "log_density": logs, "relative": relative}
         chances = asked("success_probability", "interval", "effective_trials")
         if chances or asked("collision_free"):
             test = ctx.scenes.test(built.selected)
             if test is not None:
-                free = _free(ctx, test, poses)
-        estimates = None
+                free = np.concatenate(ctx.compute.blocks(poses, partial(test.free, threads=threads)))
         if chances:
             model = ctx.successes.model(built, collisions_known=free is not None)
-            estimates = ctx.successes.estimate(model, poses, free)
-    return LikelihoodAnswer(
-        object_id=built.object_row.id,
-        revision=built.revision,
-        kernel=built.kernel,
-        density=np.exp(logs) if logs is not None and asked("density") else None,
-        log_density=logs if asked("log_density") else None,
-        relative=relative if asked("relative") else None,
-        collision_free=free if asked("collision_free") else None,
-        success_probability=estimates.probability if estimates and asked("success_probability") else None,
-        interval=(estimates.low, estimates.high) if estimates and asked("interval") else None,
-        effective_trials=estimates.effective_trials if estimates and asked("effective_trials") else None,
-    )
+            estimate = ctx.successes.estimate(model, poses, free)
+            columns["success_probability"] = estimate.probability
+            columns["interval"] = {"level": estimate.level, "low": estimate.low, "high": estimate.high}
+            columns["effective_trials"] = estimate.effective_trials
+        columns["collision_free"] = free
+    return built, {name: column for name, column in columns.items() if column is not None and asked(name)}
 
 
-def log_density(
-    ctx: Estimators,
-    density: SearchedDensity,
-    poses: Poses,
-    cutoff: float | None,
-) -> Floats:
+def log_density(ctx: Estimators, density: SearchedDensity, poses: Poses, cutoff: float | None) -> Floats:
     """Log densities (n,) of poses, computed in blocks."""
-    logs = np.empty(len(poses))
-
-    def work(part: slice) -> None:
-        logs[part] = density.log_density(poses[part], cutoff=cutoff, threads=ctx.compute.threads)
-
-    ctx.compute.blocks(len(poses), _BLOCK, work)
-    return logs
-
-
-def _free(ctx: Estimators, test: CollisionTest, poses: Poses) -> NDArray[np.bool_]:
-    free = np.empty(len(poses), dtype=bool)
-
-    def work(part: slice) -> None:
-        free[part] = test.free(poses[part], threads=ctx.compute.threads)
-
-    ctx.compute.blocks(len(poses), _BLOCK, work)
-    return free
+    work = partial(density.log_density, cutoff=cutoff, threads=ctx.compute.threads)
+    return np.concatenate(ctx.compute.blocks(poses, work))

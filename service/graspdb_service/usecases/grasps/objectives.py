@@ -7,37 +7,35 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, ModeSearch, PoseNoise, SuccessModel, expected
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.success_models import LEVEL, Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
-from graspdb_service.usecases.grasps.search import DensityModes, ScoreEvolution
-
-Floats = NDArray[np.float64]
+from graspdb_service.usecases.grasps.search import ScoreSearch
 
 #: Draws of the noise that a mean is taken over, and while searching.
 _NOISE_DRAWS, _FEW_DRAWS = 256, 16
 
 
-def by_density(search: ModeSearch, threads: int) -> tuple[DensityModes, Ranking]:
+def by_density(search: ModeSearch, threads: int) -> tuple[ScoreSearch, Ranking]:
     """The density itself."""
-    return DensityModes(search, threads), Ranking(objective="density", score="density, 1/(m^3 rad^3)")
+    return ScoreSearch(search, threads), Ranking(objective="density", score="density, 1/(m^3 rad^3)")
 
 
 def by_success(
     search: ModeSearch, model: Model, test: CollisionTest | None, pull: Pull, threads: int
-) -> tuple[ScoreEvolution, Ranking]:
+) -> tuple[ScoreSearch, Ranking]:
     """The lower end of the success probability's interval."""
     score = success_score(model.whole, "low", test, threads)
     rough = score if model.quick is model.whole else success_score(model.quick, "low", test, threads)
     told = f"lower end of the success probability's {LEVEL:.0%} interval"
     ranking = Ranking(objective="success_probability", score=told)
-    return ScoreEvolution(search, score, rough, pull, threads), ranking
+    return ScoreSearch(search, threads, score, rough, pull), ranking
 
 
 def by_mean(
@@ -47,7 +45,7 @@ def by_mean(
     value: Score | None,
     pull: Pull | None,
     threads: int,
-) -> tuple[ScoreEvolution, Ranking]:
+) -> tuple[ScoreSearch, Ranking]:
     """The mean under noise of a success probability ``value``; None: of the density."""
     pivot, named = _pivot(row, search.centres)
     about = {"pose_noise": f"the object about {named}, on the left", "tool_noise": "the tool, on the right"}
@@ -77,7 +75,7 @@ def by_mean(
             **told,
         }
     )
-    return ScoreEvolution(search, score, rough, pull, threads), ranking
+    return ScoreSearch(search, threads, score, rough, pull), ranking
 
 
 def success_score(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import ProposalsRequest
 from graspdb.wire.queries import Strategy
@@ -23,9 +22,6 @@ from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import samples
 from graspdb_service.usecases.grasps.admissible import NearSuccesses
 from graspdb_service.usecases.grasps.samples import Draw
-from graspdb_service.usecases.trials.selection import Filters
-
-Floats = NDArray[np.float64]
 
 #: Poses whose uncertainty is asked for.
 _PLACES = 2_048
@@ -54,10 +50,7 @@ CRITERIA: dict[Strategy, str] = {
 def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw, str]:
     """Poses to try next, and how they were chosen; the same revision, request and seed give the same ones.
 
-    Raises
-    ------
-    ProblemError
-        409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
+    409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
     """
     if request.strategy == "density":
         return samples.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]
@@ -96,7 +89,7 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     if choice.stored is not None:
         raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
     with ctx.compute.admitted():
-        selected = ctx.densities.selections.resolve(slug, Filters.of(request))
+        selected = ctx.densities.selections.resolve(slug, request)
         prior = ctx.priors.get(selected, choice)
         return samples.drawn_from(ctx, prior.density, selected.row, prior.kernel, request.count, request.seed)
 

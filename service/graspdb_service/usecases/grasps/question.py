@@ -10,7 +10,8 @@ from graspdb_density import ModeSearch, Separation
 from graspdb_density.search.mode_search import DISTINCT
 from graspdb_density.search.scored_poses import Admissible, distinct_from
 from graspdb_service.problems import conflict
-from graspdb_service.usecases.densities.cache import Built, kernel_of
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import Model
@@ -19,13 +20,7 @@ from graspdb_service.usecases.grasps import objectives
 from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of
 from graspdb_service.usecases.grasps.constraints import Constraints
 from graspdb_service.usecases.grasps.objectives import success_score
-from graspdb_service.usecases.grasps.search import (
-    Bounds,
-    CandidateRanking,
-    DensityModes,
-    Engine,
-    ScoreEvolution,
-)
+from graspdb_service.usecases.grasps.search import Bounds, CandidateRanking, Engine, ScoreSearch
 
 #: Up to so many attempts a model of success probability is built at once; above, it must be asked for.
 FEW_ATTEMPTS = 500_000
@@ -36,12 +31,8 @@ _CHANCES = frozenset({"success_probability", "interval", "effective_trials"})
 class Question:
     """A request about one density, everything looked up.
 
-    Attributes
-    ----------
-    search, kernel
-        In the density of successes, or before any in the prior of the object's edges.
-    chances, model
-        Whether grasps are told with their success probability, and by which model, where there is one.
+    ``search`` and ``kernel`` are of the density of successes, or before any of the prior of the object's
+    edges; ``chances``: whether grasps are told with their success probability, by ``model`` if there is one.
     """
 
     built: Built
@@ -63,12 +54,8 @@ class Question:
 def question_of(
     ctx: Estimators, request: GraspConstraints, built: Built, limits: Constraints
 ) -> Question | None:
-    """What a request asks of a density; None where there is nothing to choose from.
-
-    Raises
-    ------
-    ProblemError
-        409 for what needs a mesh, a gripper or attempts that are not there.
+    """What a request asks of a density; None where there is nothing to choose from; 409 for what needs a
+    mesh, a gripper or attempts that are not there.
     """
     source = _prior(ctx, request, built) if built.search is None else built
     row, selected = built.object_row, built.selected
@@ -92,7 +79,7 @@ def question_of(
     search, kernel, threads = source.search, source.kernel, ctx.compute.threads
     near = NearSuccesses(search.centres)
 
-    def ranked() -> tuple[DensityModes | ScoreEvolution, Ranking]:
+    def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if request.objective == "robust":
             value = None if chance is None else success_score(chance.quick, "probability", test, threads)

@@ -6,17 +6,15 @@ import secrets
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo, Selection
 from graspdb_density import se3
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grasps.likelihood import log_density
-
-Floats = NDArray[np.float64]
 
 #: Draws see more of the kernels' tails than a plain question.
 _CUTOFF = 5.0
@@ -35,17 +33,9 @@ class Draw:
 
 
 def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
-    """Draw grasps; the same revision, selection, kernel, count and seed give the same ones.
+    """Draw grasps; the same revision, selection, kernel, count and seed (None: made up) give the same ones.
 
-    Parameters
-    ----------
-    seed
-        None: one is made up, and answered.
-
-    Raises
-    ------
-    ProblemError
-        413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
+    413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
     """
     check_count(ctx, count)
     with ctx.compute.admitted():

@@ -1,9 +1,9 @@
-"""Engines that find the best grasps: modes of a density, evolution by a score, ranking of candidates."""
+"""Engines that find the best grasps: where a density or a score is highest, or by ranking candidates."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from graspdb_density import Maximum, ModeSearch, Region, Separation, se3
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Admissible, Pull, Score, distinct_from
-
-Floats = NDArray[np.float64]
+from graspdb_service.trial_columns import Floats
 
 #: Poses shown to the collision test at a time while looking for the nearest admissible one.
 _BLOCK = 1_024
@@ -35,16 +34,6 @@ class Bounds:
             return np.arange(len(poses))
         return np.flatnonzero(self.admissible(poses))
 
-    def maxima(self, search: ModeSearch, **by: Any) -> list[Maximum]:
-        """Those of a search, which takes ``by`` besides."""
-        return search.maxima(
-            self.region,
-            count=self.count,
-            separation=self.separation,
-            admissible=self.admissible,
-            **by,
-        )
-
 
 class Engine(Protocol):
     """How a question is answered."""
@@ -57,48 +46,38 @@ class Engine(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class DensityModes:
-    """The modes of a density, that of successes or a prior."""
+class ScoreSearch:
+    """Where a score is highest, from the density's centres; without one the density's own modes, that of
+    successes or a prior. ``rough`` is nearly the score and much faster.
+    """
 
     search: ModeSearch
     threads: int
+    score: Score | None = None
+    rough: Score | None = None
+    pull: Pull | None = None
 
     def best(self, bounds: Bounds) -> list[Maximum]:
-        return bounds.maxima(self.search, threads=self.threads)
-
-    def scored(self, poses: Poses) -> tuple[Floats, Floats]:
-        logs = self.search.density.log_density(poses, threads=self.threads)
-        return logs, logs
-
-    def shortlist(self, poses: Poses, _: int) -> Poses:
-        return poses
-
-
-@dataclass(frozen=True, eq=False)
-class ScoreEvolution:
-    """Where a score is highest, from the density's centres; ``rough`` is nearly the score and much faster."""
-
-    search: ModeSearch
-    score: Score
-    rough: Score
-    pull: Pull | None
-    threads: int
-
-    def best(self, bounds: Bounds) -> list[Maximum]:
-        return bounds.maxima(
-            self.search, score=self.score, rough=self.rough, pull=self.pull, threads=self.threads
+        return self.search.maxima(
+            bounds.region,
+            count=bounds.count,
+            separation=bounds.separation,
+            admissible=bounds.admissible,
+            score=self.score,
+            rough=self.rough,
+            pull=self.pull,
+            threads=self.threads,
         )
 
     def scored(self, poses: Poses) -> tuple[Floats, Floats]:
         logs = self.search.density.log_density(poses, threads=self.threads)
-        return logs, self.score(poses)
+        return logs, logs if self.score is None else self.score(poses)
 
     def shortlist(self, poses: Poses, most: int) -> Poses:
         """Only those that may be among the best are worth the score itself."""
-        if self.rough is self.score or len(poses) <= most:
+        if self.rough is None or self.rough is self.score or len(poses) <= most:
             return poses
-        rough = self.rough(poses)
-        return poses[np.argsort(-rough, kind="stable")[:most]]
+        return poses[np.argsort(-self.rough(poses), kind="stable")[:most]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +85,7 @@ class CandidateRanking:
     """The best of given poses by what another engine maximises; ``separated``: only distinct ones."""
 
     candidates: Poses
-    by: DensityModes | ScoreEvolution
+    by: ScoreSearch
     separated: bool
 
     def best(self, bounds: Bounds) -> list[Maximum]:

@@ -7,31 +7,29 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelProvenance, KernelWidths
+from graspdb.wire.kernels import KernelComponent, KernelCreate, KernelWidths
 from graspdb_density import AnisotropicKernel
-from graspdb_density.se3 import Poses
 from graspdb_density.success.axis_bandwidth import fit_axis_bandwidths
-from graspdb_service.problems import conflict, invalid
+from graspdb_service.problems import invalid, too_few_trials
+from graspdb_service.storage.kernels import NewKernel
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.kernels import fit
 from graspdb_service.usecases.trials import attempts
-from graspdb_service.usecases.trials.selection import Filters
 
 #: A correlation beyond this is one.
 _CORRELATED = 1e-9
 
 
-def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
-    """Widths chosen by held-out log loss, as :func:`graspdb_service.storage.kernels.create` takes them.
+def fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
+    """Widths chosen by held-out log loss.
 
     Attempts that collided are left out where collisions are tested, as they are when success is predicted.
     409 for too few successes or failures, or attempts all in one place.
     """
     assert request.object is not None
-    filters = Filters(request.gripper, request.protocol, request.source)
     with ctx.compute.admitted():
-        selected = ctx.densities.selections.resolve(request.object, filters)
-        row = selected.row
+        selected = ctx.densities.selections.resolve(request.object, fit.trials_of(request))
         # Said first: without axes no number of trials helps.
         axes = stored_kernel.axes(request.alignment, selected, ctx.scenes.features)
         assert not callable(axes)
@@ -39,43 +37,32 @@ def fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
         tested = ctx.scenes.test(selected) is not None
         kept = ~everything.collided if tested else np.ones(len(everything), dtype=bool)
         try:
-            fit = ctx.compute.run(
+            found = ctx.compute.run(
                 lambda: fit_axis_bandwidths(
-                    Poses.of(everything.position[kept], everything.quaternion[kept]),
+                    everything.poses[kept],
                     everything.success[kept],
                     axes=axes,
                     symmetric=everything.symmetric[kept],
                 )
             )
         except ValueError as error:
-            text = str(error)
-            raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
-    provenance = KernelProvenance(
-        origin="fitted",
-        object=row.slug,
-        revision=row.revision,
-        protocol=selected.protocol,
-        source=selected.source,
-        attempts=fit.attempts,
-        judged=fit.judged,
-        log_loss=fit.log_loss,
-        isotropic_log_loss=fit.isotropic_log_loss,
-        brier_skill=fit.skill if math.isfinite(fit.skill) else None,
-        isotropic_brier_skill=fit.isotropic_skill if math.isfinite(fit.isotropic_skill) else None,
+            raise too_few_trials(str(error)) from None
+    component = KernelComponent(covariance=np.diag(np.square(found.kernel.sigmas)).tolist())
+    return fit.fitted_on(
+        selected,
+        request,
+        [component.model_dump(mode="json")],
+        attempts=found.attempts,
+        judged=found.judged,
+        log_loss=found.log_loss,
+        isotropic_log_loss=found.isotropic_log_loss,
+        brier_skill=fit.finite(found.skill),
+        isotropic_brier_skill=fit.finite(found.isotropic_skill),
         isotropic_widths=KernelWidths(
-            sigma_position_m=fit.isotropic.sigma_position_m,
-            sigma_rotation_deg=min(40.0, math.degrees(fit.isotropic.sigma_rotation)),
+            sigma_position_m=found.isotropic.sigma_position_m,
+            sigma_rotation_deg=min(40.0, math.degrees(found.isotropic.sigma_rotation)),
         ),
     )
-    component = KernelComponent(covariance=np.diag(np.square(fit.kernel.sigmas)).tolist())
-    return {
-        "kind": request.kind,
-        "alignment": request.alignment,
-        "gripper": selected.gripper,
-        "object_id": row.id,
-        "components": [component.model_dump(mode="json")],
-        "provenance": provenance.model_dump(mode="json", exclude_none=True),
-    }
 
 
 def checked(request: KernelCreate) -> list[dict[str, Any]]:

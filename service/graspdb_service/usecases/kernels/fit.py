@@ -13,14 +13,14 @@ from graspdb.wire.kernels import (
     MAX_FITTED,
     MAX_SAMPLED,
     SAMPLED,
-    KernelComponent,
     KernelCreate,
     KernelProvenance,
     KernelWidths,
     KernelWindow,
     StoredKernel,
 )
-from graspdb_density import AnisotropicKernel, IsotropicKernel
+from graspdb.wire.queries import TrialSelection
+from graspdb_density import AnisotropicKernel
 from graspdb_density.bandwidth.mixture_fit import (
     LEAST_DISPLACEMENTS,
     displacements,
@@ -29,16 +29,17 @@ from graspdb_density.bandwidth.mixture_fit import (
 )
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import conflict, invalid
+from graspdb_service.problems import invalid, too_few_trials
 from graspdb_service.storage import kernels
-from graspdb_service.storage.kernels import KernelRow
+from graspdb_service.storage.kernels import KernelRow, NewKernel
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.report_runs import RunKey, RunRow
 from graspdb_service.usecases.densities import stored_kernel
-from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice
+from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.geometry.features import Axes, Features
 from graspdb_service.usecases.runtime.runs import Result, RunKind
-from graspdb_service.usecases.trials.selection import Filters
+from graspdb_service.usecases.trials.selection import Selected
 
 Fitted = tuple[list[dict[str, Any]], dict[str, Any]]
 """A kernel's components, and what is told of the fit."""
@@ -68,9 +69,42 @@ def check(request: KernelCreate) -> None:
         )
 
 
-def filters_of(request: KernelCreate) -> Filters:
+def trials_of(request: KernelCreate) -> TrialSelection:
     """Which trials a kernel is fitted on."""
-    return Filters(request.gripper, request.protocol, request.source)
+    return TrialSelection(gripper=request.gripper, protocol=request.protocol, source=request.source)
+
+
+def fitted_on(
+    selected: Selected, request: KernelCreate, components: list[dict[str, Any]], **told: Any
+) -> NewKernel:
+    """A kernel fitted on a selection; what else is ``told`` belongs to its provenance."""
+    provenance = KernelProvenance(
+        origin="fitted",
+        object=selected.row.slug,
+        revision=selected.row.revision,
+        protocol=selected.protocol,
+        source=selected.source,
+        **told,
+    )
+    return new_kernel(request, components, provenance, selected.gripper, selected.row.id)
+
+
+def new_kernel(
+    request: KernelCreate,
+    components: list[dict[str, Any]],
+    provenance: KernelProvenance,
+    gripper: str | None,
+    object_id: int | None = None,
+) -> NewKernel:
+    """A kernel of the kind and alignment that were asked for."""
+    return NewKernel(
+        kind=request.kind,
+        alignment=request.alignment,
+        gripper=gripper,
+        object_id=object_id,
+        components=components,
+        provenance=provenance.model_dump(mode="json", exclude_none=True),
+    )
 
 
 def fitted(
@@ -81,18 +115,17 @@ def fitted(
     threads: int,
     computed: Callable[[Callable[[], Fitted]], Fitted],
     progress: Progress,
-) -> dict[str, Any]:
-    """A kernel learned from an object's successes, as :func:`graspdb_service.storage.kernels.create` takes
-    it; ``computed`` is where numbers are. 404 for the object, 409 where its trials or geometry don't suffice.
+) -> NewKernel:
+    """A kernel learned from an object's successes; ``computed`` is where numbers are. 404 for the object, 409
+    where its trials or geometry don't suffice.
     """
     assert request.object is not None
     window, widths = request.window or KernelWindow(), request.component_widths or KernelWidths()
-    built = densities.get(densities.selections.resolve(request.object, filters_of(request)), KernelChoice())
+    built = densities.get(densities.selections.resolve(request.object, trials_of(request)), KernelChoice())
     # Said first: without axes no number of trials helps.
     axes = stored_kernel.axes(request.alignment, built.selected, features)
     if built.density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "No trial of this selection succeeded, so there is nothing to fit a kernel on:"
             f" post trials (POST /objects/{request.object}/trials) or sweep a grid first",
         )
@@ -105,25 +138,8 @@ def fitted(
             )
         )
     except ValueError as error:
-        raise conflict("too-few-trials", f"No kernel can be fitted: {error}") from None
-    provenance = KernelProvenance(
-        origin="fitted",
-        object=built.object_row.slug,
-        revision=built.revision,
-        protocol=built.selected.protocol,
-        source=built.selected.source,
-        window=window,
-        component_widths=widths,
-        **told,
-    )
-    return {
-        "kind": request.kind,
-        "alignment": request.alignment,
-        "gripper": built.selected.gripper,
-        "object_id": built.object_row.id,
-        "components": components,
-        "provenance": provenance.model_dump(mode="json", exclude_none=True),
-    }
+        raise too_few_trials(f"No kernel can be fitted: {error}") from None
+    return fitted_on(built.selected, request, components, window=window, component_widths=widths, **told)
 
 
 def _fit(
@@ -142,7 +158,7 @@ def _fit(
     fit = fit_kernel(
         density.rows,
         window=_window(window),
-        widths=_isotropic(widths),
+        widths=stored_kernel.isotropic(widths),
         compared=density.kernel,
         components=None if count == "auto" else count or 1,
         frame=stored_kernel.axes_at(axes, density.poses),
@@ -153,8 +169,8 @@ def _fit(
         "successes": fit.successes,
         "displacements": fit.displacements,
         "scale": fit.scale,
-        "log_likelihood": _finite(fit.log_likelihood),
-        "isotropic_log_likelihood": _finite(fit.isotropic_log_likelihood),
+        "log_likelihood": finite(fit.log_likelihood),
+        "isotropic_log_likelihood": finite(fit.isotropic_log_likelihood),
         "similarity": fit.similarity.value,
         "likelihood_by_components": {str(k): v for k, v in fit.likelihoods.items()} or None,
     }
@@ -176,7 +192,7 @@ def _sample(
     share = found.weights / found.weights.sum()
     chosen = found.vectors[rng.choice(len(share), size=count, p=share)]
     whole = found.vectors[rng.choice(len(share), size=min(_WHOLE, len(share)), p=share)]
-    one, every = (sampled_rows(part, _isotropic(widths)) for part in (chosen, whole))
+    one, every = (sampled_rows(part, stored_kernel.isotropic(widths)) for part in (chosen, whole))
     similarity = bhattacharyya(one, every, rng, points=4_000, window=_window(window), threads=threads)
     return [{"weight": 1.0, "mean": vector.tolist()} for vector in chosen], {
         "successes": density.size,
@@ -189,11 +205,8 @@ def _window(window: KernelWindow) -> DisplacementWindow:
     return DisplacementWindow(window.position_m, math.radians(window.rotation_deg))
 
 
-def _isotropic(widths: KernelWidths) -> IsotropicKernel:
-    return IsotropicKernel(widths.sigma_position_m, math.radians(widths.sigma_rotation_deg))
-
-
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """Null stands for what no number tells."""
     return value if math.isfinite(value) else None
 
 
@@ -207,22 +220,7 @@ def components_of(kernel: AnisotropicKernel) -> list[dict[str, Any]]:
 
 def info(row: KernelRow) -> StoredKernel:
     """As the wire has it."""
-    used = stored_kernel.info_of(row)
-    assert used.widths_m is not None
-    assert used.widths_deg is not None
-    return StoredKernel(
-        id=row.id,
-        kind=row.kind,
-        alignment=row.alignment,
-        gripper=row.gripper,
-        sigma_position_m=used.sigma_position_m,
-        sigma_rotation_deg=used.sigma_rotation_deg,
-        widths_m=used.widths_m,
-        widths_deg=used.widths_deg,
-        components=[KernelComponent.model_validate(item) for item in row.components],
-        provenance=KernelProvenance.model_validate(row.provenance),
-        created_at=row.created_at,
-    )
+    return StoredKernel.model_validate({**vars(stored_kernel.info_of(row)), **vars(row)})
 
 
 def run_key(row: ObjectRow, id: str, request: KernelCreate) -> RunKey:
@@ -235,7 +233,7 @@ def run_kind(densities: Densities, features: Features, threads: int) -> RunKind:
     """Runs that fit kernels."""
 
     def compute(run: RunRow, progress: Progress) -> Result:
-        fields = fitted(
+        kernel = fitted(
             densities,
             features,
             KernelCreate.model_validate(run.parameters["request"]),
@@ -243,6 +241,6 @@ def run_kind(densities: Densities, features: Features, threads: int) -> RunKind:
             computed=lambda work: work(),
             progress=progress,
         )
-        return lambda tx: info(kernels.create(tx, run.id, **fields)).model_dump_json()
+        return lambda tx: info(kernels.create(tx, run.id, kernel)).model_dump_json()
 
     return RunKind("fit", compute)

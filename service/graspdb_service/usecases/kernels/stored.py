@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.kernels import (
     MAX_COMPONENTS,
@@ -21,19 +20,20 @@ from graspdb.wire.kernels import (
 )
 from graspdb.wire.states import RunState
 from graspdb_density import AnisotropicKernel
-from graspdb_service.problems import invalid, not_found
-from graspdb_service.storage import grippers, kernels
+from graspdb_service.problems import found, invalid, not_found
+from graspdb_service.storage import kernels
 from graspdb_service.storage import report_runs as report_run_rows
 from graspdb_service.storage.database import Tx
+from graspdb_service.storage.kernels import NewKernel
+from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases import grippers
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.grippers import unknown
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runs import Runs, model
 
-Floats = NDArray[np.float64]
-
+_SCOPE = "POST /kernels"
 #: Axes that kernels of a kind may lie along, where not all.
 _ALIGNED = {"sampled": ("gripper",), "probability": ("gripper", "object")}
 #: Farther along an axis no displacement between grasps of one object reaches.
@@ -42,7 +42,7 @@ _MOST_SHIFT_M = 1.0
 _SAME = 1e-9
 
 
-def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | None, body: bytes) -> Created:
+def create(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Created:
     """Store a kernel, or with ``components=auto`` start the run that fits it (202) unless it is done at once.
 
     404 for the object, 422 for components that make no kernel, 409 where trials or geometry don't suffice.
@@ -52,31 +52,28 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, *, key: str | Non
         raise invalid(
             "alignment", f"a kernel of kind {request.kind} does not lie along those axes: use {ways}"
         )
-    scope = "POST /kernels"
     # A fit takes a while, and the trials may have gone since.
-    earlier = replayed(ctx.database, scope=scope, key=key, request=body)
+    earlier = replayed(ctx.database, _SCOPE, sent)
     if earlier is not None and earlier.status == 201:
         return earlier
     if not isinstance(request.components, list) and request.kind != "probability":
         fit.check(request)
         if request.components == "auto":
-            return _started(ctx, runs, request, scope=scope, key=key, body=body)
+            return _started(ctx, runs, request, sent)
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
-        row = kernels.create(tx, str(uuid.uuid4()), **made)
+        row = kernels.create(tx, str(uuid.uuid4()), made)
         return Created(fit.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
-    return replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
+    return replay_or(ctx.database, _SCOPE, sent, make)
 
 
 def get(ctx: Estimators, id: str) -> StoredKernel:
     """One kernel."""
     with ctx.database.read() as tx:
         row = kernels.find(tx, id)
-    if row is None:
-        raise not_found("kernel", id[:80], "GET /kernels lists those there are")
-    return fit.info(row)
+    return fit.info(found(row, "kernel", id, "GET /kernels lists those there are"))
 
 
 def page(
@@ -99,26 +96,18 @@ def remove(ctx: Estimators, id: str) -> None:
         report_run_rows.remove(tx, id)
 
 
-def _given(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
+def _given(ctx: Estimators, request: KernelCreate) -> NewKernel:
     assert isinstance(request.components, list)
     if request.gripper is not None:
         with ctx.database.read() as tx:
-            if grippers.find(tx, request.gripper) is None:
-                raise unknown("gripper", [request.gripper])
+            grippers.named(tx, request.gripper)
     sampled = request.kind == "sampled"
     if request.kind == "probability":
         components, widths = axis_bandwidth_fit.checked(request), None
     else:
         components, widths = _checked_samples(request) if sampled else (_checked_gaussians(request), None)
     provenance = KernelProvenance(origin="given", component_widths=widths)
-    return {
-        "kind": request.kind,
-        "alignment": request.alignment,
-        "gripper": request.gripper,
-        "object_id": None,
-        "components": components,
-        "provenance": provenance.model_dump(mode="json", exclude_none=True),
-    }
+    return fit.new_kernel(request, components, provenance, request.gripper)
 
 
 def _checked_gaussians(request: KernelCreate) -> list[dict[str, Any]]:
@@ -198,7 +187,7 @@ def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
         return None
 
 
-def _fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
+def _fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
     if request.kind == "probability":
         return axis_bandwidth_fit.fitted(ctx, request)
     with ctx.compute.admitted():
@@ -212,20 +201,18 @@ def _fitted(ctx: Estimators, request: KernelCreate) -> dict[str, Any]:
         )
 
 
-def _started(
-    ctx: Estimators, runs: Runs, request: KernelCreate, *, scope: str, key: str | None, body: bytes
-) -> Created:
+def _started(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Created:
     """A fit as a run: the kernel where it is done within the wait, else the run as it is."""
     assert request.object is not None
-    row = ctx.densities.selections.resolve(request.object, fit.filters_of(request)).row
+    row = ctx.densities.selections.resolve(request.object, fit.trials_of(request)).row
     lease = runs.place()
     id = str(uuid.uuid4())
 
     def make(tx: Tx) -> Created:
-        runs.enter(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
+        report_run_rows.ask(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
         return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
-    made = replay_or(ctx.database, scope=scope, key=key, request=body, create=make)
+    made = replay_or(ctx.database, _SCOPE, sent, make)
     # The same request may have come before, even while this one did.
     run = runs.follow(made.body["id"], lease if made.body["id"] == id else None)
     if run.state == RunState.RUNNING:

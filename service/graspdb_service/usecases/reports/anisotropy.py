@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.reports import (
@@ -17,31 +16,29 @@ from graspdb.wire.reports import (
     AnisotropyTolerance,
     Method,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, importance_weights, se3
+from graspdb_density import IsotropicKernel, importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
 from graspdb_density.vicinity.anisotropy import empirical_anisotropy
-from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES, Anisotropy, Frames
+from graspdb_density.vicinity.displacement_bins import Anisotropy, Frames, check_enough
 from graspdb_density.vicinity.displacement_density import density_anisotropy
 from graspdb_density.vicinity.half_width import Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
-from graspdb_service.problems import conflict
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities import stored_kernel
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports import surface_pairs
 from graspdb_service.usecases.reports.common import (
     LEVEL,
     ReportInputs,
     as_model,
-    attempts_of,
     enough,
     finite,
     head,
     need_failures,
 )
+from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-
-Floats = NDArray[np.float64]
 
 #: Attempts that stand for all where their density is asked for.
 _LOCAL_ATTEMPTS = 200_000
@@ -73,14 +70,8 @@ def anisotropy_report(
     frames: Frames | None = (
         (lambda poses: axes(poses.positions, poses.quaternions_xyzw)) if callable(axes) else axes
     )
-    successes = built.selected.successes
-    if successes < LEAST_SUCCESSES:
-        raise conflict(
-            "too-few-trials",
-            f"A statement about the vicinity of a success needs at least {LEAST_SUCCESSES} successes; there"
-            f" are {successes}, so {LEAST_SUCCESSES - successes} more are needed",
-        )
-    everything = attempts_of(inputs, built)
+    enough(lambda: check_enough(built.selected.successes))
+    everything = attempts.read(inputs.database, built.selected)
     need_failures(everything, "What a success tells about its vicinity", 1)
     measure = _measure(inputs, built, method, everything)
     # The same grasps along the gripper's axes, for what alignment changes.
@@ -101,20 +92,17 @@ def anisotropy_report(
             f" axes: {what}"
         )
     text = _tolerances_text(tolerances, alignment) + _hypotheses_text(expected)
-    return AnisotropyReport(
+    return as_model(
+        AnisotropyReport,
+        found,
         **{**head(built), "text": text + surface_pairs.in_words(related)},
         warnings=warnings,
-        method=method,
         alignment=alignment,
-        grasps=found.grasps,
         attempts=len(everything),
-        translation_pairs=found.translation_pairs,
-        rotation_pairs=found.rotation_pairs,
         kernel=None if method == "empirical" else built.kernel,
         tolerances=tolerances,
         translations=[as_model(AnisotropyHistogram, item) for item in found.translations],
         rotations=[as_model(AnisotropyHistogram, item) for item in found.rotations],
-        aligned=found.aligned,
         hypotheses=[as_model(AnisotropyHypothesis, item) for item in expected],
         relations=related,
     )
@@ -143,7 +131,7 @@ def _measure(
     keys = everything.keys
     symmetric = bool(everything.symmetric.all())
     return lambda alignment, frames, progress: empirical_anisotropy(
-        Poses.of(everything.position, everything.quaternion),
+        everything.poses,
         everything.success,
         rotation_keys=None if keys is None else keys[0],
         position_keys=None if keys is None else keys[1],
@@ -185,14 +173,7 @@ def _tolerances(found: Anisotropy, built: Built) -> tuple[list[AnisotropyToleran
 
 def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Poses], Floats]:
     """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
-    rows = np.arange(len(everything))
-    if len(rows) > _LOCAL_ATTEMPTS:
-        rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_LOCAL_ATTEMPTS, replace=False))
-    density = GraspDensity.build(
-        se3.Poses.of(everything.position[rows], everything.quaternion[rows]),
-        kernel=kernel,
-        symmetric=everything.symmetric[rows],
-    )
+    density = everything.density(kernel, everything.some(_LOCAL_ATTEMPTS))
     return lambda poses: len(everything) * density.density(poses)
 
 

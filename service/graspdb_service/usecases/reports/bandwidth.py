@@ -13,16 +13,10 @@ from graspdb.wire.reports import BandwidthPoint, BandwidthReport, SimulatedDraws
 from graspdb_density import IsotropicKernel
 from graspdb_density.bandwidth.selection import MOST_HELD_OUT, MOST_ROWS, WidthScore, score_widths
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import conflict
-from graspdb_service.usecases.densities.cache import Built
-from graspdb_service.usecases.reports.common import (
-    ReportInputs,
-    as_model,
-    enough,
-    head,
-    isotropic_info,
-    share,
-)
+from graspdb_service.problems import too_few_trials
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.stored_kernel import isotropic_info
+from graspdb_service.usecases.reports.common import ReportInputs, as_model, enough, head, share
 from graspdb_service.usecases.simulation import verification
 
 #: Widths whose draws are to be simulated, as factors on the recommended ones; 15, 30 and 45 mm in the paper.
@@ -36,8 +30,7 @@ def bandwidth_report(
 ) -> BandwidthReport:
     density = built.density
     if density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "Widths are told apart from 200 successes on; there are 0, so 200 more are needed",
         )
     scores = enough(lambda: score_widths(density.rows, threads=inputs.threads, progress=progress))

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb.wire.queries import SelectionQuery
-from graspdb.wire.reports import (
-    CalibrationBin,
-    CalibrationReport,
-    CheckedGrasps,
-    ReportRange,
-)
-from graspdb_density import GraspDensity, SuccessModel, importance_weights, se3
+from graspdb.wire.reports import CalibrationBin, CalibrationReport, CheckedGrasps, ReportRange
+from graspdb_density import importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import (
@@ -25,10 +18,10 @@ from graspdb_density.success.calibration import (
     calibrate,
     reliability,
 )
-from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
-from graspdb_service.problems import conflict
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.problems import too_few_trials
+from graspdb_service.trial_columns import Floats, Ints
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
     LEVEL,
@@ -38,6 +31,7 @@ from graspdb_service.usecases.reports.common import (
     finite,
     head,
     interval,
+    model_near,
     need_failures,
     share,
 )
@@ -45,25 +39,14 @@ from graspdb_service.usecases.simulation import verification
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
 
-Floats = NDArray[np.float64]
-
 #: Outcomes judged: of those that collided fewer, for nearly all are right.
 _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
 #: Of those that collided, about so many are read: enough to judge, and to tell where blocks lie.
 _KEPT_COLLIDED = 100_000
 LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
-#: Kernels end at this many standard deviations of position.
-_REACH = 5.0
 #: Bins of grasps that were simulated again: there are few of them.
 _CHECKED_BINS = 5
-
-
-def _model(everything: AllTrials, rows: NDArray[np.int64], kernel: SuccessKernel) -> SuccessModel:
-    """Of some attempts."""
-    poses = Poses.of(everything.position[rows], everything.quaternion[rows])
-    symmetric = everything.symmetric[rows]
-    return SuccessModel.build(poses, everything.success[rows], kernel=kernel, symmetric=symmetric)
 
 
 def calibration_report(
@@ -75,8 +58,7 @@ def calibration_report(
     everything = attempts.read(inputs.database, built.selected, most_collided=most)
     successes = int(everything.success.sum())
     if everything.attempts < LEAST_ATTEMPTS or successes < LEAST_SUCCESSES:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"Calibration needs at least {LEAST_ATTEMPTS} attempts and {LEAST_SUCCESSES} successes in them,"
             f" of sources that post failures, too; there are {everything.attempts} and {successes}",
         )
@@ -84,7 +66,7 @@ def calibration_report(
     density = built.density
     assert density is not None
     edge = 3.0 * density.kernel.sigma_position_m
-    blocks = enough(lambda: assign_blocks(everything.position, edge_m=edge, folds=_FOLDS))
+    blocks = enough(lambda: assign_blocks(everything.poses.positions, edge_m=edge, folds=_FOLDS))
     judged, weights = _judged(everything)
     predicted, ranked = _predictions(inputs, built, everything, test, blocks, judged, progress)
     won, collided, block = everything.success[judged], everything.collided[judged], blocks.block[judged]
@@ -126,15 +108,15 @@ def _predictions(
     everything: AllTrials,
     test: CollisionTest | None,
     blocks: Blocks,
-    judged: NDArray[np.int64],
+    judged: Ints,
     progress: Progress,
 ) -> tuple[Floats, Floats]:
     """The success probability and the log density of every judged attempt, without the blocks of its fold."""
     assert built.density is not None
     kernel = built.density.kernel
-    p, q = everything.position[judged], everything.quaternion[judged]
+    poses = everything.poses[judged]
     predicted, ranked = np.zeros(len(judged)), np.full(len(judged), -np.inf)
-    free = None if test is None else test.free(Poses(p, q), threads=inputs.threads)
+    free = None if test is None else test.free(poses, threads=inputs.threads)
     learned = everything.collided if test is not None else np.zeros(len(everything), dtype=bool)
     proposal_known = not np.isnan(everything.proposal).all()
     for fold in range(blocks.folds):
@@ -143,18 +125,14 @@ def _predictions(
         progress(fold / blocks.folds)
         if not held.size or not train.size:
             continue
-        model = _model(everything, train, built.success_kernel or kernel)
+        model = everything.success_model(built.success_kernel or kernel, train)
         progress((fold + 0.5) / blocks.folds)
-        predicted[held] = model.evaluate(Poses.of(p[held], q[held]), threads=inputs.threads).probability
+        predicted[held] = model.probability(poses[held], threads=inputs.threads)
         kept = train[everything.success[train]]
         if kept.size:
-            own = GraspDensity.build(
-                se3.Poses.of(everything.position[kept], everything.quaternion[kept]),
-                kernel=kernel,
-                weights=importance_weights(everything.proposal[kept]) if proposal_known else None,
-                symmetric=everything.symmetric[kept],
-            )
-            ranked[held] = own.log_density(se3.Poses.of(p[held], q[held]), threads=inputs.threads)
+            weights = importance_weights(everything.proposal[kept]) if proposal_known else None
+            own = everything.density(kernel, kept, weights)
+            ranked[held] = own.log_density(poses[held], threads=inputs.threads)
     if free is not None:
         predicted[~free] = 0.0
     return predicted, ranked
@@ -188,26 +166,19 @@ def _checked(
     found = [item for item in read if item.plan == "poses" and len(item.codes)]
     if not found:
         return None
-    p = np.concatenate([item.position for item in found])
-    q = np.concatenate([item.quaternion for item in found])
+    poses = Poses.concatenate([item.poses for item in found])
     codes = np.concatenate([item.codes for item in found])
     assert built.density is not None
     kernel, diagonal = built.density.kernel, built.success_kernel
-    reach = max([kernel.sigma_position_m, *(() if diagonal is None else diagonal.sigmas[:3])])
-    distance, _ = cKDTree(p).query(everything.position, distance_upper_bound=_REACH * reach)
-    near = np.isfinite(distance)
+    widest = max([kernel.sigma_position_m, *(() if diagonal is None else diagonal.sigmas[:3])])
+    known = test is not None
+    model = model_near(everything, poses, diagonal or kernel, widest, collisions_known=known)
+    predicted = np.zeros(len(poses)) if model is None else model.probability(poses, threads=inputs.threads)
     if test is not None:
-        # Those that collided tell nothing of the others.
-        near &= ~everything.collided
-    predicted = np.zeros(len(p))
-    if near.any():
-        model = _model(everything, np.flatnonzero(near), diagonal or kernel)
-        predicted = model.evaluate(Poses.of(p, q), threads=inputs.threads).probability.copy()
-    if test is not None:
-        predicted[~test.free(Poses(p, q), threads=inputs.threads)] = 0.0
+        predicted[~test.free(poses, threads=inputs.threads)] = 0.0
     outcomes = verification.tally(codes)
     won = outcomes.get("success", 0)
-    success = np.isin(codes, [OUTCOME_CODES["success"]])
+    success = codes == OUTCOME_CODES["success"]
     return CheckedGrasps(
         grasps=len(codes),
         successes=won,
@@ -221,7 +192,7 @@ def _checked(
     )
 
 
-def _judged(everything: AllTrials) -> tuple[NDArray[np.int64], Floats]:
+def _judged(everything: AllTrials) -> tuple[Ints, Floats]:
     """Rows to judge and what each stands for: drawn at random from those that collided and from the rest."""
     rng = np.random.default_rng(0)
     rows, weights = [], []

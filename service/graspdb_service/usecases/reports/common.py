@@ -9,22 +9,24 @@ from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel
+from scipy.spatial import cKDTree
 from scipy.special import betaincinv
 
-from graspdb.wire import KernelInfo
+from graspdb.wire.queries import TrialSelection
 from graspdb.wire.reports import ReportRange
-from graspdb_density import IsotropicKernel
+from graspdb_density import SuccessModel
 from graspdb_density.bandwidth.matching import Match
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_density.se3 import Poses
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
-from graspdb_service.problems import conflict
+from graspdb_density.success.kernel_regression import SUCCESS_CUTOFF, SuccessKernel
+from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage.database import Database
-from graspdb_service.usecases.densities.cache import Built, Densities
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
-from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-from graspdb_service.usecases.trials.selection import Filters
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -55,7 +57,9 @@ class KeptCurves:
     """
 
     def __init__(self, max_bytes: int) -> None:
-        self._curves: SingleFlightCache[tuple[int, Filters, str | None, float, float], IncrementalCurve]
+        self._curves: SingleFlightCache[
+            tuple[int, TrialSelection, str | None, float, float], IncrementalCurve
+        ]
         self._curves = SingleFlightCache(max_bytes, lambda curve: curve.nbytes)
         self._matches: SingleFlightCache[tuple[bytes, str], Match]
         self._matches = SingleFlightCache(_MATCHES_BYTES, lambda _: _MATCH_BYTES)
@@ -133,15 +137,6 @@ def share(won: float, tried: float) -> ReportRange:
     return ReportRange(value=value, low=min(low, value), high=max(high, value))
 
 
-def isotropic_info(kernel: IsotropicKernel, rule: str) -> KernelInfo:
-    return KernelInfo(
-        kind="isotropic",
-        sigma_position_m=kernel.sigma_position_m,
-        sigma_rotation_deg=math.degrees(kernel.sigma_rotation),
-        rule=rule,
-    )
-
-
 # -- what there has to be
 
 
@@ -150,12 +145,20 @@ def enough(call: Callable[[], T]) -> T:
     try:
         return call()
     except ValueError as error:
-        text = str(error)
-        raise conflict("too-few-trials", text[:1].upper() + text[1:]) from None
+        raise too_few_trials(str(error)) from None
 
 
-def attempts_of(inputs: ReportInputs, built: Built) -> AllTrials:
-    return attempts.read(inputs.database, built.selected)
+def model_near(
+    everything: AllTrials, poses: Poses, kernel: SuccessKernel, sigma_m: float, *, collisions_known: bool
+) -> SuccessModel | None:
+    """What attempts tell of poses, by those within a kernel of ``sigma_m`` of one: of millions few are."""
+    tree = cKDTree(poses.positions)
+    distance, _ = tree.query(everything.poses.positions, distance_upper_bound=SUCCESS_CUTOFF * sigma_m)
+    near = np.isfinite(distance)
+    if collisions_known:
+        # Those that collided tell nothing of the others.
+        near &= ~everything.collided
+    return everything.success_model(kernel, near) if near.any() else None
 
 
 def need_failures(everything: AllTrials, what: str, least: int) -> None:

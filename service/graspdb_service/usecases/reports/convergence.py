@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire import KernelInfo
 from graspdb.wire.reports import ConvergenceCurve as CurveModel
@@ -33,20 +32,12 @@ from graspdb_density.kernels.gaussian_mixture import Kernel
 from graspdb_density.statistics.convergence import ConvergenceCurve, curve_sizes, needed_ratio, verdict
 from graspdb_density.statistics.incremental_bootstrap import IncrementalCurve
 from graspdb_service.problems import conflict
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.reports.bandwidth import simulated_draws
-from graspdb_service.usecases.reports.common import (
-    LEVEL,
-    ReportInputs,
-    as_model,
-    enough,
-    head,
-    interval,
-    isotropic_info,
-)
+from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, as_model, enough, head, interval
 from graspdb_service.usecases.simulation import verification
-
-Floats = NDArray[np.float64]
 
 _METHOD = (
     "eq 9: mean Bhattacharyya coefficient between the density of all grasps and bootstrap replicates of it,"
@@ -228,10 +219,8 @@ def _by_success(
             calls=[call.model_dump(mode="json") for call in calls],
         )
     factors, aim = sorted(found), target.success.value or 0.0
-    rates, counts = (
-        [found[f].success.value or 0.0 for f in factors],
-        [found[f].draws for f in factors],
-    )
+    rates = [found[f].success.value or 0.0 for f in factors]
+    counts = [found[f].draws for f in factors]
     match = match_success(aim, base, rates, factors=factors, draws=counts)
     if not match.reached:
         return match, ()

@@ -18,8 +18,8 @@ from graspdb_density.bandwidth.mixture_fit import (
 )
 from graspdb_density.kde.bhattacharyya import Coefficient, DisplacementWindow, sampled_kernel_curve
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import conflict
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.problems import too_few_trials
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports.common import ReportInputs, head
 
 #: Displacements that stand for the full statistics, and what the paper limits a kernel to.
@@ -70,15 +70,13 @@ def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
     density = built.density
     count = 0 if density is None else density.size
     if density is None or count < LEAST_SUCCESSES:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"The similarity of kernels needs at least {LEAST_SUCCESSES} successes; there are {count}, so"
             f" {LEAST_SUCCESSES - count} more are needed",
         )
     found = displacements(density.rows, window=window, rng=np.random.default_rng(0))
     if len(found.vectors) < LEAST_DISPLACEMENTS:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"The window holds {len(found.vectors)} displacements between successes; at least"
             f" {LEAST_DISPLACEMENTS} are needed: widen window_position_m or"
             " window_rotation_deg, or add trials",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from graspdb.wire.base import Triple
@@ -13,14 +12,13 @@ from graspdb.wire.reports import ProjectionOptions, ProjectionProfile, Projectio
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
 from graspdb_geometry import meshes
-from graspdb_service.problems import conflict
+from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, interval
-
-Floats = NDArray[np.float64]
 
 #: Normals by the names of planes: towards the viewer, so that the first letter runs to the right.
 PLANES = {"xy": (0.0, 0.0, 1.0), "xz": (0.0, -1.0, 0.0), "yz": (1.0, 0.0, 0.0)}
@@ -34,8 +32,7 @@ def projection_report(
     """The density on a plane; 409 without a success, or where none points the way asked for."""
     density = built.asked
     if density is None or built.density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "A projection needs at least 1 successful trial, and there is none: post trials"
             f" (POST /objects/{built.object_row.slug}/trials) or sweep a grid first",
         )

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from graspdb.wire import Selection
+from graspdb.wire.queries import TrialSelection
 from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service import __version__
@@ -16,7 +17,8 @@ from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.report_runs import RunKey, RunRow
 from graspdb_service.storage.simulation import outcomes
-from graspdb_service.usecases.densities.cache import Built, Densities, KernelChoice, kernel_of
+from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.densities.cache import Densities, kernel_of
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.reports.anisotropy import anisotropy_report
 from graspdb_service.usecases.reports.bandwidth import bandwidth_report
@@ -27,7 +29,6 @@ from graspdb_service.usecases.reports.kernel_similarity import kernel_similarity
 from graspdb_service.usecases.reports.projection import projection_report
 from graspdb_service.usecases.reports.sources import sources_report
 from graspdb_service.usecases.runtime.runs import Result, RunKind
-from graspdb_service.usecases.trials.selection import Filters
 
 #: Kept convergence curves may take this part of what densities may.
 _CURVES_SHARE = 4
@@ -56,7 +57,7 @@ class Reports:
         selection = Selection(**{name: getattr(options, name, None) for name in Selection.model_fields})
         choice, _ = kernel_of(selection)
         densities = self._inputs.densities
-        selected = densities.selections.resolve(slug, Filters.of(selection))
+        selected = densities.selections.resolve(slug, selection)
         if choice.stored is not None:
             choice = KernelChoice(stored=densities.stored(selected, choice.stored).id)
         own = options.model_dump(mode="json", exclude=set(Selection.model_fields), exclude_none=True)
@@ -66,7 +67,7 @@ class Reports:
                 own[report_runs.CHECKS] = outcomes.checks_stamp(tx, selected.row.id)
         parameters = {
             "report": report,
-            "filters": vars(selected.filters),
+            "filters": selected.filters.model_dump(),
             "kernel": vars(choice),
             "options": own,
         }
@@ -78,9 +79,9 @@ class Reports:
         report = parameters["report"]
         own = {name: value for name, value in parameters["options"].items() if name != report_runs.CHECKS}
         options = REPORTS[report].options.model_validate(own)
-        filters, kernel = Filters(**parameters["filters"]), KernelChoice(**parameters["kernel"])
+        asked, kernel = TrialSelection(**parameters["filters"]), KernelChoice(**parameters["kernel"])
         densities = self._inputs.densities
-        built = densities.get(densities.selections.resolve(slug, filters), kernel)
+        built = densities.get(densities.selections.resolve(slug, asked), kernel)
         return _COMPUTE[report](self._inputs, built, options, progress)
 
     def run_kinds(self) -> dict[str, RunKind]:

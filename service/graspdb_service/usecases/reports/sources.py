@@ -6,8 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from graspdb.wire.reports import (
     CalibrationBin,
@@ -17,31 +15,30 @@ from graspdb.wire.reports import (
     SourcesOptions,
     SourcesReport,
 )
-from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import calibrate
-from graspdb_service.problems import conflict
+from graspdb_service.problems import too_few_trials
 from graspdb_service.storage.trials import provenances
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.trial_columns import Bools, Floats, Ints
+from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
     LEVEL,
     ReportInputs,
     as_model,
-    attempts_of,
     finite,
     head,
     interval,
-    isotropic_info,
+    model_near,
     share,
 )
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-from graspdb_service.usecases.trials.selection import Selected, outcome_counts, total
-
-Floats = NDArray[np.float64]
+from graspdb_service.usecases.trials.selection import Selected, of_provenances, outcome_counts
 
 REAL = ("robot", "human", "import")
 #: Fewest trials for a calibration and for a density's similarity, and attempts to predict from.
@@ -49,8 +46,6 @@ LEAST_TRIALS, LEAST_SUCCESSES, LEAST_SIMULATED = 20, 20, 100
 _BINS = 5
 #: Predictions from fewer simulated attempts than this, by kernel weights, rest on next to nothing.
 _WITHIN_REACH = 1.0
-#: Kernels end at this many standard deviations of position.
-_REACH = 5.0
 #: Subsets of simulated successes that tell what chance alone would do.
 _SUBSETS = 10
 _POINTS = 8_000
@@ -60,14 +55,16 @@ def sources_report(
     inputs: ReportInputs, built: Built, options: SourcesOptions, progress: Progress
 ) -> SourcesReport:
     """Compare each source of real trials with simulation, whose trials ``built`` is of."""
-    simulated = attempts_of(inputs, built)
+    simulated = attempts.read(inputs.database, built.selected)
     real = _real(inputs, built, simulated)
     assert built.density is not None
     test = inputs.scenes.test(built.selected)
     trials_of = {source: _all(inputs, built, selected) for source, selected in real.items()}
     progress(0.3)
     kernel = built.density.kernel
-    model = _model(simulated, list(trials_of.values()), kernel, collisions_known=test is not None)
+    real_poses = Poses.concatenate([item.poses for item in trials_of.values()])
+    sigma_m, known = kernel.sigma_position_m, test is not None
+    model = model_near(simulated, real_poses, kernel, sigma_m, collisions_known=known)
     progress(0.5)
     compared = []
     for number, (source, selected) in enumerate(real.items()):
@@ -92,16 +89,14 @@ def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str,
     """The trials to compare with, by source; 409 says what is needed where these or simulated are too few."""
     slug = built.object_row.slug
     if len(simulated) < LEAST_SIMULATED or built.density is None:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             f"A comparison needs at least {LEAST_SIMULATED} simulated attempts and 1 success in them; there"
             f" are {len(simulated)} and {built.selected.successes}: sweep a grid"
             f" (POST /objects/{slug}/sweeps)",
         )
     real = {source: found for source in REAL if (found := _selected(inputs, built, source)) is not None}
     if not real:
-        raise conflict(
-            "too-few-trials",
+        raise too_few_trials(
             "There are no trials of a robot, a human or an import to compare simulation with: post at least"
             f" {LEAST_TRIALS} (POST /objects/{slug}/trials with source robot)",
         )
@@ -110,40 +105,20 @@ def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str,
 
 def _predictions(
     everything: AllTrials, model: SuccessModel | None, test: CollisionTest | None, threads: int
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """What simulation predicts at the poses of trials, and whether they are within its reach."""
     predicted = np.zeros(len(everything))
     reached = np.zeros(len(everything), dtype=bool)
     if model is not None:
-        answer = model.evaluate(Poses.of(everything.position, everything.quaternion), threads=threads)
+        answer = model.evaluate(everything.poses, threads=threads)
         predicted = answer.probability.copy()
         reached = answer.effective_trials >= _WITHIN_REACH
     if test is not None:
-        free = test.free(Poses(everything.position, everything.quaternion), threads=threads)
+        free = test.free(everything.poses, threads=threads)
         predicted[~free] = 0.0
         # Geometry tells of a collision wherever it is.
         reached |= ~free
     return predicted, reached
-
-
-def _model(
-    simulated: AllTrials, real: list[AllTrials], kernel: IsotropicKernel, *, collisions_known: bool
-) -> SuccessModel | None:
-    """What simulation knows within reach of the real trials: of millions of attempts few are near them."""
-    tree = cKDTree(np.concatenate([item.position for item in real]))
-    distance, _ = tree.query(simulated.position, distance_upper_bound=_REACH * kernel.sigma_position_m)
-    near = np.isfinite(distance)
-    if collisions_known:
-        # Those that collided tell nothing of the others.
-        near &= ~simulated.collided
-    if not near.any():
-        return None
-    return SuccessModel.build(
-        Poses.of(simulated.position[near], simulated.quaternion[near]),
-        simulated.success[near],
-        kernel=kernel,
-        symmetric=simulated.symmetric[near],
-    )
 
 
 def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | None:
@@ -153,27 +128,18 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
     chosen = built.selected
     with inputs.database.read() as tx:
         counts = outcome_counts(tx, built.object_row.id)
-        own = [
-            item
-            for item in provenances.of_object(tx, built.object_row.id)
-            if item.id in counts and item.source == source and item.gripper in (None, chosen.gripper)
-        ]
-    if any(item.protocol == chosen.protocol for item in own):
-        own = [item for item in own if item.protocol in (None, chosen.protocol)]
+        own = {
+            number: item
+            for number, item in provenances.of_object(tx, built.object_row.id).items()
+            if number in counts and item.source == source and item.gripper in (None, chosen.gripper)
+        }
+    if any(item.protocol == chosen.protocol for item in own.values()):
+        own = {number: item for number, item in own.items() if item.protocol in (None, chosen.protocol)}
     if not own:
         return None
-    outcomes = total([counts[item.id] for item in own])
-    tells = bool(outcomes.keys() - {"success", "simulation_error"})
-    return Selected(
-        row=chosen.row,
-        gripper=chosen.gripper,
-        protocol=", ".join(sorted({item.protocol for item in own if item.protocol is not None})) or None,
-        source=source,
-        profile=chosen.profile,
-        provenances={item.id: item.gripper is None or chosen.jaw_symmetric for item in own},
-        outcomes=outcomes,
-        tried=frozenset(item.id for item in own) if tells else frozenset(),
-    )
+    protocols = sorted({item.protocol for item in own.values() if item.protocol is not None})
+    names = {"gripper": chosen.gripper, "protocol": ", ".join(protocols) or None, "source": source}
+    return of_provenances(chosen.row, own, counts, profile=chosen.profile, **names)
 
 
 def _all(inputs: ReportInputs, built: Built, selected: Selected) -> AllTrials:
@@ -188,7 +154,7 @@ def _compared(
     selected: Selected,
     everything: AllTrials,
     predicted: Floats,
-    reached: NDArray[np.bool_],
+    reached: Bools,
 ) -> SourceComparison:
     won = everything.success
     count = len(everything)
@@ -241,20 +207,13 @@ def _similarity(inputs: ReportInputs, built: Built, everything: AllTrials) -> So
     kernel = IsotropicKernel(sigma, max(density.kernel.sigma_rotation, math.radians(15.0)))
     rng = np.random.default_rng(0)
 
-    def under(rows: NDArray[np.int64], weights: Floats | None) -> GraspDensity:
+    def under(rows: Ints, weights: Floats | None) -> GraspDensity:
         return GraspDensity.build(
-            se3.Poses.of(density.positions[rows], density.quaternions_xyzw[rows]),
-            kernel=kernel,
-            weights=weights,
-            symmetric=density.symmetric[rows],
+            density.poses[rows], kernel=kernel, weights=weights, symmetric=density.symmetric[rows]
         )
 
     whole = under(np.arange(density.size), density.weights)
-    real = GraspDensity.build(
-        se3.Poses.of(everything.position[won], everything.quaternion[won]),
-        kernel=kernel,
-        symmetric=everything.symmetric[won],
-    )
+    real = everything.density(kernel, won)
     found = bhattacharyya(real, whole, rng, points=_POINTS, threads=inputs.threads)
     count = min(len(won), density.size)
     alone = []

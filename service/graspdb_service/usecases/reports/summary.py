@@ -50,14 +50,14 @@ def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
     counts = outcome_counts(tx, item.id)
     symmetric: dict[str | None, bool] = {None: True}
     rows = []
-    for origin in provenances.of_object(tx, item.id):
-        if origin.id not in counts:
+    for number, origin in provenances.of_object(tx, item.id).items():
+        if number not in counts:
             continue
         if origin.gripper not in symmetric:
             assert origin.gripper is not None
             gripper = grippers.find(tx, origin.gripper)
             symmetric[origin.gripper] = gripper is None or bool(gripper.profile.get("symmetric", True))
-        outcomes = total([counts[origin.id]])
+        outcomes = total([counts[number]])
         tried = sum(outcomes.values()) - outcomes.get(_NO_ATTEMPT, 0)
         won = outcomes.get("success", 0)
         twins = 2 if symmetric[origin.gripper] else 1
@@ -65,9 +65,7 @@ def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
             SummaryRow(
                 object=item.slug,
                 revision=item.revision,
-                gripper=origin.gripper,
-                protocol=origin.protocol,
-                source=origin.source,
+                **origin._asdict(),
                 outcomes=outcomes,
                 trials=tried,
                 successes=won,

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb.wire.reports import AnisotropyRelation
 from graspdb_density.success.block_bootstrap import shares
 from graspdb_geometry.features.jaw_pairs import KINDS, JawPairs
-from graspdb_geometry.poses import ToolPoses
-from graspdb_service.usecases.reports.common import LEVEL, finite
+from graspdb_service.trial_columns import Bools, Floats, Ints
+from graspdb_service.usecases.reports.common import LEVEL, as_model, finite
 from graspdb_service.usecases.trials.attempts import AllTrials
-
-Floats = NDArray[np.float64]
 
 #: Ends of the ranges of angles between the closing axis and the pair's, degrees.
 ANGLES_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 90.0)
@@ -29,45 +26,39 @@ _LEAST_TOLD = 20
 
 def relations(everything: AllTrials, pairs: JawPairs) -> list[AnisotropyRelation]:
     """The share of attempts that succeeded for every kind of pair and angle, and at no pair."""
-    rows = np.arange(len(everything))
-    if len(rows) > _MOST_ATTEMPTS:
-        rows = np.sort(np.random.default_rng(0).choice(len(rows), size=_MOST_ATTEMPTS, replace=False))
-    p, q = everything.position[rows], everything.quaternion[rows]
-    won, hit = everything.success[rows], everything.collided[rows]
+    rows = everything.some(_MOST_ATTEMPTS)
+    poses, won, hit = everything.poses[rows], everything.success[rows], everything.collided[rows]
     found: list[AnisotropyRelation] = []
     edges = np.radians(ANGLES_DEG)
     alone = np.ones(len(rows), dtype=bool)
     for kind in KINDS:
-        which, angle = pairs.of(kind).at(ToolPoses(p, q))
+        which, angle = pairs.of(kind).at(poses)
         alone &= which < 0
         if not (pairs.kinds == KINDS.index(kind)).any():
             continue
         group = np.clip(np.searchsorted(edges, np.nan_to_num(angle), side="right") - 1, 0, len(edges) - 2)
         group[which < 0] = -1
-        found += _rows(kind, won, hit, group, p)
-    return found + _rows("none", won, hit, np.where(alone, 0, -1), p)
+        found += _rows(kind, won, hit, group, poses.positions)
+    return found + _rows("none", won, hit, np.where(alone, 0, -1), poses.positions)
 
 
 def _rows(
     kind: str,
-    won: NDArray[np.bool_],
-    hit: NDArray[np.bool_],
-    group: NDArray[np.int64],
+    won: Bools,
+    hit: Bools,
+    group: Ints,
     positions: Floats,
 ) -> list[AnisotropyRelation]:
     groups = 1 if kind == "none" else len(ANGLES_DEG) - 1
     every = shares(won, group, positions, groups=groups, level=LEVEL)
     free = shares(won, np.where(hit, -1, group), positions, groups=groups, level=LEVEL)
     return [
-        AnisotropyRelation(
+        as_model(
+            AnisotropyRelation,
+            share,
             relation=kind,
             angle_deg=None if kind == "none" else (ANGLES_DEG[number], ANGLES_DEG[number + 1]),
-            attempts=share.attempts,
             collisions=share.attempts - clear.attempts,
-            successes=share.successes,
-            probability=finite(share.probability),
-            low=finite(share.low),
-            high=finite(share.high),
             free_probability=finite(clear.probability),
             free_low=finite(clear.low),
             free_high=finite(clear.high),

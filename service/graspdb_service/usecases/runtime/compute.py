@@ -6,14 +6,18 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import TypeVar
 
-from graspdb_service.problems import ProblemError
+from graspdb_density.se3 import Poses
+from graspdb_service.problems import busy
 
 T = TypeVar("T")
 
 #: Queries under way or waiting. The server has 40 threads for requests: the others must find some free.
 MAX_QUERIES = 28
+#: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
+_BLOCK = 16_384
 
 
 class Compute:
@@ -28,12 +32,10 @@ class Compute:
     def admitted(self) -> Iterator[None]:
         """A query's place, from its first computation to its last; 429 where all are taken."""
         if not self._room.acquire(blocking=False):
-            raise ProblemError(
-                429,
-                "busy",
-                "All places for queries are taken: try again in a second, or ask for fewer poses at a time",
-                headers={"Retry-After": "1"},
+            title = (
+                "All places for queries are taken: try again in a second, or ask for fewer poses at a time"
             )
+            raise busy(title, status=429)
         try:
             yield
         finally:
@@ -43,11 +45,10 @@ class Compute:
         """Do ``work`` in the pool and wait for it. Never call it from inside the pool or a transaction."""
         return self._pool.submit(work).result()
 
-    def blocks(self, count: int, block: int, work: Callable[[slice], None]) -> None:
-        """Do ``work`` on consecutive slices of ``range(count)``, one by one so that others get between."""
-        for start in range(0, count, block):
-            part = slice(start, min(start + block, count))
-            self.run(lambda part=part: work(part))  # type: ignore[misc]
+    def blocks(self, poses: Poses, work: Callable[[Poses], T]) -> list[T]:
+        """What ``work`` answers for consecutive blocks of poses, one by one so that others get between."""
+        starts = range(0, len(poses), _BLOCK)
+        return [self.run(partial(work, poses[start : start + _BLOCK])) for start in starts]
 
     def close(self) -> None:
         self._pool.shutdown(wait=False, cancel_futures=True)

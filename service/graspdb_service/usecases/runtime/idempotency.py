@@ -26,54 +26,51 @@ class Created:
     batch_key: str | None = None
 
 
-def replay_or(
-    database: Database,
-    *,
-    scope: str,
-    key: str | None,
-    request: bytes,
-    create: Callable[[Tx], Created],
-) -> Created:
+@dataclass(frozen=True)
+class Sent:
+    """A creating request: its Idempotency-Key, and its body with whatever else changes the body's meaning."""
+
+    key: str | None
+    body: bytes
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(self.body).hexdigest()
+
+
+def replay_or(database: Database, scope: str, sent: Sent, create: Callable[[Tx], Created]) -> Created:
     """Create in one transaction with the key, or answer what the same request was answered before.
 
-    ``scope`` is method and path; ``request`` the body and whatever else changes its meaning. Without a key
-    ``create`` runs anyway, inside the transaction: parse and compute before. 422 where the key was used with
-    another body, 409 where what it made has since been deleted.
+    ``scope`` is method and path. Without a key ``create`` runs anyway, inside the transaction: parse and
+    compute before. 422 where the key was used with another body, 409 where what it made has since been
+    deleted.
     """
     with database.write() as tx:
-        if key is None:
+        if sent.key is None:
             return create(tx)
-        digest = hashlib.sha256(request).hexdigest()
-        earlier = idempotency.claim(tx, scope, key, digest)
+        earlier = idempotency.claim(tx, scope, sent.key, sent.digest)
         if earlier is None:
             made = create(tx)
-            idempotency.remember(
-                tx,
-                scope,
-                key,
-                status=made.status,
-                location=made.location,
-                answer=made.body,
-                batch_key=made.batch_key,
-            )
+            answer: dict[str, Any] = {"status": made.status, "location": made.location, "answer": made.body}
+            idempotency.remember(tx, scope, sent.key, **answer, batch_key=made.batch_key)
             return made
-    return _answer(earlier, digest)
+    return _answer(earlier, sent)
 
 
-def replayed(database: Database, *, scope: str, key: str | None, request: bytes) -> Created | None:
+def replayed(database: Database, scope: str, sent: Sent) -> Created | None:
     """What the same request was answered before, or None; refused as :func:`replay_or`, which takes the key.
 
     For requests whose checks may turn out otherwise the second time, or whose work is long: looked up first.
     """
-    if key is None:
+    if sent.key is None:
         return None
     with database.read() as tx:
-        earlier = idempotency.find(tx, scope, key)
-    return None if earlier is None else _answer(earlier, hashlib.sha256(request).hexdigest())
+        earlier = idempotency.find(tx, scope, sent.key)
+    return None if earlier is None else _answer(earlier, sent)
 
 
-def _answer(earlier: Remembered, digest: str) -> Created:
-    if earlier.request_sha256 != digest:
+def _answer(earlier: Remembered, sent: Sent) -> Created:
+    if earlier.request_sha256 != sent.digest:
         raise ProblemError(
             422,
             "idempotency-key-reused",

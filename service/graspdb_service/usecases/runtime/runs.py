@@ -21,7 +21,7 @@ from typing import Any
 from graspdb.wire.reports import ReportRun
 from graspdb.wire.states import RunState
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import ProblemError, conflict, not_found
+from graspdb_service.problems import ProblemError, busy, conflict, found
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.report_runs import RunKey, RunRow
@@ -32,7 +32,6 @@ log = logging.getLogger("graspdb")
 MAX_HELD = 16
 #: Requests that may wait for a result at a time; the others are told at once where it will be.
 _MAX_WAITING = 8
-_LEASE_S = 30.0
 _TICK_S = 2.0
 _POLL_S = 0.1
 #: What the request is to blame for, and would be again: kept as the run's answer.
@@ -96,10 +95,6 @@ class Runs:
             run = self._joined(key)
         return self._answered(run)
 
-    def enter(self, tx: Tx, key: RunKey, *, id: str, lease_id: str) -> None:
-        """Enter a run of this id that is nobody else's; `follow` it once the transaction is through."""
-        report_runs.ask(tx, key, id=id, lease_id=lease_id, lease_s=_LEASE_S)
-
     def follow(self, id: str, lease_id: str | None) -> RunRow:
         """A run done, or under way after the wait; computed here where this process holds its lease."""
         run = self._row(id)
@@ -115,7 +110,7 @@ class Runs:
         if run.state == RunState.CANCELLED:
             raise conflict("report-cancelled", f"The {what} was cancelled: ask again to compute it anew")
         if run.problem is not None:
-            raise _problem(run.problem)
+            raise ProblemError(**run.problem)
         if run.state == RunState.FAILED:
             raise ProblemError(
                 500, "internal-error", f"The {what} failed; the service's log says more: ask again to retry"
@@ -128,7 +123,7 @@ class Runs:
         if run.state == RunState.RUNNING and not run.live:
             lease = str(uuid.uuid4())
             with self._database.write() as tx:
-                taken = report_runs.take_over(tx, id, lease_id=lease, lease_s=_LEASE_S)
+                taken = report_runs.take_over(tx, id, lease_id=lease)
             if taken:
                 self._start(run, lease)
             run = self._row(id)
@@ -165,27 +160,21 @@ class Runs:
     def _row(self, id: str) -> RunRow:
         with self._database.read() as tx:
             run = report_runs.get(tx, id)
-        if run is None:
-            raise not_found("report run", id[:80], "runs of a past revision are deleted: ask for the report")
-        return run
+        return found(run, "report run", id, "runs of a past revision are deleted: ask for the report")
 
     def place(self) -> str:
         """A lease for a run that this process is to compute; 429 where it has too many."""
         with self._lock:
             if len(self._held) >= MAX_HELD:
-                raise ProblemError(
-                    429,
-                    "busy",
-                    f"{MAX_HELD} reports are under way already: try again when some are done",
-                    headers={"Retry-After": "5"},
-                )
+                title = f"{MAX_HELD} reports are under way already: try again when some are done"
+                raise busy(title, status=429, retry_after_s=5)
         return str(uuid.uuid4())
 
     def _joined(self, key: RunKey) -> RunRow:
         """The key's run, taken by this process where nobody has it."""
         lease = self.place()
         with self._database.write() as tx:
-            mine = report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id=lease, lease_s=_LEASE_S)
+            mine = report_runs.ask(tx, key, id=str(uuid.uuid4()), lease_id=lease)
             run = report_runs.find(tx, key)
         if run is None:
             # A newer revision's run has swept this one away meanwhile.
@@ -202,11 +191,9 @@ class Runs:
             deadline = time.monotonic() + self._wait_s
             while run.state == RunState.RUNNING and time.monotonic() < deadline and not self._closed.is_set():
                 with self._changed:
-                    if run.id in self._held:
-                        self._changed.wait(min(1.0, max(0.0, deadline - time.monotonic())))
-                    else:
-                        # Another process computes it.
-                        self._changed.wait(min(_POLL_S, max(0.0, deadline - time.monotonic())))
+                    # What another process computes is looked for again and again.
+                    most = 1.0 if run.id in self._held else _POLL_S
+                    self._changed.wait(min(most, max(0.0, deadline - time.monotonic())))
                 run = self.get(run.id)
             return run
         finally:
@@ -276,11 +263,8 @@ class Runs:
                 continue
             try:
                 with self._database.write() as tx:
-                    kept = report_runs.renew(
-                        tx,
-                        {id: (item.lease_id, item.progress) for id, item in held.items()},
-                        lease_s=_LEASE_S,
-                    )
+                    now = {id: (item.lease_id, item.progress) for id, item in held.items()}
+                    kept = report_runs.renew(tx, now)
             except Exception:
                 log.exception("leases of report runs could not be renewed")
                 continue
@@ -296,21 +280,8 @@ def _settled(run: RunRow) -> bool:
     return run.state == RunState.DONE or run.problem is not None
 
 
-def _problem(document: dict[str, Any]) -> ProblemError:
-    return ProblemError(
-        document["status"],
-        document["kind"],
-        document["title"],
-        errors=[(name, message) for name, message in document["errors"]],
-        extra=document["extra"],
-    )
-
-
 def model(run: RunRow) -> ReportRun:
     """As the wire has it, the result included."""
-    problem = None if run.problem is None else _problem(run.problem)
+    problem = None if run.problem is None else ProblemError(**run.problem).document("")
     result = None if run.result is None else json.loads(run.result)
-    fields = {name: getattr(run, name) for name in ReportRun.model_fields}
-    return ReportRun.model_validate(
-        {**fields, "result": result, "problem": None if problem is None else problem.document("")}
-    )
+    return ReportRun.model_validate({**vars(run), "result": result, "problem": problem})

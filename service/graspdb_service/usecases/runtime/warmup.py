@@ -6,7 +6,6 @@ import gc
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb_density import (
     GraspDensity,
@@ -21,6 +20,7 @@ from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import PG70
+from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.runtime.compute import Compute
 
 
@@ -45,7 +45,7 @@ def _exercise() -> None:
     kernel = IsotropicKernel(0.015, math.radians(15.0))
     region = Region([[0.0, 0.0, 1.0, 0.0]], approach=(0.0, 0.0, 1.0), approach_angle=1.0)
 
-    def free(asked: Poses) -> NDArray[np.bool_]:
+    def free(asked: Poses) -> Bools:
         return ~scene.collides(asked, PG70)
 
     choose_widths(Rows.of(poses))
@@ -60,7 +60,7 @@ def _exercise() -> None:
     search.maxima(region, count=2, admissible=free)
     top = search.global_maximum()
 
-    def elsewhere(asked: Poses) -> NDArray[np.bool_]:
+    def elsewhere(asked: Poses) -> Bools:
         return np.asarray(np.linalg.norm(asked.positions - top.position, axis=1) > 0.005)
 
     search.maxima(admissible=elsewhere)

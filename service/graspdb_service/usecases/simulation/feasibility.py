@@ -29,18 +29,16 @@ MIN_MASS_KG = 1e-3
 
 def check_gripper(profile: GripperProfile) -> None:
     """Refuse a gripper that no physics can be done with (422)."""
-    reason = None
-    try:
-        shape_of(profile)
-    except ValueError as error:
-        reason = str(error)
-    if reason is None:
-        reason = next(_troubles(profile), None)
+    reason = next(_troubles(profile), None)
     if reason is not None:
         raise invalid("gripper", reason, "This gripper can't be simulated")
 
 
 def _troubles(profile: GripperProfile) -> Iterator[str]:
+    try:
+        shape_of(profile)
+    except ValueError as error:
+        yield str(error)
     opening, speed = profile.max_opening_m, profile.max_speed_m_s
     if opening < MIN_OPENING_M:
         yield f"max_opening_m is {opening:g}, below {MIN_OPENING_M:g}: metres are meant"

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from typing import Any
 
 from graspdb.wire import (
     ClaimedJob,
     ClaimRequest,
     ClaimResponse,
     FailureReport,
-    GridPlan,
     LeaseRenewed,
-    PosePlan,
     SimulatePayload,
     WorkerInfo,
 )
 from graspdb.wire.jobs import FailureNoted
 from graspdb.wire.states import JobState
-from graspdb_service.problems import ProblemError, conflict, invalid, not_found
+from graspdb_service.problems import ProblemError, conflict, found, invalid
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.simulation.jobs import JobRow
@@ -79,23 +78,22 @@ def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
 
 def _payload(tx: Tx, sweep: SweepRow, job: JobRow) -> SimulatePayload:
     stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
-    world = sweep.snapshot["world"]
-    return SimulatePayload(
-        sweep=sweep.id,
-        object=sweep.object,
-        convex_parts=f"/objects/{sweep.object}/convex-parts",
-        parts_sha256=world["parts_sha256"],
-        mass_kg=world["mass_kg"],
-        friction=world["friction"],
-        gripper=world["gripper"],
-        protocol=sweep.protocol,
-        fidelity=sweep.fidelity,
-        grid=None if stored is not None else GridPlan.model_validate(sweep.snapshot["grid"]),
-        poses=None
-        if stored is None
-        else PosePlan(position=stored.position.tolist(), quaternion_xyzw=stored.quaternion_xyzw.tolist()),
-        start=job.start,
-        stop=job.stop,
+    plan: dict[str, Any] = {"grid": sweep.snapshot.get("grid")}
+    if stored is not None:
+        columns = {"position": stored.position.tolist(), "quaternion_xyzw": stored.quaternion_xyzw.tolist()}
+        plan = {"poses": columns}
+    return SimulatePayload.model_validate(
+        {
+            **sweep.snapshot["world"],
+            **plan,
+            "sweep": sweep.id,
+            "object": sweep.object,
+            "convex_parts": f"/objects/{sweep.object}/convex-parts",
+            "protocol": sweep.protocol,
+            "fidelity": sweep.fidelity,
+            "start": job.start,
+            "stop": job.stop,
+        }
     )
 
 
@@ -161,9 +159,7 @@ def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> Fai
 
 def require(job: JobRow | None, job_id: str) -> JobRow:
     """The job, or a 404."""
-    if job is None:
-        raise not_found("job", job_id[:80], "its object may have been deleted")
-    return job
+    return found(job, "job", job_id, "its object may have been deleted")
 
 
 def lost_lease(job: JobRow) -> ProblemError:
@@ -175,7 +171,7 @@ def lost_lease(job: JobRow) -> ProblemError:
         JobState.WAITING: "it waits for convex parts",
         JobState.QUEUED: "it was given back or failed, and waits for another claim",
         JobState.LEASED: "another claim has it",
-    }[job.state]
+    }[JobState(job.state)]
     return conflict("lease-lost", f"This lease is no longer the job's: {reason}. Drop it and claim again")
 
 
@@ -183,15 +179,4 @@ def workers(ctx: Runtime, *, skip: int, limit: int) -> tuple[list[WorkerInfo], i
     """Every worker that ever asked for jobs, by name, and where the next page starts."""
     with ctx.database.read() as tx:
         rows = jobs.list_workers(tx, skip=skip, limit=limit + 1)
-    items = [
-        WorkerInfo(
-            worker=row.name,
-            capabilities=row.capabilities,
-            last_seen=_time(row.last_seen),
-            jobs_leased=row.jobs_leased,
-            jobs_done=row.jobs_done,
-            poses_done=row.poses_done,
-        )
-        for row in rows[:limit]
-    ]
-    return items, skip + limit if len(rows) > limit else None
+    return rows[:limit], skip + limit if len(rows) > limit else None

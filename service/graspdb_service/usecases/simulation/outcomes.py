@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,8 +40,7 @@ def page(
         chunks = packed.page(tx, sweep_id, first_number=number, poses=limit + skip + 1)
         stored = {chunk.number: sweep_plan.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
     grid = sweep_plan.grid_of(row) if row.plan == "grid" else None
-    index, position = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
-    quaternion, codes = [np.empty((0, 4))], [np.empty(0, dtype=np.uint8)]
+    parts = [TrialColumns(np.empty((0, 3)), np.empty((0, 4)))]
     following = None
     for chunk in chunks:
         first = skip if chunk.number == number else 0
@@ -53,21 +53,18 @@ def page(
         poses = stored[chunk.number]
         if poses is None:
             assert grid is not None
-            poses = sweep_plan.grid_poses(grid, chunk.start, chunk.stop)
-        part = slice(first, last)
-        index.append(poses.pose_index[part])
-        position.append(poses.position[part])
-        quaternion.append(poses.quaternion_xyzw[part])
-        codes.append(np.frombuffer(chunk.outcomes, dtype=np.uint8)[part])
+            poses = sweep_plan.grid_poses(grid, grid.pose_indices(chunk.start, chunk.stop))
+        outcome = np.frombuffer(chunk.outcomes, dtype=np.uint8)
+        parts.append(replace(poses, outcome=outcome)[first:last])
         limit -= last - first
         if last < chunk.stop - chunk.start:
             following = f"{chunk.number}.{last}"
             break
     columns = TrialColumns(
-        position=np.concatenate(position),
-        quaternion_xyzw=np.concatenate(quaternion),
-        outcome=np.concatenate(codes),
-        pose_index=np.concatenate(index),
+        position=np.concatenate([part.position for part in parts]),
+        quaternion_xyzw=np.concatenate([part.quaternion_xyzw for part in parts]),
+        outcome=np.concatenate([part.outcome for part in parts]),
+        pose_index=np.concatenate([part.pose_index for part in parts]),
     )
     return columns, following
 

@@ -4,35 +4,36 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graspdb.wire import (
     GridPlan,
     GridSpec,
     GripperProfile,
     KernelInfo,
+    Pose,
     PoseColumns,
     SampleSpec,
     Selection,
     SweepCreate,
 )
 from graspdb_service.problems import conflict, invalid
-from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import jobs, sweeps
-from graspdb_service.storage.simulation.sweeps import POSE_COLUMNS
 from graspdb_service.storage.trials import batches, provenances
-from graspdb_service.trial_columns import Provenance
+from graspdb_service.trial_columns import Floats, Provenance
+from graspdb_service.usecases import grippers
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import samples
+from graspdb_service.usecases.grasps.constraints import poses_of
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or, replayed
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.simulation import feasibility
 from graspdb_service.usecases.simulation.sweeps import require_sweep, sweep_info
 from graspdb_service.usecases.trials import sweep_plan
@@ -66,24 +67,22 @@ class _Plan:
     count: int
     grid: GridPlan | None = None
     full_count: int | None = None
-    poses: npt.NDArray[np.float64] | None = None
+    poses: Floats | None = None
     kernel: KernelInfo | None = None
 
 
-def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, request: bytes) -> Created:
+def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created:
     """Check and queue a sweep: 409 while its object lacks its mesh, 422 for what can't be simulated."""
     scope = f"POST /objects/{slug}/sweeps"
-    earlier = replayed(ctx.database, scope=scope, key=key, request=request)
+    earlier = replayed(ctx.database, scope, sent)
     if earlier is not None:
         return earlier
     with ctx.database.read() as tx:
         row = require(tx, slug)
-        gripper = grippers.find(tx, spec.gripper)
+        profile = GripperProfile.model_validate(grippers.named(tx, spec.gripper).profile)
         if row.mesh_info is not None and row.parts_sha256 is None:
             decompositions.check(tx, row)
-    if gripper is None:
-        raise invalid("gripper", f"there is no gripper {spec.gripper!r}: GET /grippers lists them")
-    world = _world(row, GripperProfile.model_validate(gripper.profile))
+    world = _world(row, profile)
     plan = _plan(ctx, slug, spec, world)
     chunk = _chunk_size(ctx, spec, plan)
     # In memory and in one go, before the transaction, that it may be short.
@@ -123,7 +122,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, *, key: str | None, re
         info = sweep_info(tx, require_sweep(tx, sweep_id))
         return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
 
-    return replay_or(ctx.database, scope=scope, key=key, request=request, create=store)
+    return replay_or(ctx.database, scope, sent, store)
 
 
 def _request(spec: SweepCreate, plan: _Plan) -> dict[str, Any]:
@@ -221,18 +220,12 @@ def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan
     return _Plan("grid", count, grid=plan, full_count=full)
 
 
-def _given(ctx: Estimators, poses: Any) -> _Plan:
-    if isinstance(poses, PoseColumns):
-        position, quaternion = poses.position, poses.quaternion_xyzw
-    else:
-        position = [pose.position for pose in poses]
-        quaternion = [pose.quaternion_xyzw for pose in poses]
+def _given(ctx: Estimators, given: Sequence[Pose] | PoseColumns) -> _Plan:
+    poses = poses_of(given)
     limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
-    if len(position) > limit:
-        raise invalid("poses", f"{len(position)} are more than {limit}: make several sweeps of them")
-    table = np.full((len(position), POSE_COLUMNS), np.nan)
-    table[:, :3] = position
-    table[:, 3:7] = quaternion
+    if len(poses) > limit:
+        raise invalid("poses", f"{len(poses)} are more than {limit}: make several sweeps of them")
+    table = np.column_stack([*poses, np.full(len(poses), np.nan)])
     return _Plan("poses", len(table), poses=table)
 
 

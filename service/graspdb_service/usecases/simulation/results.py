@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, ResultAccepted, SimulateResult
 from graspdb.wire.states import JobState
-from graspdb_service.problems import ProblemError, invalid
+from graspdb_service.problems import busy, invalid
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
@@ -19,14 +19,13 @@ from graspdb_service.storage.simulation.jobs import JobRow
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.storage.trials import rows as trial_rows
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.trial_columns import Bools, TrialColumns
 from graspdb_service.usecases.geometry import decompositions, meshes
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
 from graspdb_service.usecases.simulation import leases
 from graspdb_service.usecases.simulation.leases import lost_lease
 from graspdb_service.usecases.trials import sweep_plan
-from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
 
 #: Sweeps over the same grid that finish chunks at the same moment make one another look again.
 _MAX_LOOKS = 50
@@ -67,13 +66,13 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             if sweep is None:
                 raise lost_lease(job)
             stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
-            twins = _twins(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
+            twins = sweeps.siblings(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
             ranges = packed.done_ranges(tx, list(twins))
             seen = packed.count_done(tx, list(twins))
         outcomes = _outcomes(result, job)
         if stored is None:
             grid = sweep_plan.grid_of(sweep)
-            poses = sweep_plan.grid_poses(grid, job.start, job.stop)
+            poses = sweep_plan.grid_poses(grid, grid.pose_indices(job.start, job.stop))
             others = [(sweep_plan.grid_of(twin), ranges[twin.id]) for twin in twins.values()]
             fresh = sweep_plan.not_stored_yet(grid, job.start, job.stop, poses.pose_index, others)
         else:
@@ -84,14 +83,9 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Simu
             return _store(ctx, job, lease_id, sha256, sweep, chunk, list(twins), seen)
         except _Overtaken:
             continue
-        except _LostLease:
+        except (_LostLease, objects.ObjectGone):
             return _replayed(ctx, job_id, lease_id, sha256, "simulate")
-    raise ProblemError(
-        503,
-        "busy",
-        "Sweeps over the same grid keep overtaking this result; send it again",
-        headers={"Retry-After": "1"},
-    )
+    raise busy("Sweeps over the same grid keep overtaking this result; send it again")
 
 
 def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> ResultAccepted:
@@ -111,10 +105,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
     info = meshes.check_parts(ctx, row, body)
     try:
         with ctx.database.write() as tx:
-            try:
-                revision, _ = objects.advance(tx, row.id, append=False)
-            except objects.ObjectGone:
-                raise _LostLease from None
+            revision, _ = objects.advance(tx, row.id, append=False)
             locked = require(tx, row.slug)
             accepted = ResultAccepted(job=job.id, revision=revision, inserted=0)
             # The mesh can't have changed: it has sweeps.
@@ -124,7 +115,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
                 raise _LostLease
             meshes.store_parts(tx, locked, body, info)
             jobs.credit_worker(tx, job.worker, 0)
-    except _LostLease:
+    except (_LostLease, objects.ObjectGone):
         return _replayed(ctx, job_id, lease_id, sha256, "decompose")
     return accepted
 
@@ -160,11 +151,6 @@ class _Chunk:
     counts: dict[str, dict[str, int]]
 
 
-def _twins(tx: Tx, sweep: SweepRow) -> dict[str, SweepRow]:
-    key = sweep.snapshot["repeat_key"]
-    return {other.id: other for other in sweeps.siblings(tx, sweep) if other.snapshot["repeat_key"] == key}
-
-
 def _outcomes(result: SimulateResult, job: JobRow) -> npt.NDArray[np.uint8]:
     outcomes = np.frombuffer(result.outcomes, dtype=np.uint8)
     expected = job.stop - job.start
@@ -183,8 +169,8 @@ def _chunk(
     sweep: SweepRow,
     result: SimulateResult,
     outcomes: npt.NDArray[np.uint8],
-    poses: ChunkPoses,
-    fresh: npt.NDArray[np.bool_],
+    poses: TrialColumns,
+    fresh: Bools,
 ) -> _Chunk:
     rows = result.rows
     for name in ("width_m", "quality"):
@@ -208,15 +194,13 @@ def _chunk(
         raise invalid("rows.pose_index", f"pose {missing} succeeded, so it must have a row")
     kept = place[fresh[place]]
     new = fresh[place]
-    columns = TrialColumns(
-        position=poses.position[kept],
-        quaternion_xyzw=poses.quaternion_xyzw[kept],
+    columns = replace(
+        poses[kept],
         outcome=outcomes[kept],
         provenance=np.full(len(kept), sweep.provenance_id, dtype=np.int64),
-        proposal_density=poses.proposal_density[kept],
-        quality=_floats(rows.quality)[new],
-        width_m=_floats(rows.width_m)[new],
-        pose_index=index[new],
+        # None becomes NaN, which stands for "none" in the columns.
+        quality=np.array(rows.quality, dtype=np.float64)[new],
+        width_m=np.array(rows.width_m, dtype=np.float64)[new],
     )
     packed = {} if sweep.purpose == "check" else _count(outcomes[fresh & ~is_row])
     counts: dict[str, dict[str, int]] = {
@@ -224,11 +208,6 @@ def _chunk(
         "packed": {str(code): number for code, number in packed.items()},
     }
     return _Chunk(outcomes, columns, packed, counts)
-
-
-def _floats(values: list[float | None]) -> npt.NDArray[np.float64]:
-    # None becomes NaN, which stands for "none" in the columns.
-    return np.array(values, dtype=np.float64)
 
 
 def _count(codes: npt.NDArray[np.uint8]) -> dict[int, int]:
@@ -249,13 +228,13 @@ def _store(
     collects = sweep.purpose == "collect"
     with ctx.database.write() as tx:
         rows = len(chunk.rows) if collects else 0
-        try:
-            if collects:
-                revision, first_seq = objects.advance(tx, sweep.object_id, rows=rows, append=True)
-            else:
-                revision, first_seq = sweeps.lock_and_read_revision(tx, sweep.object_id), 0
-        except objects.ObjectGone:
-            raise _LostLease from None
+        if collects:
+            revision, first_seq = objects.advance(tx, sweep.object_id, rows=rows, append=True)
+        else:
+            unchanged, first_seq = sweeps.lock_object(tx, sweep.object_id), 0
+            if unchanged is None:
+                raise _LostLease
+            revision = unchanged
         if twins and packed.count_done(tx, twins) != seen:
             raise _Overtaken
         accepted = ResultAccepted(job=job.id, revision=revision, inserted=rows)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 
-from graspdb.wire import OUTCOMES, GridSpec, SweepInfo
+from graspdb.wire import OUTCOMES, SweepInfo
 from graspdb.wire.states import JobState, SweepState
-from graspdb.wire.sweeps import FailedChunk
-from graspdb_service.problems import conflict, not_found
+from graspdb_service.problems import conflict, found
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import Progress, SweepRow
@@ -19,9 +18,7 @@ from graspdb_service.usecases.objects import require
 def require_sweep(tx: Tx, sweep_id: str) -> SweepRow:
     """The sweep, or a 404."""
     row = sweeps.find(tx, sweep_id) if is_uuid(sweep_id) else None
-    if row is None:
-        raise not_found("sweep", sweep_id[:80], "GET /sweeps lists them")
-    return row
+    return found(row, "sweep", sweep_id, "GET /sweeps lists them")
 
 
 def get(database: Database, sweep_id: str) -> SweepInfo:
@@ -79,36 +76,24 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
     rate = _rate(row, done)
     left = row.pose_count - done.poses_done
     grid = row.request.get("grid")
-    sample = row.request.get("sample")
-    return SweepInfo(
-        id=row.id,
-        object=row.object,
-        batch=row.snapshot["batch"],
-        gripper=row.gripper,
-        protocol=row.protocol,
-        fidelity=row.fidelity,
-        purpose=row.purpose,
-        plan=row.plan,
-        grid=None if grid is None else GridSpec.model_validate(grid),
-        seed=(grid or sample or {}).get("seed"),
-        state=state,
-        chunks=row.chunks,
-        chunks_done=done.states.get(JobState.DONE, 0),
-        chunks_failed=failed,
-        poses=row.pose_count,
-        poses_done=done.poses_done,
-        full_grid_poses=row.snapshot.get("full_count"),
-        waiting_for=decompositions.waiting_for(tx, row),
-        outcomes={name: done.counts[name] for name in OUTCOMES if name in done.counts},
-        rate_poses_s=rate,
-        time_left_s=left / rate if rate and state == SweepState.RUNNING else None,
-        failed_chunks=[
-            FailedChunk(chunk=number, attempts=attempts, error=error)
-            for number, attempts, error in done.failed
-        ],
-        created_at=row.created_at,
-        started_at=row.started_at,
-        finished_at=row.finished_at,
+    return SweepInfo.model_validate(
+        {
+            **vars(row),
+            "batch": row.snapshot["batch"],
+            "grid": grid,
+            "seed": (grid or row.request.get("sample") or {}).get("seed"),
+            "state": state,
+            "chunks_done": done.states.get(JobState.DONE, 0),
+            "chunks_failed": failed,
+            "poses": row.pose_count,
+            "poses_done": done.poses_done,
+            "full_grid_poses": row.snapshot.get("full_count"),
+            "waiting_for": decompositions.waiting_for(tx, row),
+            "outcomes": {name: done.counts[name] for name in OUTCOMES if name in done.counts},
+            "rate_poses_s": rate,
+            "time_left_s": left / rate if rate and state == SweepState.RUNNING else None,
+            "failed_chunks": done.failed,
+        }
     )
 
 

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, KernelInfo
 from graspdb.wire.reports import CheckCall
 from graspdb_density import IsotropicKernel
+from graspdb_density.se3 import Poses
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import outcomes, sweeps
-from graspdb_service.usecases.densities.cache import Built
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.trials import sweep_plan
-
-Floats = NDArray[np.float64]
 
 #: Draws that a sweep named in a report makes: a share of .3 is then known within .04.
 DRAWS = 500
@@ -32,8 +31,7 @@ class Check:
     plan: str
     protocol: str
     kernel: KernelInfo | None
-    position: Floats
-    quaternion: Floats
+    poses: Poses
     codes: NDArray[np.uint8]
 
 
@@ -49,7 +47,9 @@ def read(database: Database, built: Built) -> list[Check]:
     result = []
     for chunk, given in zip(found, poses, strict=True):
         sweep = plan[chunk.sweep_id]
-        at = given or sweep_plan.grid_poses(sweep_plan.grid_of(sweep), chunk.start, chunk.stop)
+        if given is None:
+            grid = sweep_plan.grid_of(sweep)
+            given = sweep_plan.grid_poses(grid, grid.pose_indices(chunk.start, chunk.stop))
         codes = np.frombuffer(chunk.outcomes, dtype=np.uint8)
         kept = codes != _NO_ATTEMPT
         kernel = sweep.snapshot.get("drawn_with")
@@ -58,8 +58,7 @@ def read(database: Database, built: Built) -> list[Check]:
                 plan=sweep.plan,
                 protocol=sweep.protocol,
                 kernel=None if kernel is None else KernelInfo.model_validate(kernel),
-                position=at.position[kept],
-                quaternion=at.quaternion_xyzw[kept],
+                poses=given.poses[kept],
                 codes=codes[kept],
             )
         )

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from graspdb.wire import OUTCOME_CODES
-from graspdb_density import HAAR_VOLUME
+from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
+from graspdb_density.se3 import Poses
+from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.simulation import outcomes, sweeps
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import rows as trial_rows
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.selection import Selected
-from graspdb_service.usecases.trials.sweep_plan import ChunkPoses
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 COLLISION, NO_ATTEMPT = OUTCOME_CODES["collision"], OUTCOME_CODES["simulation_error"]
 _SUCCESS = OUTCOME_CODES["success"]
@@ -38,8 +36,7 @@ class AllTrials:
     not here, where fewer were asked for: those that are stand for all, each as much as the other.
     """
 
-    position: Floats
-    quaternion: Floats
+    poses: Poses
     success: Bools
     collided: Bools
     symmetric: Bools
@@ -55,6 +52,26 @@ class AllTrials:
         """All of them, those left out too."""
         return len(self) + self.left_out
 
+    def some(self, most: int) -> Ints:
+        """Rows of all of them, or of so many drawn at random."""
+        if len(self) <= most:
+            return np.arange(len(self))
+        return np.sort(np.random.default_rng(0).choice(len(self), size=most, replace=False))
+
+    def success_model(self, kernel: SuccessKernel, rows: Bools | Ints) -> SuccessModel:
+        """How likely success is by some of them."""
+        return SuccessModel.build(
+            self.poses[rows], self.success[rows], kernel=kernel, symmetric=self.symmetric[rows]
+        )
+
+    def density(
+        self, kernel: IsotropicKernel, rows: Bools | Ints, weights: ArrayLike | None = None
+    ) -> GraspDensity:
+        """The density of some of them."""
+        return GraspDensity.build(
+            self.poses[rows], kernel=kernel, weights=weights, symmetric=self.symmetric[rows]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Swept:
@@ -62,7 +79,7 @@ class Swept:
 
     sweep: SweepRow
     chunk: PackedChunk
-    poses: ChunkPoses | None
+    poses: TrialColumns | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +98,6 @@ class Stored:
             item.sweep.id: item.sweep.snapshot["repeat_key"] if item.sweep.plan == "grid" else item.sweep.id
             for item in self.swept
         }
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    position: Floats
-    quaternion: Floats
-    codes: NDArray[np.uint8]
-    symmetric: Bools
-    proposal: Floats
-    index: Ints | None = None
 
 
 def read(database: Database, selected: Selected, *, most_collided: int | None = None) -> AllTrials:
@@ -125,70 +132,58 @@ def fetch(
     for chunk in chunks:
         sweep = known[chunk.sweep_id]
         swept.append(Swept(sweep, chunk, sweep_plan.chunk_poses(tx, sweep, chunk.start, chunk.stop)))
-    rows = trial_rows.read(
-        tx,
-        selected.row.id,
-        provenance_ids=sorted(selected.tried),
-        successes_only=False,
-        after_seq=after_seq,
-        swept=False,
-        without=without,
+    rows = trial_rows.posted(
+        tx, selected.row.id, sorted(selected.tried), after_seq=after_seq, without=without
     )
     return Stored(rows, swept, selected, without)
 
 
 def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
     """Attempts in arrays, each pose of a grid once; ``most_collided`` as :func:`read` takes it."""
-    rows, provenances, swept = stored.rows, stored.selected.provenances, stored.swept
+    rows, swept = stored.rows, stored.swept
     grids = {item.sweep.id: sweep_plan.grid_of(item.sweep) for item in swept if item.poses is None}
     codes = [rows.outcome, *(np.frombuffer(item.chunk.outcomes, dtype=np.uint8) for item in swept)]
-    kept = [np.ones(len(rows.outcome), dtype=bool), *(~np.isin(c, stored.without) for c in codes[1:])]
-    indices: list[Ints | None] = [None]
-    for item in swept:
-        grid = grids.get(item.sweep.id)
-        indices.append(None if grid is None else grid.pose_indices(item.chunk.start, item.chunk.stop))
-    _drop_repeated(stored, indices, kept)
-    left_out = 0 if most_collided is None else _drop_collided(codes, kept, most_collided)
-    flags = np.array([provenances[int(p)] for p in rows.provenance], dtype=bool)
-    first = kept[0]
-    parts = [
-        _Part(
-            rows.position[first],
-            rows.quaternion_xyzw[first],
-            rows.outcome[first],
-            flags[first],
-            rows.proposal_density[first],
-        )
+    kept = [np.ones(len(rows), dtype=bool), *(~np.isin(c, stored.without) for c in codes[1:])]
+    indices = [
+        grids[item.sweep.id].pose_indices(item.chunk.start, item.chunk.stop) if item.poses is None else None
+        for item in swept
     ]
-    for item, code, keep, index in zip(swept, codes[1:], kept[1:], indices[1:], strict=True):
-        known = None if index is None else index[keep]
-        symmetric = provenances[item.sweep.provenance_id]
-        parts.append(_chunk(item, grids.get(item.sweep.id), symmetric, code, keep, known))
-    code = np.concatenate([part.codes for part in parts])
+    _drop_repeated(swept, indices, kept[1:])
+    left_out = 0 if most_collided is None else _drop_collided(codes, kept, most_collided)
+    parts = [rows[kept[0]]]
+    for item, code, keep, index in zip(swept, codes[1:], kept[1:], indices, strict=True):
+        if item.poses is not None:
+            chunk = item.poses[keep]
+        else:
+            assert index is not None
+            chunk = sweep_plan.grid_poses(grids[item.sweep.id], index[keep])
+        provenance = np.full(len(chunk), item.sweep.provenance_id)
+        parts.append(replace(chunk, outcome=code[keep], provenance=provenance))
+
+    def column(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    code = column("outcome")
     return AllTrials(
-        position=np.concatenate([part.position for part in parts]),
-        quaternion=np.concatenate([part.quaternion for part in parts]),
+        poses=Poses(column("position"), column("quaternion_xyzw")),
         success=code == _SUCCESS,
         collided=code == COLLISION,
-        symmetric=np.concatenate([part.symmetric for part in parts]),
-        proposal=np.concatenate([part.proposal for part in parts]),
-        keys=_keys(parts, stored, grids),
+        symmetric=stored.selected.symmetric(column("provenance")),
+        proposal=column("proposal_density"),
+        keys=_keys(stored, parts, grids),
         left_out=left_out,
     )
 
 
-def _drop_repeated(stored: Stored, indices: list[Ints | None], kept: list[Bools]) -> None:
+def _drop_repeated(swept: list[Swept], indices: list[Ints | None], kept: list[Bools]) -> None:
     """Two sweeps of one grid share poses, which count once: the first one stored."""
     together: dict[str, list[int]] = {}
-    sweeps_of: dict[str, set[str]] = {}
-    for place, item in enumerate(stored.swept, start=1):
-        if indices[place] is not None:
-            key = item.sweep.snapshot["repeat_key"]
-            together.setdefault(key, []).append(place)
-            sweeps_of.setdefault(key, set()).add(item.sweep.id)
-    for key, places in together.items():
+    for place, item in enumerate(swept):
+        if item.poses is None:
+            together.setdefault(item.sweep.snapshot["repeat_key"], []).append(place)
+    for places in together.values():
         # Chunks of one sweep share nothing.
-        if len(sweeps_of[key]) < 2:
+        if len({swept[place].sweep.id for place in places}) < 2:
             continue
         chosen = [np.flatnonzero(kept[place]) for place in places]
         index = np.concatenate(
@@ -220,31 +215,11 @@ def _drop_collided(codes: list[NDArray[np.uint8]], kept: list[Bools], most: int)
     return left_out
 
 
-def _chunk(
-    item: Swept,
-    grid: PoseGrid | None,
-    symmetric: bool,
-    codes: NDArray[np.uint8],
-    kept: Bools,
-    index: Ints | None,
-) -> _Part:
-    count = int(kept.sum())
-    flags, poses = np.full(count, symmetric), item.poses
-    if poses is not None:
-        at, to, proposal = poses.position[kept], poses.quaternion_xyzw[kept], poses.proposal_density[kept]
-        return _Part(at, to, codes[kept], flags, proposal)
-    assert grid is not None
-    assert index is not None
-    position, quaternion = grid.poses(index)
-    proposal = np.full(count, 1.0 / (HAAR_VOLUME * grid.volume_m3))
-    return _Part(position, quaternion, codes[kept], flags, proposal, index)
-
-
-def _keys(parts: list[_Part], stored: Stored, grids: dict[str, PoseGrid]) -> tuple[Ints, Ints] | None:
-    of_grids = [part.index for part in parts if part.index is not None]
-    elsewhere = sum(len(part.codes) for part in parts if part.index is None)
+def _keys(stored: Stored, parts: list[TrialColumns], grids: dict[str, PoseGrid]) -> tuple[Ints, Ints] | None:
+    of_grids = [part for part, item in zip(parts[1:], stored.swept, strict=True) if item.poses is None]
     keys = {stored.repeat_keys[sweep] for sweep in grids}
-    if len(keys) != 1 or elsewhere:
+    if len(keys) != 1 or sum(map(len, of_grids)) < sum(map(len, parts)):
         return None
-    position, rotation = np.divmod(np.concatenate(of_grids), next(iter(grids.values())).rotation_count)
+    index = np.concatenate([part.pose_index for part in of_grids])
+    position, rotation = np.divmod(index, next(iter(grids.values())).rotation_count)
     return rotation, position

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import outcomes, sweeps
@@ -18,9 +17,8 @@ from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.storage.trials import rows as trial_rows
 from graspdb_service.storage.trials.batches import BatchRow
+from graspdb_service.trial_columns import Ints
 from graspdb_service.usecases.trials import sweep_plan
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +56,7 @@ class Inheritance:
             if share.packed:
                 outcomes.add_packed_counts(tx, share.chunk.job_id, share.packed)
                 provenances.add_packed(tx, heir.provenance_id, share.packed)
-            batches.inherit(
+            batches.grow(
                 tx,
                 heir.id,
                 first_seq=share.rows[0][0] if share.rows else None,
@@ -125,8 +123,7 @@ def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
 
 def _chunks(tx: Tx, sweep: SweepRow) -> tuple[dict[str, SweepRow], list[DoneChunk]]:
     """The other sweeps over the grid, and the finished chunks of all of them in commit order."""
-    key = sweep.snapshot["repeat_key"]
-    heirs = {other.id: other for other in sweeps.siblings(tx, sweep) if other.snapshot["repeat_key"] == key}
+    heirs = sweeps.siblings(tx, sweep)
     return heirs, outcomes.done_chunks(tx, [sweep.id, *heirs]) if heirs else []
 
 

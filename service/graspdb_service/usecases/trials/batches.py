@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, BatchInfo
-from graspdb_service.problems import ProblemError, conflict, not_found
+from graspdb_service.problems import busy, conflict, found
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.trials import batches
@@ -58,31 +58,16 @@ def remove(database: Database, slug: str, key: str) -> None:
                 left.hand_over(tx, batch)
             batches.remove(tx, batch)
             return
-    raise ProblemError(
-        503,
-        "busy",
-        "Sweeps over the same grid keep finishing chunks meanwhile; send it again",
-        headers={"Retry-After": "1"},
-    )
+    raise busy("Sweeps over the same grid keep finishing chunks meanwhile; send it again")
 
 
 def _require(tx: Tx, object_id: int, key: str) -> BatchRow:
     batch = batches.find(tx, object_id, key) if is_uuid(key) else None
-    if batch is None:
-        raise not_found("batch", key[:80], "GET /objects/{id}/batches lists them")
-    return batch
+    return found(batch, "batch", key, "GET /objects/{id}/batches lists them")
 
 
 def _info(tx: Tx, slug: str, batch: BatchRow) -> BatchInfo:
     counts = batches.outcome_counts(tx, batch)
-    return BatchInfo(
-        batch=batch.key,
-        object=slug,
-        revision=batch.revision,
-        inserted=batch.inserted,
-        packed=batch.packed,
-        sweep=batch.sweep_id,
-        metadata=batch.metadata,
-        outcomes={OUTCOMES[code]: number for code, number in sorted(counts.items()) if number},
-        created_at=batch.created_at,
-    )
+    outcomes = {OUTCOMES[code]: number for code, number in sorted(counts.items()) if number}
+    told = {"batch": batch.key, "object": slug, "sweep": batch.sweep_id, "outcomes": outcomes}
+    return BatchInfo.model_validate({**vars(batch), **told})

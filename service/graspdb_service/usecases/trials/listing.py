@@ -9,7 +9,7 @@ from graspdb.wire import OUTCOME_CODES
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import batches, provenances, rows
-from graspdb_service.trial_columns import Provenance, TrialPage
+from graspdb_service.trial_columns import TrialPage
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 
@@ -34,7 +34,7 @@ def page(
     """A page of trials in commit order, and the sequence number after which the next one starts."""
     with database.read() as tx:
         found = _read(tx, require(tx, slug), chosen, after, limit + 1)
-    columns = found.columns.first(limit)
+    columns = found.columns[:limit]
     following = int(columns.seq[-1]) if len(found.columns) > limit else None
     return replace(found, columns=columns), following
 
@@ -59,7 +59,7 @@ def pages(database: Database, slug: str, chosen: TrialFilter, *, after: int) -> 
 def _read(
     tx: Tx, row: ObjectRow, chosen: TrialFilter, after: int, limit: int, up_to: int | None = None
 ) -> TrialPage:
-    names = {number: Provenance(*name) for number, *name in provenances.of_object(tx, row.id)}
+    names = provenances.of_object(tx, row.id)
     wanted = [chosen.gripper, chosen.source, chosen.protocol]
     passing = [
         number

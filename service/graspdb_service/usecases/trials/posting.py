@@ -13,15 +13,15 @@ from graspdb_service.storage.database import Tx
 from graspdb_service.storage.trials import batches, provenances, rows
 from graspdb_service.trial_columns import TrialBatch
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.idempotency import Created, replay_or
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 from graspdb_service.usecases.runtime.runtime import Runtime
 
 
-def add(ctx: Runtime, slug: str, *, body: bytes, media: str, key: str | None) -> Created:
+def add(ctx: Runtime, slug: str, sent: Sent, media: str) -> Created:
     """Store the trials of one request as a batch."""
     with ctx.database.read() as tx:
         require(tx, slug)
-    batch = parse(body, media, limit=ctx.settings.max_batch_trials)
+    batch = parse(sent.body, media, limit=ctx.settings.max_batch_trials)
     count = len(batch.columns)
 
     def make(tx: Tx) -> Created:
@@ -40,8 +40,8 @@ def add(ctx: Runtime, slug: str, *, body: bytes, media: str, key: str | None) ->
             batch_key=batch_key,
         )
 
-    scope = f"POST /objects/{slug}/trials"
-    return replay_or(ctx.database, scope=scope, key=key, request=media.encode() + b"\n" + body, create=make)
+    meant = Sent(sent.key, media.encode() + b"\n" + sent.body)
+    return replay_or(ctx.database, f"POST /objects/{slug}/trials", meant, make)
 
 
 def _refuse_unknown_grippers(tx: Tx, batch: TrialBatch) -> None:

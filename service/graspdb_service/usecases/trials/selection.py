@@ -7,33 +7,24 @@ from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from graspdb.wire import OUTCOMES, GripperProfile, Selection
-from graspdb_service.problems import conflict, not_found
+import numpy as np
+
+from graspdb.wire import OUTCOMES, GripperProfile
+from graspdb.wire.queries import TrialSelection
+from graspdb_service.problems import conflict, found
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
+from graspdb_service.trial_columns import Bools, Ints, Provenance
 from graspdb_service.usecases.objects import require
 
 _KEPT = 4_096
 
 
-@dataclass(frozen=True)
-class Filters:
-    """What a request names; None: not named."""
-
-    gripper: str | None = None
-    protocol: str | None = None
-    source: str | None = None
-
-    @classmethod
-    def of(cls, request: Selection) -> Filters:
-        return cls(request.gripper, request.protocol, request.source)
-
-
 @dataclass(frozen=True, eq=False)
 class Selected:
-    """What the filters mean for an object as it was when they were resolved.
+    """What a request's selection means for an object as it was when it was resolved.
 
     ``row`` is the object; ``gripper`` and ``protocol`` are the one named, else the only one among the trials,
     else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw
@@ -51,9 +42,13 @@ class Selected:
     tried: frozenset[int]
 
     @property
-    def filters(self) -> Filters:
-        """The filters that select the same trials whatever else is added to the object."""
-        return Filters(self.gripper, self.protocol, self.source)
+    def filters(self) -> TrialSelection:
+        """What selects the same trials whatever else is added to the object."""
+        return TrialSelection(gripper=self.gripper, protocol=self.protocol, source=self.source)
+
+    def symmetric(self, provenance: Ints) -> Bools:
+        """Whether the jaw was mirror-symmetric, of trials (n,) of the selection by their provenances."""
+        return np.isin(provenance, [number for number, symmetric in self.provenances.items() if symmetric])
 
     @property
     def jaw_symmetric(self) -> bool:
@@ -69,19 +64,19 @@ class Selections:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._resolved: OrderedDict[tuple[int, Filters], Selected] = OrderedDict()
+        self._resolved: OrderedDict[tuple[object, ...], Selected] = OrderedDict()
         self._lock = threading.Lock()
 
-    def resolve(self, slug: str, filters: Filters) -> Selected:
-        """The object as it is now, and which of its trials the filters select (404, 409 where ambiguous)."""
+    def resolve(self, slug: str, asked: TrialSelection) -> Selected:
+        """The object as it is now, and which of its trials a request is about (404, 409 where ambiguous)."""
         with self._database.read() as tx:
             row = require(tx, slug)
-            key = row.id, filters
+            key = row.id, asked.gripper, asked.protocol, asked.source
             with self._lock:
                 known = self._resolved.get(key)
             if known is not None and known.row.revision == row.revision:
                 return known
-            selected = resolve(tx, row, filters)
+            selected = resolve(tx, row, asked)
         with self._lock:
             self._resolved[key] = selected
             self._resolved.move_to_end(key)
@@ -98,52 +93,67 @@ def as_of(tx: Tx, selected: Selected) -> Selected:
     return selected if row.revision == selected.row.revision else resolve(tx, row, selected.filters)
 
 
-def resolve(tx: Tx, row: ObjectRow, filters: Filters) -> Selected:
-    """Find the provenances that pass the filters.
+def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
+    """Find the provenances that a request is about.
 
     A trial without gripper or protocol fits every selection and makes none ambiguous. 404 for an unknown
     gripper; 409 ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
-    profiles: dict[str, GripperProfile] = {}
-    if filters.gripper is not None:
-        profiles[filters.gripper] = _profile(tx, filters.gripper)
+    profile = None if asked.gripper is None else _profile(tx, asked.gripper)
     counts = outcome_counts(tx, row.id)
     # A provenance all of whose trials were deleted is none of the object's any more.
-    candidates = [
-        item
-        for item in provenances.of_object(tx, row.id)
-        if item.id in counts
-        and filters.source in (None, item.source)
-        and (filters.gripper is None or item.gripper in (None, filters.gripper))
-        and (filters.protocol is None or item.protocol in (None, filters.protocol))
-    ]
-    found = {name: _distinct(getattr(item, name) for item in candidates) for name in ("gripper", "protocol")}
-    ambiguous = [name for name, values in found.items() if len(values) > 1 and getattr(filters, name) is None]
+    candidates = {
+        number: item
+        for number, item in provenances.of_object(tx, row.id).items()
+        if number in counts
+        and asked.source in (None, item.source)
+        and (asked.gripper is None or item.gripper in (None, asked.gripper))
+        and (asked.protocol is None or item.protocol in (None, asked.protocol))
+    }
+    items = candidates.values()
+    named = {name: _distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
+    ambiguous = [name for name, values in named.items() if len(values) > 1 and getattr(asked, name) is None]
     if ambiguous:
-        told = "; ".join(f"{name}: {', '.join(found[name])}" for name in ambiguous)
+        told = "; ".join(f"{name}: {', '.join(named[name])}" for name in ambiguous)
         raise conflict(
             "ambiguous-selection",
             f"The trials are of several {' and '.join(name + 's' for name in ambiguous)}: name one ({told})",
-            grippers=found["gripper"],
-            protocols=found["protocol"],
+            grippers=named["gripper"],
+            protocols=named["protocol"],
         )
-    chosen = {
-        name: getattr(filters, name) or (values[0] if values else None) for name, values in found.items()
+    gripper, protocol = (getattr(asked, name) or next(iter(values), None) for name, values in named.items())
+    if gripper is not None and profile is None:
+        profile = _profile(tx, gripper)
+    names = {"gripper": gripper, "protocol": protocol, "source": asked.source}
+    return of_provenances(row, candidates, counts, profile=profile, **names)
+
+
+def of_provenances(
+    row: ObjectRow,
+    chosen: Mapping[int, Provenance],
+    counts: Mapping[int, Mapping[str, int]],
+    *,
+    gripper: str | None,
+    protocol: str | None,
+    source: str | None,
+    profile: GripperProfile | None,
+) -> Selected:
+    """The selection of provenances of no other gripper than this; ``counts`` of each are by outcome."""
+    failing = {
+        item.source
+        for number, item in chosen.items()
+        if counts[number].keys() - {"success", "simulation_error"}
     }
-    for name in _distinct([chosen["gripper"], *(item.gripper for item in candidates)]):
-        profiles.setdefault(name, _profile(tx, name))
-    failing = {item.source for item in candidates if counts[item.id].keys() - {"success", "simulation_error"}}
+    symmetric = profile is None or profile.symmetric
     return Selected(
         row=row,
-        gripper=chosen["gripper"],
-        protocol=chosen["protocol"],
-        source=filters.source,
-        profile=profiles.get(chosen["gripper"] or ""),
-        provenances={
-            item.id: item.gripper is None or profiles[item.gripper].symmetric for item in candidates
-        },
-        outcomes=total([counts[item.id] for item in candidates]),
-        tried=frozenset(item.id for item in candidates if item.source in failing),
+        gripper=gripper,
+        protocol=protocol,
+        source=source,
+        profile=profile,
+        provenances={number: item.gripper is None or symmetric for number, item in chosen.items()},
+        outcomes=total([counts[number] for number in chosen]),
+        tried=frozenset(number for number, item in chosen.items() if item.source in failing),
     )
 
 
@@ -163,9 +173,7 @@ def total(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
 
 
 def _profile(tx: Tx, name: str) -> GripperProfile:
-    row = grippers.find(tx, name)
-    if row is None:
-        raise not_found("gripper", name, "GET /grippers lists those there are")
+    row = found(grippers.find(tx, name), "gripper", name, "GET /grippers lists those there are")
     return GripperProfile.model_validate(row.profile)
 
 

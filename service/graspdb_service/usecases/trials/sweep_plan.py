@@ -10,37 +10,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from graspdb.wire import GridPlan
+from graspdb_density import HAAR_VOLUME
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import SweepRow
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-
-#: Volume of SO(3) in rad^3 under the measure that the densities use.
-ROTATION_VOLUME = 8.0 * np.pi**2
-
-
-@dataclass(frozen=True)
-class ChunkPoses:
-    """The poses of a chunk (n,), in the order of its outcomes, ascending ``pose_index``.
-
-    The tool in the object frame, metres; ``proposal_density`` is what each was drawn with, 1/(m^3 rad^3), NaN
-    where it was chosen by hand.
-    """
-
-    pose_index: IntArray
-    position: FloatArray
-    quaternion_xyzw: FloatArray
-    proposal_density: FloatArray
+from graspdb_service.trial_columns import Bools, Ints, TrialColumns
 
 
 def grid_of(sweep: SweepRow) -> PoseGrid:
@@ -63,31 +43,34 @@ def repeat_key(world: dict[str, Any], protocol: str, fidelity: str, grid: GridPl
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def chunk_poses(tx: Tx, sweep: SweepRow, start: int, stop: int) -> ChunkPoses | None:
-    """The stored poses of a chunk; None for a grid, whose poses :func:`grid_poses` computes."""
+def chunk_poses(tx: Tx, sweep: SweepRow, start: int, stop: int) -> TrialColumns | None:
+    """The stored poses of a chunk, in the order of its outcomes, with what each was drawn with; None for a
+    grid, whose poses :func:`grid_poses` computes.
+    """
     if sweep.plan == "grid":
         return None
     stored = sweeps.poses(tx, sweep.id, start, stop)
-    return ChunkPoses(
-        np.arange(start, stop, dtype=np.int64), stored[:, :3], stored[:, 3:7], np.asarray(stored[:, 7])
+    return TrialColumns(
+        stored[:, :3],
+        stored[:, 3:7],
+        proposal_density=stored[:, 7],
+        pose_index=np.arange(start, stop, dtype=np.int64),
     )
 
 
-def grid_poses(grid: PoseGrid, start: int, stop: int) -> ChunkPoses:
-    """The poses of a grid's chunk, each drawn uniformly from the grid's volume times all rotations."""
-    index = grid.pose_indices(start, stop)
-    position, quaternion = grid.poses(index)
-    density = np.full(len(index), 1.0 / (ROTATION_VOLUME * grid.volume_m3))
-    return ChunkPoses(index, position, quaternion, density)
+def grid_poses(grid: PoseGrid, index: Ints) -> TrialColumns:
+    """Poses of a grid, each drawn uniformly from the grid's volume times all rotations."""
+    density = np.full(len(index), 1.0 / (HAAR_VOLUME * grid.volume_m3))
+    return TrialColumns(*grid.poses(index), proposal_density=density, pose_index=index)
 
 
 def not_stored_yet(
     grid: PoseGrid,
     start: int,
     stop: int,
-    pose_index: IntArray,
+    pose_index: Ints,
     others: Sequence[tuple[PoseGrid, Sequence[tuple[int, int]]]],
-) -> npt.NDArray[np.bool_]:
+) -> Bools:
     """Which poses (stop - start,) of a chunk no other sweep of the same repeat key has: each counts once.
 
     ``pose_index`` is ``grid.pose_indices(start, stop)``; ``others`` are their grids and
