@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import sys
@@ -28,15 +29,17 @@ T = TypeVar("T")
 
 @dataclasses.dataclass
 class State:
-    """The global options, and the one connection of this run."""
+    """The global options, and the one connection of this run, which ends with it."""
 
+    context: typer.Context
     url: str | None
     api_key: str | None
     json: bool
 
-    def client(self) -> Client:
-        """Connect; a person waits in front of it, so fewer retries than a program's."""
-        return Client(self.url, api_key=self.api_key, retries=2)
+    @functools.cached_property
+    def db(self) -> Client:
+        """A person waits in front of it, so fewer retries than a program's."""
+        return self.context.with_resource(Client(self.url, api_key=self.api_key, retries=2))
 
     def show(self, value: Any, words: Mapping[str, Any] | str) -> None:
         """The value with --json, else these names and values, or this line."""
@@ -55,14 +58,6 @@ class State:
             show_table(
                 tuple(columns), [[cell(item) for cell in columns.values()] for item in items], empty=empty
             )
-
-
-def state_of(context: typer.Context) -> State:
-    """The global options of this run."""
-    state = context.find_root().obj
-    if not isinstance(state, State):
-        raise TypeError("commands run below the graspdb callback, which sets the state")
-    return state
 
 
 def console() -> Console:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows, show_table, state_of
-from graspdb.cli.options import Numbers, takes_options, vector_option
+from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows, show_table
+from graspdb.cli.options import Numbers, vector_option
 from graspdb.errors import Infeasible
 from graspdb.files.trials import read_poses
 from graspdb.resources.results import Grasp, Grasps, SampledPoses
@@ -20,12 +20,9 @@ Seed = Annotated[int | None, typer.Option(min=0, help="The same seed gives the s
 Csv = Annotated[bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")]
 
 
-@takes_options
-def density(context: typer.Context, id: ObjectId, selection: Selection) -> None:
+def density(state: State, id: ObjectId, selection: Selection) -> None:
     """Show an object's grasp density: kernel, widths, counts, effective sample size."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.objects.get(id).density(**selection)
+    found = state.db.objects.get(id).density(**selection)
     used = found.kernel
     rows: dict[str, Any] = {
         "object": f"{found.object}, revision {found.revision}",
@@ -41,9 +38,8 @@ def density(context: typer.Context, id: ObjectId, selection: Selection) -> None:
     state.show(found, rows)
 
 
-@takes_options
 def best_grasp(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     constraints: Constraints,
     count: Annotated[int, typer.Option(min=1, max=1_000, help="So many distinct grasps.")] = 1,
@@ -55,15 +51,13 @@ def best_grasp(
 
     All constraints are in the world's frame if --object-pose is given, else in the object's.
     """
-    state = state_of(context)
-    with state.client() as db:
-        try:
-            found = db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
-        except Infeasible as error:
-            if state.json:
-                out({"status": "infeasible", "grasps": [], "nearest": error.nearest, "message": str(error)})
-                raise typer.Exit(1) from None
-            raise
+    try:
+        found = state.db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
+    except Infeasible as error:
+        if state.json:
+            out({"status": "infeasible", "grasps": [], "nearest": error.nearest, "message": str(error)})
+            raise typer.Exit(1) from None
+        raise
     if state.json:
         names = ("status", "ranking", "revision", "kernel")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
@@ -94,9 +88,8 @@ def _show_grasps(found: Grasps) -> None:
         ERRORS.print(f"Only {len(found)} distinct grasps exist.")
 
 
-@takes_options
 def likelihood(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     selection: Selection,
     file: Annotated[
@@ -108,10 +101,8 @@ def likelihood(
     """Say how likely grasps are."""
     if (file is None) == (pose is None):
         raise typer.BadParameter("give a file or --pose")
-    state = state_of(context)
     poses = np.array([pose]) if file is None else read_poses(file)
-    with state.client() as db:
-        found = db.objects.get(id).likelihood(poses, **selection)
+    found = state.db.objects.get(id).likelihood(poses, **selection)
     if state.json:
         out(found)
         return
@@ -135,24 +126,15 @@ def _cell(value: Any) -> str:
     return f"{value:.5g}"
 
 
-@takes_options
 def samples(
-    context: typer.Context,
-    id: ObjectId,
-    selection: Selection,
-    count: Count = 10,
-    seed: Seed = None,
-    csv: Csv = False,
+    state: State, id: ObjectId, selection: Selection, count: Count = 10, seed: Seed = None, csv: Csv = False
 ) -> None:
     """Draw grasps from an object's density."""
-    state = state_of(context)
-    with state.client() as db:
-        _show_poses(state, db.objects.get(id).samples(count, seed=seed, **selection), csv)
+    _show_poses(state, state.db.objects.get(id).samples(count, seed=seed, **selection), csv)
 
 
-@takes_options
 def proposals(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     selection: Selection,
     count: Count = 10,
@@ -167,9 +149,7 @@ def proposals(
     csv: Csv = False,
 ) -> None:
     """Draw grasps to try next; their proposal_density goes back with the trials."""
-    state = state_of(context)
-    with state.client() as db:
-        drawn = db.objects.get(id).proposals(count, strategy=strategy, seed=seed, **selection)
+    drawn = state.db.objects.get(id).proposals(count, strategy=strategy, seed=seed, **selection)
     _show_poses(state, drawn, csv)
 
 

@@ -9,18 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from graspdb.cli.common import (
-    ERRORS,
-    ObjectId,
-    State,
-    number,
-    out,
-    run_bar,
-    show_rows,
-    show_table,
-    state_of,
-)
-from graspdb.cli.options import takes_options
+from graspdb import wire
+from graspdb.cli.common import ERRORS, ObjectId, State, number, out, run_bar, show_rows, show_table
 from graspdb.errors import ChecksNeeded
 from graspdb.figures import FILE_FORMATS
 from graspdb.reports import (
@@ -30,18 +20,7 @@ from graspdb.reports import (
     ProjectionOptions,
     Reports,
 )
-from graspdb.wire import OUTCOMES
-from graspdb.wire.reports import (
-    REPORT_NAMES,
-    REPORTS,
-    BandwidthReport,
-    CalibrationReport,
-    ConvergenceReport,
-    KernelSimilarityReport,
-    ReportRange,
-    SourcesReport,
-    SummaryReport,
-)
+from graspdb.wire.reports import REPORT_NAMES, REPORTS, ReportRange
 
 _NAMES = ", ".join(REPORT_NAMES)
 Table = tuple[tuple[str, ...], list[tuple[Any, ...]]]
@@ -51,9 +30,8 @@ class Options(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSi
     """Of all reports."""
 
 
-@takes_options
 def report(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     options: Options,
     name: Annotated[
@@ -87,13 +65,7 @@ def report(
             raise typer.BadParameter(
                 f"the {name} report has no such option", param_hint=f"--{option.replace('_', '-')}"
             )
-    state = state_of(context)
-    found: Any
-    if name == "summary":
-        with state.client() as db:
-            found = db.reports.summary()
-    else:
-        found = _computed(state, id, name, options, simulate)
+    found = _computed(state, id, name, options, simulate)
     if figure is not None:
         found.save(figure)
     if state.json:
@@ -108,20 +80,21 @@ def report(
 
 def _computed(state: State, id: str, name: str, options: Options, simulate: bool) -> Any:
     """The report, with a bar while the service computes it, and before that while it is simulated."""
-    with state.client() as db:
-        reports = db.objects.get(id).reports
-        try:
-            found = _asked(reports, id, name, options)
-            calls = getattr(found.raw, "calls", [])
-        except ChecksNeeded as error:
-            if not simulate:
-                raise
-            calls = error.calls
-        if not simulate or not calls:
-            return found
-        for sweep in reports.simulate(calls):
-            sweep.wait(progress=not state.json)
-        return _asked(reports, id, name, options)
+    if name == "summary":
+        return state.db.reports.summary()
+    reports = state.db.objects.get(id).reports
+    try:
+        found = _asked(reports, id, name, options)
+        calls = getattr(found.raw, "calls", [])
+    except ChecksNeeded as error:
+        if not simulate:
+            raise
+        calls = error.calls
+    if not simulate or not calls:
+        return found
+    for sweep in reports.simulate(calls):
+        sweep.wait(progress=not state.json)
+    return _asked(reports, id, name, options)
 
 
 def _asked(reports: Reports, id: str, name: str, options: Options) -> Any:
@@ -132,9 +105,9 @@ def _asked(reports: Reports, id: str, name: str, options: Options) -> Any:
 def _show(found: Any) -> None:
     raw = found.raw
     rows: dict[str, Any] = {"": found.text}
-    if not isinstance(raw, SummaryReport):
+    if not isinstance(raw, wire.reports.SummaryReport):
         rows = {"object": f"{raw.object}, revision {raw.revision}", **rows}
-    if isinstance(raw, CalibrationReport):
+    if isinstance(raw, wire.reports.CalibrationReport):
         rows |= _scores(raw)
     show_rows(rows)
     for columns, cells in _TABLES.get(raw.report, lambda _: [])(raw):
@@ -145,7 +118,7 @@ def _show(found: Any) -> None:
         )
 
 
-def _scores(raw: CalibrationReport) -> dict[str, str]:
+def _scores(raw: wire.reports.CalibrationReport) -> dict[str, str]:
     rows = {
         "Brier skill": _range(raw.skill),
         "over attempts that did not collide": _range(raw.free_skill),
@@ -161,7 +134,7 @@ def _scores(raw: CalibrationReport) -> dict[str, str]:
     return rows
 
 
-def _convergence(raw: ConvergenceReport) -> list[Table]:
+def _convergence(raw: wire.reports.ConvergenceReport) -> list[Table]:
     return [
         (
             (f"grasps ({curve.label})", "similarity", "deviation", "held-out log density"),
@@ -174,7 +147,7 @@ def _convergence(raw: ConvergenceReport) -> list[Table]:
     ]
 
 
-def _calibration(raw: CalibrationReport) -> list[Table]:
+def _calibration(raw: wire.reports.CalibrationReport) -> list[Table]:
     bins = [
         (number(b.predicted), number(b.observed), f"{number(b.low)} to {number(b.high)}", b.count)
         for b in raw.bins
@@ -183,7 +156,7 @@ def _calibration(raw: CalibrationReport) -> list[Table]:
     return [(("predicted", "came true", "interval", "attempts"), bins)]
 
 
-def _bandwidth(raw: BandwidthReport) -> list[Table]:
+def _bandwidth(raw: wire.reports.BandwidthReport) -> list[Table]:
     best = [
         (
             f"{1e3 * p.sigma_position_m:.1f}",
@@ -209,14 +182,14 @@ def _bandwidth(raw: BandwidthReport) -> list[Table]:
     ]
 
 
-def _kernel_similarity(raw: KernelSimilarityReport) -> list[Table]:
+def _kernel_similarity(raw: wire.reports.KernelSimilarityReport) -> list[Table]:
     return [
         ((what, "similarity", "error"), [(p.count, f"{p.similarity:.3f}", f"{p.error:.3f}") for p in points])
         for what, points in (("samples", raw.samples), ("Gaussians", raw.mixtures))
     ]
 
 
-def _sources(raw: SourcesReport) -> list[Table]:
+def _sources(raw: wire.reports.SourcesReport) -> list[Table]:
     columns = ("source", "trials", "succeeded", "predicted", "agreement", "Brier skill", "density similarity")
     return [
         (
@@ -239,8 +212,8 @@ def _sources(raw: SourcesReport) -> list[Table]:
     ]
 
 
-def _summary(raw: SummaryReport) -> list[Table]:
-    outcomes = [name for name in OUTCOMES if any(name in row.outcomes for row in raw.rows)]
+def _summary(raw: wire.reports.SummaryReport) -> list[Table]:
+    outcomes = [name for name in wire.OUTCOMES if any(name in row.outcomes for row in raw.rows)]
     counts = [
         (row.object, row.gripper, row.protocol, row.source, *(row.outcomes.get(o, 0) for o in outcomes))
         for row in raw.rows
