@@ -18,45 +18,14 @@ from graspdb.resources.runs import RunProgress, wait_for_run
 from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.transport import Transport
-from graspdb.wire.reports import (
-    REPORT_NAMES,
-    AnisotropyReport,
-    AnisotropyTolerance,
-    AnyReport,
-    BandwidthReport,
-    CalibrationReport,
-    CheckCall,
-    ConvergenceReport,
-    KernelSimilarityReport,
-    ProjectionReport,
-    SimilarityPoint,
-    SourceComparison,
-    SourcesReport,
-    SummaryReport,
-    Verdict,
-)
-from graspdb.wire.reports import Report as ReportModel
+from graspdb.wire.reports import REPORT_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "AllReports",
-    "Anisotropy",
-    "Bandwidth",
-    "Calibration",
-    "Convergence",
-    "KernelSimilarity",
-    "Projection",
-    "Report",
-    "Reports",
-    "Sources",
-    "Summary",
-]
-
 Floats = NDArray[np.float64]
-R = TypeVar("R", bound=AnyReport | SummaryReport)
-M = TypeVar("M", bound=ReportModel)
+R = TypeVar("R", bound=wire.reports.Report | wire.reports.SummaryReport)
+M = TypeVar("M", bound=wire.reports.Report)
 
 
 class Report(Generic[R]):
@@ -102,11 +71,11 @@ class Report(Generic[R]):
         )
 
 
-class Convergence(Report[ConvergenceReport]):
+class Convergence(Report[wire.reports.ConvergenceReport]):
     """Have we tried enough? Arrays are those of the kernel asked for, by rising number of grasps."""
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> wire.reports.Verdict:
         """``enough``, ``more`` or ``borderline``, and how many more."""
         return self.raw.curves[0].verdict
 
@@ -131,11 +100,11 @@ class Convergence(Report[ConvergenceReport]):
         return np.array([point.log_likelihood for point in self.raw.curves[0].points])
 
 
-class Anisotropy(Report[AnisotropyReport]):
+class Anisotropy(Report[wire.reports.AnisotropyReport]):
     """What a success tells about its vicinity."""
 
     @property
-    def tolerances(self) -> dict[str, AnisotropyTolerance]:
+    def tolerances(self) -> dict[str, wire.reports.AnisotropyTolerance]:
         """By axis: ``x``, ``y``, ``z`` in metres, ``rx``, ``ry``, ``rz`` in radians."""
         return {item.axis: item for item in self.raw.tolerances}
 
@@ -145,7 +114,7 @@ class Anisotropy(Report[AnisotropyReport]):
         return {axis: item.half_width for axis, item in self.tolerances.items()}
 
 
-class Calibration(Report[CalibrationReport]):
+class Calibration(Report[wire.reports.CalibrationReport]):
     """Whether ``success_probability`` can be believed."""
 
     @property
@@ -156,15 +125,15 @@ class Calibration(Report[CalibrationReport]):
     @property
     def predicted(self) -> Floats:
         """(B,) mean prediction of every bin; nan where empty."""
-        return _column(item.predicted for item in self.raw.bins)
+        return np.array([item.predicted for item in self.raw.bins], dtype=np.float64)
 
     @property
     def observed(self) -> Floats:
         """(B,) share that came true."""
-        return _column(item.observed for item in self.raw.bins)
+        return np.array([item.observed for item in self.raw.bins], dtype=np.float64)
 
 
-class Projection(Report[ProjectionReport]):
+class Projection(Report[wire.reports.ProjectionReport]):
     """Where grasps succeed, on a plane."""
 
     @property
@@ -188,7 +157,7 @@ class Projection(Report[ProjectionReport]):
         return np.array(self.raw.upward_m)
 
 
-class Bandwidth(Report[BandwidthReport]):
+class Bandwidth(Report[wire.reports.BandwidthReport]):
     """Which widths the kernel should have."""
 
     @property
@@ -197,12 +166,12 @@ class Bandwidth(Report[BandwidthReport]):
         return self.raw.recommended.sigma_position_m, self.raw.recommended.sigma_rotation_deg
 
     @property
-    def calls(self) -> list[CheckCall]:
+    def calls(self) -> list[wire.reports.CheckCall]:
         """Sweeps that would make what is missing: draws at several widths, simulated as checks."""
         return self.raw.calls
 
 
-class KernelSimilarity(Report[KernelSimilarityReport]):
+class KernelSimilarity(Report[wire.reports.KernelSimilarityReport]):
     """How many samples, or Gaussians, a kernel needs to be like the statistics it comes from (figure 13)."""
 
     @property
@@ -216,16 +185,16 @@ class KernelSimilarity(Report[KernelSimilarityReport]):
         return _curve(self.raw.mixtures)
 
 
-class Sources(Report[SourcesReport]):
+class Sources(Report[wire.reports.SourcesReport]):
     """Simulation against real trials."""
 
     @property
-    def by_source(self) -> dict[str, SourceComparison]:
+    def by_source(self) -> dict[str, wire.reports.SourceComparison]:
         """``robot``, ``human`` and ``import``, those there are."""
         return {item.source: item for item in self.raw.sources}
 
 
-class Summary(Report[SummaryReport]):
+class Summary(Report[wire.reports.SummaryReport]):
     """Every object's trials by outcome, and success rates by each way of counting."""
 
     @property
@@ -244,13 +213,9 @@ class Summary(Report[SummaryReport]):
         return found
 
 
-def _curve(points: Iterable[SimilarityPoint]) -> tuple[NDArray[np.int64], Floats]:
+def _curve(points: Iterable[wire.reports.SimilarityPoint]) -> tuple[NDArray[np.int64], Floats]:
     counts, similarities = zip(*((point.count, point.similarity) for point in points), strict=True)
     return np.array(counts, dtype=np.int64), np.array(similarities, dtype=np.float64)
-
-
-def _column(values: Iterable[float | None]) -> Floats:
-    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
 class Waiting(TypedDict, total=False):
@@ -344,7 +309,7 @@ class Reports:
         Conflict
             For too few successes, saying how many are needed.
         """
-        return Convergence(self._get(ConvergenceReport, ConvergenceOptions, options))
+        return Convergence(self._get(wire.reports.ConvergenceReport, ConvergenceOptions, options))
 
     def anisotropy(self, **options: Unpack[AnisotropyOptions]) -> Anisotropy:
         """How far a good grasp may be displaced along and about every axis.
@@ -357,11 +322,11 @@ class Reports:
             Axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the nearest) or
             ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
         """
-        return Anisotropy(self._get(AnisotropyReport, AnisotropyOptions, options))
+        return Anisotropy(self._get(wire.reports.AnisotropyReport, AnisotropyOptions, options))
 
     def calibration(self, **options: Unpack[DensityOptions]) -> Calibration:
         """How often grasps hold that are predicted to, judged on trials the prediction has not seen."""
-        return Calibration(self._get(CalibrationReport, DensityOptions, options))
+        return Calibration(self._get(wire.reports.CalibrationReport, DensityOptions, options))
 
     def projection(self, **options: Unpack[ProjectionOptions]) -> Projection:
         """The density on a plane: where grasps succeed.
@@ -374,14 +339,14 @@ class Reports:
             Only grasps whose tool z (``approach``) or tool x (``direction``, with either sign) points along
             this vector or axis (``"-z"``), within the cone.
         """
-        return Projection(self._get(ProjectionReport, ProjectionOptions, options))
+        return Projection(self._get(wire.reports.ProjectionReport, ProjectionOptions, options))
 
     def bandwidth(self, **options: Unpack[TrialOptions]) -> Bandwidth:
         """Which widths the kernel should have, and how often draws at several widths succeed.
 
         Those are simulated by sweeps of purpose ``check``; ``calls`` says which are missing.
         """
-        return Bandwidth(self._get(BandwidthReport, TrialOptions, options))
+        return Bandwidth(self._get(wire.reports.BandwidthReport, TrialOptions, options))
 
     def kernel_similarity(self, **options: Unpack[KernelSimilarityOptions]) -> KernelSimilarity:
         """How many samples, or Gaussians, a kernel needs (figure 13).
@@ -389,16 +354,18 @@ class Reports:
         Displacements count within a window (a cube's half edge, the largest turn); every sample's component
         has the component's widths.
         """
-        return KernelSimilarity(self._get(KernelSimilarityReport, KernelSimilarityOptions, options))
+        return KernelSimilarity(
+            self._get(wire.reports.KernelSimilarityReport, KernelSimilarityOptions, options)
+        )
 
     def sources(self, **options: Unpack[SourcesOptions]) -> Sources:
         """Whether simulation tells what robots find.
 
         ``protocol`` is that of the simulated trials; real ones of it are taken where there are any, else all.
         """
-        return Sources(self._get(SourcesReport, SourcesOptions, options))
+        return Sources(self._get(wire.reports.SourcesReport, SourcesOptions, options))
 
-    def simulate(self, calls: Iterable[CheckCall | Mapping[str, Any]]) -> list[Sweep]:
+    def simulate(self, calls: Iterable[wire.reports.CheckCall | Mapping[str, Any]]) -> list[Sweep]:
         """Make the sweeps that a report names as missing: checks, which enter no density.
 
         Parameters
@@ -409,7 +376,7 @@ class Reports:
         """
         made = []
         for item in calls:
-            call = CheckCall.model_validate(item)
+            call = wire.reports.CheckCall.model_validate(item)
             expected = f"{self._path}/sweeps"
             if (call.method, call.path) != ("POST", expected):
                 raise ValueError(f"{call.method} {call.path} makes no sweep of this object (POST {expected})")
@@ -446,7 +413,7 @@ class AllReports:
     def summary(self) -> Summary:
         """Every object's trials by outcome, and success rates by each way of counting (table I)."""
         answer = self._transport.json("GET", "/reports/summary")
-        return Summary(SummaryReport.model_validate(answer))
+        return Summary(wire.reports.SummaryReport.model_validate(answer))
 
     def __repr__(self) -> str:
         return "<reports: summary>"

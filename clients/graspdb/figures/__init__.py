@@ -20,7 +20,7 @@ from graspdb.figures.projection import draw_projection
 from graspdb.figures.sources import draw_sources
 from graspdb.figures.summary import draw_summary
 from graspdb.wire import reports
-from graspdb.wire.reports import AnyReport, SummaryReport
+from graspdb.wire.reports import Report, SummaryReport
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,7 +46,7 @@ _DPI = 120
 _LOCK = threading.Lock()
 
 
-def render(report: AnyReport | SummaryReport, format: Format) -> bytes:
+def render(report: Report | SummaryReport, format: Format) -> bytes:
     """The figure of a report as a file's bytes."""
     with _LOCK:
         target = io.BytesIO()
@@ -56,6 +56,6 @@ def render(report: AnyReport | SummaryReport, format: Format) -> bytes:
         return target.getvalue()
 
 
-def draw(report: AnyReport | SummaryReport) -> Figure:
+def draw(report: Report | SummaryReport) -> Figure:
     """The figure of a report; needs matplotlib (extra ``plot``)."""
     return _DRAW[type(report)](report)
