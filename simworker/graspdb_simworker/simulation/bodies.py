@@ -223,8 +223,8 @@ class Closing:
 
     ``touched``: both fingers had touched the object at the same time. ``opening_m`` is between the fingers;
     of a stalled jaw, what it holds is this wide. ``contacts`` are several instants of a stalled jaw, none of
-    any other; ``ratings`` weights held at these, over the object's, where they were rated; ``carried`` what
-    came of lift and shake, where that was asked for and the jaw had stalled.
+    any other; ``ratings`` weights held at these, over the object's, or ``carried`` what came of lift and
+    shake, where that was asked for.
     """
 
     end: End

@@ -270,23 +270,14 @@ class GraspWorld(BulletWorld):
 
     def _drive(self, dt: float) -> None:
         # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
-        pybullet.setPhysicsEngineParameter(fixedTimeStep=dt, physicsClientId=self._client)
-        speed, force = -self.gripper.max_speed_m_s, self.gripper.closing_force_n
-        pybullet.setJointMotorControlArray(
-            self._jaw,
-            (0, 1),
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=(speed, speed),
-            forces=(force, force),
-            physicsClientId=self._client,
+        self._bullet.setPhysicsEngineParameter(fixedTimeStep=dt)
+        speeds, forces = [-self.gripper.max_speed_m_s] * 2, [self.gripper.closing_force_n] * 2
+        self._bullet.setJointMotorControlArray(
+            self._jaw, (0, 1), pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=forces
         )
 
     def _contacts(self) -> Contacts:
-        contacts = [
-            contact
-            for contact in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
-            if contact[9] > 0.0
-        ]
+        contacts = [c for c in self._bullet.getContactPoints(self._jaw, self._object) if c[9] > 0.0]
         # contactNormalOnB points from B, the object, to A: turned round it points into the object.
         return Contacts(
             np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
@@ -301,6 +292,7 @@ class GraspWorld(BulletWorld):
         # by the root: the same motion, in slow motion.
         scale = self.gripper.closing_force_n / self.gripper.force_n
         pace = math.sqrt(scale)
+        mass, inertia = self.mass.mass_kg, self.mass.inertia
         self._damp(0.0)
         self._drive(dt)
         self._couple(self._gear, _GEAR_FORCES * self.gripper.closing_force_n)
@@ -313,14 +305,9 @@ class GraspWorld(BulletWorld):
         held = True
         for step, frame in enumerate(lifting.frames(dt * pace), 1):
             velocity, spin = pybullet.getBaseVelocity(body, physicsClientId=client)
-            force, torque = lifting.load(
-                frame,
-                self.mass,
-                where,
-                orientation,
-                (velocity[0] / pace, velocity[1] / pace, velocity[2] / pace),
-                (spin[0] / pace, spin[1] / pace, spin[2] / pace),
-            )
+            velocity = (velocity[0] / pace, velocity[1] / pace, velocity[2] / pace)
+            spin = (spin[0] / pace, spin[1] / pace, spin[2] / pace)
+            force, torque = lifting.load(frame, mass, inertia, where, orientation, velocity, spin)
             pybullet.applyExternalForce(
                 body, -1, [scale * f for f in force], where, pybullet.WORLD_FRAME, physicsClientId=client
             )
@@ -335,10 +322,8 @@ class GraspWorld(BulletWorld):
                 continue
             moved = rotate(orientation, anchor)
             away = math.hypot(where[0] + moved[0], where[1] + moved[1], where[2] + moved[2])
-            translation, rotation = (
-                max(translation, away),
-                max(rotation, lifting.angle_between(began, orientation)),
-            )
+            translation = max(translation, away)
+            rotation = max(rotation, lifting.angle_between(began, orientation))
             if not self._between():
                 held = False
                 break
@@ -373,9 +358,7 @@ class GraspWorld(BulletWorld):
         ratings: Sequence[float],
         steps: int,
     ) -> Closing:
-        where, orientation = pybullet.getBasePositionAndOrientation(
-            self._object, physicsClientId=self._client
-        )
+        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
         if not all(map(math.isfinite, (*where, *orientation))):
             end = End.UNSTABLE
         elif end is End.STALLED:
@@ -390,16 +373,13 @@ class GraspWorld(BulletWorld):
 
     def _park(self) -> None:
         """Empty Bullet's caches: the object far away, one step without any contact."""
-        client, jaw = self._client, self._jaw
         if self._lifts:
             self._couple(self._gear, 0.0)
             self._touch_by_faces(False)
             self._damp(self._damping)
-        pybullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY, physicsClientId=client)
-        pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
+        self._bullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY)
+        self._bullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         for joint in (0, 1):
-            pybullet.resetJointState(
-                jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0, physicsClientId=client
-            )
+            self._bullet.resetJointState(self._jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0)
         self._drive(self.stepping.approach_dt_s)
-        pybullet.stepSimulation(physicsClientId=client)
+        self._bullet.stepSimulation()
