@@ -3,6 +3,7 @@ its result."""
 
 from __future__ import annotations
 
+import pickle
 import signal
 import subprocess
 import sys
@@ -10,7 +11,8 @@ from collections.abc import Callable, Sequence
 
 from graspdb.processes import ChildProcess
 from graspdb.wire import SimulatePayload, SimulateResult
-from graspdb_simworker.process import channel, messages
+from graspdb_simworker.process import channel
+from graspdb_simworker.process.messages import Chunk
 from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
 from graspdb_simworker.simulation.labels import SIMULATION_ERROR, Label
 
@@ -151,9 +153,9 @@ class _Attempt:
 
     def run(self, payload: SimulatePayload, parts_glb: bytes) -> SimulateResult | None:
         """The result, or None if the process died or fell silent."""
-        chunk = messages.Chunk(payload.model_dump_json(), self._known, self._pose_s, parts_glb)
+        chunk = Chunk(payload.model_dump_json(), self._known, self._pose_s, parts_glb)
         try:
-            channel.send(_fd(self._process.stdin), channel.CHUNK, messages.pack_chunk(chunk))
+            channel.send(_fd(self._process.stdin), channel.CHUNK, pickle.dumps(chunk))
             while True:
                 # Before the first closing the prefilter runs: minutes at worst, for the largest chunks.
                 silence = START_SECONDS if self.simulating is None else SILENT * self._pose_s + 5.0
@@ -162,9 +164,9 @@ class _Attempt:
                 # Here too: a busy child leaves no silence in which to ask.
                 self._check()
                 if kind == channel.BEFORE:
-                    self.simulating = messages.unpack_row(body)
+                    self.simulating = pickle.loads(body)
                 elif kind == channel.AFTER:
-                    row, label = messages.unpack_label(body)
+                    row, label = pickle.loads(body)
                     self._known[row] = label
                     self.simulating = None
                     self._progress(len(self._known))
