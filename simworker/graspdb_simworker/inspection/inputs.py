@@ -45,11 +45,10 @@ def load(
         parts, mass, friction = thing.parts, thing.mass_kg, thing.friction
     else:
         with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
-            info = ObjectInfo.model_validate_json(transport.request("GET", f"/objects/{name}").content)
+            info = transport.model(ObjectInfo, "GET", f"/objects/{name}")
             if info.mass_kg is None or info.convex_parts is None:
                 raise ValueError(f"{name} needs mass_kg and convex parts before it can be simulated")
-            answer = transport.request("GET", f"/grippers/{gripper}")
-            profile = GripperInfo.model_validate_json(answer.content).profile
+            profile = transport.model(GripperInfo, "GET", f"/grippers/{gripper}").profile
             parts = meshes.parts_from_glb(transport.request("GET", f"/objects/{name}/convex-parts").content)
         mass = info.mass_kg
         friction = profile.friction if info.friction is None else info.friction

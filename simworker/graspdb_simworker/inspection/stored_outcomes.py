@@ -44,12 +44,11 @@ def sample_of(
     kept = {name: np.empty((0, 8)) for name in OUTCOME_CODES if name != "collision"}
     counts = dict.fromkeys(OUTCOME_CODES, 0)
     with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
-        info = SweepInfo.model_validate_json(transport.request("GET", f"/sweeps/{sweep}").content)
+        info = transport.model(SweepInfo, "GET", f"/sweeps/{sweep}")
         cursor: str | None = None
         while True:
-            params = {"limit": "100000", **({} if cursor is None else {"cursor": cursor})}
-            answer = transport.request("GET", f"/sweeps/{sweep}/outcomes", params=params)
-            page = SweepOutcomes.model_validate_json(answer.content)
+            params = {"limit": "100000", "cursor": cursor}
+            page = transport.model(SweepOutcomes, "GET", f"/sweeps/{sweep}/outcomes", params=params)
             outcomes = np.array(page.outcome, dtype=object)
             keys = rng.random(len(outcomes))
             for name, before in kept.items():
