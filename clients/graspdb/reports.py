@@ -5,13 +5,14 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypedDict, TypeVar, Unpack
+from typing import Annotated, Any, Generic, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.figures import FILE_FORMATS, draw, render
+from graspdb.figures.style import Figure
 from graspdb.options import Option, known_keywords
 from graspdb.poses import vector
 from graspdb.resources.runs import RunProgress, wait_for_run
@@ -19,9 +20,6 @@ from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.transport import Transport
 from graspdb.wire.reports import REPORT_NAMES
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 R = TypeVar("R", bound=wire.reports.Report | wire.reports.SummaryReport)

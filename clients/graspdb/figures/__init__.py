@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from graspdb.figures.anisotropy import draw_anisotropy
 from graspdb.figures.bandwidth import draw_bandwidth
@@ -18,12 +18,10 @@ from graspdb.figures.convergence import draw_convergence
 from graspdb.figures.kernel_similarity import draw_kernel_similarity
 from graspdb.figures.projection import draw_projection
 from graspdb.figures.sources import draw_sources
+from graspdb.figures.style import Figure
 from graspdb.figures.summary import draw_summary
 from graspdb.wire import reports
 from graspdb.wire.reports import Report, SummaryReport
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["FILE_FORMATS", "Format", "draw", "render"]
 

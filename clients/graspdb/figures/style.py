@@ -11,8 +11,10 @@ import numpy as np
 from graspdb.wire.reports import ReportRange
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:  # what draws imports matplotlib, an extra; annotations do not need it
+    Axes = Figure = Any
 
 #: Okabe and Ito's, which colour-blind readers tell apart.
 BLUE, ORANGE, GREEN, YELLOW, GREY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#666666"
@@ -53,6 +55,12 @@ def heading(figure: Figure, first: str, text: str) -> int:
     return 1 + words.count("\n")
 
 
+def place(figure: Figure, left: float, bottom: float, width: float, height: float, **shared: Any) -> Axes:
+    """Axes at a place on the figure, in inches: a layout that measures every label takes seconds for many."""
+    size = np.tile(figure.get_size_inches(), 2)
+    return figure.add_axes(tuple(np.array([left, bottom, width, height]) / size), **shared)
+
+
 def show_grid(axes: Axes) -> None:
     """A grid behind, ticks that can be read, and no frame above and to the right."""
     axes.spines[["top", "right"]].set_visible(False)
@@ -80,11 +88,10 @@ def show_ranges(
     high = [value if item.high is None else item.high for item, value in zip(ranges, values, strict=True)]
     ends = np.maximum([np.subtract(values, low), np.subtract(high, values)], 0.0)
     places = {"x": at, "y": values, "yerr": ends} if upright else {"x": values, "y": at, "xerr": ends}
-    axes.errorbar(**places, linestyle="none", **style)
+    axes.errorbar(**places, **{"linestyle": "none", **style})
 
 
 def show_ticks(axes: Axes, values: list[float]) -> None:
     """Ticks at these values only."""
-    axes.set_xticks(values)
-    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values])
+    axes.set_xticks(values, [f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values])
     axes.minorticks_off()
