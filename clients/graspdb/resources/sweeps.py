@@ -24,7 +24,7 @@ from graspdb import wire
 from graspdb.errors import SweepFailed
 from graspdb.options import Corners, Option, PoseFile
 from graspdb.poses import as_poses, vector
-from graspdb.resources.pages import Listing, segment, validate
+from graspdb.resources.pages import Listing, answers, segment, validate
 from graspdb.resources.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
 
@@ -178,21 +178,15 @@ class Sweep:
     def outcomes(self) -> OutcomeArrays:
         """Every pose of the finished chunks with its outcome, as arrays."""
         # Straight into arrays: a model of millions of rows would take longer than their simulation's answer.
-        pages: list[dict[str, NDArray[Any]]] = []
-        params: dict[str, Any] = {"limit": _OUTCOMES_PAGE, "cursor": None}
-        while True:
-            answer = self._transport.json("GET", f"{self._path}/outcomes", params=params)
-            pages.append(
-                {
-                    "pose_index": np.array(answer["pose_index"], dtype=np.int64),
-                    "position": np.array(answer["position"], dtype=np.float64).reshape(-1, 3),
-                    "quaternion_xyzw": np.array(answer["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
-                    "outcome": np.array(answer["outcome"], dtype=np.str_),
-                }
-            )
-            params["cursor"] = answer["next"]
-            if params["cursor"] is None:
-                break
+        pages: list[dict[str, NDArray[Any]]] = [
+            {
+                "pose_index": np.array(page["pose_index"], dtype=np.int64),
+                "position": np.array(page["position"], dtype=np.float64).reshape(-1, 3),
+                "quaternion_xyzw": np.array(page["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
+                "outcome": np.array(page["outcome"], dtype=np.str_),
+            }
+            for page in answers(self._transport, f"{self._path}/outcomes", {"limit": _OUTCOMES_PAGE})
+        ]
         columns = {name: np.concatenate([page[name] for page in pages]) for name in pages[0]}
         return OutcomeArrays(sweep=self.id, **columns)
 
