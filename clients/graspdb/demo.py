@@ -229,17 +229,9 @@ def _running(
     url = f"http://127.0.0.1:{port}"
     with Children(folder) as children:
         with console.status("Starting the service ..."):
+            where = ("--host", "127.0.0.1", "--port", str(port))
             database = f"sqlite:///{folder / 'graspdb.sqlite'}"
-            children.start(
-                "graspdb-server",
-                "serve",
-                "--host",
-                "127.0.0.1",
-                "--port",
-                str(port),
-                "--database-url",
-                database,
-            )
+            children.start("graspdb-server", "serve", *where, "--database-url", database)
             with Client(url) as db:
                 deadline = time.monotonic() + START_S
                 while not db.ready():

@@ -36,33 +36,19 @@ app = typer.Typer(
 )
 
 log = logging.getLogger("graspdb.simworker")
-MISSING = (
-    "graspdb-simworker: {what}: install the extra, `pip install 'graspdb[sim]'`"
-    " (pybullet has wheels for CPython 3.10 and 3.11 on x86-64 Linux;"
-    " this is CPython {version} on {machine} {system})"
-)
-
-
-@app.callback()
-def _root() -> None:
-    """Simulates the grasps that a GraspDB service plans."""
 
 
 def _require_pybullet() -> None:
     """Say in one line what is missing and leave with code 2."""
-    missing = [
-        name
-        for name in ("pybullet", "numba", "scipy", "trimesh", "PIL")
-        if importlib.util.find_spec(name) is None
-    ]
+    needed = ("pybullet", "numba", "scipy", "trimesh", "PIL")
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
-        text = MISSING.format(
-            what=f"{', '.join(missing)} is missing",
-            version=platform.python_version(),
-            machine=platform.machine(),
-            system=platform.system(),
+        typer.echo(
+            f"graspdb-simworker: {', '.join(missing)} is missing: install the extra, `pip install"
+            " 'graspdb[sim]'` (pybullet has wheels for CPython 3.10 and 3.11 on x86-64 Linux; this is CPython"
+            f" {platform.python_version()} on {platform.machine()} {platform.system()})",
+            err=True,
         )
-        typer.echo(text, err=True)
         raise typer.Exit(2)
 
 
@@ -267,12 +253,8 @@ def show(
         payload, parts = inputs.load(
             object_name, gripper, protocol=protocol, fine=fine, url=url, api_key=api_key
         )
-        shown = pictures.simulate_one(
-            payload,
-            parts,
-            pose,
-            film_every_s=pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf,
-        )
+        film_every_s = pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf
+        shown = pictures.simulate_one(payload, parts, pose, film_every_s=film_every_s)
         # The outcome's name and the object's: what a picture is worth that went astray.
         outcome = shown.label.outcome.name.lower().replace("_", " ")
         written = pictures.write(out, shown.pictures, f"{object_name}, {gripper}, {protocol}: {outcome}")
