@@ -15,10 +15,10 @@ from graspdb.figures import FILE_FORMATS, draw, render
 from graspdb.figures.style import Figure
 from graspdb.options import Option, known_keywords
 from graspdb.poses import vector
+from graspdb.resources.pages import Resource
 from graspdb.resources.runs import RunProgress, wait_for_run
 from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
-from graspdb.transport import Transport
 from graspdb.wire.reports import REPORT_NAMES
 
 Floats = NDArray[np.float64]
@@ -282,14 +282,10 @@ class SourcesOptions(Waiting, total=False):
     sigma_rotation_deg: float | None
 
 
-class Reports:
+class Reports(Resource):
     """``mug.reports``. They take the selection of trials, most of them the kernel, too: see
     :class:`Selection`; and how to wait for them: see :class:`Waiting`.
     """
-
-    def __init__(self, transport: Transport, path: str) -> None:
-        self._transport = transport
-        self._path = path
 
     def convergence(self, **options: Unpack[ConvergenceOptions]) -> Convergence:
         """Whether there are enough successful grasps, and how many more it takes.
@@ -402,16 +398,13 @@ class Reports:
         return f"<reports: {', '.join(REPORT_NAMES)}>"
 
 
-class AllReports:
+class AllReports(Resource):
     """``db.reports``: what there is to say of all objects together."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def summary(self) -> Summary:
         """Every object's trials by outcome, and success rates by each way of counting (table I)."""
-        answer = self._transport.json("GET", "/reports/summary")
-        return Summary(wire.reports.SummaryReport.model_validate(answer))
+        answer = self._transport.model(wire.reports.SummaryReport, "GET", f"{self._path}/summary")
+        return Summary(answer)
 
     def __repr__(self) -> str:
         return "<reports: summary>"

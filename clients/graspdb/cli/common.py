@@ -127,23 +127,12 @@ def numbers(values: Any, digits: int = 4) -> str:
     return " ".join(f"{float(value):+.{digits}f}" for value in values)
 
 
-def number(value: float | None) -> str:
-    """Two decimals, or that it is not known."""
-    return "unknown" if value is None else f"{value:.2f}"
-
-
 @contextmanager
 def run_bar(title: str) -> Iterator[Callable[[ReportRun], None]]:
     """How far a run is, for a person to see, once it is told."""
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
     )
+    task = bar.add_task(title, total=1.0, visible=False)
     with bar:
-        task: Any = None
-
-        def show(run: ReportRun) -> None:
-            nonlocal task
-            task = bar.add_task(title, total=1.0) if task is None else task
-            bar.update(task, completed=run.progress)
-
-        yield show
+        yield lambda run: bar.update(task, completed=run.progress, visible=True)

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ObjectId, State, number, run_bar
+from graspdb.cli.common import ObjectId, State, run_bar
 from graspdb.cli.options import Commands
+from graspdb.figures.style import number
 from graspdb.resources.kernels import KernelOptions
 from graspdb.wire.kernels import KernelProvenance
 

@@ -11,6 +11,7 @@ import typer
 from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows, show_table
 from graspdb.cli.options import Numbers, vector_option
 from graspdb.errors import Infeasible
+from graspdb.figures.style import widths
 from graspdb.files.trials import read_poses
 from graspdb.resources.results import Grasp, Grasps, SampledPoses
 from graspdb.resources.selection import Constraints, Selection
@@ -23,11 +24,10 @@ Csv = Annotated[bool, typer.Option("--csv", help="CSV that `likelihood` and `swe
 def density(state: State, id: ObjectId, selection: Selection) -> None:
     """Show an object's grasp density: kernel, widths, counts, effective sample size."""
     found = state.db.objects.get(id).density(**selection)
-    used = found.kernel
     rows: dict[str, Any] = {
         "object": f"{found.object}, revision {found.revision}",
-        "kernel": f"{used.kind}, {used.sigma_position_m * 1e3:.1f} mm, {used.sigma_rotation_deg:.1f}°",
-        "widths": used.rule,
+        "kernel": f"{found.kernel.kind}, {widths(found.kernel)}",
+        "widths": found.kernel.rule,
         "selection": ", ".join(x for x in (found.gripper, found.protocol, found.source) if x) or "all trials",
         "successes": f"{found.size:,}",
         "effective sample size": f"{found.effective_sample_size:,.0f}",

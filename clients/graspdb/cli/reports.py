@@ -10,9 +10,10 @@ from typing import Annotated, Any
 import typer
 
 from graspdb import wire
-from graspdb.cli.common import ERRORS, ObjectId, State, number, out, run_bar, show_rows, show_table
+from graspdb.cli.common import ERRORS, ObjectId, State, out, run_bar, show_rows, show_table
 from graspdb.errors import ChecksNeeded
 from graspdb.figures import FILE_FORMATS
+from graspdb.figures.style import number, widths
 from graspdb.reports import (
     AnisotropyOptions,
     ConvergenceOptions,
@@ -168,7 +169,7 @@ def _bandwidth(raw: wire.reports.BandwidthReport) -> list[Table]:
     ]
     draws = [
         (
-            f"{1e3 * d.kernel.sigma_position_m:.1f} mm, {d.kernel.sigma_rotation_deg:.1f}°",
+            widths(d.kernel),
             d.protocol,
             d.draws,
             *map(_range, (d.success, d.collision, d.free_success)),

@@ -12,7 +12,7 @@ from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
 from graspdb.poses import as_poses
-from graspdb.resources.pages import segment, validate
+from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
     Constraints,
@@ -29,16 +29,20 @@ QUERY_POSES = 100_000
 """Poses a likelihood request: some 15 MB of JSON, well under the service's default body limit."""
 
 
-class GraspQueries:
+class GraspQueries(Resource):
     """The questions about one object; all take the trials and kernel of a density, see :class:`Selection`.
 
     All poses are of the tool frame in the object frame, in metres, quaternions xyzw.
     """
 
-    def __init__(self, transport: Transport, object_id: str) -> None:
-        self._transport = transport
-        self._object = object_id
-        self._path = f"/objects/{segment(object_id)}"
+    def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:
+        super().__init__(transport, f"/objects/{segment(info.id)}")
+        self.info = info
+
+    @property
+    def id(self) -> str:
+        """The object's identifier."""
+        return self.info.id
 
     def density(self, **selection: Unpack[Selection]) -> wire.DensityInfo:
         """The grasp density: kernel, widths and how they were chosen, counts, effective sample size."""
@@ -123,11 +127,11 @@ class GraspQueries:
                 "" if given.get("prior") is False else "; with a mesh, name a gripper to choose by its edges"
             )
             raise Infeasible(
-                f"{self._object} has no successful trial yet, so there is no grasp to choose from{way_out}"
+                f"{self.id} has no successful trial yet, so there is no grasp to choose from{way_out}"
             )
         where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
         raise Infeasible(
-            f"no grasp of {self._object} fulfils the constraints within reach of what was tried{where}",
+            f"no grasp of {self.id} fulfils the constraints within reach of what was tried{where}",
             nearest=grasps.nearest,
         )
 
@@ -142,7 +146,7 @@ class GraspQueries:
         protocol = chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None
         plan: SweepOptions = {"poses": grasps.matrices, "gripper": chosen.gripper, "protocol": protocol}
         plan |= {"fidelity": "fine", "purpose": "check"}
-        sweep = create_sweep(self._transport, self._object, plan)
+        sweep = create_sweep(self._transport, self._path, plan)
         try:
             sweep.wait(timeout=timeout_s)
         except TimeoutError as error:

@@ -40,14 +40,21 @@ def validate(model: type[Model], fields: Mapping[str, Any]) -> Model:
         raise InvalidInput(text, problem=problem) from None
 
 
-class Listing(Generic[Item]):
+class Resource:
+    """Something on the service, asked about below its path."""
+
+    def __init__(self, transport: Transport, path: str) -> None:
+        self._transport = transport
+        self._path = path
+
+
+class Listing(Resource, Generic[Item]):
     """A list on the service, read as it is iterated; every iteration asks anew."""
 
     def __init__(
         self, transport: Transport, path: str, item: type[Item], params: Mapping[str, Any] | None = None
     ) -> None:
-        self._transport = transport
-        self._path = path
+        super().__init__(transport, path)
         self._item = item
         self._params = dict(params or {})
 

@@ -24,7 +24,7 @@ from graspdb import wire
 from graspdb.errors import SweepFailed
 from graspdb.options import Corners, Option, PoseFile
 from graspdb.poses import as_poses, vector
-from graspdb.resources.pages import Listing, answers, segment, validate
+from graspdb.resources.pages import Listing, Resource, answers, segment, validate
 from graspdb.resources.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
 
@@ -80,12 +80,11 @@ class SweepOptions(TypedDict, total=False):
     chunk_poses: Annotated[int | None, Option("Poses a job.", min=1)]
 
 
-class Sweep:
+class Sweep(Resource):
     """A sweep on the service. ``info`` is its state when last heard of; :meth:`refresh` asks again."""
 
     def __init__(self, transport: Transport, info: wire.SweepInfo) -> None:
-        self._transport = transport
-        self._path = f"/sweeps/{segment(info.id)}"
+        super().__init__(transport, f"/sweeps/{segment(info.id)}")
         self.info = info
 
     @property
@@ -223,26 +222,23 @@ class Sweep:
         return table_html("Sweep", self.summary())
 
 
-class Sweeps:
+class Sweeps(Resource):
     """``db.sweeps``: every object's sweeps."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def get(self, sweep: str) -> Sweep:
         """The sweep with this identifier."""
-        info = self._transport.model(wire.SweepInfo, "GET", f"/sweeps/{segment(sweep)}")
+        info = self._transport.model(wire.SweepInfo, "GET", f"{self._path}/{segment(sweep)}")
         return Sweep(self._transport, info)
 
     def list(self, *, object: str | None = None, state: str | None = None) -> Iterator[Sweep]:
         """The sweeps, the newest first; of one object and in one state if said."""
         params = {"object": object, "state": state}
-        for info in Listing(self._transport, "/sweeps", wire.SweepInfo, params):
+        for info in Listing(self._transport, self._path, wire.SweepInfo, params):
             yield Sweep(self._transport, info)
 
 
-def create_sweep(transport: Transport, object_id: str, options: SweepOptions) -> Sweep:
-    """Queue a sweep of an object."""
+def create_sweep(transport: Transport, path: str, options: SweepOptions) -> Sweep:
+    """Queue a sweep of the object at ``path``."""
     fields: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     seed = {name: fields.pop(name) for name in ("seed",) if name in fields}
     poses, sample = fields.pop("poses", None), fields.pop("sample", None)
@@ -265,8 +261,8 @@ def create_sweep(transport: Transport, object_id: str, options: SweepOptions) ->
             }
         fields["grid"] = {**grid, **seed}
     request = validate(wire.SweepCreate, fields)
-    path = f"/objects/{segment(object_id)}/sweeps"
-    return Sweep(transport, transport.model(wire.SweepInfo, "POST", path, body=request, idempotent=True))
+    info = transport.model(wire.SweepInfo, "POST", f"{path}/sweeps", body=request, idempotent=True)
+    return Sweep(transport, info)
 
 
 def duration(seconds: float) -> str:
