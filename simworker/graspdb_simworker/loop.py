@@ -15,7 +15,7 @@ import random
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 from graspdb import errors, wire
@@ -73,6 +73,7 @@ class WorkTally:
         )
 
 
+@dataclass(eq=False)
 class Worker:
     """Pulls jobs from one service and runs up to ``processes`` chunks at once, a thread and a runner each.
 
@@ -81,26 +82,18 @@ class Worker:
     are the limits of one mesh's; None leaves them to other workers.
     """
 
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        name: str,
-        processes: int = 1,
-        exit_when_idle: bool = False,
-        once: bool = False,
-        make_runner: Callable[[], ChunkRunner] = LocalRunner,
-        decompositions: ResourceLimits | None = None,
-    ) -> None:
-        if processes < 1:
+    transport: Transport
+    _: KW_ONLY
+    name: str
+    processes: int = 1
+    exit_when_idle: bool = False
+    once: bool = False
+    make_runner: Callable[[], ChunkRunner] = LocalRunner
+    decompositions: ResourceLimits | None = None
+
+    def __post_init__(self) -> None:
+        if self.processes < 1:
             raise ValueError("processes must be at least 1")
-        self._transport = transport
-        self._name = name
-        self._processes = processes
-        self._exit_when_idle = exit_when_idle
-        self._once = once
-        self._make_runner = make_runner
-        self._decompositions = decompositions
         self._stop = threading.Event()
         self._done = threading.Event()
         self._lock = threading.Lock()
@@ -123,7 +116,7 @@ class Worker:
         )
         slots = [
             threading.Thread(target=self._guard, args=(self._slot,), name=f"slot-{number}", daemon=True)
-            for number in range(self._processes)
+            for number in range(self.processes)
         ]
         heartbeat.start()
         for slot in slots:
@@ -176,7 +169,7 @@ class Worker:
         try:
             params = {"lease_id": lease.lease_id, "progress": lease.progress}
             path = f"/jobs/{lease.job}/lease"
-            renewed = self._transport.model(wire.LeaseRenewed, "PUT", path, params=params, retries=0)
+            renewed = self.transport.model(wire.LeaseRenewed, "PUT", path, params=params, retries=0)
         except (errors.LeaseLost, errors.NotFound) as error:
             log.warning("job %s: lease lost (%s)", lease.job, error)
             lease.lost.set()
@@ -196,7 +189,7 @@ class Worker:
 
     def _slot(self) -> None:
         failures = 0
-        with self._make_runner() as runner:
+        with self.make_runner() as runner:
             while not self._stop.is_set():
                 try:
                     job, wait = self._claim()
@@ -212,18 +205,18 @@ class Worker:
                     continue
                 failures = 0
                 if job is None:
-                    if self._exit_when_idle or self._once:
+                    if self.exit_when_idle or self.once:
                         return
                     self._stop.wait(wait)
                     continue
                 self._work(runner, job)
-                if self._once:
+                if self.once:
                     return
 
     def _claim(self) -> tuple[wire.ClaimedJob | None, float]:
-        capabilities = [*CAPABILITIES, *(["decompose"] if self._decompositions else [])]
-        request = wire.ClaimRequest(worker=self._name, capabilities=capabilities, limit=1)
-        answer = self._transport.model(wire.ClaimResponse, "POST", "/jobs/claim", body=request, retries=0)
+        capabilities = [*CAPABILITIES, *(["decompose"] if self.decompositions else [])]
+        request = wire.ClaimRequest(worker=self.name, capabilities=capabilities, limit=1)
+        answer = self.transport.model(wire.ClaimResponse, "POST", "/jobs/claim", body=request, retries=0)
         return (answer.jobs[0] if answer.jobs else None), max(0.1, answer.retry_after_s or IDLE_S)
 
     def _work(self, runner: ChunkRunner, job: wire.ClaimedJob) -> None:
@@ -250,10 +243,10 @@ class Worker:
 
     def _decompose(self, payload: wire.DecomposePayload, lease: Lease) -> None:
         """Make an object's convex parts and hand them in."""
-        if self._decompositions is None:
+        if self.decompositions is None:
             raise ChunkFailed("this worker does not do 'decompose' jobs")
         mesh = self._fetched(payload.mesh, payload.mesh_sha256, lease)
-        limits, wanted = self._decompositions, lambda: self._wanted(lease)
+        limits, wanted = self.decompositions, lambda: self._wanted(lease)
         parts = decompose(payload, mesh, limits=limits, wanted=wanted, progress=lease.note)
         if self._hand_in(lease, "result", parts):
             self._count()
@@ -281,7 +274,7 @@ class Worker:
     def _release(self, lease: Lease) -> None:
         """Give a lease back, so that another worker need not wait until it runs out."""
         try:
-            self._transport.request(
+            self.transport.request(
                 "DELETE", f"/jobs/{lease.job}/lease", params={"lease_id": lease.lease_id}, retries=0
             )
         except errors.GraspDBError as error:
@@ -311,7 +304,7 @@ class Worker:
             if not self._wanted(lease):
                 raise ChunkCancelled
             try:
-                data = self._transport.request("GET", path, retries=0).content
+                data = self.transport.request("GET", path, retries=0).content
                 break
             except (errors.NotFound, errors.Unauthorized, errors.Forbidden, errors.InvalidInput) as error:
                 raise ChunkFailed(f"can't fetch {path}: {error}") from error
@@ -353,7 +346,7 @@ class Worker:
                 return False
             try:
                 params = {"lease_id": lease.lease_id}
-                self._transport.request("PUT", f"/jobs/{lease.job}/{what}", params=params, retries=0, **sent)
+                self.transport.request("PUT", f"/jobs/{lease.job}/{what}", params=params, retries=0, **sent)
             except (errors.Conflict, errors.NotFound) as error:
                 log.warning("job %s: %s not wanted: %s", lease.job, what, error)
                 self.tally.lost += 1
