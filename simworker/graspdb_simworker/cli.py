@@ -13,10 +13,9 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
@@ -146,8 +145,7 @@ def run(
     typer.echo(str(worker.tally), err=True)
 
 
-@dataclass(frozen=True)
-class _Cluster:
+class _Cluster(NamedTuple):
     """Where chunks are simulated: ``make_runner`` for each of ``threads`` at once."""
 
     threads: int

@@ -64,24 +64,17 @@ class BulletWorld:
         self._client: int = self._bullet._client
         if self._client < 0:
             raise RuntimeError("pybullet could not open a DIRECT world")
-        try:
-            self._configure(solver_iterations, by_faces)
-            if by_faces:
-                self._jaw, self._object = self._load_bodies(parts)
-            else:
-                self._jaw = self._build_gripper()
-                self._object = self._build_object(parts, self.mass)
-            self._column, self._column_at = self._build_column()
-            self._gear = self._build_gear() if by_faces else -1
-            self._finish_bodies(math.sqrt(friction))
-            if by_faces:
-                self._anchor()
-        except BaseException:
-            self.close_world()
-            raise
+        self._configure(solver_iterations, by_faces)
+        if by_faces:
+            self._jaw, self._object = self._load_bodies(parts)
+        else:
+            self._jaw, self._object = self._build_gripper(), self._build_object(parts, self.mass)
+        self._column, self._column_at = self._build_column()
+        self._gear = self._build_gear() if by_faces else -1
+        self._finish_bodies(math.sqrt(friction), anchored=by_faces)
 
     def close_world(self) -> None:
-        """Free Bullet's memory; the world can't be used afterwards."""
+        """Free Bullet's memory at once; the world can't be used afterwards."""
         if self._client >= 0:
             self._bullet.disconnect()
             self._client = -1
@@ -182,14 +175,15 @@ class BulletWorld:
     def _couple(self, gear: int, force_n: float) -> None:
         self._bullet.changeConstraint(gear, gearRatio=-1, maxForce=force_n)
 
-    def _finish_bodies(self, friction_root: float) -> None:
+    def _finish_bodies(self, friction_root: float, *, anchored: bool) -> None:
+        """Surfaces and inertia. ``anchored`` friction pulls back what crept: the solver balances speeds only,
+        and what it leaves undone at every step lets a firmly held object slide by millimetres while it is
+        carried, even at the fine step (a bar of 1.5 kg in the middle of its faces)."""
         # Bullet multiplies the coefficients of the two bodies, hence the root.
-        surface = {
-            "lateralFriction": friction_root,
-            "spinningFriction": 0.0,
-            "rollingFriction": 0.0,
-            "restitution": 0.0,
-        }
+        surface = {"lateralFriction": friction_root}
+        surface |= dict.fromkeys(("spinningFriction", "rollingFriction", "restitution"), 0.0)
+        if anchored:
+            surface["frictionAnchor"] = 1
         for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
             for link in links:
                 # In a call of its own: beside a setting that only a base has, such as a damping or a
@@ -207,14 +201,6 @@ class BulletWorld:
         for link in (0, 1):
             self._bullet.changeDynamics(self._jaw, link, jointDamping=0.0)
         self._bullet.changeDynamics(self._object, -1, localInertiaDiagonal=self.mass.inertia)
-
-    def _anchor(self) -> None:
-        """Friction that pulls back what crept. The solver balances speeds only: what it leaves undone at
-        every step lets a firmly held object slide by millimetres while it is carried, even at the fine
-        step (a bar of 1.5 kg in the middle of its faces)."""
-        for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
-            for link in links:
-                self._bullet.changeDynamics(body, link, frictionAnchor=1)
 
     def _touch_by_faces(self, yes: bool) -> None:
         self._bullet.setPhysicsEngineParameter(enableSAT=int(yes))

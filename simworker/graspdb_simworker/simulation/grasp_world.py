@@ -142,12 +142,8 @@ class GraspWorld(BulletWorld):
         self._radius = self.mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
         self._seen: tuple[Vector, Quaternion, float] | None = None
-        try:
-            self._damp(self._damping)
-            self._park()
-        except BaseException:
-            self.close_world()
-            raise
+        self._damp(self._damping)
+        self._park()
 
     # -- one grasp -----------------------------------------------------------------------------------------
 
