@@ -344,10 +344,7 @@ def _in_workspace(item: GraspObject) -> str:
 def _reports(item: GraspObject) -> str:
     """How far a grasp may be off and whether enough was tried, or what it takes to say so."""
     lines = []
-    for title, ask in (
-        ("Tolerance", item.reports.anisotropy),
-        ("Convergence", item.reports.convergence),
-    ):
+    for title, ask in (("Tolerance", item.reports.anisotropy), ("Convergence", item.reports.convergence)):
         try:
             text = ask().text
         except Conflict as error:

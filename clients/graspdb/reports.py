@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.figures import FILE_FORMATS, draw, render
-from graspdb.figures.style import Figure
+from graspdb.figures.canvas import Figure
 from graspdb.options import Option, known_keywords
 from graspdb.poses import vector
 from graspdb.resources.pages import Resource
@@ -234,23 +234,17 @@ class DensityOptions(Selection, Waiting, total=False):
 
 
 class ConvergenceOptions(DensityOptions, total=False):
-    """Options of `Reports.convergence`."""
-
     matching: Annotated[
         str | None, Option("convergence: determinants, likelihood or success, beside a stored kernel.")
     ]
 
 
 class AnisotropyOptions(DensityOptions, total=False):
-    """Options of `Reports.anisotropy`."""
-
     method: Annotated[str | None, Option("anisotropy: empirical or density.")]
     alignment: Annotated[str | None, Option("anisotropy: gripper, object, edge or surface-pair.")]
 
 
 class ProjectionOptions(DensityOptions, total=False):
-    """Options of `Reports.projection`."""
-
     plane: Annotated[str | ArrayLike | None, Option("projection: xy, xz, yz or the plane's normal x,y,z.")]
     approach: Annotated[
         str | ArrayLike | None,
@@ -265,8 +259,6 @@ class ProjectionOptions(DensityOptions, total=False):
 
 
 class KernelSimilarityOptions(TrialOptions, total=False):
-    """Options of `Reports.kernel_similarity`."""
-
     window_position_m: Annotated[float | None, Option("kernel-similarity: half edge of the window.")]
     window_rotation_deg: Annotated[float | None, Option("kernel-similarity: largest turn.")]
     component_position_m: Annotated[float | None, Option("kernel-similarity: width of a sample.")]
@@ -274,8 +266,6 @@ class KernelSimilarityOptions(TrialOptions, total=False):
 
 
 class SourcesOptions(Waiting, total=False):
-    """Options of `Reports.sources`."""
-
     gripper: str | None
     protocol: str | None
     sigma_position_m: float | None

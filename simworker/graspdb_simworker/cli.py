@@ -210,10 +210,8 @@ def verify(
                 info, stored = stored_outcomes.sample_of(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
-            object_name = info.object
-            payload, parts = inputs.load(
-                info.object, info.gripper, protocol=info.protocol, url=url, api_key=api_key
-            )
+            object_name, gripper, protocol = info.object, info.gripper, info.protocol
+            payload, parts = inputs.load(object_name, gripper, protocol=protocol, url=url, api_key=api_key)
             with _progress("grasps") as progress:
                 found = agreement.verify_stored(
                     payload, parts, stored, count=count, seed=seed, progress=progress

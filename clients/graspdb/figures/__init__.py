@@ -14,11 +14,11 @@ from typing import Any, Literal
 from graspdb.figures.anisotropy import draw_anisotropy
 from graspdb.figures.bandwidth import draw_bandwidth
 from graspdb.figures.calibration import draw_calibration
+from graspdb.figures.canvas import Figure
 from graspdb.figures.convergence import draw_convergence
 from graspdb.figures.kernel_similarity import draw_kernel_similarity
 from graspdb.figures.projection import draw_projection
 from graspdb.figures.sources import draw_sources
-from graspdb.figures.style import Figure
 from graspdb.figures.summary import draw_summary
 from graspdb.wire import reports
 from graspdb.wire.reports import Report, SummaryReport

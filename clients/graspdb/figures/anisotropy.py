@@ -8,19 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    Axes,
-    Figure,
-    new_figure,
-    place,
-    show_grid,
-    show_ranges,
-    title,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, place, show_grid
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, show_ranges, title
 from graspdb.wire.reports import (
     AnisotropyHistogram,
     AnisotropyHypothesis,
@@ -201,7 +190,6 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
     axes.set_xlabel(f"{name} [{unit}]", fontsize=8)
     if turn:
         axes.set_xticks([-90, -45, 0, 45, 90])
-    axes.tick_params(labelsize=8)
     if first:
         axes.set_ylabel("share that succeeds\n(others unchanged)", fontsize=8)
     else:
@@ -239,7 +227,6 @@ def _forest(axes: Axes, found: list[AnisotropyHypothesis], level: float) -> None
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_yticks(range(len(found)), [_EXPECTED.get(item.name, item.name) for item in found], fontsize=8)
     axes.set_ylim(len(found) - 0.4, -0.6)
-    axes.tick_params(axis="x", labelsize=8)
     axes.set_xlabel(
         f"quotient of half widths, {level:.0%} intervals (right of 1: as the paper expects)", fontsize=8
     )
@@ -296,7 +283,6 @@ def _shares(axes: Axes, found: list[AnisotropyRelation], level: float) -> None:
                         capsize=2.5, label=label)  # fmt: skip
     axes.set_yticks(at, labels, fontsize=8)
     axes.set(ylim=(row - 0.4, -0.6), xlim=(0.0, 1.0))
-    axes.tick_params(axis="x", labelsize=8)
     axes.set_xlabel(f"share that succeeded, {level:.0%} intervals", fontsize=8)
     axes.set_title("by what the jaw closes on", fontsize=9, loc="left")
     axes.legend(fontsize=7.5, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)

@@ -4,21 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from graspdb.figures.style import (
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    MARKERS,
-    ORANGE,
-    Axes,
-    Figure,
-    new_figure,
-    show_grid,
-    show_ranges,
-    show_ticks,
-    title,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid, show_ticks
+from graspdb.figures.style import BLUE, COLOURS, GREEN, GREY, MARKERS, ORANGE, show_ranges, title
 from graspdb.wire.reports import BandwidthReport, SimulatedDraws
 
 

@@ -5,19 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from graspdb.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    Axes,
-    Figure,
-    new_figure,
-    number,
-    show_grid,
-    show_ranges,
-    title,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, number, show_ranges, title
 from graspdb.wire.reports import CalibrationBin, CalibrationReport, ReportRange
 
 

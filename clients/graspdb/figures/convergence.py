@@ -2,18 +2,8 @@
 
 from __future__ import annotations
 
-from graspdb.figures.style import (
-    BLUE,
-    CURVE,
-    GREEN,
-    GREY,
-    ORANGE,
-    Figure,
-    new_figure,
-    show_grid,
-    title,
-    widths,
-)
+from graspdb.figures.canvas import Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, CURVE, GREEN, GREY, ORANGE, title, widths
 from graspdb.wire.reports import ConvergenceReport
 
 _COLOURS = (BLUE, ORANGE, GREEN)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from graspdb.figures.style import BLUE, CURVE, GREY, ORANGE, Figure, new_figure, show_grid, show_ticks, title
+from graspdb.figures.canvas import Figure, new_figure, show_grid, show_ticks
+from graspdb.figures.style import BLUE, CURVE, GREY, ORANGE, title
 from graspdb.wire.reports import KernelSimilarityReport
 
 

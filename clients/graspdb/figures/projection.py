@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.figures.style import BLUE, GREY, Axes, Figure, new_figure, place, show_grid, title, widths
+from graspdb.figures.canvas import Axes, Figure, new_figure, place, show_grid
+from graspdb.figures.style import BLUE, GREY, title, widths
 from graspdb.wire.reports import ProjectionProfile, ProjectionReport
 
 #: Inches: the plane's longer side and its shorter one at least, the profiles, and what is left around them.

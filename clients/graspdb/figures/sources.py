@@ -5,20 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from graspdb.figures.calibration import show_bins
-from graspdb.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    Axes,
-    Figure,
-    new_figure,
-    number,
-    show_grid,
-    show_ranges,
-    title,
-    widths,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, number, show_ranges, title, widths
 from graspdb.wire.reports import SourceComparison, SourcesReport
 
 _MARK: dict[str, Any] = {"markersize": 6, "capsize": 4}

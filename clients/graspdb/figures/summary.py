@@ -7,20 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.figures.style import (
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    MARKERS,
-    ORANGE,
-    Axes,
-    Figure,
-    heading,
-    new_figure,
-    show_grid,
-    show_ranges,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, COLOURS, GREEN, GREY, MARKERS, ORANGE, heading, show_ranges
 from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import SummaryReport, SummaryRow
 
