@@ -7,7 +7,7 @@ import functools
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any, TypeVar
 
@@ -55,9 +55,7 @@ class State:
         if self.json:
             out(items)
         else:
-            show_table(
-                tuple(columns), [[cell(item) for cell in columns.values()] for item in items], empty=empty
-            )
+            show_table(items, columns, empty=empty)
 
 
 def console() -> Console:
@@ -107,9 +105,10 @@ def show_rows(rows: Mapping[str, Any]) -> None:
     console().print(table)
 
 
-def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, empty: str) -> None:
-    """A table; numbers stand to the right."""
-    body = [[("" if cell is None else cell) for cell in row] for row in rows]
+def show_table(items: Sequence[T], columns: Mapping[str, Callable[[T], Any]], *, empty: str) -> None:
+    """A row an item, and in each column what it says of the item; numbers stand to the right."""
+    rows = [[cell(item) for cell in columns.values()] for item in items]
+    body = [["" if cell is None else cell for cell in row] for row in rows]
     if not body:
         console().print(empty)
         return

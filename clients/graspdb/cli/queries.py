@@ -69,6 +69,7 @@ def best_grasp(
 
 def _show_grasps(found: Grasps) -> None:
     columns: dict[str, Callable[[Grasp], Any]] = {
+        "": lambda g: 1 + found.index(g),
         "position [m]": lambda g: numbers(g.position),
         "quaternion xyzw": lambda g: numbers(g.quaternion_xyzw),
         "in the world [m]": lambda g: None if g.world is None else numbers(g.world[:3, 3]),
@@ -80,8 +81,7 @@ def _show_grasps(found: Grasps) -> None:
         del columns["in the world [m]"]
     if found[0].simulated is None:
         del columns["simulated"]
-    rows = [[number, *(cell(g) for cell in columns.values())] for number, g in enumerate(found, start=1)]
-    show_table(("", *columns), rows, empty="No grasp.")
+    show_table(found, columns, empty="No grasp.")
     if found[0].prior:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
@@ -106,16 +106,11 @@ def likelihood(
     if state.json:
         out(found)
         return
-    names = ("density", "log_density", "relative", "success_probability", "collision_free")
-    columns = {name: column for name in names if (column := getattr(found, name)) is not None}
-    show_table(
-        ("", "position [m]", *(name.replace("_", " ") for name in columns)),
-        [
-            (row, numbers(poses[row, :3]), *(_cell(column[row]) for column in columns.values()))
-            for row in range(min(limit, len(poses)))
-        ],
-        empty="No poses.",
-    )
+    columns: dict[str, Callable[[int], Any]] = {"": int, "position [m]": lambda row: numbers(poses[row, :3])}
+    for name in ("density", "log_density", "relative", "success_probability", "collision_free"):
+        if (values := getattr(found, name)) is not None:
+            columns[name.replace("_", " ")] = lambda row, values=values: _cell(values[row])
+    show_table(range(min(limit, len(poses))), columns, empty="No poses.")
     if len(poses) > limit:
         ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json gives all.")
 
@@ -161,9 +156,9 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
     elif state.json:
         out(found)
     else:
-        rows = zip(found.position, found.quaternion_xyzw, found.proposal_density, strict=True)
-        show_table(
-            ("position [m]", "quaternion xyzw", "density"),
-            [(numbers(position), numbers(turn), f"{weight:.4g}") for position, turn, weight in rows],
-            empty="No samples.",
-        )
+        columns: dict[str, Callable[[int], Any]] = {
+            "position [m]": lambda row: numbers(found.position[row]),
+            "quaternion xyzw": lambda row: numbers(found.quaternion_xyzw[row]),
+            "density": lambda row: f"{found.proposal_density[row]:.4g}",
+        }
+        show_table(range(len(found)), columns, empty="No samples.")

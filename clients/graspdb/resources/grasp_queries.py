@@ -17,7 +17,6 @@ from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPo
 from graspdb.resources.selection import (
     Constraints,
     Selection,
-    TrialSelection,
     best_grasp_request,
     names,
     query,
@@ -94,8 +93,8 @@ class GraspQueries(Resource):
         """
         if "count" in constraints:
             raise TypeError("best_grasp() gives one grasp; use best_grasps(count=...)")
-        given = known_keywords(Constraints, constraints, "best_grasp")
-        return self._best_grasps(1, given, verify, verify_timeout_s)[0]
+        known_keywords(Constraints, constraints, "best_grasp")
+        return self.best_grasps(count=1, verify=verify, verify_timeout_s=verify_timeout_s, **constraints)[0]
 
     def best_grasps(
         self,
@@ -113,21 +112,17 @@ class GraspQueries(Resource):
         TimeoutError if that takes longer than ``verify_timeout_s``; it says so where no worker has come.
         """
         given = known_keywords(Constraints, constraints, "best_grasps")
-        return self._best_grasps(count, given, verify, verify_timeout_s)
-
-    def _best_grasps(self, count: int, given: dict[str, Any], verify: bool, timeout_s: float) -> Grasps:
         request = best_grasp_request(count, given)
         grasps = Grasps(
             self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
         )
         if len(grasps):
-            return self._simulated(grasps, given, timeout_s) if verify else grasps
+            return self._simulated(grasps, given, verify_timeout_s) if verify else grasps
         if grasps.status == "no_successes":
-            way_out = (
-                "" if given.get("prior") is False else "; with a mesh, name a gripper to choose by its edges"
-            )
+            way_out = "; with a mesh, name a gripper to choose by its edges"
             raise Infeasible(
-                f"{self.id} has no successful trial yet, so there is no grasp to choose from{way_out}"
+                f"{self.id} has no successful trial yet, so there is no grasp to choose from"
+                f"{'' if given.get('prior') is False else way_out}"
             )
         where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
         raise Infeasible(
@@ -137,12 +132,7 @@ class GraspQueries(Resource):
 
     def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:
         """The grasps with their outcomes in simulation, by the gripper and protocol of their trials."""
-        trials: TrialSelection = {
-            "gripper": given.get("gripper"),
-            "protocol": given.get("protocol"),
-            "source": given.get("source"),
-        }
-        chosen = self.density(**trials)
+        chosen = self.density(**{name: given.get(name) for name in ("gripper", "protocol", "source")})
         protocol = chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None
         plan: SweepOptions = {"poses": grasps.matrices, "gripper": chosen.gripper, "protocol": protocol}
         plan |= {"fidelity": "fine", "purpose": "check"}
