@@ -280,31 +280,18 @@ class Reports(Resource):
     def convergence(self, **options: Unpack[ConvergenceOptions]) -> Convergence:
         """Whether there are enough successful grasps, and how many more it takes.
 
-        Parameters
-        ----------
-        matching
-            With a stored kernel: how the isotropic one beside it is chosen, by ``determinants``,
-            ``likelihood``, or ``success`` of draws simulated as checks.
-
-        Raises
-        ------
-        ChecksNeeded
-            Where draws to match by have not been simulated; :meth:`simulate` its ``calls`` and ask again.
-        Conflict
-            For too few successes, saying how many are needed.
+        ``matching``, with a stored kernel: how the isotropic one beside it is chosen, by ``determinants``,
+        ``likelihood``, or ``success`` of draws simulated as checks. ChecksNeeded where these have not been
+        simulated: :meth:`simulate` its ``calls`` and ask again. Conflict says how many successes are needed.
         """
         return Convergence(self._get(wire.reports.ConvergenceReport, ConvergenceOptions, options))
 
     def anisotropy(self, **options: Unpack[AnisotropyOptions]) -> Anisotropy:
         """How far a good grasp may be displaced along and about every axis.
 
-        Parameters
-        ----------
-        method
-            ``empirical`` counts pairs of trials; ``density`` compares densities.
-        alignment
-            Axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the nearest) or
-            ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
+        - ``method``: ``empirical`` counts pairs of trials; ``density`` compares densities.
+        - ``alignment``: axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the
+          nearest) or ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
         """
         return Anisotropy(self._get(wire.reports.AnisotropyReport, AnisotropyOptions, options))
 
@@ -315,13 +302,9 @@ class Reports(Resource):
     def projection(self, **options: Unpack[ProjectionOptions]) -> Projection:
         """The density on a plane: where grasps succeed.
 
-        Parameters
-        ----------
-        plane
-            ``xy``, ``xz``, ``yz`` or a normal (3,); None: the one that shows most of the grasps.
-        approach, direction
-            Only grasps whose tool z (``approach``) or tool x (``direction``, with either sign) points along
-            this vector or axis (``"-z"``), within the cone.
+        - ``plane``: ``xy``, ``xz``, ``yz`` or a normal (3,); None: the one that shows most of the grasps.
+        - ``approach``, ``direction``: only grasps whose tool z, or tool x with either sign, points along this
+          vector or axis (``"-z"``), within the cone.
         """
         return Projection(self._get(wire.reports.ProjectionReport, ProjectionOptions, options))
 
@@ -352,11 +335,8 @@ class Reports(Resource):
     def simulate(self, calls: Iterable[wire.reports.CheckCall | Mapping[str, Any]]) -> list[Sweep]:
         """Make the sweeps that a report names as missing: checks, which enter no density.
 
-        Parameters
-        ----------
-        calls
-            ``calls`` of a bandwidth report, or of :class:`graspdb.errors.ChecksNeeded`, with which
-            ``convergence(matching="success")`` is refused.
+        ``calls`` are those of a bandwidth report, or of :class:`graspdb.errors.ChecksNeeded`, with which
+        ``convergence(matching="success")`` is refused.
         """
         made = []
         for item in calls:
