@@ -148,7 +148,7 @@ class Children:
 
 
 def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
-    """Wilson's score interval (1927) of a share, two-sided at ``level``; ValueError for a share of nothing."""
+    """Wilson's score interval (1927) of a share, two-sided at ``level``; ValueError where there is none."""
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"{successes} successes of {trials} trials")
     z = NormalDist().inv_cdf(0.5 + level / 2)

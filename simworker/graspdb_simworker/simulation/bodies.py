@@ -77,11 +77,6 @@ class MassProperties:
     inertia: tuple[float, float, float]
     _axes: NDArray[np.float64]
 
-    def inverse_rotation(self) -> tuple[float, float, float, float]:
-        """Rotation from the object frame to the principal frame, xyzw."""
-        x, y, z, w = self.principal_xyzw
-        return (-x, -y, -z, w)
-
     def to_principal(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 3) of the object frame in the principal frame."""
         return np.asarray((points - np.array(self.centre)) @ self._axes, dtype=np.float64)
@@ -157,6 +152,12 @@ def obj_of_parts(parts: Sequence[Part], mass: MassProperties) -> str:
             lines.append("f {} {} {}".format(*(int(i) + offset for i in face)))
         offset += len(vertices)
     return "\n".join(lines) + "\n"
+
+
+def inverse(q: Quaternion) -> Quaternion:
+    """The rotation back, of a unit quaternion xyzw."""
+    x, y, z, w = q
+    return (-x, -y, -z, w)
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:

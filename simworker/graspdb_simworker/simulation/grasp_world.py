@@ -16,12 +16,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
+from graspdb.wire.sweeps import Fidelity
 from graspdb_simworker.simulation import lifting
 from graspdb_simworker.simulation.bodies import (
     HEAVY_KG,
@@ -33,14 +33,13 @@ from graspdb_simworker.simulation.bodies import (
     Part,
     Quaternion,
     Vector,
+    inverse,
     multiply,
     rotate,
 )
 from graspdb_simworker.simulation.bullet_world import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
 from graspdb_simworker.simulation.force_test import rating
 from graspdb_simworker.simulation.labels import MOVED_M, TURNED_RAD
-
-Fidelity = Literal["standard", "fine"]
 
 APPROACH_GAP_M = 0.0005
 """The fingers start this far before their first contact: nothing can happen on the way there."""
@@ -138,7 +137,7 @@ class GraspWorld(BulletWorld):
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
         the end is last. Empty unless the world is visible."""
-        self._to_body = self.mass.inverse_rotation()
+        self._to_body = inverse(self.mass.principal_xyzw)
         self._radius = self.mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
         self._seen: tuple[Vector, Quaternion, float] | None = None
@@ -258,11 +257,9 @@ class GraspWorld(BulletWorld):
         In scalars: a vectorised product may round differently with the length of its batch, and labels
         must not.
         """
-        x, y, z, w = quaternion_xyzw
-        inverse = (-x, -y, -z, w)
-        centre = self.mass.centre
+        back, centre = inverse(quaternion_xyzw), self.mass.centre
         offset = (centre[0] - position[0], centre[1] - position[1], centre[2] - position[2])
-        return rotate(inverse, offset), multiply(inverse, self.mass.principal_xyzw)
+        return rotate(back, offset), multiply(back, self.mass.principal_xyzw)
 
     def _drive(self, dt: float) -> None:
         # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
@@ -295,8 +292,8 @@ class GraspWorld(BulletWorld):
         pybullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
         where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
         # The point of the object at the tool's origin, in the object's principal frame.
-        x, y, z, w = began = orientation
-        anchor = rotate((-x, -y, -z, w), (-where[0], -where[1], -where[2]))
+        began = orientation
+        anchor = rotate(inverse(began), (-where[0], -where[1], -where[2]))
         translation = rotation = 0.0
         held = True
         for step, frame in enumerate(lifting.frames(dt * pace), 1):

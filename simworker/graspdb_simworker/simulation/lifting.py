@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 from numba import njit
 
-from graspdb_simworker.simulation.bodies import Quaternion, Vector, multiply, rotate
+from graspdb_simworker.simulation.bodies import Quaternion, Vector, inverse, multiply, rotate
 from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
 
 LIFT_M = 0.10
@@ -127,7 +127,7 @@ def load(frame, mass_kg, inertia, position, orientation, velocity, spin):  # typ
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
     """Angle of the rotation that leads from one orientation to another, radians."""
-    x, y, z, w = multiply((-a[0], -a[1], -a[2], a[3]), b)
+    x, y, z, w = multiply(inverse(a), b)
     return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
 
 
