@@ -16,7 +16,7 @@ from graspdb.figures.canvas import Figure
 from graspdb.options import Option, known_keywords
 from graspdb.poses import vector
 from graspdb.resources.pages import Resource
-from graspdb.resources.runs import RunProgress, wait_for_run
+from graspdb.resources.runs import RunProgress, computed
 from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.wire.reports import REPORT_NAMES
@@ -358,10 +358,7 @@ class Reports(Resource):
             params={key: _in_query(key, value) for key, value in params.items()},
             headers={"Accept": "application/json"},
         )
-        found = answer.json()
-        if answer.status_code == 202:
-            where = answer.headers["Location"]
-            found = wait_for_run(self._transport, where, f"the {name} report", progress, timeout_s)
+        found = computed(self._transport, answer, f"the {name} report", progress, timeout_s)
         return model.model_validate(found)
 
     def __repr__(self) -> str:

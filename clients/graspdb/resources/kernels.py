@@ -8,7 +8,7 @@ from typing import Annotated, Any, Unpack
 from graspdb import wire
 from graspdb.options import Option
 from graspdb.resources.pages import Listing, Resource, segment, validate
-from graspdb.resources.runs import RunProgress, wait_for_run
+from graspdb.resources.runs import RunProgress, computed
 from graspdb.resources.selection import TrialSelection
 
 
@@ -74,8 +74,5 @@ class Kernels(Resource):
     ) -> wire.StoredKernel:
         request = validate(wire.KernelCreate, fields)
         answer = self._transport.request("POST", self._path, body=request, idempotent=True)
-        made = answer.json()
-        if answer.status_code == 202:
-            where = answer.headers["Location"]
-            made = wait_for_run(self._transport, where, "the kernel", progress, timeout_s)
+        made = computed(self._transport, answer, "the kernel", progress, timeout_s)
         return wire.StoredKernel.model_validate(made)

@@ -9,7 +9,7 @@ import numpy as np
 
 from graspdb.examples import example
 from graspdb.transport import Transport
-from graspdb.wire import Finger, GridPlan, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
+from graspdb.wire import Finger, GridPlan, GridSpec, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
 from graspdb.wire.sweeps import Protocol
 from graspdb_geometry import meshes
 from graspdb_geometry.grippers import GRIPPER_SHAPES
@@ -54,15 +54,8 @@ def load(
         friction = profile.friction if info.friction is None else info.friction
     points = np.concatenate([vertices for vertices, _ in parts])
     low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-    grid = GridPlan(
-        lower=(low[0], low[1], low[2]),
-        upper=(high[0], high[1], high[2]),
-        position_step_m=0.01,
-        rotation_step_deg=15.0,
-        margin_m=0.02,
-        seed=seed,
-        symmetric=profile.symmetric,
-    )
+    where = {"lower": low, "upper": high, "symmetric": profile.symmetric}
+    grid = GridPlan.model_validate({**GridSpec(seed=seed).model_dump(), **where})
     payload = SimulatePayload(
         sweep="",
         object=name,
