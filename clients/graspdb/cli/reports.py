@@ -139,15 +139,13 @@ def _scores(raw: wire.reports.CalibrationReport) -> dict[str, str]:
 
 def _convergence(raw: wire.reports.ConvergenceReport) -> Iterator[Table]:
     for curve in raw.curves:
-        yield (
-            curve.points,
-            {
-                f"grasps ({curve.label})": lambda p: p.grasps,
-                "similarity": lambda p: f"{p.similarity:.4f}",
-                "deviation": lambda p: f"{p.deviation:.4f}",
-                "held-out log density": lambda p: f"{p.log_likelihood:.3f}",
-            },
-        )
+        columns: Columns = {
+            f"grasps ({curve.label})": lambda p: p.grasps,
+            "similarity": lambda p: f"{p.similarity:.4f}",
+            "deviation": lambda p: f"{p.deviation:.4f}",
+            "held-out log density": lambda p: f"{p.log_likelihood:.3f}",
+        }
+        yield curve.points, columns
 
 
 def _calibration(raw: wire.reports.CalibrationReport) -> Iterator[Table]:
@@ -209,16 +207,12 @@ def _alike(found: wire.reports.SourceSimilarity | None) -> str:
 
 def _summary(raw: wire.reports.SummaryReport) -> Iterator[Table]:
     outcomes = [name for name in wire.OUTCOMES if any(name in row.outcomes for row in raw.rows)]
-    fields = ("object", "gripper", "protocol", "source")
-    yield (
-        raw.rows,
-        {
-            **{name: attrgetter(name) for name in fields},
-            **{name: lambda row, name=name: row.outcomes.get(name, 0) for name in outcomes},
-        },
-    )
-    rates = {rule: lambda row, k=k: _percent(row.rates[k].rate) for k, rule in enumerate(raw.rules)}
-    yield raw.rows, {"object": attrgetter("object"), "source": attrgetter("source"), **rates}
+    counts: Columns = {name: attrgetter(name) for name in ("object", "gripper", "protocol", "source")}
+    counts |= {name: lambda row, name=name: row.outcomes.get(name, 0) for name in outcomes}
+    yield raw.rows, counts
+    rates: Columns = {name: attrgetter(name) for name in ("object", "source")}
+    rates |= {rule: lambda row, k=k: _percent(row.rates[k].rate) for k, rule in enumerate(raw.rules)}
+    yield raw.rows, rates
 
 
 _TABLES: dict[str, Callable[[Any], Iterator[Table]]] = {
