@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -109,13 +110,14 @@ def likelihood(
     columns: dict[str, Callable[[int], Any]] = {"": int, "position [m]": lambda row: numbers(poses[row, :3])}
     for name in ("density", "log_density", "relative", "success_probability", "collision_free"):
         if (values := getattr(found, name)) is not None:
-            columns[name.replace("_", " ")] = lambda row, values=values: _cell(values[row])
+            columns[name.replace("_", " ")] = partial(_cell, values)
     show_table(range(min(limit, len(poses))), columns, empty="No poses.")
     if len(poses) > limit:
         ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json gives all.")
 
 
-def _cell(value: Any) -> str:
+def _cell(values: Any, row: int) -> str:
+    value = values[row]
     if isinstance(value, (bool, np.bool_)):
         return "yes" if value else "no"
     return f"{value:.5g}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
@@ -208,11 +209,19 @@ def _alike(found: wire.reports.SourceSimilarity | None) -> str:
 def _summary(raw: wire.reports.SummaryReport) -> Iterator[Table]:
     outcomes = [name for name in wire.OUTCOMES if any(name in row.outcomes for row in raw.rows)]
     counts: Columns = {name: attrgetter(name) for name in ("object", "gripper", "protocol", "source")}
-    counts |= {name: lambda row, name=name: row.outcomes.get(name, 0) for name in outcomes}
+    counts |= {name: partial(_count, name) for name in outcomes}
     yield raw.rows, counts
     rates: Columns = {name: attrgetter(name) for name in ("object", "source")}
-    rates |= {rule: lambda row, k=k: _percent(row.rates[k].rate) for k, rule in enumerate(raw.rules)}
+    rates |= {rule: partial(_rate, rule) for rule in raw.rules}
     yield raw.rows, rates
+
+
+def _count(outcome: str, row: wire.reports.SummaryRow) -> int:
+    return row.outcomes.get(outcome, 0)
+
+
+def _rate(rule: str, row: wire.reports.SummaryRow) -> str:
+    return _percent(next(item.rate for item in row.rates if item.rule == rule))
 
 
 _TABLES: dict[str, Callable[[Any], Iterator[Table]]] = {

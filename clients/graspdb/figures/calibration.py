@@ -44,7 +44,7 @@ def show_bins(axes: Axes, bins: Sequence[CalibrationBin], **style: Any) -> list[
     known = [item for item in bins if item.predicted is not None and item.observed is not None]
     observed = [ReportRange(value=item.observed, low=item.low, high=item.high) for item in known]
     predicted = [item.predicted for item in known]
-    look = {"color": BLUE, "linestyle": "-", "marker": "o", "markersize": 5, "capsize": 3}
+    look: dict[str, Any] = {"color": BLUE, "linestyle": "-", "marker": "o", "markersize": 5, "capsize": 3}
     show_ranges(axes, predicted, observed, **look, **style)
     return known
 

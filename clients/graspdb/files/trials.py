@@ -73,7 +73,7 @@ def read_poses(path: str) -> NDArray[np.float64]:
     rows = []
     for number, record in enumerate(records):
         try:
-            pose = record
+            pose: Any = record
             if isinstance(record, dict) and "matrix" in record:
                 pose = record["matrix"]
             elif isinstance(record, dict):
