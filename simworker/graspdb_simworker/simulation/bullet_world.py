@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import tempfile
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,6 @@ from typing import Any
 import numpy as np
 import pybullet
 from numpy.typing import NDArray
-from pybullet_utils.bullet_client import BulletClient
 
 from graspdb_simworker.simulation import camera, urdf
 from graspdb_simworker.simulation.bodies import (
@@ -34,6 +35,19 @@ _RESIDUAL = 1e-7
 friction is balanced between them."""
 PARKED: Vector = (0.0, 0.0, -1000.0)
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+class _Connection:
+    """Pybullet's functions for one world, which ends with this object. `BulletClient` would print a line."""
+
+    def __init__(self) -> None:
+        self.number: int = pybullet.connect(pybullet.DIRECT)
+        if self.number < 0:
+            raise RuntimeError("pybullet could not open a DIRECT world")
+        self.end = weakref.finalize(self, pybullet.disconnect, self.number)
+
+    def __getattr__(self, function: str) -> Any:
+        return functools.partial(getattr(pybullet, function), physicsClientId=self.number)
 
 
 class BulletWorld:
@@ -60,10 +74,8 @@ class BulletWorld:
         self._visible = visible
         self._views: list[camera.View] = []
         # Gives every call the world's number; calls of every step give it themselves, which is faster.
-        self._bullet: Any = BulletClient(pybullet.DIRECT)
-        self._client: int = self._bullet._client
-        if self._client < 0:
-            raise RuntimeError("pybullet could not open a DIRECT world")
+        self._bullet = _Connection()
+        self._client = self._bullet.number
         self._configure(solver_iterations, by_faces)
         if by_faces:
             self._jaw, self._object = self._load_bodies(parts)
@@ -75,9 +87,7 @@ class BulletWorld:
 
     def close_world(self) -> None:
         """Free Bullet's memory at once; the world can't be used afterwards."""
-        if self._client >= 0:
-            self._bullet.disconnect()
-            self._client = -1
+        self._bullet.end()
 
     def _configure(self, solver_iterations: int, by_faces: bool) -> None:
         self._bullet.resetSimulation()
