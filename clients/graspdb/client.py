@@ -36,11 +36,11 @@ class Client:
         self._transport = Transport(
             url, api_key=api_key, timeout_s=timeout_s, retries=retries, user_agent="graspdb-python"
         )
-        self.objects = Objects(self._transport)
-        self.grippers = Grippers(self._transport)
-        self.kernels = Kernels(self._transport)
-        self.reports = AllReports(self._transport)
-        self.sweeps = Sweeps(self._transport)
+        self.objects = Objects(self._transport, "/objects")
+        self.grippers = Grippers(self._transport, "/grippers")
+        self.kernels = Kernels(self._transport, "/kernels")
+        self.reports = AllReports(self._transport, "/reports")
+        self.sweeps = Sweeps(self._transport, "/sweeps")
 
     @property
     def url(self) -> str:

@@ -148,13 +148,7 @@ class Children:
 
 
 def wilson_interval(successes: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
-    """Wilson's score interval (1927) of a share, two-sided at ``level``.
-
-    Raises
-    ------
-    ValueError
-        If there are no trials or more successes than trials.
-    """
+    """Wilson's score interval (1927) of a share, two-sided at ``level``; ValueError where there is none."""
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"{successes} successes of {trials} trials")
     z = NormalDist().inv_cdf(0.5 + level / 2)
@@ -229,17 +223,9 @@ def _running(
     url = f"http://127.0.0.1:{port}"
     with Children(folder) as children:
         with console.status("Starting the service ..."):
+            where = ("--host", "127.0.0.1", "--port", str(port))
             database = f"sqlite:///{folder / 'graspdb.sqlite'}"
-            children.start(
-                "graspdb-server",
-                "serve",
-                "--host",
-                "127.0.0.1",
-                "--port",
-                str(port),
-                "--database-url",
-                database,
-            )
+            children.start("graspdb-server", "serve", *where, "--database-url", database)
             with Client(url) as db:
                 deadline = time.monotonic() + START_S
                 while not db.ready():
@@ -352,10 +338,7 @@ def _in_workspace(item: GraspObject) -> str:
 def _reports(item: GraspObject) -> str:
     """How far a grasp may be off and whether enough was tried, or what it takes to say so."""
     lines = []
-    for title, ask in (
-        ("Tolerance", item.reports.anisotropy),
-        ("Convergence", item.reports.convergence),
-    ):
+    for title, ask in (("Tolerance", item.reports.anisotropy), ("Convergence", item.reports.convergence)):
         try:
             text = ask().text
         except Conflict as error:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from graspdb.files.meshes import scene_of
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -85,11 +87,8 @@ class ExampleObject:
         """The convex parts as GLB, one geometry a part."""
         import trimesh
 
-        scene = trimesh.Scene()
-        for number, (vertices, faces) in enumerate(self.parts):
-            part = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
-            scene.add_geometry(part, geom_name=f"part_{number:04d}", node_name=f"part_{number:04d}")
-        data = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
+        parts = [trimesh.Trimesh(vertices=v, faces=f, process=False) for v, f in self.parts]
+        data = scene_of(parts).export(file_type="glb")
         if not isinstance(data, bytes):
             raise TypeError("trimesh did not export GLB as bytes")
         return data
@@ -248,11 +247,7 @@ def _mug() -> ExampleObject:
         np.column_stack([loop, np.full(24, z)])
         for loop, z in ((outer, low), (outer, high), (inner, high), (inner, floor))
     ]
-    index = np.arange(4 * 24).reshape(4, 24)
-    faces = [_band(lower, upper) for lower, upper in pairwise(index)]
-    faces += [_fan(index[0])[:, ::-1], _fan(index[-1])]
-    body = (np.concatenate(loops), np.concatenate(faces))
-    return ExampleObject("mug", "Mug", tuple(parts), (body, handle))
+    return ExampleObject("mug", "Mug", tuple(parts), (_stack(loops), handle))
 
 
 _BUILDERS: dict[str, Callable[[], ExampleObject]] = {

@@ -5,58 +5,25 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, TypedDict, TypeVar, Unpack
+from typing import Annotated, Any, Generic, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from graspdb import wire
 from graspdb.figures import FILE_FORMATS, draw, render
+from graspdb.figures.canvas import Figure
 from graspdb.options import Option, known_keywords
 from graspdb.poses import vector
-from graspdb.resources.runs import RunProgress, wait_for_run
+from graspdb.resources.pages import Resource
+from graspdb.resources.runs import RunProgress, computed
 from graspdb.resources.selection import Selection, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
-from graspdb.transport import Transport
-from graspdb.wire.reports import (
-    REPORT_NAMES,
-    AnisotropyReport,
-    AnisotropyTolerance,
-    AnyReport,
-    BandwidthReport,
-    CalibrationReport,
-    CheckCall,
-    ConvergenceReport,
-    KernelSimilarityReport,
-    ProjectionReport,
-    SimilarityPoint,
-    SourceComparison,
-    SourcesReport,
-    SummaryReport,
-    Verdict,
-)
-from graspdb.wire.reports import Report as ReportModel
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = [
-    "AllReports",
-    "Anisotropy",
-    "Bandwidth",
-    "Calibration",
-    "Convergence",
-    "KernelSimilarity",
-    "Projection",
-    "Report",
-    "Reports",
-    "Sources",
-    "Summary",
-]
+from graspdb.wire.reports import REPORT_NAMES
 
 Floats = NDArray[np.float64]
-R = TypeVar("R", bound=AnyReport | SummaryReport)
-M = TypeVar("M", bound=ReportModel)
+R = TypeVar("R", bound=wire.reports.Report | wire.reports.SummaryReport)
+M = TypeVar("M", bound=wire.reports.Report)
 
 
 class Report(Generic[R]):
@@ -102,11 +69,11 @@ class Report(Generic[R]):
         )
 
 
-class Convergence(Report[ConvergenceReport]):
+class Convergence(Report[wire.reports.ConvergenceReport]):
     """Have we tried enough? Arrays are those of the kernel asked for, by rising number of grasps."""
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> wire.reports.Verdict:
         """``enough``, ``more`` or ``borderline``, and how many more."""
         return self.raw.curves[0].verdict
 
@@ -131,11 +98,11 @@ class Convergence(Report[ConvergenceReport]):
         return np.array([point.log_likelihood for point in self.raw.curves[0].points])
 
 
-class Anisotropy(Report[AnisotropyReport]):
+class Anisotropy(Report[wire.reports.AnisotropyReport]):
     """What a success tells about its vicinity."""
 
     @property
-    def tolerances(self) -> dict[str, AnisotropyTolerance]:
+    def tolerances(self) -> dict[str, wire.reports.AnisotropyTolerance]:
         """By axis: ``x``, ``y``, ``z`` in metres, ``rx``, ``ry``, ``rz`` in radians."""
         return {item.axis: item for item in self.raw.tolerances}
 
@@ -145,7 +112,7 @@ class Anisotropy(Report[AnisotropyReport]):
         return {axis: item.half_width for axis, item in self.tolerances.items()}
 
 
-class Calibration(Report[CalibrationReport]):
+class Calibration(Report[wire.reports.CalibrationReport]):
     """Whether ``success_probability`` can be believed."""
 
     @property
@@ -156,15 +123,15 @@ class Calibration(Report[CalibrationReport]):
     @property
     def predicted(self) -> Floats:
         """(B,) mean prediction of every bin; nan where empty."""
-        return _column(item.predicted for item in self.raw.bins)
+        return np.array([item.predicted for item in self.raw.bins], dtype=np.float64)
 
     @property
     def observed(self) -> Floats:
         """(B,) share that came true."""
-        return _column(item.observed for item in self.raw.bins)
+        return np.array([item.observed for item in self.raw.bins], dtype=np.float64)
 
 
-class Projection(Report[ProjectionReport]):
+class Projection(Report[wire.reports.ProjectionReport]):
     """Where grasps succeed, on a plane."""
 
     @property
@@ -188,7 +155,7 @@ class Projection(Report[ProjectionReport]):
         return np.array(self.raw.upward_m)
 
 
-class Bandwidth(Report[BandwidthReport]):
+class Bandwidth(Report[wire.reports.BandwidthReport]):
     """Which widths the kernel should have."""
 
     @property
@@ -197,12 +164,12 @@ class Bandwidth(Report[BandwidthReport]):
         return self.raw.recommended.sigma_position_m, self.raw.recommended.sigma_rotation_deg
 
     @property
-    def calls(self) -> list[CheckCall]:
+    def calls(self) -> list[wire.reports.CheckCall]:
         """Sweeps that would make what is missing: draws at several widths, simulated as checks."""
         return self.raw.calls
 
 
-class KernelSimilarity(Report[KernelSimilarityReport]):
+class KernelSimilarity(Report[wire.reports.KernelSimilarityReport]):
     """How many samples, or Gaussians, a kernel needs to be like the statistics it comes from (figure 13)."""
 
     @property
@@ -216,16 +183,16 @@ class KernelSimilarity(Report[KernelSimilarityReport]):
         return _curve(self.raw.mixtures)
 
 
-class Sources(Report[SourcesReport]):
+class Sources(Report[wire.reports.SourcesReport]):
     """Simulation against real trials."""
 
     @property
-    def by_source(self) -> dict[str, SourceComparison]:
+    def by_source(self) -> dict[str, wire.reports.SourceComparison]:
         """``robot``, ``human`` and ``import``, those there are."""
         return {item.source: item for item in self.raw.sources}
 
 
-class Summary(Report[SummaryReport]):
+class Summary(Report[wire.reports.SummaryReport]):
     """Every object's trials by outcome, and success rates by each way of counting."""
 
     @property
@@ -244,13 +211,9 @@ class Summary(Report[SummaryReport]):
         return found
 
 
-def _curve(points: Iterable[SimilarityPoint]) -> tuple[NDArray[np.int64], Floats]:
+def _curve(points: Iterable[wire.reports.SimilarityPoint]) -> tuple[NDArray[np.int64], Floats]:
     counts, similarities = zip(*((point.count, point.similarity) for point in points), strict=True)
     return np.array(counts, dtype=np.int64), np.array(similarities, dtype=np.float64)
-
-
-def _column(values: Iterable[float | None]) -> Floats:
-    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
 class Waiting(TypedDict, total=False):
@@ -271,23 +234,17 @@ class DensityOptions(Selection, Waiting, total=False):
 
 
 class ConvergenceOptions(DensityOptions, total=False):
-    """Options of `Reports.convergence`."""
-
     matching: Annotated[
         str | None, Option("convergence: determinants, likelihood or success, beside a stored kernel.")
     ]
 
 
 class AnisotropyOptions(DensityOptions, total=False):
-    """Options of `Reports.anisotropy`."""
-
     method: Annotated[str | None, Option("anisotropy: empirical or density.")]
     alignment: Annotated[str | None, Option("anisotropy: gripper, object, edge or surface-pair.")]
 
 
 class ProjectionOptions(DensityOptions, total=False):
-    """Options of `Reports.projection`."""
-
     plane: Annotated[str | ArrayLike | None, Option("projection: xy, xz, yz or the plane's normal x,y,z.")]
     approach: Annotated[
         str | ArrayLike | None,
@@ -302,8 +259,6 @@ class ProjectionOptions(DensityOptions, total=False):
 
 
 class KernelSimilarityOptions(TrialOptions, total=False):
-    """Options of `Reports.kernel_similarity`."""
-
     window_position_m: Annotated[float | None, Option("kernel-similarity: half edge of the window.")]
     window_rotation_deg: Annotated[float | None, Option("kernel-similarity: largest turn.")]
     component_position_m: Annotated[float | None, Option("kernel-similarity: width of a sample.")]
@@ -311,77 +266,54 @@ class KernelSimilarityOptions(TrialOptions, total=False):
 
 
 class SourcesOptions(Waiting, total=False):
-    """Options of `Reports.sources`."""
-
     gripper: str | None
     protocol: str | None
     sigma_position_m: float | None
     sigma_rotation_deg: float | None
 
 
-class Reports:
+class Reports(Resource):
     """``mug.reports``. They take the selection of trials, most of them the kernel, too: see
     :class:`Selection`; and how to wait for them: see :class:`Waiting`.
     """
 
-    def __init__(self, transport: Transport, path: str) -> None:
-        self._transport = transport
-        self._path = path
-
     def convergence(self, **options: Unpack[ConvergenceOptions]) -> Convergence:
         """Whether there are enough successful grasps, and how many more it takes.
 
-        Parameters
-        ----------
-        matching
-            With a stored kernel: how the isotropic one beside it is chosen, by ``determinants``,
-            ``likelihood``, or ``success`` of draws simulated as checks.
-
-        Raises
-        ------
-        ChecksNeeded
-            Where draws to match by have not been simulated; :meth:`simulate` its ``calls`` and ask again.
-        Conflict
-            For too few successes, saying how many are needed.
+        ``matching``, with a stored kernel: how the isotropic one beside it is chosen, by ``determinants``,
+        ``likelihood``, or ``success`` of draws simulated as checks. ChecksNeeded where these have not been
+        simulated: :meth:`simulate` its ``calls`` and ask again. Conflict says how many successes are needed.
         """
-        return Convergence(self._get(ConvergenceReport, ConvergenceOptions, options))
+        return Convergence(self._get(wire.reports.ConvergenceReport, ConvergenceOptions, options))
 
     def anisotropy(self, **options: Unpack[AnisotropyOptions]) -> Anisotropy:
         """How far a good grasp may be displaced along and about every axis.
 
-        Parameters
-        ----------
-        method
-            ``empirical`` counts pairs of trials; ``density`` compares densities.
-        alignment
-            Axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the nearest) or
-            ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
+        - ``method``: ``empirical`` counts pairs of trials; ``density`` compares densities.
+        - ``alignment``: axes of translations: ``gripper``, ``object`` (its principal ones), ``edge`` (the
+          nearest) or ``surface-pair`` (what the jaw closes on); all but the first take a mesh.
         """
-        return Anisotropy(self._get(AnisotropyReport, AnisotropyOptions, options))
+        return Anisotropy(self._get(wire.reports.AnisotropyReport, AnisotropyOptions, options))
 
     def calibration(self, **options: Unpack[DensityOptions]) -> Calibration:
         """How often grasps hold that are predicted to, judged on trials the prediction has not seen."""
-        return Calibration(self._get(CalibrationReport, DensityOptions, options))
+        return Calibration(self._get(wire.reports.CalibrationReport, DensityOptions, options))
 
     def projection(self, **options: Unpack[ProjectionOptions]) -> Projection:
         """The density on a plane: where grasps succeed.
 
-        Parameters
-        ----------
-        plane
-            ``xy``, ``xz``, ``yz`` or a normal (3,); None: the one that shows most of the grasps.
-        approach, direction
-            Only grasps whose tool z (``approach``) or tool x (``direction``, with either sign) points along
-            this vector or axis (``"-z"``), within the cone.
+        - ``plane``: ``xy``, ``xz``, ``yz`` or a normal (3,); None: the one that shows most of the grasps.
+        - ``approach``, ``direction``: only grasps whose tool z, or tool x with either sign, points along this
+          vector or axis (``"-z"``), within the cone.
         """
-        return Projection(self._get(ProjectionReport, ProjectionOptions, options))
+        return Projection(self._get(wire.reports.ProjectionReport, ProjectionOptions, options))
 
     def bandwidth(self, **options: Unpack[TrialOptions]) -> Bandwidth:
         """Which widths the kernel should have, and how often draws at several widths succeed.
 
         Those are simulated by sweeps of purpose ``check``; ``calls`` says which are missing.
         """
-        return Bandwidth(self._get(BandwidthReport, TrialOptions, options))
+        return Bandwidth(self._get(wire.reports.BandwidthReport, TrialOptions, options))
 
     def kernel_similarity(self, **options: Unpack[KernelSimilarityOptions]) -> KernelSimilarity:
         """How many samples, or Gaussians, a kernel needs (figure 13).
@@ -389,27 +321,26 @@ class Reports:
         Displacements count within a window (a cube's half edge, the largest turn); every sample's component
         has the component's widths.
         """
-        return KernelSimilarity(self._get(KernelSimilarityReport, KernelSimilarityOptions, options))
+        return KernelSimilarity(
+            self._get(wire.reports.KernelSimilarityReport, KernelSimilarityOptions, options)
+        )
 
     def sources(self, **options: Unpack[SourcesOptions]) -> Sources:
         """Whether simulation tells what robots find.
 
         ``protocol`` is that of the simulated trials; real ones of it are taken where there are any, else all.
         """
-        return Sources(self._get(SourcesReport, SourcesOptions, options))
+        return Sources(self._get(wire.reports.SourcesReport, SourcesOptions, options))
 
-    def simulate(self, calls: Iterable[CheckCall | Mapping[str, Any]]) -> list[Sweep]:
+    def simulate(self, calls: Iterable[wire.reports.CheckCall | Mapping[str, Any]]) -> list[Sweep]:
         """Make the sweeps that a report names as missing: checks, which enter no density.
 
-        Parameters
-        ----------
-        calls
-            ``calls`` of a bandwidth report, or of :class:`graspdb.errors.ChecksNeeded`, with which
-            ``convergence(matching="success")`` is refused.
+        ``calls`` are those of a bandwidth report, or of :class:`graspdb.errors.ChecksNeeded`, with which
+        ``convergence(matching="success")`` is refused.
         """
         made = []
         for item in calls:
-            call = CheckCall.model_validate(item)
+            call = wire.reports.CheckCall.model_validate(item)
             expected = f"{self._path}/sweeps"
             if (call.method, call.path) != ("POST", expected):
                 raise ValueError(f"{call.method} {call.path} makes no sweep of this object (POST {expected})")
@@ -427,26 +358,20 @@ class Reports:
             params={key: _in_query(key, value) for key, value in params.items()},
             headers={"Accept": "application/json"},
         )
-        found = answer.json()
-        if answer.status_code == 202:
-            where = answer.headers["Location"]
-            found = wait_for_run(self._transport, where, f"the {name} report", progress, timeout_s)
+        found = computed(self._transport, answer, f"the {name} report", progress, timeout_s)
         return model.model_validate(found)
 
     def __repr__(self) -> str:
         return f"<reports: {', '.join(REPORT_NAMES)}>"
 
 
-class AllReports:
+class AllReports(Resource):
     """``db.reports``: what there is to say of all objects together."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def summary(self) -> Summary:
         """Every object's trials by outcome, and success rates by each way of counting (table I)."""
-        answer = self._transport.json("GET", "/reports/summary")
-        return Summary(SummaryReport.model_validate(answer))
+        answer = self._transport.model(wire.reports.SummaryReport, "GET", f"{self._path}/summary")
+        return Summary(answer)
 
     def __repr__(self) -> str:
         return "<reports: summary>"

@@ -116,7 +116,7 @@ class Transport:
 
     def model(self, model: type[Model], method: str, path: str, **options: Any) -> Model:
         """:meth:`request`, and the answer as this model."""
-        return model.model_validate(self.json(method, path, **options))
+        return model.model_validate_json(self.request(method, path, **options).content)
 
 
 def _retry_after(response: httpx.Response) -> float:

@@ -13,10 +13,9 @@ import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
@@ -36,33 +35,19 @@ app = typer.Typer(
 )
 
 log = logging.getLogger("graspdb.simworker")
-MISSING = (
-    "graspdb-simworker: {what}: install the extra, `pip install 'graspdb[sim]'`"
-    " (pybullet has wheels for CPython 3.10 and 3.11 on x86-64 Linux;"
-    " this is CPython {version} on {machine} {system})"
-)
-
-
-@app.callback()
-def _root() -> None:
-    """Simulates the grasps that a GraspDB service plans."""
 
 
 def _require_pybullet() -> None:
     """Say in one line what is missing and leave with code 2."""
-    missing = [
-        name
-        for name in ("pybullet", "numba", "scipy", "trimesh", "PIL")
-        if importlib.util.find_spec(name) is None
-    ]
+    needed = ("pybullet", "numba", "scipy", "trimesh", "PIL")
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
-        text = MISSING.format(
-            what=f"{', '.join(missing)} is missing",
-            version=platform.python_version(),
-            machine=platform.machine(),
-            system=platform.system(),
+        typer.echo(
+            f"graspdb-simworker: {', '.join(missing)} is missing: install the extra, `pip install"
+            " 'graspdb[sim]'` (pybullet has wheels for CPython 3.10 and 3.11 on x86-64 Linux; this is CPython"
+            f" {platform.python_version()} on {platform.machine()} {platform.system()})",
+            err=True,
         )
-        typer.echo(text, err=True)
         raise typer.Exit(2)
 
 
@@ -160,8 +145,7 @@ def run(
     typer.echo(str(worker.tally), err=True)
 
 
-@dataclass(frozen=True)
-class _Cluster:
+class _Cluster(NamedTuple):
     """Where chunks are simulated: ``make_runner`` for each of ``threads`` at once."""
 
     threads: int
@@ -226,10 +210,8 @@ def verify(
                 info, stored = stored_outcomes.sample_of(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
-            object_name = info.object
-            payload, parts = inputs.load(
-                info.object, info.gripper, protocol=info.protocol, url=url, api_key=api_key
-            )
+            object_name, gripper, protocol = info.object, info.gripper, info.protocol
+            payload, parts = inputs.load(object_name, gripper, protocol=protocol, url=url, api_key=api_key)
             with _progress("grasps") as progress:
                 found = agreement.verify_stored(
                     payload, parts, stored, count=count, seed=seed, progress=progress
@@ -267,12 +249,8 @@ def show(
         payload, parts = inputs.load(
             object_name, gripper, protocol=protocol, fine=fine, url=url, api_key=api_key
         )
-        shown = pictures.simulate_one(
-            payload,
-            parts,
-            pose,
-            film_every_s=pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf,
-        )
+        film_every_s = pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf
+        shown = pictures.simulate_one(payload, parts, pose, film_every_s=film_every_s)
         # The outcome's name and the object's: what a picture is worth that went astray.
         outcome = shown.label.outcome.name.lower().replace("_", " ")
         written = pictures.write(out, shown.pictures, f"{object_name}, {gripper}, {protocol}: {outcome}")

@@ -15,28 +15,11 @@ import random
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
 
-from graspdb.errors import (
-    Conflict,
-    Forbidden,
-    GraspDBError,
-    InvalidInput,
-    LeaseLost,
-    NotFound,
-    TooLarge,
-    Unauthorized,
-)
+from graspdb import errors, wire
 from graspdb.transport import Transport
-from graspdb.wire import (
-    ClaimedJob,
-    ClaimRequest,
-    ClaimResponse,
-    DecomposePayload,
-    LeaseRenewed,
-    SimulatePayload,
-    SimulateResult,
-)
 from graspdb_simworker.decomposition.supervisor import DecompositionFailed, ResourceLimits, decompose
 from graspdb_simworker.process.local import LocalRunner
 from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
@@ -90,6 +73,7 @@ class WorkTally:
         )
 
 
+@dataclass(eq=False)
 class Worker:
     """Pulls jobs from one service and runs up to ``processes`` chunks at once, a thread and a runner each.
 
@@ -98,26 +82,18 @@ class Worker:
     are the limits of one mesh's; None leaves them to other workers.
     """
 
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        name: str,
-        processes: int = 1,
-        exit_when_idle: bool = False,
-        once: bool = False,
-        make_runner: Callable[[], ChunkRunner] = LocalRunner,
-        decompositions: ResourceLimits | None = None,
-    ) -> None:
-        if processes < 1:
+    transport: Transport
+    _: KW_ONLY
+    name: str
+    processes: int = 1
+    exit_when_idle: bool = False
+    once: bool = False
+    make_runner: Callable[[], ChunkRunner] = LocalRunner
+    decompositions: ResourceLimits | None = None
+
+    def __post_init__(self) -> None:
+        if self.processes < 1:
             raise ValueError("processes must be at least 1")
-        self._transport = transport
-        self._name = name
-        self._processes = processes
-        self._exit_when_idle = exit_when_idle
-        self._once = once
-        self._make_runner = make_runner
-        self._decompositions = decompositions
         self._stop = threading.Event()
         self._done = threading.Event()
         self._lock = threading.Lock()
@@ -140,7 +116,7 @@ class Worker:
         )
         slots = [
             threading.Thread(target=self._guard, args=(self._slot,), name=f"slot-{number}", daemon=True)
-            for number in range(self._processes)
+            for number in range(self.processes)
         ]
         heartbeat.start()
         for slot in slots:
@@ -191,27 +167,19 @@ class Worker:
 
     def _renew(self, lease: Lease) -> None:
         try:
-            answer = self._transport.request(
-                "PUT",
-                f"/jobs/{lease.job}/lease",
-                params={"lease_id": lease.lease_id, "progress": lease.progress},
-                retries=0,
-            )
-        except (LeaseLost, NotFound) as error:
+            params = {"lease_id": lease.lease_id, "progress": lease.progress}
+            path = f"/jobs/{lease.job}/lease"
+            renewed = self.transport.model(wire.LeaseRenewed, "PUT", path, params=params, retries=0)
+        except (errors.LeaseLost, errors.NotFound) as error:
             log.warning("job %s: lease lost (%s)", lease.job, error)
             lease.lost.set()
-        except GraspDBError as error:
+        except errors.GraspDBError as error:
             # Perhaps the service restarts. A lease that ran out may still be ours when it is back.
-            log.log(
-                logging.DEBUG if lease.unheard else logging.WARNING,
-                "job %s: could not renew the lease, trying on: %s",
-                lease.job,
-                error,
-            )
+            level = logging.DEBUG if lease.unheard else logging.WARNING
+            log.log(level, "job %s: could not renew the lease, trying on: %s", lease.job, error)
             lease.unheard = True
             lease.renewed += min(1.0, lease.lease_s / 10.0)
         else:
-            renewed = LeaseRenewed.model_validate_json(answer.content)
             lease.renewed, lease.lease_s, lease.unheard = time.monotonic(), renewed.lease_s, False
             if renewed.cancel:
                 log.info("job %s: cancelled", lease.job)
@@ -221,15 +189,15 @@ class Worker:
 
     def _slot(self) -> None:
         failures = 0
-        with self._make_runner() as runner:
+        with self.make_runner() as runner:
             while not self._stop.is_set():
                 try:
                     job, wait = self._claim()
-                except (Unauthorized, Forbidden) as error:
+                except (errors.Unauthorized, errors.Forbidden) as error:
                     raise WorkerFailed(f"the service refuses this worker: {error}") from error
-                except InvalidInput as error:
+                except errors.InvalidInput as error:
                     raise WorkerFailed(f"the service does not understand this worker: {error}") from error
-                except GraspDBError as error:
+                except errors.GraspDBError as error:
                     failures += 1
                     delay = _backoff(failures)
                     log.warning("can't claim jobs (again in %.1f s): %s", delay, error)
@@ -237,27 +205,25 @@ class Worker:
                     continue
                 failures = 0
                 if job is None:
-                    if self._exit_when_idle or self._once:
+                    if self.exit_when_idle or self.once:
                         return
                     self._stop.wait(wait)
                     continue
                 self._work(runner, job)
-                if self._once:
+                if self.once:
                     return
 
-    def _claim(self) -> tuple[ClaimedJob | None, float]:
-        capabilities = [*CAPABILITIES, *(["decompose"] if self._decompositions else [])]
-        request = ClaimRequest(worker=self._name, capabilities=capabilities, limit=1)
-        answer = ClaimResponse.model_validate_json(
-            self._transport.request("POST", "/jobs/claim", body=request, retries=0).content
-        )
+    def _claim(self) -> tuple[wire.ClaimedJob | None, float]:
+        capabilities = [*CAPABILITIES, *(["decompose"] if self.decompositions else [])]
+        request = wire.ClaimRequest(worker=self.name, capabilities=capabilities, limit=1)
+        answer = self.transport.model(wire.ClaimResponse, "POST", "/jobs/claim", body=request, retries=0)
         return (answer.jobs[0] if answer.jobs else None), max(0.1, answer.retry_after_s or IDLE_S)
 
-    def _work(self, runner: ChunkRunner, job: ClaimedJob) -> None:
+    def _work(self, runner: ChunkRunner, job: wire.ClaimedJob) -> None:
         with self._holding(job) as lease:
             try:
                 payload = job.payload
-                if isinstance(payload, DecomposePayload):
+                if isinstance(payload, wire.DecomposePayload):
                     self._decompose(payload, lease)
                     return
                 parts = self._parts_of(payload, lease)
@@ -267,8 +233,7 @@ class Worker:
             except ChunkFailed as error:
                 log.error("job %s failed: %s", job.id, error)
                 self.tally.failures += 1
-                permanent = isinstance(error, DecompositionFailed)
-                self._hand_in(lease, "failure", {"error": str(error)[:4000], "permanent": permanent})
+                self._report_failure(lease, str(error), permanent=isinstance(error, DecompositionFailed))
             except PybulletMissing:
                 self._release(lease)
                 raise
@@ -276,23 +241,18 @@ class Worker:
                 if self._hand_in(lease, "result", result):
                     self._count(payload.stop - payload.start, len(result.rows.pose_index))
 
-    def _decompose(self, payload: DecomposePayload, lease: Lease) -> None:
+    def _decompose(self, payload: wire.DecomposePayload, lease: Lease) -> None:
         """Make an object's convex parts and hand them in."""
-        if self._decompositions is None:
+        if self.decompositions is None:
             raise ChunkFailed("this worker does not do 'decompose' jobs")
         mesh = self._fetched(payload.mesh, payload.mesh_sha256, lease)
-        parts = decompose(
-            payload,
-            mesh,
-            limits=self._decompositions,
-            wanted=lambda: self._wanted(lease),
-            progress=lease.note,
-        )
+        limits, wanted = self.decompositions, lambda: self._wanted(lease)
+        parts = decompose(payload, mesh, limits=limits, wanted=wanted, progress=lease.note)
         if self._hand_in(lease, "result", parts):
             self._count()
 
     @contextlib.contextmanager
-    def _holding(self, job: ClaimedJob) -> Iterator[Lease]:
+    def _holding(self, job: wire.ClaimedJob) -> Iterator[Lease]:
         lease = Lease(job.id, job.lease_id, job.lease_s, time.monotonic())
         with self._lock:
             self._leases[lease.lease_id] = lease
@@ -314,13 +274,13 @@ class Worker:
     def _release(self, lease: Lease) -> None:
         """Give a lease back, so that another worker need not wait until it runs out."""
         try:
-            self._transport.request(
+            self.transport.request(
                 "DELETE", f"/jobs/{lease.job}/lease", params={"lease_id": lease.lease_id}, retries=0
             )
-        except GraspDBError as error:
+        except errors.GraspDBError as error:
             log.warning("job %s: could not release the lease, it will run out: %s", lease.job, error)
 
-    def _parts_of(self, payload: SimulatePayload, lease: Lease) -> bytes:
+    def _parts_of(self, payload: wire.SimulatePayload, lease: Lease) -> bytes:
         """The object's convex parts as GLB, fetched once for each hash.
 
         ChunkCancelled if the job is not wanted any more before they came; ChunkFailed if the service does not
@@ -344,11 +304,11 @@ class Worker:
             if not self._wanted(lease):
                 raise ChunkCancelled
             try:
-                data = self._transport.request("GET", path, retries=0).content
+                data = self.transport.request("GET", path, retries=0).content
                 break
-            except (NotFound, Unauthorized, Forbidden, InvalidInput) as error:
+            except (errors.NotFound, errors.Unauthorized, errors.Forbidden, errors.InvalidInput) as error:
                 raise ChunkFailed(f"can't fetch {path}: {error}") from error
-            except GraspDBError as error:
+            except errors.GraspDBError as error:
                 failures += 1
                 log.warning("can't fetch %s: %s", path, error)
                 self._stop.wait(_backoff(failures))
@@ -365,41 +325,39 @@ class Worker:
             self.tally.grasps += grasps
             log.info("%s", self.tally)
 
-    def _hand_in(self, lease: Lease, what: str, body: SimulateResult | dict[str, str | bool] | bytes) -> bool:
+    def _report_failure(self, lease: Lease, message: str, *, permanent: bool) -> None:
+        self._hand_in(lease, "failure", {"error": message[:4000], "permanent": permanent})
+
+    def _hand_in(self, lease: Lease, what: str, body: wire.SimulateResult | dict[str, Any] | bytes) -> bool:
         """Send until the service answers for good: whether it took it.
 
         The same body under the same lease is idempotent, so an answer lost on the way does no harm.
         Once the worker is asked to stop there is one more attempt, then the lease runs out by itself.
         """
         failures = 0
+        is_glb = isinstance(body, bytes)
+        sent: dict[str, Any] = (
+            {"content": body, "headers": {"Content-Type": GLB}} if is_glb else {"body": body}
+        )
         while True:
             last = self._stop.is_set()
             if lease.lost.is_set():
                 self.tally.lost += 1
                 return False
             try:
-                self._transport.request(
-                    "PUT",
-                    f"/jobs/{lease.job}/{what}",
-                    params={"lease_id": lease.lease_id},
-                    body=None if isinstance(body, bytes) else body,
-                    content=body if isinstance(body, bytes) else None,
-                    headers={"Content-Type": GLB} if isinstance(body, bytes) else None,
-                    retries=0,
-                )
-            except (Conflict, NotFound) as error:
+                params = {"lease_id": lease.lease_id}
+                self.transport.request("PUT", f"/jobs/{lease.job}/{what}", params=params, retries=0, **sent)
+            except (errors.Conflict, errors.NotFound) as error:
                 log.warning("job %s: %s not wanted: %s", lease.job, what, error)
                 self.tally.lost += 1
                 return False
-            except (InvalidInput, TooLarge, Unauthorized, Forbidden) as error:
+            except (errors.InvalidInput, errors.TooLarge, errors.Unauthorized, errors.Forbidden) as error:
                 log.error("job %s: the service refuses the %s: %s", lease.job, what, error)
                 self.tally.failures += 1
                 if what == "result":
-                    message = f"the service refused the result: {error}"
-                    permanent = isinstance(body, bytes)
-                    self._hand_in(lease, "failure", {"error": message[:4000], "permanent": permanent})
+                    self._report_failure(lease, f"the service refused the result: {error}", permanent=is_glb)
                 return False
-            except GraspDBError as error:
+            except errors.GraspDBError as error:
                 if last:
                     log.error("job %s: %s not sent, stopping: %s", lease.job, what, error)
                     return False

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_simworker.simulation.bodies import Part, mass_properties
+from graspdb_simworker.simulation.bodies import Part, inverse, mass_properties
 
 FACES = np.array(
     [
@@ -51,7 +51,7 @@ def test_points_go_to_the_principal_frame() -> None:
     turn = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
     vertices, faces = box(SIZE, np.array([0.4, -0.2, 0.1]), turn)
     mass = mass_properties([(vertices, faces)], 0.6)
-    expected = Rotation.from_quat(mass.inverse_rotation()).apply(vertices - np.array(mass.centre))
+    expected = Rotation.from_quat(inverse(mass.principal_xyzw)).apply(vertices - np.array(mass.centre))
     np.testing.assert_allclose(mass.to_principal(vertices), expected, atol=1e-12)
 
 

@@ -53,7 +53,7 @@ def test_the_rim_of_a_mug_is_held(
     held = workpiece.world.close(*grasps["rim"])
     assert held.end is End.STALLED
     assert held.touched
-    label = label_of(held, workpiece.gripper, workpiece.mass_kg, workpiece.friction)
+    label = label_of(held)
     assert label.outcome is Outcome.SUCCESS
     # The wall is 4 mm; across a finger's width it bulges by 2 mm.
     assert 0.0045 < label.width_m < 0.0070
@@ -71,9 +71,7 @@ def test_nothing_to_close_on_is_a_miss(
     workpiece = workpiece_of("mug")
     closing = workpiece.world.close(*grasps["above"])
     assert closing.end is End.EMPTY
-    assert (
-        label_of(closing, workpiece.gripper, workpiece.mass_kg, workpiece.friction).outcome is Outcome.MISSED
-    )
+    assert label_of(closing).outcome is Outcome.MISSED
 
 
 def test_the_cone_is_as_wide_as_it_is(workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]) -> None:
@@ -81,7 +79,7 @@ def test_the_cone_is_as_wide_as_it_is(workpiece_of: GetWorkpiece, grasps: dict[s
     position, quaternion = grasps["waist"]
     for z in (-0.1, 0.0, 0.1):
         closing = workpiece.world.close((*position[:2], z), quaternion)
-        label = label_of(closing, workpiece.gripper, workpiece.mass_kg, workpiece.friction)
+        label = label_of(closing)
         assert label.outcome is Outcome.SUCCESS
         # The diameter there; flat fingers, 20 mm wide, ride on the thicker side of the taper.
         diameter = 2.0 * (0.025 - 0.075 * z)
@@ -125,8 +123,9 @@ def test_labels_do_not_depend_on_order_or_world(
     shuffled = close_all(workpiece.world, [poses[k] for k in order], [travel[k] for k in order])
     assert all(same(forward[k], result) for k, result in zip(order, shuffled, strict=True))
     thing = example(name)
-    with GraspWorld(thing.parts, thing.mass_kg, thing.friction, workpiece.gripper) as other:
-        fresh = [other.close(*poses[k], travel[k]) for k in reversed(range(20))]
+    other = GraspWorld(thing.parts, thing.mass_kg, thing.friction, workpiece.gripper)
+    fresh = [other.close(*poses[k], travel[k]) for k in reversed(range(20))]
+    other.close_world()
     assert all(same(a, b) for a, b in zip(forward[:20], reversed(fresh), strict=True))
     assert len({closing.end for closing in forward}) > 1, "the sample must hold more than one kind of end"
 

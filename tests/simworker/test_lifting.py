@@ -100,9 +100,8 @@ def test_a_body_that_nothing_holds_falls_freely_however_the_jaw_turns(axis: int)
 
     def rates(t: float, state: np.ndarray) -> np.ndarray:
         r, v, q, spin = state[:3], state[3:6], state[6:10] / np.linalg.norm(state[6:10]), state[10:]
-        force, torque = lifting.load(
-            lifting.frame_at(began + t), mass, tuple(r), tuple(q), tuple(v), tuple(spin)
-        )
+        where = (tuple(r), tuple(q), tuple(v), tuple(spin))
+        force, torque = lifting.load(lifting.frame_at(began + t), mass.mass_kg, mass.inertia, *where)
         rotation = Rotation.from_quat(q)
         own_spin, own_torque = rotation.inv().apply(spin), rotation.inv().apply(torque)
         own_rate = (own_torque - np.cross(own_spin, inertia * own_spin)) / inertia

@@ -17,11 +17,11 @@ import pytest
 
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload
-from graspdb_simworker.process import channel, local, messages
+from graspdb_simworker.process import channel, local
 from graspdb_simworker.process.local import LocalRunner
 from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, PybulletMissing
 from graspdb_simworker.simulation import chunks
-from graspdb_simworker.simulation.labels import Label, Outcome
+from graspdb_simworker.simulation.labels import Outcome
 
 MakePayload = Callable[..., SimulatePayload]
 GetWorkpiece = Callable[..., chunks.Workpiece]
@@ -187,7 +187,3 @@ def test_messages_survive_the_pipe_and_broken_pipes_are_noticed() -> None:
     with pytest.raises(channel.Closed):
         channel.receive(reader)
     os.close(reader)
-    label = Label(Outcome.SLIPPED, 0.0125, 0.0)
-    assert messages.unpack_label(messages.pack_label(2**40, label)) == (2**40, label)
-    chunk = messages.Chunk("{}", {3: label}, 2.5, b"glb")
-    assert messages.unpack_chunk(messages.pack_chunk(chunk)) == chunk

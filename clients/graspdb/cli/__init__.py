@@ -15,12 +15,13 @@ from rich.markup import escape
 from graspdb import __version__
 from graspdb.cli import kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
+from graspdb.cli.options import Commands
 from graspdb.demo import demo
 from graspdb.errors import GraspDBError
 
 __all__ = ["app", "main"]
 
-app = typer.Typer(
+app = Commands(
     name="graspdb",
     help="GraspDB: grasp trials in; densities, best grasps and their likelihood out.",
     no_args_is_help=True,
@@ -55,7 +56,7 @@ def settings(
     ] = False,
 ) -> None:
     """GraspDB: grasp trials in; densities, best grasps and their likelihood out."""
-    context.obj = State(url=url, api_key=api_key, json=json)
+    context.obj = State(context, url, api_key, json)
 
 
 app.add_typer(objects.objects, name="objects")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any, TypeVar
 
@@ -28,15 +29,17 @@ T = TypeVar("T")
 
 @dataclasses.dataclass
 class State:
-    """The global options, and the one connection of this run."""
+    """The global options, and the one connection of this run, which ends with it."""
 
+    context: typer.Context
     url: str | None
     api_key: str | None
     json: bool
 
-    def client(self) -> Client:
-        """Connect; a person waits in front of it, so fewer retries than a program's."""
-        return Client(self.url, api_key=self.api_key, retries=2)
+    @functools.cached_property
+    def db(self) -> Client:
+        """A person waits in front of it, so fewer retries than a program's."""
+        return self.context.with_resource(Client(self.url, api_key=self.api_key, retries=2))
 
     def show(self, value: Any, words: Mapping[str, Any] | str) -> None:
         """The value with --json, else these names and values, or this line."""
@@ -52,17 +55,7 @@ class State:
         if self.json:
             out(items)
         else:
-            show_table(
-                tuple(columns), [[cell(item) for cell in columns.values()] for item in items], empty=empty
-            )
-
-
-def state_of(context: typer.Context) -> State:
-    """The global options of this run."""
-    state = context.find_root().obj
-    if not isinstance(state, State):
-        raise TypeError("commands run below the graspdb callback, which sets the state")
-    return state
+            show_table(items, columns, empty=empty)
 
 
 def console() -> Console:
@@ -112,9 +105,10 @@ def show_rows(rows: Mapping[str, Any]) -> None:
     console().print(table)
 
 
-def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, empty: str) -> None:
-    """A table; numbers stand to the right."""
-    body = [[("" if cell is None else cell) for cell in row] for row in rows]
+def show_table(items: Sequence[T], columns: Mapping[str, Callable[[T], Any]], *, empty: str) -> None:
+    """A row an item, and in each column what it says of the item; numbers stand to the right."""
+    rows = [[cell(item) for cell in columns.values()] for item in items]
+    body = [["" if cell is None else cell for cell in row] for row in rows]
     if not body:
         console().print(empty)
         return
@@ -132,23 +126,12 @@ def numbers(values: Any, digits: int = 4) -> str:
     return " ".join(f"{float(value):+.{digits}f}" for value in values)
 
 
-def number(value: float | None) -> str:
-    """Two decimals, or that it is not known."""
-    return "unknown" if value is None else f"{value:.2f}"
-
-
 @contextmanager
 def run_bar(title: str) -> Iterator[Callable[[ReportRun], None]]:
     """How far a run is, for a person to see, once it is told."""
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=ERRORS, transient=True
     )
+    task = bar.add_task(title, total=1.0, visible=False)
     with bar:
-        task: Any = None
-
-        def show(run: ReportRun) -> None:
-            nonlocal task
-            task = bar.add_task(title, total=1.0) if task is None else task
-            bar.update(task, completed=run.progress)
-
-        yield show
+        yield lambda run: bar.update(task, completed=run.progress, visible=True)

@@ -6,12 +6,13 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ObjectId, number, run_bar, state_of
-from graspdb.cli.options import takes_options
+from graspdb.cli.common import ObjectId, State, run_bar
+from graspdb.cli.options import Commands
+from graspdb.figures.style import number
 from graspdb.resources.kernels import KernelOptions
 from graspdb.wire.kernels import KernelProvenance
 
-kernels = typer.Typer(help="Stored kernels.", no_args_is_help=True)
+kernels = Commands(help="Stored kernels.", no_args_is_help=True)
 
 
 def _fitted_on(source: KernelProvenance) -> dict[str, str]:
@@ -32,24 +33,19 @@ def _fitted_on(source: KernelProvenance) -> dict[str, str]:
 
 
 @kernels.command("fit")
-@takes_options
-def fit_kernel(context: typer.Context, id: ObjectId, options: KernelOptions) -> None:
+def fit_kernel(state: State, id: ObjectId, options: KernelOptions) -> None:
     """Fit a kernel on an object's successes, or widths that predict success on all its attempts."""
-    state = state_of(context)
-    with state.client() as db, run_bar(f"kernel of {id}") as show:
-        made = db.kernels.fit(id, progress=show, **options)
+    with run_bar(f"kernel of {id}") as show:
+        made = state.db.kernels.fit(id, progress=show, **options)
     widths = f"{_widths(made.widths_m, 1e3)} mm; {_widths(made.widths_deg)} °"
     state.show(made, {"id": made.id, "widths": widths, **_fitted_on(made.provenance)})
 
 
 @kernels.command("list")
-def list_kernels(context: typer.Context) -> None:
+def list_kernels(state: State) -> None:
     """List stored kernels."""
-    state = state_of(context)
-    with state.client() as db:
-        found = list(db.kernels)
     state.show_list(
-        found,
+        list(state.db.kernels),
         {
             "id": lambda k: k.id,
             "object": lambda k: k.provenance.object,
@@ -63,12 +59,9 @@ def list_kernels(context: typer.Context) -> None:
 
 
 @kernels.command("delete")
-def delete_kernel(
-    context: typer.Context, kernel: Annotated[str, typer.Argument(help="The kernel's id.")]
-) -> None:
+def delete_kernel(state: State, kernel: Annotated[str, typer.Argument(help="The kernel's id.")]) -> None:
     """Delete a stored kernel."""
-    with state_of(context).client() as db:
-        db.kernels.delete(kernel)
+    state.db.kernels.delete(kernel)
 
 
 def _widths(values: tuple[float, ...], factor: float = 1.0) -> str:

@@ -8,27 +8,24 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ERRORS, ObjectId, Yes, flat, out, show_rows, state_of
-from graspdb.cli.options import takes_options
+from graspdb.cli.common import ERRORS, ObjectId, State, Yes, flat, out, show_rows
+from graspdb.cli.options import Commands
 from graspdb.errors import Conflict
 from graspdb.examples import EXAMPLES
 from graspdb.resources.objects import GraspObject, ObjectProperties
 
-objects = typer.Typer(no_args_is_help=True, help="Create, list, show and delete objects.")
-grippers = typer.Typer(no_args_is_help=True, help="Create, list and show gripper profiles.")
+objects = Commands(no_args_is_help=True, help="Create, list, show and delete objects.")
+grippers = Commands(no_args_is_help=True, help="Create, list and show gripper profiles.")
 
 GripperId = Annotated[str, typer.Argument(metavar="GRIPPER", show_default=False)]
 Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
 
 
 @objects.command("list")
-def list_objects(context: typer.Context) -> None:
+def list_objects(state: State) -> None:
     """List all objects."""
-    state = state_of(context)
-    with state.client() as db:
-        found = [item.info for item in db.objects.list()]
     state.show_list(
-        found,
+        [item.info for item in state.db.objects],
         {
             "object": lambda i: i.id,
             "name": lambda i: i.name,
@@ -42,18 +39,15 @@ def list_objects(context: typer.Context) -> None:
 
 
 @objects.command("show")
-def show_object(context: typer.Context, id: ObjectId) -> None:
+def show_object(state: State, id: ObjectId) -> None:
     """Show one object."""
-    state = state_of(context)
-    with state.client() as db:
-        item = db.objects.get(id)
+    item = state.db.objects.get(id)
     state.show(item.info, item.summary())
 
 
 @objects.command("create")
-@takes_options
 def create_object(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     properties: ObjectProperties,
     mesh: Annotated[Path | None, typer.Option(help="Mesh file: .stl, .obj, .ply or .glb.")] = None,
@@ -63,71 +57,60 @@ def create_object(
     ] = None,
 ) -> None:
     """Create an object, with its mesh if given."""
-    state = state_of(context)
-    with state.client() as db:
-        item = db.objects.create(id, mesh=mesh, unit=unit, convex_parts=convex_parts, **properties)
+    item = state.db.objects.create(id, mesh=mesh, unit=unit, convex_parts=convex_parts, **properties)
     state.show(item.info, item.summary())
 
 
 @objects.command("set-mesh")
 def set_mesh(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     mesh: Annotated[Path, typer.Argument(help="Mesh file.", show_default=False)],
     unit: Unit = "m",
 ) -> None:
     """Upload an object's mesh."""
-    state = state_of(context)
-    with state.client() as db:
-        item = db.objects.get(id)
-        info = item.upload_mesh(mesh, unit=unit)
+    item = state.db.objects.get(id)
+    info = item.upload_mesh(mesh, unit=unit)
     state.show(info, item.summary())
 
 
 @objects.command("delete")
-def delete_object(context: typer.Context, id: ObjectId, yes: Yes = False) -> None:
+def delete_object(state: State, id: ObjectId, yes: Yes = False) -> None:
     """Delete an object with its trials and sweeps."""
-    state = state_of(context)
-    with state.client() as db:
-        item = db.objects.get(id)
-        if not yes:
-            typer.confirm(f"Delete {id} with its {item.info.trials:,} trials?", abort=True, err=True)
-        item.delete()
+    item = state.db.objects.get(id)
+    if not yes:
+        typer.confirm(f"Delete {id} with its {item.info.trials:,} trials?", abort=True, err=True)
+    item.delete()
     state.show({"deleted": id}, f"{id} is deleted.")
 
 
 def add_example(
-    context: typer.Context,
+    state: State,
     names: Annotated[
         list[str], typer.Argument(metavar="NAME...", help="cone, elongated-d, screwdriver, mug, or all.")
     ],
 ) -> None:
     """Add the paper's objects, with mesh and convex parts."""
-    state = state_of(context)
     added: list[GraspObject] = []
-    with state.client() as db:
-        for name in EXAMPLES if "all" in names else names:
-            try:
-                added.append(db.add_example(name))
-            except Conflict:
-                if "all" not in names:
-                    raise
-                ERRORS.print(f"{name} exists already.")
-                continue
-            if not state.json:
-                show_rows(added[-1].summary())
+    for name in EXAMPLES if "all" in names else names:
+        try:
+            added.append(state.db.add_example(name))
+        except Conflict:
+            if "all" not in names:
+                raise
+            ERRORS.print(f"{name} exists already.")
+            continue
+        if not state.json:
+            show_rows(added[-1].summary())
     if state.json:
         out([item.info for item in added])
 
 
 @grippers.command("list")
-def list_grippers(context: typer.Context) -> None:
+def list_grippers(state: State) -> None:
     """List all gripper profiles."""
-    state = state_of(context)
-    with state.client() as db:
-        found = list(db.grippers)
     state.show_list(
-        found,
+        list(state.db.grippers),
         {
             "gripper": lambda g: g.id,
             "name": lambda g: g.name,
@@ -141,28 +124,24 @@ def list_grippers(context: typer.Context) -> None:
 
 
 @grippers.command("show")
-def show_gripper(context: typer.Context, id: GripperId) -> None:
+def show_gripper(state: State, id: GripperId) -> None:
     """Show one gripper profile."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.grippers.get(id)
+    found = state.db.grippers.get(id)
     name = {"name": found.name} if found.name else {}
     state.show(found, {"gripper": found.id, **name, **flat(found.profile.model_dump(mode="json"))})
 
 
 @grippers.command("create")
 def create_gripper(
-    context: typer.Context,
+    state: State,
     id: GripperId,
     file: Annotated[Path, typer.Argument(help="JSON file with the profile's fields.", show_default=False)],
     name: Annotated[str | None, typer.Option(help="A name for people.")] = None,
 ) -> None:
     """Create a gripper profile from a JSON file."""
-    state = state_of(context)
     profile = json.loads(file.read_text(encoding="utf-8"))
     if not isinstance(profile, dict):
         raise ValueError(f"{file} holds no JSON object")
     fields = {**profile, **({"name": name} if name else {}), "id": id}
-    with state.client() as db:
-        created = db.grippers.create(**fields)
+    created = state.db.grippers.create(**fields)
     state.show(created, f"Gripper {created.id} is created.")

@@ -1,10 +1,10 @@
 """Commands that take the SDK's keywords: parameters made of its typed options, and values as it wants them.
 
-A command says which keywords of the SDK it takes by the TypedDict (or pydantic model) that declares them::
+A command of :class:`Commands` says which keywords of the SDK it takes by the TypedDict that declares them::
 
-    @takes_options
-    def density(context: typer.Context, id: ObjectId, selection: Selection) -> None:
-        db.objects.get(id).density(**selection)
+    @app.command("density")
+    def density(state: State, id: ObjectId, selection: Selection) -> None:
+        state.db.objects.get(id).density(**selection)
 
 On the command line, every field that has an :class:`graspdb.options.Option` is an option with its help; the
 command gets those that were given, by the names and in the types of the SDK. Several such parameters may
@@ -18,16 +18,18 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import NoneType
-from typing import Annotated, Any, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints, is_typeddict
 
 import numpy as np
 import typer
-from pydantic import BaseModel
 
+from graspdb.cli.common import State
 from graspdb.files.trials import read_poses
 from graspdb.options import Corners, Option, PoseFile, Vector
 
-__all__ = ["Numbers", "takes_options", "vector_option"]
+__all__ = ["Commands", "Numbers", "vector_option"]
+
+Command = TypeVar("Command", bound=Callable[..., None])
 
 
 class Numbers(tuple[float, ...]):
@@ -50,26 +52,43 @@ def vector_option(help: str, flag: str, of: str = "x,y,z") -> Any:
     return typer.Option(flag, help=help, parser=parse, metavar=of)
 
 
-def takes_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameters of a TypedDict's or model's type are its options; see above."""
-    signature = inspect.signature(command, eval_str=True)
-    own, models = [], {}
+class Commands(typer.Typer):
+    """Commands made of functions of the run's :class:`State`, of own parameters and the SDK's keywords."""
+
+    def command(self, name: str | None = None, **settings: Any) -> Callable[[Command], Command]:
+        """Register a function as the command of this name."""
+        register = super().command(name, **settings)
+
+        def add(function: Command) -> Command:
+            register(_command(function))
+            return function
+
+        return add
+
+
+def _command(function: Callable[..., None]) -> Callable[..., None]:
+    """The function as typer takes it: with the context for a state, and an option for every keyword."""
+    signature = inspect.signature(function, eval_str=True)
+    own, models, states = [], {}, []
     for parameter in signature.parameters.values():
-        if is_typeddict(parameter.annotation) or _is_model(parameter.annotation):
+        if is_typeddict(parameter.annotation):
             models[parameter.name] = list(_fields(parameter.annotation))
-        else:
-            own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            continue
+        if parameter.annotation is State:
+            states.append(parameter.name)
+            parameter = parameter.replace(annotation=typer.Context)
+        own.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     options = {
         option.name: option for fields in models.values() for field in fields for option in field.options()
     }
 
-    @functools.wraps(command)
+    @functools.wraps(function)
     def call(**given: Any) -> None:
         values = {name: given.pop(name) for name in options}
         for name, fields in models.items():
             parsed = {field.name: field.value(values) for field in fields}
             given[name] = {key: value for key, value in parsed.items() if value is not None}
-        command(**given)
+        function(**given | {name: given[name].find_root().obj for name in states})
 
     parameters = [*own, *options.values()]
     vars(call)["__signature__"] = signature.replace(parameters=parameters)
@@ -77,19 +96,10 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def _is_model(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _fields(model: type[Any]) -> Iterator[_Field]:
-    """The fields that are options of commands."""
-    if _is_model(model):
-        declared = [(name, info.annotation, info.metadata) for name, info in model.model_fields.items()]
-    else:
-        hints = get_type_hints(model, include_extras=True).items()
-        declared = [(name, hint, list(getattr(hint, "__metadata__", ()))) for name, hint in hints]
-    for name, hint, metadata in declared:
-        for option in metadata:
+def _fields(keywords: type[Any]) -> Iterator[_Field]:
+    """The fields of a TypedDict that are options of commands."""
+    for name, hint in get_type_hints(keywords, include_extras=True).items():
+        for option in getattr(hint, "__metadata__", ()):
             if isinstance(option, Option):
                 yield _Field(name, _typer_type(hint), option)
 

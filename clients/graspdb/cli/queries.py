@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows, show_table, state_of
-from graspdb.cli.options import Numbers, takes_options, vector_option
+from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows, show_table
+from graspdb.cli.options import Numbers, vector_option
 from graspdb.errors import Infeasible
+from graspdb.figures.style import widths
 from graspdb.files.trials import read_poses
 from graspdb.resources.results import Grasp, Grasps, SampledPoses
 from graspdb.resources.selection import Constraints, Selection
@@ -20,17 +22,13 @@ Seed = Annotated[int | None, typer.Option(min=0, help="The same seed gives the s
 Csv = Annotated[bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")]
 
 
-@takes_options
-def density(context: typer.Context, id: ObjectId, selection: Selection) -> None:
+def density(state: State, id: ObjectId, selection: Selection) -> None:
     """Show an object's grasp density: kernel, widths, counts, effective sample size."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.objects.get(id).density(**selection)
-    used = found.kernel
+    found = state.db.objects.get(id).density(**selection)
     rows: dict[str, Any] = {
         "object": f"{found.object}, revision {found.revision}",
-        "kernel": f"{used.kind}, {used.sigma_position_m * 1e3:.1f} mm, {used.sigma_rotation_deg:.1f}°",
-        "widths": used.rule,
+        "kernel": f"{found.kernel.kind}, {widths(found.kernel)}",
+        "widths": found.kernel.rule,
         "selection": ", ".join(x for x in (found.gripper, found.protocol, found.source) if x) or "all trials",
         "successes": f"{found.size:,}",
         "effective sample size": f"{found.effective_sample_size:,.0f}",
@@ -41,9 +39,8 @@ def density(context: typer.Context, id: ObjectId, selection: Selection) -> None:
     state.show(found, rows)
 
 
-@takes_options
 def best_grasp(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     constraints: Constraints,
     count: Annotated[int, typer.Option(min=1, max=1_000, help="So many distinct grasps.")] = 1,
@@ -55,15 +52,13 @@ def best_grasp(
 
     All constraints are in the world's frame if --object-pose is given, else in the object's.
     """
-    state = state_of(context)
-    with state.client() as db:
-        try:
-            found = db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
-        except Infeasible as error:
-            if state.json:
-                out({"status": "infeasible", "grasps": [], "nearest": error.nearest, "message": str(error)})
-                raise typer.Exit(1) from None
-            raise
+    try:
+        found = state.db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
+    except Infeasible as error:
+        if state.json:
+            out({"status": "infeasible", "grasps": [], "nearest": error.nearest, "message": str(error)})
+            raise typer.Exit(1) from None
+        raise
     if state.json:
         names = ("status", "ranking", "revision", "kernel")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
@@ -75,6 +70,7 @@ def best_grasp(
 
 def _show_grasps(found: Grasps) -> None:
     columns: dict[str, Callable[[Grasp], Any]] = {
+        "": lambda g: 1 + found.index(g),
         "position [m]": lambda g: numbers(g.position),
         "quaternion xyzw": lambda g: numbers(g.quaternion_xyzw),
         "in the world [m]": lambda g: None if g.world is None else numbers(g.world[:3, 3]),
@@ -86,17 +82,15 @@ def _show_grasps(found: Grasps) -> None:
         del columns["in the world [m]"]
     if found[0].simulated is None:
         del columns["simulated"]
-    rows = [[number, *(cell(g) for cell in columns.values())] for number, g in enumerate(found, start=1)]
-    show_table(("", *columns), rows, empty="No grasp.")
+    show_table(found, columns, empty="No grasp.")
     if found[0].prior:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
         ERRORS.print(f"Only {len(found)} distinct grasps exist.")
 
 
-@takes_options
 def likelihood(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     selection: Selection,
     file: Annotated[
@@ -108,51 +102,36 @@ def likelihood(
     """Say how likely grasps are."""
     if (file is None) == (pose is None):
         raise typer.BadParameter("give a file or --pose")
-    state = state_of(context)
     poses = np.array([pose]) if file is None else read_poses(file)
-    with state.client() as db:
-        found = db.objects.get(id).likelihood(poses, **selection)
+    found = state.db.objects.get(id).likelihood(poses, **selection)
     if state.json:
         out(found)
         return
-    names = ("density", "log_density", "relative", "success_probability", "collision_free")
-    columns = {name: column for name in names if (column := getattr(found, name)) is not None}
-    show_table(
-        ("", "position [m]", *(name.replace("_", " ") for name in columns)),
-        [
-            (row, numbers(poses[row, :3]), *(_cell(column[row]) for column in columns.values()))
-            for row in range(min(limit, len(poses)))
-        ],
-        empty="No poses.",
-    )
+    columns: dict[str, Callable[[int], Any]] = {"": int, "position [m]": lambda row: numbers(poses[row, :3])}
+    for name in ("density", "log_density", "relative", "success_probability", "collision_free"):
+        if (values := getattr(found, name)) is not None:
+            columns[name.replace("_", " ")] = partial(_cell, values)
+    show_table(range(min(limit, len(poses))), columns, empty="No poses.")
     if len(poses) > limit:
         ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json gives all.")
 
 
-def _cell(value: Any) -> str:
+def _cell(values: Any, row: int) -> str:
+    value = values[row]
     if isinstance(value, (bool, np.bool_)):
         return "yes" if value else "no"
     return f"{value:.5g}"
 
 
-@takes_options
 def samples(
-    context: typer.Context,
-    id: ObjectId,
-    selection: Selection,
-    count: Count = 10,
-    seed: Seed = None,
-    csv: Csv = False,
+    state: State, id: ObjectId, selection: Selection, count: Count = 10, seed: Seed = None, csv: Csv = False
 ) -> None:
     """Draw grasps from an object's density."""
-    state = state_of(context)
-    with state.client() as db:
-        _show_poses(state, db.objects.get(id).samples(count, seed=seed, **selection), csv)
+    _show_poses(state, state.db.objects.get(id).samples(count, seed=seed, **selection), csv)
 
 
-@takes_options
 def proposals(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     selection: Selection,
     count: Count = 10,
@@ -167,9 +146,7 @@ def proposals(
     csv: Csv = False,
 ) -> None:
     """Draw grasps to try next; their proposal_density goes back with the trials."""
-    state = state_of(context)
-    with state.client() as db:
-        drawn = db.objects.get(id).proposals(count, strategy=strategy, seed=seed, **selection)
+    drawn = state.db.objects.get(id).proposals(count, strategy=strategy, seed=seed, **selection)
     _show_poses(state, drawn, csv)
 
 
@@ -181,9 +158,9 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
     elif state.json:
         out(found)
     else:
-        rows = zip(found.position, found.quaternion_xyzw, found.proposal_density, strict=True)
-        show_table(
-            ("position [m]", "quaternion xyzw", "density"),
-            [(numbers(position), numbers(turn), f"{weight:.4g}") for position, turn, weight in rows],
-            empty="No samples.",
-        )
+        columns: dict[str, Callable[[int], Any]] = {
+            "position [m]": lambda row: numbers(found.position[row]),
+            "quaternion xyzw": lambda row: numbers(found.quaternion_xyzw[row]),
+            "density": lambda row: f"{found.proposal_density[row]:.4g}",
+        }
+        show_table(range(len(found)), columns, empty="No samples.")

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from graspdb.cli.common import (
-    ERRORS,
-    ObjectId,
-    State,
-    number,
-    out,
-    run_bar,
-    show_rows,
-    show_table,
-    state_of,
-)
-from graspdb.cli.options import takes_options
+from graspdb import wire
+from graspdb.cli.common import ERRORS, ObjectId, State, out, run_bar, show_rows, show_table
 from graspdb.errors import ChecksNeeded
 from graspdb.figures import FILE_FORMATS
+from graspdb.figures.style import number, widths
 from graspdb.reports import (
     AnisotropyOptions,
     ConvergenceOptions,
@@ -30,30 +23,19 @@ from graspdb.reports import (
     ProjectionOptions,
     Reports,
 )
-from graspdb.wire import OUTCOMES
-from graspdb.wire.reports import (
-    REPORT_NAMES,
-    REPORTS,
-    BandwidthReport,
-    CalibrationReport,
-    ConvergenceReport,
-    KernelSimilarityReport,
-    ReportRange,
-    SourcesReport,
-    SummaryReport,
-)
+from graspdb.wire.reports import REPORT_NAMES, REPORTS, ReportRange
 
 _NAMES = ", ".join(REPORT_NAMES)
-Table = tuple[tuple[str, ...], list[tuple[Any, ...]]]
+Columns = dict[str, Callable[[Any], Any]]
+Table = tuple[Sequence[Any], Columns]
 
 
 class Options(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, total=False):
     """Of all reports."""
 
 
-@takes_options
 def report(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     options: Options,
     name: Annotated[
@@ -87,13 +69,7 @@ def report(
             raise typer.BadParameter(
                 f"the {name} report has no such option", param_hint=f"--{option.replace('_', '-')}"
             )
-    state = state_of(context)
-    found: Any
-    if name == "summary":
-        with state.client() as db:
-            found = db.reports.summary()
-    else:
-        found = _computed(state, id, name, options, simulate)
+    found = _computed(state, id, name, options, simulate)
     if figure is not None:
         found.save(figure)
     if state.json:
@@ -108,20 +84,21 @@ def report(
 
 def _computed(state: State, id: str, name: str, options: Options, simulate: bool) -> Any:
     """The report, with a bar while the service computes it, and before that while it is simulated."""
-    with state.client() as db:
-        reports = db.objects.get(id).reports
-        try:
-            found = _asked(reports, id, name, options)
-            calls = getattr(found.raw, "calls", [])
-        except ChecksNeeded as error:
-            if not simulate:
-                raise
-            calls = error.calls
-        if not simulate or not calls:
-            return found
-        for sweep in reports.simulate(calls):
-            sweep.wait(progress=not state.json)
-        return _asked(reports, id, name, options)
+    if name == "summary":
+        return state.db.reports.summary()
+    reports = state.db.objects.get(id).reports
+    try:
+        found = _asked(reports, id, name, options)
+        calls = getattr(found.raw, "calls", [])
+    except ChecksNeeded as error:
+        if not simulate:
+            raise
+        calls = error.calls
+    if not simulate or not calls:
+        return found
+    for sweep in reports.simulate(calls):
+        sweep.wait(progress=not state.json)
+    return _asked(reports, id, name, options)
 
 
 def _asked(reports: Reports, id: str, name: str, options: Options) -> Any:
@@ -132,20 +109,20 @@ def _asked(reports: Reports, id: str, name: str, options: Options) -> Any:
 def _show(found: Any) -> None:
     raw = found.raw
     rows: dict[str, Any] = {"": found.text}
-    if not isinstance(raw, SummaryReport):
+    if not isinstance(raw, wire.reports.SummaryReport):
         rows = {"object": f"{raw.object}, revision {raw.revision}", **rows}
-    if isinstance(raw, CalibrationReport):
+    if isinstance(raw, wire.reports.CalibrationReport):
         rows |= _scores(raw)
     show_rows(rows)
-    for columns, cells in _TABLES.get(raw.report, lambda _: [])(raw):
-        show_table(columns, cells, empty="Nothing.")
+    for items, columns in _TABLES[raw.report](raw) if raw.report in _TABLES else ():
+        show_table(items, columns, empty="Nothing.")
     for call in getattr(raw, "calls", []):
         ERRORS.print(
             f"Missing: {call.method} {call.path} {json.dumps(call.body)}", soft_wrap=True, markup=False
         )
 
 
-def _scores(raw: CalibrationReport) -> dict[str, str]:
+def _scores(raw: wire.reports.CalibrationReport) -> dict[str, str]:
     rows = {
         "Brier skill": _range(raw.skill),
         "over attempts that did not collide": _range(raw.free_skill),
@@ -161,98 +138,93 @@ def _scores(raw: CalibrationReport) -> dict[str, str]:
     return rows
 
 
-def _convergence(raw: ConvergenceReport) -> list[Table]:
-    return [
-        (
-            (f"grasps ({curve.label})", "similarity", "deviation", "held-out log density"),
-            [
-                (p.grasps, f"{p.similarity:.4f}", f"{p.deviation:.4f}", f"{p.log_likelihood:.3f}")
-                for p in curve.points
-            ],
-        )
-        for curve in raw.curves
-    ]
+def _convergence(raw: wire.reports.ConvergenceReport) -> Iterator[Table]:
+    for curve in raw.curves:
+        columns: Columns = {
+            f"grasps ({curve.label})": lambda p: p.grasps,
+            "similarity": lambda p: f"{p.similarity:.4f}",
+            "deviation": lambda p: f"{p.deviation:.4f}",
+            "held-out log density": lambda p: f"{p.log_likelihood:.3f}",
+        }
+        yield curve.points, columns
 
 
-def _calibration(raw: CalibrationReport) -> list[Table]:
-    bins = [
-        (number(b.predicted), number(b.observed), f"{number(b.low)} to {number(b.high)}", b.count)
-        for b in raw.bins
-        if b.count
-    ]
-    return [(("predicted", "came true", "interval", "attempts"), bins)]
+def _calibration(raw: wire.reports.CalibrationReport) -> Iterator[Table]:
+    columns: Columns = {
+        "predicted": lambda b: number(b.predicted),
+        "came true": lambda b: number(b.observed),
+        "interval": lambda b: f"{number(b.low)} to {number(b.high)}",
+        "attempts": lambda b: b.count,
+    }
+    yield [b for b in raw.bins if b.count], columns
 
 
-def _bandwidth(raw: BandwidthReport) -> list[Table]:
-    best = [
-        (
-            f"{1e3 * p.sigma_position_m:.1f}",
-            f"{p.sigma_rotation_deg:.1f}",
-            number(p.log_likelihood),
-            f"{number(p.below_best)} ± {number(p.below_best_error)}",
-        )
-        for p in sorted(raw.grid, key=lambda p: -(p.log_likelihood or -1e99))[:8]
-    ]
-    draws = [
-        (
-            f"{1e3 * d.kernel.sigma_position_m:.1f} mm, {d.kernel.sigma_rotation_deg:.1f}°",
-            d.protocol,
-            d.draws,
-            *map(_range, (d.success, d.collision, d.free_success)),
-        )
-        for d in raw.draws
-    ]
-    columns = ("draws at", "protocol", "simulated", "succeed", "collide", "succeed of the rest")
-    return [
-        (("position [mm]", "rotation [°]", "held-out log density", "below the best"), best),
-        *([(columns, draws)] if draws else []),
-    ]
+def _bandwidth(raw: wire.reports.BandwidthReport) -> Iterator[Table]:
+    pairs: Columns = {
+        "position [mm]": lambda p: f"{1e3 * p.sigma_position_m:.1f}",
+        "rotation [°]": lambda p: f"{p.sigma_rotation_deg:.1f}",
+        "held-out log density": lambda p: number(p.log_likelihood),
+        "below the best": lambda p: f"{number(p.below_best)} ± {number(p.below_best_error)}",
+    }
+    yield sorted(raw.grid, key=lambda p: -(p.log_likelihood or -1e99))[:8], pairs
+    draws: Columns = {
+        "draws at": lambda d: widths(d.kernel),
+        "protocol": lambda d: d.protocol,
+        "simulated": lambda d: d.draws,
+        "succeed": lambda d: _range(d.success),
+        "collide": lambda d: _range(d.collision),
+        "succeed of the rest": lambda d: _range(d.free_success),
+    }
+    if raw.draws:
+        yield raw.draws, draws
 
 
-def _kernel_similarity(raw: KernelSimilarityReport) -> list[Table]:
-    return [
-        ((what, "similarity", "error"), [(p.count, f"{p.similarity:.3f}", f"{p.error:.3f}") for p in points])
-        for what, points in (("samples", raw.samples), ("Gaussians", raw.mixtures))
-    ]
+def _kernel_similarity(raw: wire.reports.KernelSimilarityReport) -> Iterator[Table]:
+    for what, points in (("samples", raw.samples), ("Gaussians", raw.mixtures)):
+        columns: Columns = {
+            what: lambda p: p.count,
+            "similarity": lambda p: f"{p.similarity:.3f}",
+            "error": lambda p: f"{p.error:.3f}",
+        }
+        yield points, columns
 
 
-def _sources(raw: SourcesReport) -> list[Table]:
-    columns = ("source", "trials", "succeeded", "predicted", "agreement", "Brier skill", "density similarity")
-    return [
-        (
-            columns,
-            [
-                (
-                    item.source,
-                    item.trials,
-                    _range(item.share),
-                    number(item.predicted),
-                    _range(item.agreement),
-                    _range(item.skill),
-                    "unknown"
-                    if item.similarity is None
-                    else f"{item.similarity.value:.2f} (chance alone {_range(item.similarity.expected)})",
-                )
-                for item in raw.sources
-            ],
-        )
-    ]
+def _sources(raw: wire.reports.SourcesReport) -> Iterator[Table]:
+    columns: Columns = {
+        "source": lambda s: s.source,
+        "trials": lambda s: s.trials,
+        "succeeded": lambda s: _range(s.share),
+        "predicted": lambda s: number(s.predicted),
+        "agreement": lambda s: _range(s.agreement),
+        "Brier skill": lambda s: _range(s.skill),
+        "density similarity": lambda s: _alike(s.similarity),
+    }
+    yield raw.sources, columns
 
 
-def _summary(raw: SummaryReport) -> list[Table]:
-    outcomes = [name for name in OUTCOMES if any(name in row.outcomes for row in raw.rows)]
-    counts = [
-        (row.object, row.gripper, row.protocol, row.source, *(row.outcomes.get(o, 0) for o in outcomes))
-        for row in raw.rows
-    ]
-    rates = [(row.object, row.source, *(_percent(item.rate) for item in row.rates)) for row in raw.rows]
-    return [
-        (("object", "gripper", "protocol", "source", *outcomes), counts),
-        (("object", "source", *raw.rules), rates),
-    ]
+def _alike(found: wire.reports.SourceSimilarity | None) -> str:
+    return "unknown" if found is None else f"{found.value:.2f} (chance alone {_range(found.expected)})"
 
 
-_TABLES: dict[str, Callable[[Any], list[Table]]] = {
+def _summary(raw: wire.reports.SummaryReport) -> Iterator[Table]:
+    outcomes = [name for name in wire.OUTCOMES if any(name in row.outcomes for row in raw.rows)]
+    counts: Columns = {name: attrgetter(name) for name in ("object", "gripper", "protocol", "source")}
+    counts |= {name: partial(_count, name) for name in outcomes}
+    yield raw.rows, counts
+    rates: Columns = {name: attrgetter(name) for name in ("object", "source")}
+    rates |= {rule: partial(_rate, rule) for rule in raw.rules}
+    yield raw.rows, rates
+
+
+def _count(outcome: str, row: wire.reports.SummaryRow) -> int:
+    return row.outcomes.get(outcome, 0)
+
+
+def _rate(rule: str, row: wire.reports.SummaryRow) -> str:
+    return _percent(next(item.rate for item in row.rates if item.rule == rule))
+
+
+_TABLES: dict[str, Callable[[Any], Iterator[Table]]] = {
     "bandwidth": _bandwidth,
     "calibration": _calibration,
     "convergence": _convergence,

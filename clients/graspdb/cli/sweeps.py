@@ -2,49 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
 
-from graspdb.cli.common import ObjectId, flat, out, state_of
-from graspdb.cli.options import takes_options
+from graspdb.cli.common import ObjectId, State, flat, out
+from graspdb.cli.options import Commands
 from graspdb.resources.sweeps import Sweep, SweepOptions
 
-sweeps = typer.Typer(no_args_is_help=True, help="List, show, cancel and retry sweeps.")
+sweeps = Commands(no_args_is_help=True, help="List, show, cancel and retry sweeps.")
 
 SweepId = Annotated[str, typer.Argument(metavar="SWEEP", help="The sweep's id.", show_default=False)]
 
 
-@takes_options
 def sweep(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     options: SweepOptions,
     wait: Annotated[bool, typer.Option("--wait", help="Stay until it has finished.")] = False,
     timeout: Annotated[float | None, typer.Option(help="Seconds to --wait at most.")] = None,
 ) -> None:
     """Have workers simulate grasps of an object: the whole grid, or what the options say."""
-    state = state_of(context)
-    with state.client() as db:
-        made = db.objects.get(id).sweep(**options)
-        if wait:
-            made.wait(progress=not state.json, timeout=timeout)
-        state.show(made.info, made.summary())
+    made = state.db.objects.get(id).sweep(**options)
+    if wait:
+        made.wait(progress=not state.json, timeout=timeout)
+    _show(state, made)
 
 
 @sweeps.command("list")
 def list_sweeps(
-    context: typer.Context,
+    options: State,
     object: Annotated[str | None, typer.Option(help="Only this object's.")] = None,
     state: Annotated[str | None, typer.Option(help="Only in this state.")] = None,
 ) -> None:
     """List sweeps."""
-    options = state_of(context)
-    with options.client() as db:
-        found = [item.info for item in db.sweeps.list(object=object, state=state)]
     options.show_list(
-        found,
+        [item.info for item in options.db.sweeps.list(object=object, state=state)],
         {
             "sweep": lambda i: i.id,
             "object": lambda i: i.object,
@@ -59,49 +52,38 @@ def list_sweeps(
     )
 
 
-def _show(context: typer.Context, id: str, act: Callable[[Sweep], Sweep] = lambda found: found) -> None:
-    """A sweep, after something was done with it."""
-    state = state_of(context)
-    with state.client() as db:
-        found = act(db.sweeps.get(id))
-    state.show(found.info, found.summary())
-
-
 @sweeps.command("show")
-def show_sweep(context: typer.Context, id: SweepId) -> None:
+def show_sweep(state: State, id: SweepId) -> None:
     """Show one sweep."""
-    _show(context, id)
+    _show(state, state.db.sweeps.get(id))
 
 
 @sweeps.command("wait")
 def wait_for_sweep(
-    context: typer.Context,
+    state: State,
     id: SweepId,
     timeout: Annotated[float | None, typer.Option(help="Seconds to wait at most.")] = None,
 ) -> None:
     """Wait until a sweep has finished."""
-    progress = not state_of(context).json
-    _show(context, id, lambda found: found.wait(progress=progress, timeout=timeout))
+    _show(state, state.db.sweeps.get(id).wait(progress=not state.json, timeout=timeout))
 
 
 @sweeps.command("cancel")
-def cancel_sweep(context: typer.Context, id: SweepId) -> None:
+def cancel_sweep(state: State, id: SweepId) -> None:
     """Stop a sweep; what is stored stays."""
-    _show(context, id, Sweep.cancel)
+    _show(state, state.db.sweeps.get(id).cancel())
 
 
 @sweeps.command("retry")
-def retry_sweep(context: typer.Context, id: SweepId) -> None:
+def retry_sweep(state: State, id: SweepId) -> None:
     """Queue a sweep's failed chunks again."""
-    _show(context, id, Sweep.retry)
+    _show(state, state.db.sweeps.get(id).retry())
 
 
 @sweeps.command("outcomes")
-def sweep_outcomes(context: typer.Context, id: SweepId) -> None:
+def sweep_outcomes(state: State, id: SweepId) -> None:
     """Every simulated pose and its outcome: CSV, or JSON columns with --json."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.sweeps.get(id).outcomes()
+    found = state.db.sweeps.get(id).outcomes()
     if state.json:
         out(found)
         return
@@ -110,14 +92,10 @@ def sweep_outcomes(context: typer.Context, id: SweepId) -> None:
         typer.echo(",".join((str(index), *(repr(value) for value in pose), str(outcome))))
 
 
-def workers(context: typer.Context) -> None:
+def workers(state: State) -> None:
     """List the simulation workers."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.workers()
-        url = db.url
     state.show_list(
-        found,
+        state.db.workers(),
         {
             "worker": lambda w: w.worker,
             "can": lambda w: ", ".join(w.capabilities),
@@ -126,13 +104,15 @@ def workers(context: typer.Context) -> None:
             "jobs done": lambda w: w.jobs_done,
             "poses done": lambda w: w.poses_done,
         },
-        empty=f"No worker has come yet: graspdb-simworker run --url {url}",
+        empty=f"No worker has come yet: graspdb-simworker run --url {state.db.url}",
     )
 
 
-def info(context: typer.Context) -> None:
+def info(state: State) -> None:
     """Show the service's versions and limits."""
-    state = state_of(context)
-    with state.client() as db:
-        answer: dict[str, Any] = {"url": db.url, **db.info()}
+    answer: dict[str, Any] = {"url": state.db.url, **state.db.info()}
     state.show(answer, flat(answer))
+
+
+def _show(state: State, found: Sweep) -> None:
+    state.show(found.info, found.summary())

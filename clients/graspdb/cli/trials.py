@@ -6,21 +6,20 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ObjectId, Yes, numbers, state_of
-from graspdb.cli.options import takes_options
+from graspdb.cli.common import ObjectId, State, Yes, numbers
+from graspdb.cli.options import Commands
 from graspdb.files.trials import read_trials
 from graspdb.resources.trials import TrialFilters, Upload
 
-trials = typer.Typer(no_args_is_help=True, help="Add and list grasp trials.")
-batches = typer.Typer(no_args_is_help=True, help="List and delete what arrived together.")
+trials = Commands(no_args_is_help=True, help="Add and list grasp trials.")
+batches = Commands(no_args_is_help=True, help="List and delete what arrived together.")
 
 BatchId = Annotated[str, typer.Argument(show_default=False)]
 
 
 @trials.command("add")
-@takes_options
 def add_trials(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     file: Annotated[
         str, typer.Argument(help="JSON, NDJSON or CSV; - reads JSON from standard input.", show_default=False)
@@ -35,31 +34,25 @@ def add_trials(
     CSV has the columns x,y,z,qx,qy,qz,qw,outcome and optionally gripper, source, protocol,
     proposal_density, quality, width_m, measured_at.
     """
-    state = state_of(context)
     records, shared = read_trials(file)
     given = {"gripper": gripper, "source": source, "protocol": protocol}
     shared |= {name: value for name, value in given.items() if value is not None}
     upload["progress"] = not state.json and len(records) > 1_000
-    with state.client() as db:
-        receipt = db.objects.get(id).trials.add_records(records, **upload, **shared)
+    receipt = state.db.objects.get(id).trials.add_records(records, **upload, **shared)
     stored = f"{receipt.inserted:,} trials stored in batch {', '.join(receipt.batches)}"
     state.show(receipt, f"{stored}; {id} is at revision {receipt.revision}.")
 
 
 @trials.command("list")
-@takes_options
 def list_trials(
-    context: typer.Context,
+    state: State,
     id: ObjectId,
     filters: TrialFilters,
     limit: Annotated[int, typer.Option(min=1, help="At most so many.")] = 20,
 ) -> None:
     """List stored trials, oldest first."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.objects.get(id).trials.list(**filters).first(limit)
     state.show_list(
-        found,
+        state.db.objects.get(id).trials.list(**filters).first(limit),
         {
             "seq": lambda t: t.seq,
             "position [m]": lambda t: numbers(t.position),
@@ -75,13 +68,10 @@ def list_trials(
 
 
 @batches.command("list")
-def list_batches(context: typer.Context, id: ObjectId) -> None:
+def list_batches(state: State, id: ObjectId) -> None:
     """List an object's batches."""
-    state = state_of(context)
-    with state.client() as db:
-        found = list(db.objects.get(id).batches.list())
     state.show_list(
-        found,
+        list(state.db.objects.get(id).batches),
         {
             "batch": lambda b: b.batch,
             "revision": lambda b: b.revision,
@@ -95,22 +85,18 @@ def list_batches(context: typer.Context, id: ObjectId) -> None:
 
 
 @batches.command("show")
-def show_batch(context: typer.Context, id: ObjectId, batch: BatchId) -> None:
+def show_batch(state: State, id: ObjectId, batch: BatchId) -> None:
     """Show one batch."""
-    state = state_of(context)
-    with state.client() as db:
-        found = db.objects.get(id).batches.get(batch)
+    found = state.db.objects.get(id).batches.get(batch)
     state.show(found, {k: v for k, v in found.model_dump(mode="json").items() if v is not None})
 
 
 @batches.command("delete")
-def delete_batch(context: typer.Context, id: ObjectId, batch: BatchId, yes: Yes = False) -> None:
+def delete_batch(state: State, id: ObjectId, batch: BatchId, yes: Yes = False) -> None:
     """Delete a batch with all its trials."""
-    state = state_of(context)
-    with state.client() as db:
-        item = db.objects.get(id)
-        if not yes:
-            found = item.batches.get(batch)
-            typer.confirm(f"Delete the {found.inserted:,} trials of {batch}?", abort=True, err=True)
-        item.batches.delete(batch)
+    batches = state.db.objects.get(id).batches
+    if not yes:
+        found = batches.get(batch)
+        typer.confirm(f"Delete the {found.inserted:,} trials of {batch}?", abort=True, err=True)
+    batches.delete(batch)
     state.show({"deleted": batch}, f"{batch} is deleted.")

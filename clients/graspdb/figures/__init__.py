@@ -9,21 +9,19 @@ from __future__ import annotations
 import io
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from graspdb.figures.anisotropy import draw_anisotropy
 from graspdb.figures.bandwidth import draw_bandwidth
 from graspdb.figures.calibration import draw_calibration
+from graspdb.figures.canvas import Figure
 from graspdb.figures.convergence import draw_convergence
 from graspdb.figures.kernel_similarity import draw_kernel_similarity
 from graspdb.figures.projection import draw_projection
 from graspdb.figures.sources import draw_sources
 from graspdb.figures.summary import draw_summary
 from graspdb.wire import reports
-from graspdb.wire.reports import AnyReport, SummaryReport
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from graspdb.wire.reports import Report, SummaryReport
 
 __all__ = ["FILE_FORMATS", "Format", "draw", "render"]
 
@@ -46,7 +44,7 @@ _DPI = 120
 _LOCK = threading.Lock()
 
 
-def render(report: AnyReport | SummaryReport, format: Format) -> bytes:
+def render(report: Report | SummaryReport, format: Format) -> bytes:
     """The figure of a report as a file's bytes."""
     with _LOCK:
         target = io.BytesIO()
@@ -56,6 +54,6 @@ def render(report: AnyReport | SummaryReport, format: Format) -> bytes:
         return target.getvalue()
 
 
-def draw(report: AnyReport | SummaryReport) -> Figure:
+def draw(report: Report | SummaryReport) -> Figure:
     """The figure of a report; needs matplotlib (extra ``plot``)."""
     return _DRAW[type(report)](report)

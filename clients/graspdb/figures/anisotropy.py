@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, new_figure, show_grid, title
+from graspdb.figures.canvas import Axes, Figure, new_figure, place, show_grid
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, show_ranges, title
 from graspdb.wire.reports import (
     AnisotropyHistogram,
     AnisotropyHypothesis,
     AnisotropyRelation,
     AnisotropyReport,
     AnisotropyTolerance,
+    ReportRange,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Inches: the figure's width, left and right of the panels, a line of the words above them.
 _WIDTH, _LEFT, _RIGHT, _LINE = 10.0, 0.75, 0.25, 0.19
@@ -61,12 +58,10 @@ def draw_anisotropy(report: AnisotropyReport) -> Figure:
     heights += [_rows(_lines(related))] if related else []
     total = _LINE * (lines + 1) + sum(heights) + len(heights) * (_ABOVE + _BELOW)
     figure.set_size_inches(_WIDTH, total)
-    # Placed by hand, in inches: a layout that measures every label takes seconds for as many axes.
     below = total - _LINE * (lines + 1)
 
     def placed(left: float, width: float, height: float) -> Axes:
-        rectangle = (left / _WIDTH, (below - height) / total, width / _WIDTH, height / total)
-        return figure.add_axes(rectangle)
+        return place(figure, left, below - height, width, height)
 
     below -= _ABOVE
     for i, histogram in enumerate(report.translations):
@@ -139,7 +134,7 @@ def _total(histogram: AnisotropyHistogram) -> str:
 
 
 def _heat(axes: Axes, histogram: AnisotropyHistogram, factor: float) -> Any:
-    value = _array(histogram.probability)
+    value = np.array(histogram.probability, dtype=np.float64)
     axes.set_facecolor("white")
     x, y = (factor * np.asarray(edge) for edge in histogram.edges)
     axes.fill_between(
@@ -156,10 +151,6 @@ def _heat(axes: Axes, histogram: AnisotropyHistogram, factor: float) -> Any:
     axes.set_yticks(ticks)
     axes.tick_params(labelsize=8)
     return image
-
-
-def _array(values: Sequence[Sequence[float | None]]) -> NDArray[np.float64]:
-    return np.array([[math.nan if v is None else v for v in row] for row in values], dtype=np.float64)
 
 
 def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool) -> None:
@@ -199,7 +190,6 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
     axes.set_xlabel(f"{name} [{unit}]", fontsize=8)
     if turn:
         axes.set_xticks([-90, -45, 0, 45, 90])
-    axes.tick_params(labelsize=8)
     if first:
         axes.set_ylabel("share that succeeds\n(others unchanged)", fontsize=8)
     else:
@@ -228,20 +218,15 @@ def _forest(axes: Axes, found: list[AnisotropyHypothesis], level: float) -> None
                 xytext=(high if item.bound == "lower" else low, i),
                 arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.2},
             )  # fmt: skip
-        axes.annotate(
-            f"{bound}{ratio:.2f} ({low:.2f} to {high:.2f}):\n{item.verdict}", (1.02, i),
-            xycoords=("axes fraction", "data"), fontsize=8, va="center", color="0.15",
-        )  # fmt: skip
+        _beside(axes, f"{bound}{ratio:.2f} ({low:.2f} to {high:.2f}):\n{item.verdict}", (1.02, i))
     axes.axvline(1.0, color="0.15", linewidth=1.0)
     axes.set_xscale("log")
     axes.set_xlim(min(ends), max(ends))
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_yticks(range(len(found)))
-    axes.set_yticklabels([_EXPECTED.get(item.name, item.name) for item in found], fontsize=8)
+    axes.set_yticks(range(len(found)), [_EXPECTED.get(item.name, item.name) for item in found], fontsize=8)
     axes.set_ylim(len(found) - 0.4, -0.6)
-    axes.tick_params(axis="x", labelsize=8)
     axes.set_xlabel(
         f"quotient of half widths, {level:.0%} intervals (right of 1: as the paper expects)", fontsize=8
     )
@@ -251,19 +236,22 @@ def _forest(axes: Axes, found: list[AnisotropyHypothesis], level: float) -> None
     show_grid(axes)
 
 
+def _beside(axes: Axes, text: str, at: tuple[float, float]) -> None:
+    """Words to the right of a share of the axes' width, in a row."""
+    across = ("axes fraction", "data")
+    axes.annotate(text, at, xycoords=across, fontsize=8, va="center", color="0.15")
+
+
 def _shares(axes: Axes, found: list[AnisotropyRelation], level: float) -> None:
     """P(success | relation), all attempts and those that did not collide, with how many there are."""
     row, labels, at, last = 0.0, [], [], None
-    series: dict[str, list[tuple[float, float, float, float]]] = {"all": [], "free": []}
+    series: dict[str, list[tuple[float, ReportRange]]] = {"all": [], "free": []}
     for item in found:
         if item.relation != last:
             row += 0.35 if last is not None else 0.0
             if item.angle_deg is not None:
                 heading = _RELATIONS.get(item.relation, item.relation)
-                axes.annotate(
-                    f"{heading}, the closing axis off theirs by", (0.01, row),
-                    xycoords=("axes fraction", "data"), fontsize=8, va="center", color="0.15",
-                )  # fmt: skip
+                _beside(axes, f"{heading}, the closing axis off theirs by", (0.01, row))
                 row += 0.8
             last = item.relation
         labels.append(
@@ -277,9 +265,7 @@ def _shares(axes: Axes, found: list[AnisotropyRelation], level: float) -> None:
             ("free", item.free_probability, item.free_low, item.free_high),
         ):
             if value is not None:
-                series[name].append(
-                    (row, value, value if low is None else low, value if high is None else high)
-                )
+                series[name].append((row, ReportRange(value=value, low=low, high=high)))
         free = item.attempts - item.collisions
         axes.annotate(
             f"n = {item.attempts:,}; {free:,} do not collide", (1.02, row),
@@ -291,16 +277,12 @@ def _shares(axes: Axes, found: list[AnisotropyRelation], level: float) -> None:
         ("free", GREEN, "s", 0.14, "attempts that do not collide"),
     ):
         if series[name]:
-            y, middle, least, most = np.array(series[name]).T
-            axes.errorbar(
-                middle, y + shift, xerr=[middle - least, most - middle], color=colour, marker=marker,
-                markersize=5, capsize=2.5, linestyle="none", label=label,
-            )  # fmt: skip
-    axes.set_yticks(at)
-    axes.set_yticklabels(labels, fontsize=8)
-    axes.set_ylim(row - 0.4, -0.6)
-    axes.set_xlim(0.0, 1.0)
-    axes.tick_params(axis="x", labelsize=8)
+            rows, ranges = zip(*series[name], strict=True)
+            at_row = np.array(rows) + shift
+            show_ranges(axes, at_row, ranges, upright=False, color=colour, marker=marker, markersize=5,
+                        capsize=2.5, label=label)  # fmt: skip
+    axes.set_yticks(at, labels, fontsize=8)
+    axes.set(ylim=(row - 0.4, -0.6), xlim=(0.0, 1.0))
     axes.set_xlabel(f"share that succeeded, {level:.0%} intervals", fontsize=8)
     axes.set_title("by what the jaw closes on", fontsize=9, loc="left")
     axes.legend(fontsize=7.5, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)

@@ -2,28 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from graspdb.figures.style import (
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    MARKERS,
-    ORANGE,
-    new_figure,
-    show_grid,
-    show_ranges,
-    show_ticks,
-    title,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid, show_ticks
+from graspdb.figures.style import BLUE, COLOURS, GREEN, GREY, MARKERS, ORANGE, show_ranges, title
 from graspdb.wire.reports import BandwidthReport, SimulatedDraws
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 def draw_bandwidth(report: BandwidthReport) -> Figure:
@@ -72,17 +55,15 @@ def _draws(axes: Axes, draws: list[SimulatedDraws], level: float) -> None:
         shown = [ranges[i] for i in known]
         show_ranges(axes, at[known] + shift, shown, color=colour, marker=marker, markersize=5, capsize=3,
                     label=label)  # fmt: skip
-    axes.set_xticks(at)
-    axes.set_xticklabels(
+    axes.set_xticks(
+        at,
         [
             f"{1e3 * d.kernel.sigma_position_m:.1f} mm\n{d.kernel.sigma_rotation_deg:.1f}°"
             + ("" if d.kernel.id is None else f"\n{d.kernel.kind}")
             + f"\n{d.protocol}\nn = {d.draws:,}"
             for d in draws
-        ]
+        ],
     )
-    axes.set_xlim(-0.5, len(draws) - 0.5)
-    axes.set_ylim(0.0, 1.02)
-    axes.set_ylabel("share of simulated draws")
+    axes.set(xlim=(-0.5, len(draws) - 0.5), ylim=(0.0, 1.02), ylabel="share of simulated draws")
     axes.set_title(f"draws simulated as checks, {level:.0%} intervals", fontsize=8)
     axes.legend(fontsize=8, loc="upper right", framealpha=0.9)

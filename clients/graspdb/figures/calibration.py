@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, new_figure, number, show_grid, show_ranges, title
-from graspdb.wire.reports import CalibrationBin, CalibrationReport
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, number, show_ranges, title
+from graspdb.wire.reports import CalibrationBin, CalibrationReport, ReportRange
 
 
 def draw_calibration(report: CalibrationReport) -> Figure:
@@ -32,9 +27,7 @@ def draw_calibration(report: CalibrationReport) -> Figure:
             top, [again.predicted], [again.rate], color=ORANGE, marker="D", markersize=6, capsize=4,
             label=f"{again.grasps:,} given grasps simulated again ({again.successes:,} succeed)",
         )  # fmt: skip
-    top.set_ylabel("share that succeeded")
-    top.set_xlim(0, 1)
-    top.set_ylim(0, 1.02)
+    top.set(ylabel="share that succeeded", xlim=(0, 1), ylim=(0, 1.02))
     top.legend(fontsize=8, loc="upper left", framealpha=0.9)
     top.text(
         0.98, 0.03, _scores(report), transform=top.transAxes, ha="right", va="bottom", fontsize=8,
@@ -49,14 +42,10 @@ def draw_calibration(report: CalibrationReport) -> Figure:
 def show_bins(axes: Axes, bins: Sequence[CalibrationBin], **style: Any) -> list[CalibrationBin]:
     """Draw what came true over what was predicted with its intervals, and give the bins that have both."""
     known = [item for item in bins if item.predicted is not None and item.observed is not None]
-    observed = np.array([item.observed for item in known], dtype=float)
-    low = np.array([item.observed if item.low is None else item.low for item in known], dtype=float)
-    high = np.array([item.observed if item.high is None else item.high for item in known], dtype=float)
-    axes.errorbar(
-        [item.predicted or 0.0 for item in known], observed,
-        yerr=[np.maximum(observed - low, 0.0), np.maximum(high - observed, 0.0)],
-        color=BLUE, marker="o", markersize=5, capsize=3, **style,
-    )  # fmt: skip
+    observed = [ReportRange(value=item.observed, low=item.low, high=item.high) for item in known]
+    predicted = [item.predicted for item in known]
+    look: dict[str, Any] = {"color": BLUE, "linestyle": "-", "marker": "o", "markersize": 5, "capsize": 3}
+    show_ranges(axes, predicted, observed, **look, **style)
     return known
 
 
@@ -79,7 +68,6 @@ def _counts(axes: Axes, bins: Sequence[CalibrationBin]) -> None:
         if item.count:
             middle = (0.5 * (item.lower + item.upper), item.count)
             axes.annotate(f"{item.count:,}", middle, ha="center", va="bottom", fontsize=8)
-    axes.set_yscale("log")
-    axes.set_ylim(0.7, 10 * max((item.count for item in bins), default=1))
-    axes.set_ylabel("attempts judged")
-    axes.set_xlabel("predicted success probability")
+    most = max((item.count for item in bins), default=1)
+    axes.set(yscale="log", ylim=(0.7, 10 * most))
+    axes.set(ylabel="attempts judged", xlabel="predicted success probability")

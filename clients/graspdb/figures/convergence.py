@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from graspdb.figures.style import BLUE, CURVE, GREEN, GREY, ORANGE, new_figure, show_grid, title, widths
+from graspdb.figures.canvas import Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, CURVE, GREEN, GREY, ORANGE, title, widths
 from graspdb.wire.reports import ConvergenceReport
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _COLOURS = (BLUE, ORANGE, GREEN)
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from graspdb.figures.style import BLUE, CURVE, GREY, ORANGE, new_figure, show_grid, show_ticks, title
+from graspdb.figures.canvas import Figure, new_figure, show_grid, show_ticks
+from graspdb.figures.style import BLUE, CURVE, GREY, ORANGE, title
 from graspdb.wire.reports import KernelSimilarityReport
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def draw_kernel_similarity(report: KernelSimilarityReport) -> Figure:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from graspdb.figures.style import BLUE, GREY, new_figure, show_grid, title, widths
+from graspdb.figures.canvas import Axes, Figure, new_figure, place, show_grid
+from graspdb.figures.style import BLUE, GREY, title, widths
 from graspdb.wire.reports import ProjectionProfile, ProjectionReport
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Inches: the plane's longer side and its shorter one at least, the profiles, and what is left around them.
 _LONGEST, _SHORTEST, _ABOVE, _BESIDE, _GAP = 5.2, 2.4, 1.1, 1.3, 0.15
@@ -30,30 +27,23 @@ def draw_projection(report: ProjectionReport) -> Figure:
     across, upward = (1e3 * np.asarray(edges) for edges in (report.across_m, report.upward_m))
     left, right, bottom, top = _reach(report, across, upward)
     wide, high = right - left, top - bottom
-    # Placed by hand, in inches: the plane keeps its shape, and the profiles stand along its sides.
+    # Placed by hand: the plane keeps its shape, and the profiles stand along its sides.
     scale = _LONGEST / max(wide, high)
     size = max(scale * wide, _SHORTEST), max(scale * high, _SHORTEST)
     beside_inches = max(_BESIDE, _NARROWEST - size[0])
     total = _LEFT + size[0] + _GAP + beside_inches + 1.25, _BELOW + size[1] + _GAP + _ABOVE + _TITLE
     figure.set_size_inches(*total)
 
-    def placed(left: float, bottom: float, width: float, height: float, **shared: Any) -> Axes:
-        rectangle = (left / total[0], bottom / total[1], width / total[0], height / total[1])
-        return figure.add_axes(rectangle, **shared)
-
-    axes = placed(_LEFT, _BELOW, *size)
-    above = placed(_LEFT, _BELOW + size[1] + _GAP, size[0], _ABOVE, sharex=axes)
-    beside = placed(_LEFT + size[0] + _GAP, _BELOW, beside_inches, size[1], sharey=axes)
+    axes = place(figure, _LEFT, _BELOW, *size)
+    above = place(figure, _LEFT, _BELOW + size[1] + _GAP, size[0], _ABOVE, sharex=axes)
+    beside = place(figure, _LEFT + size[0] + _GAP, _BELOW, beside_inches, size[1], sharey=axes)
     values = np.ma.masked_less(np.asarray(report.values), 1e-3)
     image = axes.pcolormesh(
         across, upward, values.T, cmap="Reds", vmin=0.0, vmax=1.0, linewidth=0, rasterized=True
     )
     for polygon in report.outline:
-        axes.add_patch(
-            Polygon(
-                1e3 * np.asarray(polygon), closed=True, fill=False, edgecolor=GREY, linewidth=0.9, zorder=3
-            )
-        )
+        corners = 1e3 * np.asarray(polygon)
+        axes.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=GREY, linewidth=0.9, zorder=3))
     first, second = report.profiles
     limits = (axes.set_xlim, left, right, size[0]), (axes.set_ylim, bottom, top, size[1])
     for set_limits, low, most, inches in limits:
@@ -61,9 +51,8 @@ def draw_projection(report: ProjectionReport) -> Figure:
         set_limits(middle - 0.5 * inches / scale, middle + 0.5 * inches / scale)
     axes.set_xlabel(f"{first.axis} [mm]")
     axes.set_ylabel(f"{second.axis} [mm]")
-    bar = figure.colorbar(
-        image, cax=placed(_LEFT + size[0] + _GAP + beside_inches + 0.25, _BELOW, 0.16, size[1])
-    )
+    scale_left = _LEFT + size[0] + _GAP + beside_inches + 0.25
+    bar = figure.colorbar(image, cax=place(figure, scale_left, _BELOW, 0.16, size[1]))
     bar.set_label(
         f"density on the plane; 1 is {1e-4 * report.peak_per_m2:.3g} % of all grasps per mm\u00b2", fontsize=8
     )
@@ -73,7 +62,7 @@ def draw_projection(report: ProjectionReport) -> Figure:
     _profile(beside, second, upright=True)
     above.tick_params(labelbottom=False)
     beside.tick_params(labelleft=False)
-    corner = placed(_LEFT + size[0] + _GAP, _BELOW + size[1] + _GAP, beside_inches, _ABOVE)
+    corner = place(figure, _LEFT + size[0] + _GAP, _BELOW + size[1] + _GAP, beside_inches, _ABOVE)
     corner.axis("off")
     corner.text(0.0, 1.0, _key(report), transform=corner.transAxes, va="top", fontsize=8)
     return figure

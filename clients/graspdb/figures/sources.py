@@ -2,27 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from graspdb.figures.calibration import show_bins
-from graspdb.figures.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    new_figure,
-    number,
-    show_grid,
-    show_ranges,
-    title,
-    widths,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, GREEN, GREY, ORANGE, number, show_ranges, title, widths
 from graspdb.wire.reports import SourceComparison, SourcesReport
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _MARK: dict[str, Any] = {"markersize": 6, "capsize": 4}
 
@@ -54,8 +39,7 @@ def _calibrated(axes: Axes, item: SourceComparison, level: float) -> None:
         axes.text(0.5, 0.5, "only successes, or too few trials", transform=axes.transAxes, ha="center",
                   va="center", fontsize=8, color=GREY,
                   bbox={"facecolor": "white", "edgecolor": "none"})  # fmt: skip
-    axes.set_xlim(0, 1)
-    axes.set_ylim(0, 1.02)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02))
     axes.set_xlabel("predicted from simulation", fontsize=8)
     axes.set_ylabel(f"{item.source}: share that succeeded", fontsize=8)
     axes.set_title(
@@ -74,10 +58,8 @@ def _shares(axes: Axes, item: SourceComparison, report: SourcesReport) -> None:
     if item.predicted is not None:
         axes.plot([0], [item.predicted], color=ORANGE, marker="D", markersize=6, linestyle="none",
                   label="simulation's mean prediction")  # fmt: skip
-    axes.set_xticks(range(len(names)))
-    axes.set_xticklabels(names)
-    axes.set_xlim(-0.6, len(names) - 0.4)
-    axes.set_ylim(0.0, 1.02)
+    axes.set_xticks(range(len(names)), names)
+    axes.set(xlim=(-0.6, len(names) - 0.4), ylim=(0.0, 1.02))
     axes.set_ylabel("share of trials", fontsize=8)
     axes.legend(fontsize=8, loc="lower right", framealpha=0.9)
     axes.set_title(f"simulation: {report.successes:,} of {report.attempts:,} succeeded", fontsize=8)
@@ -96,7 +78,6 @@ def _similar(axes: Axes, item: SourceComparison) -> None:
         [0], [found.value], yerr=[1.64 * found.error], color=BLUE, marker="o", linestyle="none", **_MARK
     )
     show_ranges(axes, [1], [found.expected], color=GREEN, marker="s", **_MARK)
-    axes.set_xticks([0, 1])
-    axes.set_xticklabels([f"{item.source}\nto simulation", "as many grasps\nof simulation"])
+    axes.set_xticks([0, 1], [f"{item.source}\nto simulation", "as many grasps\nof simulation"])
     axes.set_xlim(-0.6, 1.6)
     axes.set_title(f"kernel {widths(found.kernel)};\ngreen: range of 10 draws of simulation", fontsize=8)

@@ -1,18 +1,15 @@
-"""What the figures of reports look like: colours, titles, grids, and how numbers are written."""
+"""What the figures of reports look like: colours, titles, ranges, and how numbers are written."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from graspdb.figures.canvas import Axes, Figure
 from graspdb.wire.reports import ReportRange
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Okabe and Ito's, which colour-blind readers tell apart.
 BLUE, ORANGE, GREEN, YELLOW, GREY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#666666"
@@ -22,20 +19,6 @@ COLOURS = (BLUE, ORANGE, GREEN, YELLOW, "#CC79A7", "#56B4E9", GREY)
 MARKERS = "osD^v"
 #: Of a curve with error bars.
 CURVE: dict[str, Any] = {"markersize": 4, "capsize": 3, "linewidth": 1.5}
-
-
-def new_figure(width: float | None = None, height: float | None = None) -> Figure:
-    """A figure of this size in inches, laid out by itself; without a size, whoever draws places its axes.
-
-    Made without pyplot, so that a server may draw from its threads.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("figures need matplotlib: pip install 'graspdb[plot]'") from error
-    if width is None or height is None:
-        return Figure()
-    return Figure(figsize=(width, height), layout="constrained")
 
 
 def title(figure: Figure, report: Any, kind: str) -> int:
@@ -51,14 +34,6 @@ def heading(figure: Figure, first: str, text: str) -> int:
     words = f"{first}\n{textwrap.fill(text, width, break_long_words=False, break_on_hyphens=False)}"
     figure.suptitle(words, fontsize=10)
     return 1 + words.count("\n")
-
-
-def show_grid(axes: Axes) -> None:
-    """A grid behind, ticks that can be read, and no frame above and to the right."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="0.9", linewidth=0.6)
-    axes.tick_params(labelsize=8)
-    axes.set_axisbelow(True)
 
 
 def number(value: float | None) -> str:
@@ -80,11 +55,4 @@ def show_ranges(
     high = [value if item.high is None else item.high for item, value in zip(ranges, values, strict=True)]
     ends = np.maximum([np.subtract(values, low), np.subtract(high, values)], 0.0)
     places = {"x": at, "y": values, "yerr": ends} if upright else {"x": values, "y": at, "xerr": ends}
-    axes.errorbar(**places, linestyle="none", **style)
-
-
-def show_ticks(axes: Axes, values: list[float]) -> None:
-    """Ticks at these values only."""
-    axes.set_xticks(values)
-    axes.set_xticklabels([f"{value:,.0f}" if value >= 10 else f"{value:.3g}" for value in values])
-    axes.minorticks_off()
+    axes.errorbar(**places, **{"linestyle": "none", **style})

@@ -3,29 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.figures.style import (
-    BLUE,
-    COLOURS,
-    GREEN,
-    GREY,
-    MARKERS,
-    ORANGE,
-    heading,
-    new_figure,
-    show_grid,
-    show_ranges,
-)
+from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
+from graspdb.figures.style import BLUE, COLOURS, GREEN, GREY, MARKERS, ORANGE, heading, show_ranges
 from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import SummaryReport, SummaryRow
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: Okabe and Ito's, success the darkest.
 _OUTCOME_COLOURS = dict(
@@ -70,11 +55,8 @@ def _outcomes(axes: Axes, rows: Sequence[SummaryRow], at: NDArray[np.float64]) -
                 axes.text(begin + 0.5 * part, y, f"{100 * part:.0f} %", fontsize=8, ha="center", va="center",
                           color="white" if name in _DARK else "0.1")  # fmt: skip
         start += share
-    axes.set_yticks(at)
-    axes.set_yticklabels([_name(row) for row in rows], fontsize=8)
-    axes.set_ylim(-0.6, len(rows) - 0.4)
-    axes.set_xlim(0.0, 1.0)
-    axes.set_xlabel("share of the trials, by outcome")
+    axes.set_yticks(at, [_name(row) for row in rows], fontsize=8)
+    axes.set(xlim=(0.0, 1.0), ylim=(-0.6, len(rows) - 0.4), xlabel="share of the trials, by outcome")
 
 
 def _rates(axes: Axes, report: SummaryReport, at: NDArray[np.float64]) -> None:
@@ -89,8 +71,7 @@ def _rates(axes: Axes, report: SummaryReport, at: NDArray[np.float64]) -> None:
             axes.annotate(f"{100 * (rate.value or 0.0):.2f} %", (rate.high or 0.0, y), xytext=(6, 0),
                           textcoords="offset points", fontsize=8, va="center")  # fmt: skip
     # Room for the numbers beside the markers.
-    axes.set_xlim(0.0, 1.2)
-    axes.set_xticks(np.linspace(0.0, 1.0, 6))
+    axes.set(xlim=(0.0, 1.2), xticks=np.linspace(0.0, 1.0, 6))
     axes.set_xlabel(f"share that succeeded, {report.level:.0%} intervals")
 
 

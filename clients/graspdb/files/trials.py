@@ -73,14 +73,11 @@ def read_poses(path: str) -> NDArray[np.float64]:
     rows = []
     for number, record in enumerate(records):
         try:
-            if isinstance(record, dict):
-                pose = (
-                    record["matrix"]
-                    if "matrix" in record
-                    else [*record["position"], *record["quaternion_xyzw"]]
-                )
-            else:
-                pose = record
+            pose: Any = record
+            if isinstance(record, dict) and "matrix" in record:
+                pose = record["matrix"]
+            elif isinstance(record, dict):
+                pose = [*record["position"], *record["quaternion_xyzw"]]
             rows.append(as_poses(pose).rows[0])
         except (KeyError, TypeError, ValueError) as error:
             reason = f"has no {error}" if isinstance(error, KeyError) else str(error)

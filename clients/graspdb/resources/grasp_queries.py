@@ -12,12 +12,11 @@ from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
 from graspdb.poses import as_poses
-from graspdb.resources.pages import segment, validate
+from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
     Constraints,
     Selection,
-    TrialSelection,
     best_grasp_request,
     names,
     query,
@@ -29,16 +28,20 @@ QUERY_POSES = 100_000
 """Poses a likelihood request: some 15 MB of JSON, well under the service's default body limit."""
 
 
-class GraspQueries:
+class GraspQueries(Resource):
     """The questions about one object; all take the trials and kernel of a density, see :class:`Selection`.
 
     All poses are of the tool frame in the object frame, in metres, quaternions xyzw.
     """
 
-    def __init__(self, transport: Transport, object_id: str) -> None:
-        self._transport = transport
-        self._object = object_id
-        self._path = f"/objects/{segment(object_id)}"
+    def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:
+        super().__init__(transport, f"/objects/{segment(info.id)}")
+        self.info = info
+
+    @property
+    def id(self) -> str:
+        """The object's identifier."""
+        return self.info.id
 
     def density(self, **selection: Unpack[Selection]) -> wire.DensityInfo:
         """The grasp density: kernel, widths and how they were chosen, counts, effective sample size."""
@@ -90,8 +93,8 @@ class GraspQueries:
         """
         if "count" in constraints:
             raise TypeError("best_grasp() gives one grasp; use best_grasps(count=...)")
-        given = known_keywords(Constraints, constraints, "best_grasp")
-        return self._best_grasps(1, given, verify, verify_timeout_s)[0]
+        known_keywords(Constraints, constraints, "best_grasp")
+        return self.best_grasps(count=1, verify=verify, verify_timeout_s=verify_timeout_s, **constraints)[0]
 
     def best_grasps(
         self,
@@ -109,40 +112,31 @@ class GraspQueries:
         TimeoutError if that takes longer than ``verify_timeout_s``; it says so where no worker has come.
         """
         given = known_keywords(Constraints, constraints, "best_grasps")
-        return self._best_grasps(count, given, verify, verify_timeout_s)
-
-    def _best_grasps(self, count: int, given: dict[str, Any], verify: bool, timeout_s: float) -> Grasps:
         request = best_grasp_request(count, given)
         grasps = Grasps(
             self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
         )
         if len(grasps):
-            return self._simulated(grasps, given, timeout_s) if verify else grasps
+            return self._simulated(grasps, given, verify_timeout_s) if verify else grasps
         if grasps.status == "no_successes":
-            way_out = (
-                "" if given.get("prior") is False else "; with a mesh, name a gripper to choose by its edges"
-            )
+            way_out = "; with a mesh, name a gripper to choose by its edges"
             raise Infeasible(
-                f"{self._object} has no successful trial yet, so there is no grasp to choose from{way_out}"
+                f"{self.id} has no successful trial yet, so there is no grasp to choose from"
+                f"{'' if given.get('prior') is False else way_out}"
             )
         where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
         raise Infeasible(
-            f"no grasp of {self._object} fulfils the constraints within reach of what was tried{where}",
+            f"no grasp of {self.id} fulfils the constraints within reach of what was tried{where}",
             nearest=grasps.nearest,
         )
 
     def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:
         """The grasps with their outcomes in simulation, by the gripper and protocol of their trials."""
-        trials: TrialSelection = {
-            "gripper": given.get("gripper"),
-            "protocol": given.get("protocol"),
-            "source": given.get("source"),
-        }
-        chosen = self.density(**trials)
+        chosen = self.density(**{name: given.get(name) for name in ("gripper", "protocol", "source")})
         protocol = chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None
         plan: SweepOptions = {"poses": grasps.matrices, "gripper": chosen.gripper, "protocol": protocol}
         plan |= {"fidelity": "fine", "purpose": "check"}
-        sweep = create_sweep(self._transport, self._object, plan)
+        sweep = create_sweep(self._transport, self._path, plan)
         try:
             sweep.wait(timeout=timeout_s)
         except TimeoutError as error:

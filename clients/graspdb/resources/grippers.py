@@ -6,28 +6,24 @@ from collections.abc import Iterator
 from typing import Any
 
 from graspdb import wire
-from graspdb.resources.pages import Listing, segment, validate
-from graspdb.transport import Transport
+from graspdb.resources.pages import Listing, Resource, segment, validate
 
 
-class Grippers:
+class Grippers(Resource):
     """``db.grippers``: ``pg70``, ``panda`` and your own."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
         """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
         request = validate(wire.GripperCreate, {"id": id, "name": name, **profile})
-        return self._transport.model(wire.GripperInfo, "POST", "/grippers", body=request, idempotent=True)
+        return self._transport.model(wire.GripperInfo, "POST", self._path, body=request, idempotent=True)
 
     def get(self, id: str) -> wire.GripperInfo:
         """The gripper with this id."""
-        return self._transport.model(wire.GripperInfo, "GET", f"/grippers/{segment(id)}")
+        return self._transport.model(wire.GripperInfo, "GET", f"{self._path}/{segment(id)}")
 
     def list(self) -> Iterator[wire.GripperInfo]:
         """All grippers."""
-        return iter(Listing(self._transport, "/grippers", wire.GripperInfo))
+        return iter(Listing(self._transport, self._path, wire.GripperInfo))
 
     def __iter__(self) -> Iterator[wire.GripperInfo]:
         return self.list()

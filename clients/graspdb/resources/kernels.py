@@ -7,10 +7,9 @@ from typing import Annotated, Any, Unpack
 
 from graspdb import wire
 from graspdb.options import Option
-from graspdb.resources.pages import Listing, segment, validate
-from graspdb.resources.runs import RunProgress, wait_for_run
+from graspdb.resources.pages import Listing, Resource, segment, validate
+from graspdb.resources.runs import RunProgress, computed
 from graspdb.resources.selection import TrialSelection
-from graspdb.transport import Transport
 
 
 class KernelOptions(TrialSelection, total=False):
@@ -31,11 +30,8 @@ class KernelOptions(TrialSelection, total=False):
     component_widths: wire.KernelWidths | Mapping[str, float] | None
 
 
-class Kernels:
+class Kernels(Resource):
     """``db.kernels``: queries take a kernel's id, or ``anisotropic`` for the newest, as ``kernel``."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def fit(
         self,
@@ -60,26 +56,23 @@ class Kernels:
 
     def get(self, id: str) -> wire.StoredKernel:
         """The kernel with this id."""
-        return self._transport.model(wire.StoredKernel, "GET", f"/kernels/{segment(id)}")
+        return self._transport.model(wire.StoredKernel, "GET", f"{self._path}/{segment(id)}")
 
     def list(self) -> Iterator[wire.StoredKernel]:
         """All kernels, oldest first."""
-        return iter(Listing(self._transport, "/kernels", wire.StoredKernel))
+        return iter(Listing(self._transport, self._path, wire.StoredKernel))
 
     def __iter__(self) -> Iterator[wire.StoredKernel]:
         return self.list()
 
     def delete(self, id: str) -> None:
         """Delete a kernel."""
-        self._transport.request("DELETE", f"/kernels/{segment(id)}")
+        self._transport.request("DELETE", f"{self._path}/{segment(id)}")
 
     def _create(
         self, fields: dict[str, Any], progress: RunProgress | None = None, timeout_s: float | None = None
     ) -> wire.StoredKernel:
         request = validate(wire.KernelCreate, fields)
-        answer = self._transport.request("POST", "/kernels", body=request, idempotent=True)
-        made = answer.json()
-        if answer.status_code == 202:
-            where = answer.headers["Location"]
-            made = wait_for_run(self._transport, where, "the kernel", progress, timeout_s)
+        answer = self._transport.request("POST", self._path, body=request, idempotent=True)
+        made = computed(self._transport, answer, "the kernel", progress, timeout_s)
         return wire.StoredKernel.model_validate(made)

@@ -13,7 +13,7 @@ from graspdb.files.meshes import GLB, MeshLike, read_mesh, scene_of
 from graspdb.options import Option, known_keywords
 from graspdb.reports import Reports
 from graspdb.resources.grasp_queries import GraspQueries
-from graspdb.resources.pages import Listing, segment, validate
+from graspdb.resources.pages import Listing, Resource, segment, validate
 from graspdb.resources.results import table_html
 from graspdb.resources.sweeps import Sweep, SweepOptions, Sweeps, create_sweep
 from graspdb.resources.trials import Batches, Trials
@@ -38,16 +38,10 @@ class GraspObject(GraspQueries):
     """
 
     def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:
-        super().__init__(transport, info.id)
-        self.info = info
-        self.trials = Trials(transport, info.id)
-        self.batches = Batches(transport, info.id)
+        super().__init__(transport, info)
+        self.trials = Trials(transport, f"{self._path}/trials")
+        self.batches = Batches(transport, f"{self._path}/batches")
         self.reports = Reports(transport, self._path)
-
-    @property
-    def id(self) -> str:
-        """The object's identifier."""
-        return self.info.id
 
     def refresh(self) -> GraspObject:
         """Ask the service for its present state."""
@@ -108,11 +102,11 @@ class GraspObject(GraspQueries):
     def sweep(self, **options: Unpack[SweepOptions]) -> Sweep:
         """Have workers simulate grasps: over a grid, given poses, or draws, as :class:`SweepOptions` say."""
         known_keywords(SweepOptions, options, "sweep")
-        return create_sweep(self._transport, self.id, options)
+        return create_sweep(self._transport, self._path, options)
 
     def sweeps(self) -> Iterator[Sweep]:
         """The sweeps of this object."""
-        return Sweeps(self._transport).list(object=self.id)
+        return Sweeps(self._transport, "/sweeps").list(object=self.id)
 
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
@@ -154,11 +148,8 @@ class GraspObject(GraspQueries):
         return table_html(f"Object {self.info.name or self.info.id}", self.summary())
 
 
-class Objects:
+class Objects(Resource):
     """``db.objects``: create, find, list and delete objects."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def create(
         self,
@@ -178,7 +169,7 @@ class Objects:
         fields = known_keywords(ObjectProperties, properties, "create")
         request = validate(wire.ObjectCreate, {"id": id, **fields})
         loaded = None if mesh is None else read_mesh(mesh, media_type)
-        info = self._transport.model(wire.ObjectInfo, "POST", "/objects", body=request, idempotent=True)
+        info = self._transport.model(wire.ObjectInfo, "POST", self._path, body=request, idempotent=True)
         created = GraspObject(self._transport, info)
         try:
             if loaded is not None:
@@ -192,12 +183,12 @@ class Objects:
 
     def get(self, id: str) -> GraspObject:
         """The object with this id."""
-        info = self._transport.model(wire.ObjectInfo, "GET", f"/objects/{segment(id)}")
+        info = self._transport.model(wire.ObjectInfo, "GET", f"{self._path}/{segment(id)}")
         return GraspObject(self._transport, info)
 
     def list(self) -> Iterator[GraspObject]:
         """All objects."""
-        for info in Listing(self._transport, "/objects", wire.ObjectInfo):
+        for info in Listing(self._transport, self._path, wire.ObjectInfo):
             yield GraspObject(self._transport, info)
 
     def __iter__(self) -> Iterator[GraspObject]:
@@ -205,4 +196,4 @@ class Objects:
 
     def delete(self, id: str) -> None:
         """Delete an object with everything that belongs to it."""
-        self._transport.request("DELETE", f"/objects/{segment(id)}")
+        self._transport.request("DELETE", f"{self._path}/{segment(id)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import chain, islice
 from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
@@ -39,39 +40,43 @@ def validate(model: type[Model], fields: Mapping[str, Any]) -> Model:
         raise InvalidInput(text, problem=problem) from None
 
 
-class Listing(Generic[Item]):
+class Resource:
+    """Something on the service, asked about below its path."""
+
+    def __init__(self, transport: Transport, path: str) -> None:
+        self._transport = transport
+        self._path = path
+
+
+class Listing(Resource, Generic[Item]):
     """A list on the service, read as it is iterated; every iteration asks anew."""
 
     def __init__(
         self, transport: Transport, path: str, item: type[Item], params: Mapping[str, Any] | None = None
     ) -> None:
-        self._transport = transport
-        self._path = path
+        super().__init__(transport, path)
         self._item = item
         self._params = dict(params or {})
 
     def pages(self, limit: int = PAGE) -> Iterator[list[Item]]:
         """Lists of at most ``limit`` items."""
-        cursor: str | None = None
-        while True:
-            params = {**self._params, "limit": limit, "cursor": cursor}
-            answer = self._transport.json("GET", self._path, params=params)
+        for answer in answers(self._transport, self._path, {**self._params, "limit": limit}):
             yield [self._item.model_validate(item) for item in answer["items"]]
-            cursor = answer.get("next")
-            if cursor is None:
-                return
 
     def __iter__(self) -> Iterator[Item]:
-        for page in self.pages():
-            yield from page
+        return chain.from_iterable(self.pages())
 
     def first(self, count: int) -> list[Item]:
         """At most the first ``count`` items."""
-        found: list[Item] = []
-        if count < 1:
-            return found
-        for page in self.pages(min(count, PAGE)):
-            found += page
-            if len(found) >= count:
-                break
-        return found[:count]
+        return list(islice(chain.from_iterable(self.pages(min(count, PAGE))), max(count, 0)))
+
+
+def answers(transport: Transport, path: str, params: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """The pages of a list as the service answers them, one after the other."""
+    cursor: str | None = None
+    while True:
+        answer = transport.json("GET", path, params={**params, "cursor": cursor})
+        yield answer
+        cursor = answer.get("next")
+        if cursor is None:
+            return

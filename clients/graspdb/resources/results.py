@@ -211,11 +211,18 @@ class Grasps(Sequence[Grasp]):
         )
 
 
-#: Columns of a likelihood, and what stands for a null in each.
-_NULLS = dict.fromkeys(
-    ("density", "log_density", "relative", "success_probability", "effective_trials"), np.nan
-)
-_NULLS["log_density"] = -np.inf
+_COLUMNS = ("density", "log_density", "relative", "success_probability", "effective_trials")
+
+
+class Columns:
+    """What can be read as a table."""
+
+    def _columns(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a pose (extra ``pandas``)."""
+        return to_pandas(self._columns())
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +235,7 @@ class IntervalArrays:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LikelihoodArrays:
+class LikelihoodArrays(Columns):
     """Answers for N poses, in their order; a column not asked for or not known is None.
 
     ``density`` in 1/(m^3 rad^3); ``log_density`` natural, minus infinity where the density is exactly
@@ -249,22 +256,26 @@ class LikelihoodArrays:
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
         """From the answers to consecutive parts of the poses."""
         free = _joined(answers, "collision_free")
-        columns = {name: _joined(answers, name) for name in _NULLS}
+        # NumPy makes NaN of nulls; the log of an exact zero is another null.
+        joined = {name: _joined(answers, name) for name in _COLUMNS}
+        columns = {name: None if x is None else np.array(x, dtype=float) for name, x in joined.items()}
+        if (log_density := columns["log_density"]) is not None:
+            log_density[np.isnan(log_density)] = -np.inf
         intervals = [a.interval for a in answers if a.interval is not None and a.interval.low]
         interval = None
         if intervals:
             ends = ([x for i in intervals for x in getattr(i, end)] for end in ("low", "high"))
-            interval = IntervalArrays(intervals[0].level, *(_floats(end, np.nan) for end in ends))
+            interval = IntervalArrays(intervals[0].level, *(np.array(end, dtype=float) for end in ends))
         return cls(
             revision=answers[-1].revision,
             kernel=answers[-1].kernel,
             interval=interval,
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
-            **{name: None if x is None else _floats(x, _NULLS[name]) for name, x in columns.items()},
+            **columns,
         )
 
     def _columns(self) -> dict[str, Any]:
-        names = [name for name in (*_NULLS, "collision_free") if getattr(self, name) is not None]
+        names = [name for name in (*_COLUMNS, "collision_free") if getattr(self, name) is not None]
         columns = {name: getattr(self, name) for name in names}
         if self.interval is not None:
             columns |= {"low": self.interval.low, "high": self.interval.high}
@@ -272,10 +283,6 @@ class LikelihoodArrays:
 
     def __len__(self) -> int:
         return next((len(column) for column in self._columns().values()), 0)
-
-    def to_pandas(self) -> Any:
-        """A DataFrame with a row a pose (extra ``pandas``)."""
-        return to_pandas(self._columns())
 
     def __repr__(self) -> str:
         return f"LikelihoodArrays({len(self)} poses: {', '.join(self._columns())}; revision {self.revision})"
@@ -290,12 +297,8 @@ def _joined(answers: Sequence[wire.Likelihoods], name: str) -> list[Any] | None:
     return None if name != "log_density" and all(v is None for v in joined) else joined
 
 
-def _floats(values: Sequence[float | None], null: float) -> Floats:
-    return np.array([null if v is None else v for v in values], dtype=np.float64)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class PoseArrays:
+class PoseArrays(Columns):
     """N tool frames in the object frame: ``position`` (N, 3) metres, ``quaternion_xyzw`` (N, 4)."""
 
     position: Floats
@@ -313,10 +316,6 @@ class PoseArrays:
 
     def _columns(self) -> dict[str, Any]:
         return dict(pose_columns(self))
-
-    def to_pandas(self) -> Any:
-        """A DataFrame with a row a pose (extra ``pandas``)."""
-        return to_pandas(self._columns())
 
     def __len__(self) -> int:
         return len(self.position)

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import httpx
+
 from graspdb import wire
 from graspdb.errors import GraspDBError, error_for
 from graspdb.transport import Transport
@@ -17,16 +19,22 @@ RunProgress = Callable[[ReportRun], None]
 _POLL_S = 0.5
 
 
-def wait_for_run(
-    transport: Transport, location: str, what: str, progress: RunProgress | None, timeout_s: float | None
-) -> dict[str, Any]:
-    """The result of the run at ``location``, or the typed error it ended with; ``what`` it is, for messages.
+def computed(
+    transport: Transport,
+    answer: httpx.Response,
+    what: str,
+    progress: RunProgress | None,
+    timeout_s: float | None,
+) -> Any:
+    """What was answered, or (202) the result of the run that computes it; the typed error that it ended with.
 
-    TimeoutError after ``timeout_s``, which does not end the run.
+    ``what`` it is, for messages. TimeoutError after ``timeout_s``, which does not end the run.
     """
+    if answer.status_code != 202:
+        return answer.json()
     began = time.monotonic()
     while True:
-        run = ReportRun.model_validate(transport.json("GET", location))
+        run = transport.model(ReportRun, "GET", answer.headers["Location"])
         if progress is not None:
             progress(run)
         if run.result is not None:

@@ -24,7 +24,7 @@ from graspdb import wire
 from graspdb.errors import SweepFailed
 from graspdb.options import Corners, Option, PoseFile
 from graspdb.poses import as_poses, vector
-from graspdb.resources.pages import Listing, segment, validate
+from graspdb.resources.pages import Listing, Resource, answers, segment, validate
 from graspdb.resources.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
 
@@ -80,12 +80,11 @@ class SweepOptions(TypedDict, total=False):
     chunk_poses: Annotated[int | None, Option("Poses a job.", min=1)]
 
 
-class Sweep:
+class Sweep(Resource):
     """A sweep on the service. ``info`` is its state when last heard of; :meth:`refresh` asks again."""
 
     def __init__(self, transport: Transport, info: wire.SweepInfo) -> None:
-        self._transport = transport
-        self._path = f"/sweeps/{segment(info.id)}"
+        super().__init__(transport, f"/sweeps/{segment(info.id)}")
         self.info = info
 
     @property
@@ -178,21 +177,15 @@ class Sweep:
     def outcomes(self) -> OutcomeArrays:
         """Every pose of the finished chunks with its outcome, as arrays."""
         # Straight into arrays: a model of millions of rows would take longer than their simulation's answer.
-        pages: list[dict[str, NDArray[Any]]] = []
-        params: dict[str, Any] = {"limit": _OUTCOMES_PAGE, "cursor": None}
-        while True:
-            answer = self._transport.json("GET", f"{self._path}/outcomes", params=params)
-            pages.append(
-                {
-                    "pose_index": np.array(answer["pose_index"], dtype=np.int64),
-                    "position": np.array(answer["position"], dtype=np.float64).reshape(-1, 3),
-                    "quaternion_xyzw": np.array(answer["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
-                    "outcome": np.array(answer["outcome"], dtype=np.str_),
-                }
-            )
-            params["cursor"] = answer["next"]
-            if params["cursor"] is None:
-                break
+        pages: list[dict[str, NDArray[Any]]] = [
+            {
+                "pose_index": np.array(page["pose_index"], dtype=np.int64),
+                "position": np.array(page["position"], dtype=np.float64).reshape(-1, 3),
+                "quaternion_xyzw": np.array(page["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
+                "outcome": np.array(page["outcome"], dtype=np.str_),
+            }
+            for page in answers(self._transport, f"{self._path}/outcomes", {"limit": _OUTCOMES_PAGE})
+        ]
         columns = {name: np.concatenate([page[name] for page in pages]) for name in pages[0]}
         return OutcomeArrays(sweep=self.id, **columns)
 
@@ -229,26 +222,23 @@ class Sweep:
         return table_html("Sweep", self.summary())
 
 
-class Sweeps:
+class Sweeps(Resource):
     """``db.sweeps``: every object's sweeps."""
-
-    def __init__(self, transport: Transport) -> None:
-        self._transport = transport
 
     def get(self, sweep: str) -> Sweep:
         """The sweep with this identifier."""
-        info = self._transport.model(wire.SweepInfo, "GET", f"/sweeps/{segment(sweep)}")
+        info = self._transport.model(wire.SweepInfo, "GET", f"{self._path}/{segment(sweep)}")
         return Sweep(self._transport, info)
 
     def list(self, *, object: str | None = None, state: str | None = None) -> Iterator[Sweep]:
         """The sweeps, the newest first; of one object and in one state if said."""
         params = {"object": object, "state": state}
-        for info in Listing(self._transport, "/sweeps", wire.SweepInfo, params):
+        for info in Listing(self._transport, self._path, wire.SweepInfo, params):
             yield Sweep(self._transport, info)
 
 
-def create_sweep(transport: Transport, object_id: str, options: SweepOptions) -> Sweep:
-    """Queue a sweep of an object."""
+def create_sweep(transport: Transport, path: str, options: SweepOptions) -> Sweep:
+    """Queue a sweep of the object at ``path``."""
     fields: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     seed = {name: fields.pop(name) for name in ("seed",) if name in fields}
     poses, sample = fields.pop("poses", None), fields.pop("sample", None)
@@ -271,8 +261,8 @@ def create_sweep(transport: Transport, object_id: str, options: SweepOptions) ->
             }
         fields["grid"] = {**grid, **seed}
     request = validate(wire.SweepCreate, fields)
-    path = f"/objects/{segment(object_id)}/sweeps"
-    return Sweep(transport, transport.model(wire.SweepInfo, "POST", path, body=request, idempotent=True))
+    info = transport.model(wire.SweepInfo, "POST", f"{path}/sweeps", body=request, idempotent=True)
+    return Sweep(transport, info)
 
 
 def duration(seconds: float) -> str:

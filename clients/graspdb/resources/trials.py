@@ -18,10 +18,9 @@ from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses
-from graspdb.resources.pages import Listing, segment
+from graspdb.resources.pages import Listing, Resource, segment
 from graspdb.resources.results import TrialArrays
 from graspdb.resources.selection import TrialSelection
-from graspdb.transport import Transport
 
 CHUNK_TRIALS = 50_000
 """Trials a request: some 10 MB of JSON, well under the service's default body limit."""
@@ -80,12 +79,8 @@ class TrialListing(Listing[wire.TrialOut]):
         return self.arrays().to_pandas()
 
 
-class Trials:
+class Trials(Resource):
     """``mug.trials``: the trials of one object."""
-
-    def __init__(self, transport: Transport, object_id: str) -> None:
-        self._transport = transport
-        self._path = f"/objects/{segment(object_id)}/trials"
 
     # long: most of it says what its keywords are.
     def add(
@@ -121,7 +116,8 @@ class Trials:
         numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
         columns |= {name: _numbers(name, x, count) for name, x in numbers.items() if x is not None}
         if pose_covariance is not None:
-            columns["pose_covariance"] = _covariances(pose_covariance, count)
+            covariances = np.asarray(pose_covariance, dtype=np.float64)
+            columns["pose_covariance"] = _listed("pose_covariance", covariances, count, (6, 6))
         if measured_at is not None:
             times = _each("measured_at", measured_at, datetime, count)
             columns["measured_at"] = [None if time is None else time.isoformat() for time in times]
@@ -210,12 +206,8 @@ class Trials:
         return self.list(**filters).to_pandas()
 
 
-class Batches:
+class Batches(Resource):
     """``mug.batches``: what arrived together and can be deleted together."""
-
-    def __init__(self, transport: Transport, object_id: str) -> None:
-        self._transport = transport
-        self._path = f"/objects/{segment(object_id)}/batches"
 
     def list(self) -> Listing[wire.BatchInfo]:
         """All batches, read page by page."""
@@ -234,12 +226,7 @@ class Batches:
 
 
 def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
-    array: NDArray[Any] = np.asarray(outcomes)
-    if array.ndim == 0:
-        array = np.broadcast_to(array, (count,))
-    if array.shape != (count,):
-        raise ValueError(f"outcomes have shape {array.shape}; expected ({count},), one a pose")
-    values: list[Any] = array.tolist()
+    values = _listed("outcomes", np.asarray(outcomes), count)
     for index, value in enumerate(values):
         if not isinstance(value, bool) and value not in wire.OUTCOME_CODES:
             raise ValueError(
@@ -249,17 +236,17 @@ def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> list[float | None]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape not in {(), (count,)}:
-        raise ValueError(f"{name} has shape {array.shape}; expected ({count},) or one number")
-    return [None if np.isnan(value) else value for value in np.broadcast_to(array, (count,)).tolist()]
+    listed = _listed(name, np.asarray(values, dtype=np.float64), count)
+    return [None if np.isnan(value) else value for value in listed]
 
 
-def _covariances(values: ArrayLike, count: int) -> list[Any]:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape not in {(6, 6), (count, 6, 6)}:
-        raise ValueError(f"pose_covariance has shape {array.shape}; expected (6, 6) or ({count}, 6, 6)")
-    listed: list[Any] = np.broadcast_to(array, (count, 6, 6)).tolist()
+def _listed(name: str, array: NDArray[Any], count: int, one: tuple[int, ...] = ()) -> list[Any]:
+    """A value of shape ``one`` a trial; one goes for all."""
+    if array.shape not in {one, (count, *one)}:
+        raise ValueError(
+            f"{name}: shape {array.shape}; expected {(count, *one)}, one a pose, or {one} for all"
+        )
+    listed: list[Any] = np.broadcast_to(array, (count, *one)).tolist()
     return listed
 
 

@@ -6,6 +6,7 @@ closing direction. Requests forbid unknown fields; responses may grow, so client
 not know.
 """
 
+from graspdb.wire import reports as reports
 from graspdb.wire.base import OUTCOME_CODES as OUTCOME_CODES
 from graspdb.wire.base import OUTCOMES as OUTCOMES
 from graspdb.wire.base import SOURCES as SOURCES

@@ -145,10 +145,7 @@ def _storable(value: dict[str, Any]) -> dict[str, Any]:
 def rotation_to_quaternion(matrix: list[list[float]]) -> Quadruple:
     """The unit quaternion (x, y, z, w) of a 3x3 rotation matrix (Shepperd's method, 1978).
 
-    Raises
-    ------
-    ValueError
-        If the matrix is not a rotation within :data:`UNIT_TOLERANCE`.
+    ValueError if the matrix is not a rotation within :data:`UNIT_TOLERANCE`.
     """
     for i in range(3):
         for j in range(i, 3):
@@ -175,10 +172,7 @@ def rotation_to_quaternion(matrix: list[list[float]]) -> Quadruple:
 def pose_from_matrix(matrix: Any) -> tuple[Triple, Quadruple]:
     """Position and quaternion of a 4x4 homogeneous matrix, row-major, metres.
 
-    Raises
-    ------
-    ValueError
-        If the shape, the last row or the rotation block is not that of a rigid motion.
+    ValueError if the shape, the last row or the rotation block is not that of a rigid motion.
     """
     if not (isinstance(matrix, (list, tuple)) and len(matrix) == 4):
         raise ValueError("a pose's matrix has shape (4, 4)")

@@ -7,7 +7,6 @@ the SDK and the command line follow.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
@@ -33,8 +32,13 @@ Matching = Literal["determinants", "likelihood", "success"]
 
 
 class Report(Response):
-    """What every report says first: of which trials it is, and ``text``, its answer in words."""
+    """What every report says first: of which trials it is, and ``text``, its answer in words.
 
+    A kind of report declares the ``question`` that it answers, and the model of the options it is asked by.
+    """
+
+    question: ClassVar[str]
+    options: ClassVar[type[Request]]
     report: ReportName
     object: str
     revision: int
@@ -106,6 +110,10 @@ class ConvergenceReport(Report):
     bootstrap, which subsets, and what stays while trials are added.
     """
 
+    question: ClassVar = (
+        "Have we tried enough? Similarity and held-out likelihood against the number of successes."
+    )
+    options: ClassVar = ConvergenceOptions
     report: Literal["convergence"] = "convergence"
     level: float
     held_out: int
@@ -207,6 +215,10 @@ class AnisotropyReport(Report):
     ``aligned`` of the ``grasps`` have axes of that alignment, the others the gripper's.
     """
 
+    question: ClassVar = (
+        "How far off may the gripper be? Success by displacement from successes, tolerances by axis."
+    )
+    options: ClassVar = AnisotropyOptions
     report: Literal["anisotropy"] = "anisotropy"
     method: Method
     alignment: str
@@ -269,6 +281,10 @@ class CalibrationReport(Report):
     best grasps are that are verified; where there are none, a warning says how to make some.
     """
 
+    question: ClassVar = (
+        "Can success probabilities be believed? Judged on outcomes of blocks of space left out."
+    )
+    options: ClassVar = SelectionQuery
     report: Literal["calibration"] = "calibration"
     level: float
     kernel: KernelInfo
@@ -345,6 +361,10 @@ class ProjectionReport(Report):
     convex part, or the hull of its mesh. ``drawn`` grasps were drawn where it could not be computed.
     """
 
+    question: ClassVar = (
+        "Where do grasps succeed? The density on a plane, of all grasps or of those that point one way."
+    )
+    options: ClassVar = ProjectionOptions
     report: Literal["projection"] = "projection"
     level: float
     kernel: KernelInfo
@@ -403,6 +423,10 @@ class BandwidthReport(Report):
     ``range_m`` and ``range_deg``: widths of which the trials can't say that they are worse.
     """
 
+    question: ClassVar = (
+        "How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks."
+    )
+    options: ClassVar = TrialSelection
     report: Literal["bandwidth"] = "bandwidth"
     level: float
     kernel: KernelInfo
@@ -442,6 +466,10 @@ class KernelSimilarityReport(Report):
     stand for the full statistics.
     """
 
+    question: ClassVar = (
+        "How many samples, or Gaussians, does a kernel need to be like its statistics? (figure 13)"
+    )
+    options: ClassVar = KernelSimilarityOptions
     report: Literal["kernel-similarity"] = "kernel-similarity"
     level: float
     window_position_m: float
@@ -503,9 +531,16 @@ class SourcesOptions(Request):
     sigma_rotation_deg: WidthDeg | None = None
 
 
+ReportOptions = TrialSelection | SourcesOptions
+
+
 class SourcesReport(Report):
     """Does simulation tell what real trials find?"""
 
+    question: ClassVar = (
+        "Does simulation tell what robots find? Predictions at real poses, and how alike densities are."
+    )
+    options: ClassVar = SourcesOptions
     report: Literal["sources"] = "sources"
     level: float
     kernel: KernelInfo
@@ -554,63 +589,17 @@ class SummaryReport(Response):
     warnings: list[str] = Field(default_factory=list)
 
 
-AnyReport = (
-    ConvergenceReport
-    | AnisotropyReport
-    | CalibrationReport
-    | ProjectionReport
-    | BandwidthReport
-    | KernelSimilarityReport
-    | SourcesReport
-)
-ReportOptions = TrialSelection | SourcesOptions
-
-
-@dataclass(frozen=True)
-class ReportSpec:
-    """A report as declared: what it answers, what it can be asked by, and what it says."""
-
-    question: str
-    options: type[ReportOptions]
-    result: type[AnyReport]
-
-
-REPORTS: Mapping[str, ReportSpec] = {
-    "projection": ReportSpec(
-        "Where do grasps succeed? The density on a plane, of all grasps or of those that point one way.",
-        ProjectionOptions,
+REPORTS: Mapping[str, type[Report]] = {
+    model.model_fields["report"].default: model
+    for model in (
         ProjectionReport,
-    ),
-    "convergence": ReportSpec(
-        "Have we tried enough? Similarity and held-out likelihood against the number of successes.",
-        ConvergenceOptions,
         ConvergenceReport,
-    ),
-    "anisotropy": ReportSpec(
-        "How far off may the gripper be? Success by displacement from successes, tolerances by axis.",
-        AnisotropyOptions,
         AnisotropyReport,
-    ),
-    "calibration": ReportSpec(
-        "Can success probabilities be believed? Judged on outcomes of blocks of space left out.",
-        SelectionQuery,
         CalibrationReport,
-    ),
-    "bandwidth": ReportSpec(
-        "How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks.",
-        TrialSelection,
         BandwidthReport,
-    ),
-    "kernel-similarity": ReportSpec(
-        "How many samples, or Gaussians, does a kernel need to be like its statistics? (figure 13)",
-        KernelSimilarityOptions,
         KernelSimilarityReport,
-    ),
-    "sources": ReportSpec(
-        "Does simulation tell what robots find? Predictions at real poses, and how alike densities are.",
-        SourcesOptions,
         SourcesReport,
-    ),
+    )
 }
 
 

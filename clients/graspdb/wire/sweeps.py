@@ -89,6 +89,12 @@ class WaitingFor(Response):
     error: str | None = None
 
 
+class FailedChunk(Response):
+    chunk: int
+    attempts: int
+    error: str
+
+
 class SweepInfo(Response):
     """``poses`` counts what is simulated (one of each jaw-symmetric pair); ``rate_poses_s`` over the last
     minutes; ``time_left_s`` by that rate."""
@@ -120,12 +126,6 @@ class SweepInfo(Response):
     finished_at: datetime | None = None
 
 
-class FailedChunk(Response):
-    chunk: int
-    attempts: int
-    error: str
-
-
 class SweepOutcomes(Response):
     """Columns: every pose of the finished chunks, collisions included, ascending within a chunk."""
 
@@ -135,6 +135,3 @@ class SweepOutcomes(Response):
     quaternion_xyzw: list[Quadruple]
     outcome: list[str]
     next: str | None = None
-
-
-SweepInfo.model_rebuild()

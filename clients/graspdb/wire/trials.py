@@ -5,11 +5,12 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from graspdb.wire.base import (
     Metadata,
     Outcome,
+    Pose,
     Position,
     Quadruple,
     Quaternion,
@@ -18,7 +19,6 @@ from graspdb.wire.base import (
     Slug,
     Source,
     Triple,
-    expand_matrix,
 )
 
 
@@ -34,6 +34,7 @@ ProposalDensity = Annotated[float, Field(gt=0, le=1e15)]
 Quality = Annotated[float, Field(ge=-1e9, le=1e9)]
 Width = Annotated[float, Field(ge=0, le=10)]
 Row6 = tuple[float, float, float, float, float, float]
+Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
 
 
 class TrialDefaults(Request):
@@ -46,24 +47,17 @@ class TrialDefaults(Request):
     metadata: Metadata | None = None
 
 
-class TrialIn(TrialDefaults):
+class TrialIn(Pose, TrialDefaults):
     """One attempt.
 
     ``proposal_density`` is in 1/(m^3 rad^3); ``pose_covariance`` 6x6, translation first, tool frame.
     """
 
-    position: Position
-    quaternion_xyzw: Quaternion
     outcome: OutcomeIn
     quality: Quality | None = None
     width_m: Width | None = None
-    pose_covariance: tuple[Row6, Row6, Row6, Row6, Row6, Row6] | None = None
+    pose_covariance: Matrix6 | None = None
     measured_at: datetime | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_matrix(cls, data: Any) -> Any:
-        return expand_matrix(data)
 
 
 class TrialsIn(TrialDefaults):
@@ -82,7 +76,7 @@ class TrialColumns(Request):
     proposal_density: list[ProposalDensity | None] | None = None
     quality: list[Quality | None] | None = None
     width_m: list[Width | None] | None = None
-    pose_covariance: list[tuple[Row6, Row6, Row6, Row6, Row6, Row6] | None] | None = None
+    pose_covariance: list[Matrix6 | None] | None = None
     measured_at: list[datetime | None] | None = None
     metadata: list[Metadata | None] | None = None
 

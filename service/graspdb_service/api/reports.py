@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from graspdb import figures
-from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions, ReportRun, ReportSpec, SummaryReport
+from graspdb.wire.reports import REPORTS, Report, ReportOptions, ReportRun, SummaryReport
 from graspdb.wire.states import RunState
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
@@ -33,7 +33,7 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def _add_route(name: str, report: ReportSpec) -> None:
+def _add_route(name: str, report: type[Report]) -> None:
     def get_report(ctx: Ctx, id: str, request: Request, query: ReportOptions) -> Response:
         return _answer(ctx, id, name, request, query)
 
@@ -43,7 +43,7 @@ def _add_route(name: str, report: ReportSpec) -> None:
         get_report,
         name=f"get_{name.replace('-', '_')}",
         description=report.question,
-        response_model=report.result,
+        response_model=report,
         responses=_RESPONSES,
         **scope("read"),
     )
@@ -88,11 +88,11 @@ def _answer(ctx: Context, slug: str, name: str, request: Request, options: Repor
         )
     assert run.result is not None
     tag = (run.object_id, run.revision, run.parameters_key[:24])
-    return _tagged(request, media, REPORTS[name].result, run.result, *tag)
+    return _tagged(request, media, REPORTS[name], run.result, *tag)
 
 
 def _tagged(
-    request: Request, media: str, model: type[AnyReport | SummaryReport], content: str, *parts: object
+    request: Request, media: str, model: type[Report | SummaryReport], content: str, *parts: object
 ) -> Response:
     """A report as JSON or its figure, under a tag; 304 where the client has it."""
     figure = _FIGURES.get(media)

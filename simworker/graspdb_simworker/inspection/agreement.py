@@ -109,14 +109,10 @@ def verify(
             raise ValueError("no pose of this sample needs physics: take more poses")
         rows = np.sort(rng.permutation(rows)[: 3 * count])
         total = len(rows) + min(count, len(rows))
-
-        def outcomes(workpiece: chunks.Workpiece, chosen: NDArray[np.int64], done: int) -> NDArray[np.uint8]:
-            poses = positions[chosen], quaternions[chosen], travel[chosen]
-            return _outcomes(workpiece, *poses, lambda more: progress(done + more, total))
-
-        labels = outcomes(coarse, rows, 0)
+        poses = positions, quaternions, travel
+        labels = _outcomes(coarse, poses, rows, lambda done: progress(done, total))
         picked = _stratified(labels, count, rng)
-        again = outcomes(fine, rows[picked], len(rows))
+        again = _outcomes(fine, poses, rows[picked], lambda done: progress(len(rows) + done, total))
     found = {int(kind): float(n) for kind, n in zip(*np.unique(labels, return_counts=True), strict=True)}
     return _agreement(found, labels[picked], again, rng)
 
@@ -147,9 +143,8 @@ def verify_stored(
             for kind in np.unique(labels)
         }
         picked = _stratified(labels, count, rng)
-        chosen = rows[picked]
-        poses = stored.positions[chosen], stored.quaternions[chosen], travel[chosen]
-        again = _outcomes(fine, *poses, lambda done: progress(done, len(picked)))
+        poses = stored.positions, stored.quaternions, travel
+        again = _outcomes(fine, poses, rows[picked], lambda done: progress(done, len(picked)))
     return _agreement(found, labels[picked], again, rng)
 
 
@@ -159,16 +154,16 @@ def _fine(payload: SimulatePayload, parts: Sequence[Part]) -> chunks.Workpiece:
 
 def _outcomes(
     workpiece: chunks.Workpiece,
-    positions: NDArray[np.float64],
-    quaternions: NDArray[np.float64],
-    travel: NDArray[np.float64],
+    poses: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    rows: NDArray[np.int64],
     progress: Callable[[int], None],
 ) -> NDArray[np.uint8]:
-    """Outcomes of tool poses (n, 3), (n, 4), whose fingers close freely by (n,) metres."""
-    found = np.empty(len(positions), dtype=np.uint8)
-    for row, way in enumerate(travel.tolist()):
-        found[row] = workpiece.simulate(positions[row], quaternions[row], way).outcome
-        progress(row + 1)
+    """Outcomes of rows of tool poses (n, 3), (n, 4), whose fingers close freely by (n,) metres."""
+    positions, quaternions, travel = poses
+    found = np.empty(len(rows), dtype=np.uint8)
+    for done, row in enumerate(rows.tolist()):
+        found[done] = workpiece.simulate(positions[row], quaternions[row], float(travel[row])).outcome
+        progress(done + 1)
     return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from graspdb.examples import example
 from graspdb.transport import Transport
-from graspdb.wire import Finger, GridPlan, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
+from graspdb.wire import Finger, GridPlan, GridSpec, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
 from graspdb.wire.sweeps import Protocol
 from graspdb_geometry import meshes
 from graspdb_geometry.grippers import GRIPPER_SHAPES
@@ -45,25 +45,17 @@ def load(
         parts, mass, friction = thing.parts, thing.mass_kg, thing.friction
     else:
         with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
-            info = ObjectInfo.model_validate_json(transport.request("GET", f"/objects/{name}").content)
+            info = transport.model(ObjectInfo, "GET", f"/objects/{name}")
             if info.mass_kg is None or info.convex_parts is None:
                 raise ValueError(f"{name} needs mass_kg and convex parts before it can be simulated")
-            answer = transport.request("GET", f"/grippers/{gripper}")
-            profile = GripperInfo.model_validate_json(answer.content).profile
+            profile = transport.model(GripperInfo, "GET", f"/grippers/{gripper}").profile
             parts = meshes.parts_from_glb(transport.request("GET", f"/objects/{name}/convex-parts").content)
         mass = info.mass_kg
         friction = profile.friction if info.friction is None else info.friction
     points = np.concatenate([vertices for vertices, _ in parts])
     low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-    grid = GridPlan(
-        lower=(low[0], low[1], low[2]),
-        upper=(high[0], high[1], high[2]),
-        position_step_m=0.01,
-        rotation_step_deg=15.0,
-        margin_m=0.02,
-        seed=seed,
-        symmetric=profile.symmetric,
-    )
+    where = {"lower": low, "upper": high, "symmetric": profile.symmetric}
+    grid = GridPlan.model_validate({**GridSpec(seed=seed).model_dump(), **where})
     payload = SimulatePayload(
         sweep="",
         object=name,

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.resources.pages import answers
 from graspdb.transport import Transport
-from graspdb.wire import OUTCOME_CODES, SweepInfo, SweepOutcomes
+from graspdb.wire import OUTCOME_CODES, SweepInfo
 
 
 @dataclass(frozen=True)
@@ -44,27 +45,20 @@ def sample_of(
     kept = {name: np.empty((0, 8)) for name in OUTCOME_CODES if name != "collision"}
     counts = dict.fromkeys(OUTCOME_CODES, 0)
     with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
-        info = SweepInfo.model_validate_json(transport.request("GET", f"/sweeps/{sweep}").content)
-        cursor: str | None = None
-        while True:
-            params = {"limit": "100000", **({} if cursor is None else {"cursor": cursor})}
-            answer = transport.request("GET", f"/sweeps/{sweep}/outcomes", params=params)
-            page = SweepOutcomes.model_validate_json(answer.content)
-            outcomes = np.array(page.outcome, dtype=object)
+        info = transport.model(SweepInfo, "GET", f"/sweeps/{sweep}")
+        for page in answers(transport, f"/sweeps/{sweep}/outcomes", {"limit": 100_000}):
+            outcomes = np.array(page["outcome"], dtype=object)
             keys = rng.random(len(outcomes))
             for name, before in kept.items():
                 rows = np.flatnonzero(outcomes == name)
                 counts[name] += len(rows)
                 new: NDArray[np.float64] = np.array(
-                    [[keys[row], *page.position[row], *page.quaternion_xyzw[row]] for row in rows]
+                    [[keys[row], *page["position"][row], *page["quaternion_xyzw"][row]] for row in rows]
                 ).reshape(-1, 8)
                 both = np.concatenate([before, new])
                 kept[name] = both[np.argsort(both[:, 0])[:per_outcome]]
             counts["collision"] += int((outcomes == "collision").sum())
             progress(sum(counts.values()), info.poses)
-            cursor = page.next
-            if cursor is None:
-                break
     if not any(map(len, kept.values())):
         raise ValueError(f"sweep {sweep} has no outcome to verify yet")
     sample: NDArray[np.float64] = np.concatenate(list(kept.values()))

@@ -3,14 +3,17 @@ its result."""
 
 from __future__ import annotations
 
+import pickle
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from graspdb.processes import ChildProcess
 from graspdb.wire import SimulatePayload, SimulateResult
-from graspdb_simworker.process import channel, messages
+from graspdb_simworker.process import channel
+from graspdb_simworker.process.messages import Chunk
 from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
 from graspdb_simworker.simulation.labels import SIMULATION_ERROR, Label
 
@@ -130,44 +133,37 @@ class LocalRunner(ChunkRunner):
         return "a grasp took too long" if name == "SIGPROF" else name
 
 
+@dataclass
 class _Attempt:
     """One try of one process at a chunk; remembers how far it came."""
 
-    def __init__(
-        self,
-        process: ChildProcess,
-        known: dict[int, Label],
-        pose_s: float,
-        check: Callable[[], None],
-        progress: Callable[[int], None],
-    ) -> None:
-        self._process = process
-        self._known = known
-        self._pose_s = pose_s
-        self._check = check
-        self._progress = progress
-        self.simulating: int | None = None
-        self.heard = 0
+    process: ChildProcess
+    known: dict[int, Label]
+    pose_s: float
+    check: Callable[[], None]
+    progress: Callable[[int], None]
+    simulating: int | None = None
+    heard: int = 0
 
     def run(self, payload: SimulatePayload, parts_glb: bytes) -> SimulateResult | None:
         """The result, or None if the process died or fell silent."""
-        chunk = messages.Chunk(payload.model_dump_json(), self._known, self._pose_s, parts_glb)
+        chunk = Chunk(payload.model_dump_json(), self.known, self.pose_s, parts_glb)
         try:
-            channel.send(_fd(self._process.stdin), channel.CHUNK, messages.pack_chunk(chunk))
+            channel.send(_fd(self.process.stdin), channel.CHUNK, pickle.dumps(chunk))
             while True:
                 # Before the first closing the prefilter runs: minutes at worst, for the largest chunks.
-                silence = START_SECONDS if self.simulating is None else SILENT * self._pose_s + 5.0
-                kind, body = channel.receive(_fd(self._process.stdout), silence_s=silence, check=self._check)
+                silence = START_SECONDS if self.simulating is None else SILENT * self.pose_s + 5.0
+                kind, body = channel.receive(_fd(self.process.stdout), silence_s=silence, check=self.check)
                 self.heard += 1
                 # Here too: a busy child leaves no silence in which to ask.
-                self._check()
+                self.check()
                 if kind == channel.BEFORE:
-                    self.simulating = messages.unpack_row(body)
+                    self.simulating = pickle.loads(body)
                 elif kind == channel.AFTER:
-                    row, label = messages.unpack_label(body)
-                    self._known[row] = label
+                    row, label = pickle.loads(body)
+                    self.known[row] = label
                     self.simulating = None
-                    self._progress(len(self._known))
+                    self.progress(len(self.known))
                 elif kind == channel.RESULT:
                     return SimulateResult.model_validate_json(body)
                 elif kind == channel.ERROR:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
 import signal
 
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import meshes
-from graspdb_simworker.process import channel, messages
+from graspdb_simworker.process import channel
+from graspdb_simworker.process.messages import Chunk
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.labels import Label
 
@@ -24,7 +26,7 @@ def serve(source: int, sink: int) -> None:
         if kind != channel.CHUNK:
             raise channel.Closed(f"unexpected message {kind!r}")
         try:
-            chunk = messages.unpack_chunk(body)
+            chunk: Chunk = pickle.loads(body)
             payload = SimulatePayload.model_validate_json(chunk.payload_json)
             wanted = payload.model_dump_json(include=WORKPIECE_FIELDS)
             if workpiece is None or key != wanted:
@@ -35,12 +37,12 @@ def serve(source: int, sink: int) -> None:
 
             # By the processor's time: what else the machine does must not change a label.
             def before(row: int, limit: float = chunk.pose_s) -> None:
-                channel.send(sink, channel.BEFORE, messages.pack_row(row))
+                channel.send(sink, channel.BEFORE, pickle.dumps(row))
                 signal.setitimer(signal.ITIMER_PROF, limit)
 
             def after(row: int, label: Label) -> None:
                 signal.setitimer(signal.ITIMER_PROF, 0.0)
-                channel.send(sink, channel.AFTER, messages.pack_label(row, label))
+                channel.send(sink, channel.AFTER, pickle.dumps((row, label)))
 
             result = chunks.simulate_chunk(payload, workpiece, known=chunk.known, before=before, after=after)
         except channel.Closed:

@@ -77,11 +77,6 @@ class MassProperties:
     inertia: tuple[float, float, float]
     _axes: NDArray[np.float64]
 
-    def inverse_rotation(self) -> tuple[float, float, float, float]:
-        """Rotation from the object frame to the principal frame, xyzw."""
-        x, y, z, w = self.principal_xyzw
-        return (-x, -y, -z, w)
-
     def to_principal(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 3) of the object frame in the principal frame."""
         return np.asarray((points - np.array(self.centre)) @ self._axes, dtype=np.float64)
@@ -159,6 +154,12 @@ def obj_of_parts(parts: Sequence[Part], mass: MassProperties) -> str:
     return "\n".join(lines) + "\n"
 
 
+def inverse(q: Quaternion) -> Quaternion:
+    """The rotation back, of a unit quaternion xyzw."""
+    x, y, z, w = q
+    return (-x, -y, -z, w)
+
+
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Rotate by b, then by a; quaternions xyzw."""
     ax, ay, az, aw = a
@@ -223,8 +224,8 @@ class Closing:
 
     ``touched``: both fingers had touched the object at the same time. ``opening_m`` is between the fingers;
     of a stalled jaw, what it holds is this wide. ``contacts`` are several instants of a stalled jaw, none of
-    any other; ``ratings`` weights held at these, over the object's, where they were rated; ``carried`` what
-    came of lift and shake, where that was asked for and the jaw had stalled.
+    any other; ``ratings`` weights held at these, over the object's, or ``carried`` what came of lift and
+    shake, where that was asked for.
     """
 
     end: End

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import tempfile
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -36,6 +37,19 @@ PARKED: Vector = (0.0, 0.0, -1000.0)
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
+class _Connection:
+    """Pybullet's functions for one world, which ends with this object. `BulletClient` would print a line."""
+
+    def __init__(self) -> None:
+        self.number: int = pybullet.connect(pybullet.DIRECT)
+        if self.number < 0:
+            raise RuntimeError("pybullet could not open a DIRECT world")
+        self.end = weakref.finalize(self, pybullet.disconnect, self.number)
+
+    def __getattr__(self, function: str) -> Any:
+        return functools.partial(getattr(pybullet, function), physicsClientId=self.number)
+
+
 class BulletWorld:
     """A jaw at the origin, its tool frame the world's, and an object.
 
@@ -59,50 +73,32 @@ class BulletWorld:
         self.mass = mass_properties(parts, mass_kg)
         self._visible = visible
         self._views: list[camera.View] = []
-        self._client = pybullet.connect(pybullet.DIRECT)
-        if self._client < 0:
-            raise RuntimeError("pybullet could not open a DIRECT world")
-        try:
-            self._configure(solver_iterations, by_faces)
-            if by_faces:
-                self._jaw, self._object = self._load_bodies(parts)
-            else:
-                self._jaw = self._build_gripper()
-                self._object = self._build_object(parts, self.mass)
-            self._column, self._column_at = self._build_column()
-            self._gear = self._build_gear() if by_faces else -1
-            self._finish_bodies(math.sqrt(friction))
-            if by_faces:
-                self._anchor()
-        except BaseException:
-            self.close_world()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close_world()
+        # Gives every call the world's number; calls of every step give it themselves, which is faster.
+        self._bullet = _Connection()
+        self._client = self._bullet.number
+        self._configure(solver_iterations, by_faces)
+        if by_faces:
+            self._jaw, self._object = self._load_bodies(parts)
+        else:
+            self._jaw, self._object = self._build_gripper(), self._build_object(parts, self.mass)
+        self._column, self._column_at = self._build_column()
+        self._gear = self._build_gear() if by_faces else -1
+        self._finish_bodies(math.sqrt(friction), anchored=by_faces)
 
     def close_world(self) -> None:
-        """Free Bullet's memory; the world can't be used afterwards."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        """Free Bullet's memory at once; the world can't be used afterwards."""
+        self._bullet.end()
 
     def _configure(self, solver_iterations: int, by_faces: bool) -> None:
-        pybullet.resetSimulation(physicsClientId=self._client)
-        pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=self._client)
-        pybullet.setPhysicsEngineParameter(
+        self._bullet.resetSimulation()
+        self._bullet.setGravity(0.0, 0.0, 0.0)
+        self._bullet.setPhysicsEngineParameter(
             numSolverIterations=solver_iterations,
             solverResidualThreshold=0.0 if by_faces else _RESIDUAL,
             contactBreakingThreshold=CONTACT_BREAKING_M,
             deterministicOverlappingPairs=1,
             numSubSteps=0,
             enableSAT=0,
-            physicsClientId=self._client,
         )
 
     def _build_gripper(self) -> int:
@@ -113,61 +109,47 @@ class BulletWorld:
         palm_look = self._look(halfExtents=palm_half, rgbaColor=(0.55, 0.58, 0.62, 1.0))
         closed = gripper.tip_offset_m - finger_half[2]
         frames = [(0.0, side * finger_half[1], closed) for side in (-1.0, 1.0)]
-        return int(
-            pybullet.createMultiBody(
-                baseMass=0.0,
-                # The base frame is the tool frame; the palm hangs behind it, so that links count from
-                # the tool.
-                baseCollisionShapeIndex=palm,
-                baseVisualShapeIndex=palm_look,
-                basePosition=(0.0, 0.0, gripper.palm_centre_z),
-                linkMasses=[gripper.finger_mass_kg] * 2,
-                linkCollisionShapeIndices=[finger, finger],
-                linkVisualShapeIndices=[finger_look, finger_look],
-                linkPositions=[(x, y, z - gripper.palm_centre_z) for x, y, z in frames],
-                linkOrientations=[IDENTITY] * 2,
-                linkInertialFramePositions=[(0.0, 0.0, 0.0)] * 2,
-                linkInertialFrameOrientations=[IDENTITY] * 2,
-                linkParentIndices=[0, 0],
-                linkJointTypes=[pybullet.JOINT_PRISMATIC] * 2,
-                linkJointAxis=[(0.0, -1.0, 0.0), (0.0, 1.0, 0.0)],
-                physicsClientId=self._client,
-            )
+        jaw: int = self._bullet.createMultiBody(
+            baseMass=0.0,
+            # The base frame is the tool frame; the palm hangs behind it, so that links count from the tool.
+            baseCollisionShapeIndex=palm,
+            baseVisualShapeIndex=palm_look,
+            basePosition=(0.0, 0.0, gripper.palm_centre_z),
+            linkMasses=[gripper.finger_mass_kg] * 2,
+            linkCollisionShapeIndices=[finger, finger],
+            linkVisualShapeIndices=[finger_look, finger_look],
+            linkPositions=[(x, y, z - gripper.palm_centre_z) for x, y, z in frames],
+            linkOrientations=[IDENTITY] * 2,
+            linkInertialFramePositions=[(0.0, 0.0, 0.0)] * 2,
+            linkInertialFrameOrientations=[IDENTITY] * 2,
+            linkParentIndices=[0, 0],
+            linkJointTypes=[pybullet.JOINT_PRISMATIC] * 2,
+            linkJointAxis=[(0.0, -1.0, 0.0), (0.0, 1.0, 0.0)],
         )
+        return jaw
 
     def _box(self, half_extents: Vector) -> int:
-        return int(
-            pybullet.createCollisionShape(
-                pybullet.GEOM_BOX, halfExtents=half_extents, physicsClientId=self._client
-            )
-        )
+        return int(self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half_extents))
 
     def _look(self, **shape: Any) -> int:
         """A visual shape; none unless the world is to be seen."""
         if not self._visible:
             return -1
         kind = pybullet.GEOM_MESH if "fileName" in shape else pybullet.GEOM_BOX
-        return int(pybullet.createVisualShape(kind, physicsClientId=self._client, **shape))
+        return int(self._bullet.createVisualShape(kind, **shape))
 
     def _build_object(self, parts: Sequence[Part], mass: MassProperties) -> int:
         # pybullet takes several hulls in one body only from an OBJ file, a group a part. In it the body
         # frame is the principal frame of inertia, so that no inertial offset is left to go wrong.
         with tempfile.TemporaryDirectory(prefix="graspdb-parts-") as folder:
-            path = Path(folder) / "parts.obj"
-            path.write_text(obj_of_parts(parts, mass), encoding="ascii")
-            shape = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=os.fspath(path), physicsClientId=self._client
-            )
-            body = int(
-                pybullet.createMultiBody(
-                    baseMass=mass.mass_kg,
-                    baseCollisionShapeIndex=shape,
-                    baseVisualShapeIndex=self._look(
-                        fileName=os.fspath(path), rgbaColor=(0.93, 0.62, 0.25, 1.0)
-                    ),
-                    basePosition=PARKED,
-                    physicsClientId=self._client,
-                )
+            path = os.fspath(Path(folder) / "parts.obj")
+            Path(path).write_text(obj_of_parts(parts, mass), encoding="ascii")
+            shape = self._bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=path)
+            body: int = self._bullet.createMultiBody(
+                baseMass=mass.mass_kg,
+                baseCollisionShapeIndex=shape,
+                baseVisualShapeIndex=self._look(fileName=path, rgbaColor=(0.93, 0.62, 0.25, 1.0)),
+                basePosition=PARKED,
             )
         if shape < 0 or body < 0:
             raise RuntimeError("pybullet refused the object's convex parts")
@@ -178,20 +160,11 @@ class BulletWorld:
         flags = pybullet.URDF_INITIALIZE_SAT_FEATURES | pybullet.URDF_USE_INERTIA_FROM_FILE
         with tempfile.TemporaryDirectory(prefix="graspdb-bodies-") as name:
             folder = Path(name)
-            jaw = pybullet.loadURDF(
-                os.fspath(urdf.write_gripper(folder, self.gripper)),
-                basePosition=(0.0, 0.0, self.gripper.palm_centre_z),
-                useFixedBase=1,
-                flags=flags,
-                physicsClientId=self._client,
-            )
-            body = pybullet.loadURDF(
-                os.fspath(urdf.write_object(folder, parts, self.mass)),
-                basePosition=PARKED,
-                flags=flags,
-                physicsClientId=self._client,
-            )
-        return int(jaw), int(body)
+            gripper = os.fspath(urdf.write_gripper(folder, self.gripper))
+            place = (0.0, 0.0, self.gripper.palm_centre_z)
+            jaw = self._bullet.loadURDF(gripper, basePosition=place, useFixedBase=1, flags=flags)
+            thing = os.fspath(urdf.write_object(folder, parts, self.mass))
+            return jaw, self._bullet.loadURDF(thing, basePosition=PARKED, flags=flags)
 
     def _build_column(self) -> tuple[int, Vector]:
         """The space between the open fingers: a shape without a body, which would cost time at every step,
@@ -202,37 +175,31 @@ class BulletWorld:
 
     def _build_gear(self) -> int:
         """What couples the fingers while they carry: both joints move alike. Idle until then."""
-        gear = pybullet.createConstraint(
-            self._jaw,
-            0,
-            self._jaw,
-            1,
-            pybullet.JOINT_GEAR,
-            jointAxis=(0.0, 1.0, 0.0),
-            parentFramePosition=(0.0, 0.0, 0.0),
-            childFramePosition=(0.0, 0.0, 0.0),
-            physicsClientId=self._client,
+        axis, middle = (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)
+        gear: int = self._bullet.createConstraint(
+            self._jaw, 0, self._jaw, 1, pybullet.JOINT_GEAR, axis, middle, middle
         )
         self._couple(gear, 0.0)
-        return int(gear)
+        return gear
 
     def _couple(self, gear: int, force_n: float) -> None:
-        pybullet.changeConstraint(gear, gearRatio=-1, maxForce=force_n, physicsClientId=self._client)
+        self._bullet.changeConstraint(gear, gearRatio=-1, maxForce=force_n)
 
-    def _finish_bodies(self, friction_root: float) -> None:
+    def _finish_bodies(self, friction_root: float, *, anchored: bool) -> None:
+        """Surfaces and inertia. ``anchored`` friction pulls back what crept: the solver balances speeds only,
+        and what it leaves undone at every step lets a firmly held object slide by millimetres while it is
+        carried, even at the fine step (a bar of 1.5 kg in the middle of its faces)."""
         # Bullet multiplies the coefficients of the two bodies, hence the root.
-        surface = {
-            "lateralFriction": friction_root,
-            "spinningFriction": 0.0,
-            "rollingFriction": 0.0,
-            "restitution": 0.0,
-        }
+        surface = {"lateralFriction": friction_root}
+        surface |= dict.fromkeys(("spinningFriction", "rollingFriction", "restitution"), 0.0)
+        if anchored:
+            surface["frictionAnchor"] = 1
         for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
             for link in links:
                 # In a call of its own: beside a setting that only a base has, such as a damping or a
                 # margin, pybullet drops all others of a link without a word.
-                pybullet.changeDynamics(body, link, physicsClientId=self._client, **surface)
-            pybullet.changeDynamics(
+                self._bullet.changeDynamics(body, link, **surface)
+            self._bullet.changeDynamics(
                 body,
                 -1,
                 linearDamping=0.0,
@@ -240,29 +207,16 @@ class BulletWorld:
                 jointDamping=0.0,
                 collisionMargin=COLLISION_MARGIN_M,
                 activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=self._client,
             )
         for link in (0, 1):
-            pybullet.changeDynamics(self._jaw, link, jointDamping=0.0, physicsClientId=self._client)
-        pybullet.changeDynamics(
-            self._object, -1, localInertiaDiagonal=self.mass.inertia, physicsClientId=self._client
-        )
-
-    def _anchor(self) -> None:
-        """Friction that pulls back what crept. The solver balances speeds only: what it leaves undone at
-        every step lets a firmly held object slide by millimetres while it is carried, even at the fine
-        step (a bar of 1.5 kg in the middle of its faces)."""
-        for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
-            for link in links:
-                pybullet.changeDynamics(body, link, frictionAnchor=1, physicsClientId=self._client)
+            self._bullet.changeDynamics(self._jaw, link, jointDamping=0.0)
+        self._bullet.changeDynamics(self._object, -1, localInertiaDiagonal=self.mass.inertia)
 
     def _touch_by_faces(self, yes: bool) -> None:
-        pybullet.setPhysicsEngineParameter(enableSAT=int(yes), physicsClientId=self._client)
+        self._bullet.setPhysicsEngineParameter(enableSAT=int(yes))
 
     def _damp(self, rate: float) -> None:
-        pybullet.changeDynamics(
-            self._object, -1, linearDamping=rate, angularDamping=rate, physicsClientId=self._client
-        )
+        self._bullet.changeDynamics(self._object, -1, linearDamping=rate, angularDamping=rate)
 
     def _depth_between(self) -> float:
         """How deep the object is in the space between the open fingers, metres; negative outside.
@@ -281,7 +235,7 @@ class BulletWorld:
 
     def _aim(self) -> None:
         """Choose from where the grasp that begins is looked at."""
-        low, high = np.array(pybullet.getAABB(self._object, -1, physicsClientId=self._client))
+        low, high = np.array(self._bullet.getAABB(self._object, -1))
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
         finger, palm = (
             np.array(e) for e in (self.gripper.finger_half_extents, self.gripper.palm_half_extents)
@@ -308,7 +262,7 @@ class BulletWorld:
         """Pixels (height, width, 3), what each shows, and how far it is in metres."""
         near, far = 0.2 * view.distance_m, 4.0 * view.distance_m
         towards = np.subtract(view.eye, view.target) / view.distance_m
-        _, _, pixels, depth, bodies = pybullet.getCameraImage(
+        _, _, pixels, depth, bodies = self._bullet.getCameraImage(
             width,
             height,
             pybullet.computeViewMatrix(view.eye, view.target, camera.UP),
@@ -321,7 +275,6 @@ class BulletWorld:
             shadow=0,
             flags=pybullet.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX,
             renderer=pybullet.ER_TINY_RENDERER,
-            physicsClientId=self._client,
         )
         shape = (height, width)
         buffer = np.asarray(depth, dtype=np.float64).reshape(shape)

@@ -40,12 +40,9 @@ class UnsupportedProtocol(ValueError):
 class Workpiece:
     """An object ready to be grasped: collision scene and physics world. Reused from chunk to chunk."""
 
-    parts: Sequence[Part]
     scene: collision.Scene
     world: GraspWorld
     gripper: Gripper
-    mass_kg: float
-    friction: float
 
     def classify(
         self, positions: NDArray[np.float64], quaternions: NDArray[np.float64]
@@ -61,8 +58,7 @@ class Workpiece:
         """Close the jaw at one pose (tool in the object frame) and label the outcome."""
         px, py, pz = (float(v) for v in position)
         x, y, z, w = (float(v) for v in quaternion)
-        closing = self.world.close((px, py, pz), (x, y, z, w), travel_m)
-        return label_of(closing, self.gripper, self.mass_kg, self.friction)
+        return label_of(self.world.close((px, py, pz), (x, y, z, w), travel_m))
 
     def close(self) -> None:
         self.world.close_world()
@@ -85,23 +81,17 @@ def prepare(
         )
     compile_force_test()
     gripper = gripper_of(payload.gripper, payload.mass_kg)
-    return Workpiece(
-        parts=parts,
-        scene=collision.Scene(parts),
-        world=GraspWorld(
-            parts,
-            payload.mass_kg,
-            payload.friction,
-            gripper,
-            payload.fidelity,
-            lifts=payload.protocol == "lift",
-            visible=visible,
-            film_every_s=film_every_s,
-        ),
-        gripper=gripper,
-        mass_kg=payload.mass_kg,
-        friction=payload.friction,
+    world = GraspWorld(
+        parts,
+        payload.mass_kg,
+        payload.friction,
+        gripper,
+        payload.fidelity,
+        lifts=payload.protocol == "lift",
+        visible=visible,
+        film_every_s=film_every_s,
     )
+    return Workpiece(collision.Scene(parts), world, gripper)
 
 
 def shape_of(profile: GripperProfile) -> GripperShape:

@@ -16,12 +16,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
+from graspdb.wire.sweeps import Fidelity
 from graspdb_simworker.simulation import lifting
 from graspdb_simworker.simulation.bodies import (
     HEAVY_KG,
@@ -33,14 +33,13 @@ from graspdb_simworker.simulation.bodies import (
     Part,
     Quaternion,
     Vector,
+    inverse,
     multiply,
     rotate,
 )
 from graspdb_simworker.simulation.bullet_world import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
 from graspdb_simworker.simulation.force_test import rating
 from graspdb_simworker.simulation.labels import MOVED_M, TURNED_RAD
-
-Fidelity = Literal["standard", "fine"]
 
 APPROACH_GAP_M = 0.0005
 """The fingers start this far before their first contact: nothing can happen on the way there."""
@@ -138,16 +137,12 @@ class GraspWorld(BulletWorld):
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
         the end is last. Empty unless the world is visible."""
-        self._to_body = self.mass.inverse_rotation()
+        self._to_body = inverse(self.mass.principal_xyzw)
         self._radius = self.mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
         self._seen: tuple[Vector, Quaternion, float] | None = None
-        try:
-            self._damp(self._damping)
-            self._park()
-        except BaseException:
-            self.close_world()
-            raise
+        self._damp(self._damping)
+        self._park()
 
     # -- one grasp -----------------------------------------------------------------------------------------
 
@@ -262,31 +257,20 @@ class GraspWorld(BulletWorld):
         In scalars: a vectorised product may round differently with the length of its batch, and labels
         must not.
         """
-        x, y, z, w = quaternion_xyzw
-        inverse = (-x, -y, -z, w)
-        centre = self.mass.centre
+        back, centre = inverse(quaternion_xyzw), self.mass.centre
         offset = (centre[0] - position[0], centre[1] - position[1], centre[2] - position[2])
-        return rotate(inverse, offset), multiply(inverse, self.mass.principal_xyzw)
+        return rotate(back, offset), multiply(back, self.mass.principal_xyzw)
 
     def _drive(self, dt: float) -> None:
         # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
-        pybullet.setPhysicsEngineParameter(fixedTimeStep=dt, physicsClientId=self._client)
-        speed, force = -self.gripper.max_speed_m_s, self.gripper.closing_force_n
-        pybullet.setJointMotorControlArray(
-            self._jaw,
-            (0, 1),
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=(speed, speed),
-            forces=(force, force),
-            physicsClientId=self._client,
+        self._bullet.setPhysicsEngineParameter(fixedTimeStep=dt)
+        speeds, forces = [-self.gripper.max_speed_m_s] * 2, [self.gripper.closing_force_n] * 2
+        self._bullet.setJointMotorControlArray(
+            self._jaw, (0, 1), pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=forces
         )
 
     def _contacts(self) -> Contacts:
-        contacts = [
-            contact
-            for contact in pybullet.getContactPoints(self._jaw, self._object, physicsClientId=self._client)
-            if contact[9] > 0.0
-        ]
+        contacts = [c for c in self._bullet.getContactPoints(self._jaw, self._object) if c[9] > 0.0]
         # contactNormalOnB points from B, the object, to A: turned round it points into the object.
         return Contacts(
             np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
@@ -301,26 +285,22 @@ class GraspWorld(BulletWorld):
         # by the root: the same motion, in slow motion.
         scale = self.gripper.closing_force_n / self.gripper.force_n
         pace = math.sqrt(scale)
+        mass, inertia = self.mass.mass_kg, self.mass.inertia
         self._damp(0.0)
         self._drive(dt)
         self._couple(self._gear, _GEAR_FORCES * self.gripper.closing_force_n)
         pybullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
         where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
         # The point of the object at the tool's origin, in the object's principal frame.
-        x, y, z, w = began = orientation
-        anchor = rotate((-x, -y, -z, w), (-where[0], -where[1], -where[2]))
+        began = orientation
+        anchor = rotate(inverse(began), (-where[0], -where[1], -where[2]))
         translation = rotation = 0.0
         held = True
         for step, frame in enumerate(lifting.frames(dt * pace), 1):
             velocity, spin = pybullet.getBaseVelocity(body, physicsClientId=client)
-            force, torque = lifting.load(
-                frame,
-                self.mass,
-                where,
-                orientation,
-                (velocity[0] / pace, velocity[1] / pace, velocity[2] / pace),
-                (spin[0] / pace, spin[1] / pace, spin[2] / pace),
-            )
+            velocity = (velocity[0] / pace, velocity[1] / pace, velocity[2] / pace)
+            spin = (spin[0] / pace, spin[1] / pace, spin[2] / pace)
+            force, torque = lifting.load(frame, mass, inertia, where, orientation, velocity, spin)
             pybullet.applyExternalForce(
                 body, -1, [scale * f for f in force], where, pybullet.WORLD_FRAME, physicsClientId=client
             )
@@ -335,10 +315,8 @@ class GraspWorld(BulletWorld):
                 continue
             moved = rotate(orientation, anchor)
             away = math.hypot(where[0] + moved[0], where[1] + moved[1], where[2] + moved[2])
-            translation, rotation = (
-                max(translation, away),
-                max(rotation, lifting.angle_between(began, orientation)),
-            )
+            translation = max(translation, away)
+            rotation = max(rotation, lifting.angle_between(began, orientation))
             if not self._between():
                 held = False
                 break
@@ -373,9 +351,7 @@ class GraspWorld(BulletWorld):
         ratings: Sequence[float],
         steps: int,
     ) -> Closing:
-        where, orientation = pybullet.getBasePositionAndOrientation(
-            self._object, physicsClientId=self._client
-        )
+        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
         if not all(map(math.isfinite, (*where, *orientation))):
             end = End.UNSTABLE
         elif end is End.STALLED:
@@ -390,16 +366,13 @@ class GraspWorld(BulletWorld):
 
     def _park(self) -> None:
         """Empty Bullet's caches: the object far away, one step without any contact."""
-        client, jaw = self._client, self._jaw
         if self._lifts:
             self._couple(self._gear, 0.0)
             self._touch_by_faces(False)
             self._damp(self._damping)
-        pybullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY, physicsClientId=client)
-        pybullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
+        self._bullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY)
+        self._bullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         for joint in (0, 1):
-            pybullet.resetJointState(
-                jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0, physicsClientId=client
-            )
+            self._bullet.resetJointState(self._jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0)
         self._drive(self.stepping.approach_dt_s)
-        pybullet.stepSimulation(physicsClientId=client)
+        self._bullet.stepSimulation()

@@ -17,8 +17,7 @@ import statistics
 from dataclasses import dataclass
 from enum import IntEnum
 
-from graspdb_simworker.simulation.bodies import Carried, Closing, End, Gripper
-from graspdb_simworker.simulation.force_test import rating
+from graspdb_simworker.simulation.bodies import Carried, Closing, End
 
 MOVED_M = 0.010
 TURNED_RAD = math.radians(15.0)
@@ -59,7 +58,7 @@ class Label:
 SIMULATION_ERROR = Label(Outcome.SIMULATION_ERROR, math.nan, math.nan)
 
 
-def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float) -> Label:
+def label_of(closing: Closing) -> Label:
     """Name a closing's outcome and rate it.
 
     ``missed``: nothing was between the fingers, or the object was pushed out before both touched it;
@@ -76,10 +75,7 @@ def label_of(closing: Closing, gripper: Gripper, mass_kg: float, friction: float
         return SIMULATION_ERROR
     if closing.carried is not None:
         return _carried_label(closing.carried, width)
-    ratings = closing.ratings[-RATED:] or [
-        rating(now, gripper, mass_kg, friction) for now in closing.contacts[-RATED:]
-    ]
-    quality = statistics.median(ratings)
+    quality = statistics.median(closing.ratings[-RATED:])
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
 
 

@@ -20,13 +20,12 @@ open, but not pushed aside together.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import njit
 
-from graspdb_simworker.simulation.bodies import MassProperties, Quaternion, Vector, multiply, rotate
+from graspdb_simworker.simulation.bodies import Quaternion, Vector, inverse, multiply, rotate
 from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
 
 LIFT_M = 0.10
@@ -42,8 +41,7 @@ _TURNS_FROM_S = ONSET_S + LIFT_S + 3.0 * SHAKE_S
 DURATION_S = _TURNS_FROM_S + 3.0 * TURN_S + REST_S
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """The jaw's motion at one instant, in its own axes.
 
     ``push`` is R^T (g - p''), what a particle at rest at the origin feels, m/s^2; ``spin`` and ``spin_rate``
@@ -84,33 +82,6 @@ def frame_at(time_s: float) -> Frame:
     return Frame((0.0, 0.0, GRAVITY_M_S2), _NOTHING, _NOTHING)
 
 
-def load(
-    frame: Frame,
-    mass: MassProperties,
-    position: Vector,
-    orientation: Quaternion,
-    velocity: Vector,
-    spin: Vector,
-) -> tuple[Vector, Vector]:
-    """Force (newtons, at the centre of mass) and torque (newton metres) on a carried body.
-
-    The pose is of the body's principal frame in the jaw's; ``velocity`` and ``spin`` are relative to the jaw,
-    in its axes. Compiled: this is done at every step.
-    """
-    found: tuple[Vector, Vector] = _load(
-        frame.push,
-        frame.spin,
-        frame.spin_rate,
-        mass.mass_kg,
-        mass.inertia,
-        position,
-        orientation,
-        velocity,
-        spin,
-    )
-    return found
-
-
 @lru_cache(maxsize=4)
 def frames(step_s: float) -> tuple[Frame, ...]:
     """The jaw's motion in the middle of every step, from the first on."""
@@ -126,13 +97,19 @@ _turned: Any = njit(rotate)
 
 
 @njit
-def _load(push, s, rate, m, inertia, position, orientation, velocity, spin):  # type: ignore[no-untyped-def]
+def load(frame, mass_kg, inertia, position, orientation, velocity, spin):  # type: ignore[no-untyped-def]
+    """Force (newtons, at the centre of mass) and torque (newton metres) on a carried body.
+
+    ``inertia`` is the principal one, the pose that of its frame in the jaw's; ``velocity`` and ``spin`` are
+    relative to the jaw, in its axes. Compiled: this is done at every step.
+    """
+    push, s, rate = frame
     euler, inward = _cross(rate, position), _cross(s, _cross(s, position))
     coriolis = _cross(s, velocity)
     force = (
-        m * (push[0] - euler[0] - inward[0] - 2.0 * coriolis[0]),
-        m * (push[1] - euler[1] - inward[1] - 2.0 * coriolis[1]),
-        m * (push[2] - euler[2] - inward[2] - 2.0 * coriolis[2]),
+        mass_kg * (push[0] - euler[0] - inward[0] - 2.0 * coriolis[0]),
+        mass_kg * (push[1] - euler[1] - inward[1] - 2.0 * coriolis[1]),
+        mass_kg * (push[2] - euler[2] - inward[2] - 2.0 * coriolis[2]),
     )
     back = (-orientation[0], -orientation[1], -orientation[2], orientation[3])
     own, a, w = _turned(back, s), _turned(back, rate), _turned(back, spin)
@@ -150,7 +127,7 @@ def _load(push, s, rate, m, inertia, position, orientation, velocity, spin):  # 
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
     """Angle of the rotation that leads from one orientation to another, radians."""
-    x, y, z, w = multiply((-a[0], -a[1], -a[2], a[3]), b)
+    x, y, z, w = multiply(inverse(a), b)
     return 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
 
 

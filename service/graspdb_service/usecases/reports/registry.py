@@ -9,7 +9,7 @@ from typing import Any
 
 from graspdb.wire import Selection
 from graspdb.wire.queries import TrialSelection
-from graspdb.wire.reports import REPORTS, AnyReport, ReportOptions
+from graspdb.wire.reports import REPORTS, Report, ReportOptions
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_service import __version__
 from graspdb_service.settings import Settings
@@ -34,7 +34,7 @@ from graspdb_service.usecases.runtime.runs import Result, RunKind
 _CURVES_SHARE = 4
 #: Reports that say what became of simulated checks.
 _OF_CHECKS = ("bandwidth", "calibration")
-_COMPUTE: Mapping[str, Callable[[ReportInputs, Built, Any, Progress], AnyReport]] = {
+_COMPUTE: Mapping[str, Callable[[ReportInputs, Built, Any, Progress], Report]] = {
     "anisotropy": anisotropy_report,
     "bandwidth": bandwidth_report,
     "calibration": calibration_report,
@@ -74,7 +74,7 @@ class Reports:
         digest = hashlib.sha256(json.dumps([parameters, __version__], sort_keys=True).encode()).hexdigest()
         return RunKey(selected.row.id, selected.row.revision, report, digest, parameters)
 
-    def compute(self, slug: str, parameters: Mapping[str, Any], progress: Progress) -> AnyReport:
+    def compute(self, slug: str, parameters: Mapping[str, Any], progress: Progress) -> Report:
         """The report by the parameters of a run; 409 says what is missing where the trials don't suffice."""
         report = parameters["report"]
         own = {name: value for name, value in parameters["options"].items() if name != report_runs.CHECKS}
