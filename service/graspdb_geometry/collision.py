@@ -60,7 +60,7 @@ class Scene:
             raise ValueError("parts must hold at least one convex part")
         solids = [_Solid(number, np.asarray(part[0], dtype=np.float64)) for number, part in enumerate(parts)]
         self.part_count = len(solids)
-        self._model = convex.ConvexParts(
+        self._model = (
             np.concatenate([s.vertices for s in solids]),
             _starts([len(s.vertices) for s in solids]),
             np.concatenate([s.planes for s in solids]),
@@ -270,9 +270,7 @@ class Surface:
             order[begin:end] = members[np.argpartition(centres[:, axis], half)]
             pending.append((begin + half, end, number, 1))
             pending.append((begin, begin + half, number, 0))
-        return surface.Tree(
-            np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
-        )
+        return np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
 
 
 class PointCloud:

@@ -9,12 +9,7 @@ Cheap tests come first (bounding sphere, box about the transformed part, the par
 only ever proves two solids apart.
 """
 
-# Numba infers the types of compiled functions.
-# mypy: allow-untyped-defs
-
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -22,36 +17,16 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+#: Vertices (V, 3) and where each part's begin (parts + 1), planes (P, 4) as n, d with n.x <= d inside and
+#: where they begin, edges (E, 2) as vertex numbers within the part and where they begin, bounding spheres'
+#: centres (parts, 3) and radii (parts).
+Model = tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray, IntArray, FloatArray, FloatArray]
+
 _INF = np.inf
 
 
-class ConvexParts(NamedTuple):
-    """An object of convex parts, as the loops take it.
-
-    Attributes
-    ----------
-    vertices : (V, 3), vertex_start : (parts + 1,)
-        And where those of each part begin.
-    planes : (P, 4), plane_start : (parts + 1,)
-        n, d with n.x <= d inside.
-    edges : (E, 2), edge_start : (parts + 1,)
-        Vertex numbers within the part.
-    centres : (parts, 3), radii : (parts,)
-        Bounding spheres.
-    """
-
-    vertices: FloatArray
-    vertex_start: IntArray
-    planes: FloatArray
-    plane_start: IntArray
-    edges: IntArray
-    edge_start: IntArray
-    centres: FloatArray
-    radii: FloatArray
-
-
 @nb.njit(cache=True, inline="always")
-def _clip_slab(a, b, low, high, t0, t1):
+def _clip_slab(a: float, b: float, low: float, high: float, t0: float, t1: float) -> tuple[float, float]:
     """Clip the parameters of the segment a + t (b - a) to low <= . <= high on one axis."""
     d = b - a
     if d == 0.0:
@@ -66,7 +41,7 @@ def _clip_slab(a, b, low, high, t0, t1):
 
 
 @nb.njit(cache=True, inline="always")
-def _segment_in_box(va, vb, c, h):
+def _segment_in_box(va: FloatArray, vb: FloatArray, c: FloatArray, h: FloatArray) -> tuple[float, float]:
     """Parameters of the piece of a segment inside the box with centre c and half extents h."""
     t0, t1 = _clip_slab(va[0], vb[0], c[0] - h[0], c[0] + h[0], 0.0, 1.0)
     if t0 <= t1:
@@ -77,27 +52,7 @@ def _segment_in_box(va, vb, c, h):
 
 
 @nb.njit(cache=True)
-def _line_in_part(planes, count, axes, sj, sk, t0, t1):
-    """The piece of t0..t1 inside the solid of half-spaces (tool frame), along the first of three axes at sj
-    and sk on the others; empty, t0 > t1, where the line misses it.
-    """
-    axis, j, k = axes
-    for m in range(count):
-        slope = planes[m, axis]
-        rest = planes[m, 3] - planes[m, j] * sj - planes[m, k] * sk
-        if slope > 0.0:
-            t1 = min(t1, rest / slope)
-        elif slope < 0.0:
-            t0 = max(t0, rest / slope)
-        elif rest < 0.0:
-            t1 = -_INF
-        if t0 > t1:
-            break
-    return t0, t1
-
-
-@nb.njit(cache=True)
-def _box_edge_meets_part(c, h, planes, count):
+def _box_edge_meets_part(c: FloatArray, h: FloatArray, planes: FloatArray, count: int) -> bool:
     """Does one of the box's twelve edges meet the solid of the given half-spaces (tool frame)?"""
     for axis in range(3):
         j = (axis + 1) % 3
@@ -105,15 +60,28 @@ def _box_edge_meets_part(c, h, planes, count):
         for corner in range(4):
             sj = c[j] + (h[j] if corner & 1 else -h[j])
             sk = c[k] + (h[k] if corner & 2 else -h[k])
-            low, high = c[axis] - h[axis], c[axis] + h[axis]
-            t0, t1 = _line_in_part(planes, count, (axis, j, k), sj, sk, low, high)
+            t0 = c[axis] - h[axis]
+            t1 = c[axis] + h[axis]
+            for m in range(count):
+                slope = planes[m, axis]
+                rest = planes[m, 3] - planes[m, j] * sj - planes[m, k] * sk
+                if slope > 0.0:
+                    t1 = min(t1, rest / slope)
+                elif slope < 0.0:
+                    t0 = max(t0, rest / slope)
+                elif rest < 0.0:
+                    t1 = -_INF
+                if t0 > t1:
+                    break
             if t0 <= t1:
                 return True
     return False
 
 
 @nb.njit(cache=True)
-def _part_edge_meets_box(c, h, points, edges, first, last):
+def _part_edge_meets_box(
+    c: FloatArray, h: FloatArray, points: FloatArray, edges: IntArray, first: int, last: int
+) -> bool:
     """Does one of the part's edges first..last meet the solid box?"""
     for e in range(first, last):
         t0, t1 = _segment_in_box(points[edges[e, 0]], points[edges[e, 1]], c, h)
@@ -123,29 +91,52 @@ def _part_edge_meets_box(c, h, points, edges, first, last):
 
 
 @nb.njit(cache=True)
-def _extent_in_column(column, points, edges, planes, count):
+def _extent_in_column(
+    c: FloatArray,
+    h: FloatArray,
+    points: FloatArray,
+    edges: IntArray,
+    first: int,
+    last: int,
+    planes: FloatArray,
+    count: int,
+) -> tuple[float, float]:
     """Least and greatest y of the part's solid inside the column; (inf, -inf) if it misses the column."""
-    c, h = column[0], column[1]
-    low, high = _INF, -_INF
-    for e in range(edges.shape[0]):
+    low = _INF
+    high = -_INF
+    for e in range(first, last):
         va = points[edges[e, 0]]
         vb = points[edges[e, 1]]
         t0, t1 = _segment_in_box(va, vb, c, h)
         if t0 <= t1:
             ya = va[1] + t0 * (vb[1] - va[1])
             yb = va[1] + t1 * (vb[1] - va[1])
-            low, high = min(low, ya, yb), max(high, ya, yb)
+            low = min(low, ya, yb)
+            high = max(high, ya, yb)
     for corner in range(4):
         x = c[0] + (h[0] if corner & 1 else -h[0])
         z = c[2] + (h[2] if corner & 2 else -h[2])
-        y0, y1 = _line_in_part(planes, count, (1, 0, 2), x, z, c[1] - h[1], c[1] + h[1])
+        y0 = c[1] - h[1]
+        y1 = c[1] + h[1]
+        for m in range(count):
+            slope = planes[m, 1]
+            rest = planes[m, 3] - planes[m, 0] * x - planes[m, 2] * z
+            if slope > 0.0:
+                y1 = min(y1, rest / slope)
+            elif slope < 0.0:
+                y0 = max(y0, rest / slope)
+            elif rest < 0.0:
+                y1 = -_INF
+            if y0 > y1:
+                break
         if y0 <= y1:
-            low, high = min(low, y0), max(high, y1)
+            low = min(low, y0)
+            high = max(high, y1)
     return low, high
 
 
 @nb.njit(cache=True, inline="always")
-def _rotation(q, r):
+def _rotation(q: FloatArray, r: FloatArray) -> None:
     """Fill r with the matrix of the unit quaternion q (xyzw)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     r[0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -160,7 +151,7 @@ def _rotation(q, r):
 
 
 @nb.njit(cache=True, inline="always")
-def _to_tool(v, p, r, out):
+def _to_tool(v: FloatArray, p: FloatArray, r: FloatArray, out: FloatArray) -> None:
     """Fill out with R^T (v - p), a point of the object seen from the tool."""
     dx = v[0] - p[0]
     dy = v[1] - p[1]
@@ -172,7 +163,17 @@ def _to_tool(v, p, r, out):
 
 # long: a chain of tests, cheapest first, in one compiled loop.
 @nb.njit(cache=True)
-def _near(part, first_box, last_box, p, r, boxes, model, points, planes):
+def _near(
+    part: int,
+    first_box: int,
+    last_box: int,
+    p: FloatArray,
+    r: FloatArray,
+    boxes: FloatArray,
+    model: Model,
+    points: FloatArray,
+    planes: FloatArray,
+) -> int:
     """Bit mask of the boxes that the cheap tests can't separate from a part.
 
     Unless the mask is 0, ``points`` and ``planes`` then hold the part's vertices and planes, tool frame.
@@ -226,7 +227,10 @@ def _near(part, first_box, last_box, p, r, boxes, model, points, planes):
         ny = r[0, 1] * n[0] + r[1, 1] * n[1] + r[2, 1] * n[2]
         nz = r[0, 2] * n[0] + r[1, 2] * n[1] + r[2, 2] * n[2]
         d = n[3] - n[0] * p[0] - n[1] * p[1] - n[2] * p[2]
-        planes[m, 0], planes[m, 1], planes[m, 2], planes[m, 3] = nx, ny, nz, d
+        planes[m, 0] = nx
+        planes[m, 1] = ny
+        planes[m, 2] = nz
+        planes[m, 3] = d
         for b in range(first_box, last_box):
             c = boxes[b, 0]
             h = boxes[b, 1]
@@ -240,7 +244,15 @@ def _near(part, first_box, last_box, p, r, boxes, model, points, planes):
 
 # long: two loops over the same poses that share their buffers.
 @nb.njit(cache=True, nogil=True)
-def classify(positions, quaternions, boxes, model, contact, codes, extents):
+def classify(
+    positions: FloatArray,
+    quaternions: FloatArray,
+    boxes: FloatArray,
+    model: Model,
+    contact: bool,
+    codes: npt.NDArray[np.uint8],
+    extents: FloatArray,
+) -> None:
     """Fill codes (0 collides, 1 empty, 2 contact) and extents (least and greatest y between the fingers).
 
     positions (n, 3) and quaternions (n, 4) place the tool in the object frame; boxes (4, 2, 3) hold centre
@@ -249,13 +261,19 @@ def classify(positions, quaternions, boxes, model, contact, codes, extents):
     """
     _, vertex_start, _, plane_start, edges, edge_start, _, _ = model
     parts = vertex_start.size - 1
-    points = np.empty((np.diff(vertex_start).max(), 3))
-    planes = np.empty((np.diff(plane_start).max(), 4))
+    most_points = 1
+    most_planes = 1
+    for part in range(parts):
+        most_points = max(most_points, vertex_start[part + 1] - vertex_start[part])
+        most_planes = max(most_planes, plane_start[part + 1] - plane_start[part])
+    points = np.empty((most_points, 3))
+    planes = np.empty((most_planes, 4))
     r = np.empty((3, 3))
     for i in range(positions.shape[0]):
         p = positions[i]
         _rotation(quaternions[i], r)
-        extents[i] = np.nan
+        extents[i, 0] = np.nan
+        extents[i, 1] = np.nan
         hit = False
         for part in range(parts):
             mask = _near(part, 0, 3, p, r, boxes, model, points, planes)
@@ -279,14 +297,22 @@ def classify(positions, quaternions, boxes, model, contact, codes, extents):
         codes[i] = 1
         if not contact:
             continue
-        low, high = _INF, -_INF
+        low = _INF
+        high = -_INF
         for part in range(parts):
             mask = _near(part, 3, 4, p, r, boxes, model, points, planes)
             if mask == 0:
                 continue
-            part_edges = edges[edge_start[part] : edge_start[part + 1]]
-            plane_count = plane_start[part + 1] - plane_start[part]
-            y0, y1 = _extent_in_column(boxes[3], points, part_edges, planes, plane_count)
+            y0, y1 = _extent_in_column(
+                boxes[3, 0],
+                boxes[3, 1],
+                points,
+                edges,
+                edge_start[part],
+                edge_start[part + 1],
+                planes,
+                plane_start[part + 1] - plane_start[part],
+            )
             low = min(low, y0)
             high = max(high, y1)
         if low <= high:

@@ -7,12 +7,7 @@ ray grazes an edge the winding number (van Oosterom and Strackee, "The solid ang
 TBME 30, 1983).
 """
 
-# Numba infers the types of compiled functions.
-# mypy: allow-untyped-defs
-
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -22,7 +17,11 @@ from graspdb_geometry._compiled.convex import _rotation, _segment_in_box, _to_to
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-STACK = 128
+#: Node boxes (M, 2, 3) as centre and half extents; for an inner node the numbers of its children, for a leaf
+#: first = -1 - begin and second = end of its triangles; triangles' corners (F, 3, 3) in the leaves' order.
+Tree = tuple[FloatArray, IntArray, FloatArray]
+
+_STACK = 128
 #: Ray direction of the inside test and two directions that complete it to a right-handed frame (rows 2, 0,
 #: 1); askew, so that it seldom meets an edge of an object aligned with the axes.
 _RAY = np.array(
@@ -34,26 +33,10 @@ _RAY = np.array(
 )
 
 
-class Tree(NamedTuple):
-    """Triangles in a tree of bounding boxes.
-
-    Attributes
-    ----------
-    nodes : (M, 2, 3)
-        Centres and half extents of the boxes.
-    links : (M, 2)
-        For an inner node the numbers of its children, for a leaf -1 - begin and end of its triangles.
-    triangles : (F, 3, 3)
-        Corners, in the leaves' order.
-    """
-
-    nodes: FloatArray
-    links: IntArray
-    triangles: FloatArray
-
-
 @nb.njit(cache=True, inline="always")
-def _boxes_apart(c, h, node, p, r, centre):
+def _boxes_apart(
+    c: FloatArray, h: FloatArray, node: FloatArray, p: FloatArray, r: FloatArray, centre: FloatArray
+) -> bool:
     """Whether a face direction of either box separates the tool's box from a node's (conservative)."""
     _to_tool(node[0], p, r, centre)
     d0 = centre[0] - c[0]
@@ -74,7 +57,7 @@ def _boxes_apart(c, h, node, p, r, centre):
 
 
 @nb.njit(cache=True)
-def _box_edge_meets_triangle(c, h, t):
+def _box_edge_meets_triangle(c: FloatArray, h: FloatArray, t: FloatArray) -> bool:
     """Does one of the box's edges, which run along the axes, pass through the triangle's interior?"""
     for axis in range(3):
         j = (axis + 1) % 3
@@ -97,33 +80,31 @@ def _box_edge_meets_triangle(c, h, t):
 
 
 @nb.njit(cache=True)
-def next_leaf(c, h, p, r, tree, stack, depth, scratch):
-    """First and last + 1 triangle of the next leaf that the tool's box may meet, none at the end, and how
-    deep the stack of nodes to look at is then.
-    """
-    nodes, links, _ = tree
-    while depth > 0:
-        depth -= 1
-        node = stack[depth]
-        if _boxes_apart(c, h, nodes[node], p, r, scratch):
-            continue
-        if links[node, 0] < 0:
-            return -1 - links[node, 0], links[node, 1], depth
-        stack[depth] = links[node, 0]
-        stack[depth + 1] = links[node, 1]
-        depth += 2
-    return 0, 0, 0
-
-
-@nb.njit(cache=True)
-def _meets(c, h, p, r, tree, stack, t, centre):
+def _meets(
+    c: FloatArray,
+    h: FloatArray,
+    p: FloatArray,
+    r: FloatArray,
+    tree: Tree,
+    stack: IntArray,
+    t: FloatArray,
+    centre: FloatArray,
+) -> bool:
     """Whether the tool's box with centre c and half extents h meets a triangle of the tree."""
-    triangles = tree.triangles
+    nodes, links, triangles = tree
     stack[0] = 0
     depth = 1
     while depth > 0:
-        begin, end, depth = next_leaf(c, h, p, r, tree, stack, depth, centre)
-        for f in range(begin, end):
+        depth -= 1
+        node = stack[depth]
+        if _boxes_apart(c, h, nodes[node], p, r, centre):
+            continue
+        if links[node, 0] >= 0:
+            stack[depth] = links[node, 0]
+            stack[depth + 1] = links[node, 1]
+            depth += 2
+            continue
+        for f in range(-1 - links[node, 0], links[node, 1]):
             for v in range(3):
                 _to_tool(triangles[f, v], p, r, t[v])
             apart = False
@@ -145,7 +126,7 @@ def _meets(c, h, p, r, tree, stack, t, centre):
 
 
 @nb.njit(cache=True)
-def winding_number(x, triangles):
+def winding_number(x: FloatArray, triangles: FloatArray) -> float:
     """How often the surface winds about the point x: about 1 inside a closed outward surface, 0 outside."""
     total = 0.0
     for f in range(triangles.shape[0]):
@@ -170,7 +151,7 @@ def winding_number(x, triangles):
 
 
 @nb.njit(cache=True)
-def inside(x, tree, stack):
+def inside(x: FloatArray, tree: Tree, stack: IntArray) -> bool:
     """Whether the closed surface winds about the point x: signed crossings of a ray.
 
     A ray that passes too close to an edge for rounding leaves the answer to the winding number, which is
@@ -221,7 +202,7 @@ def inside(x, tree, stack):
 
 
 @nb.njit(cache=True, inline="always")
-def _ray_frame(point, x):
+def _ray_frame(point: FloatArray, x: FloatArray) -> tuple[float, float, float]:
     """Coordinates of a point seen from x: two across the ray, one along it."""
     e = _RAY
     dx = point[0] - x[0]
@@ -235,13 +216,20 @@ def _ray_frame(point, x):
 
 
 @nb.njit(cache=True, nogil=True)
-def collides(positions, quaternions, boxes, tree, solid, hits):
+def collides(
+    positions: FloatArray,
+    quaternions: FloatArray,
+    boxes: FloatArray,
+    tree: Tree,
+    solid: bool,
+    hits: npt.NDArray[np.bool_],
+) -> None:
     """Fill hits: whether a box (B, 2, 3: centre, half extents; tool frame) overlaps the surface or solid."""
-    nodes = tree.nodes
+    nodes = tree[0]
     r = np.empty((3, 3))
     t = np.empty((3, 3))
     centre = np.empty(3)
-    stack = np.empty(STACK, dtype=np.int64)
+    stack = np.empty(_STACK, dtype=np.int64)
     for i in range(positions.shape[0]):
         p = positions[i]
         _rotation(quaternions[i], r)
@@ -266,10 +254,10 @@ def collides(positions, quaternions, boxes, tree, solid, hits):
 
 
 @nb.njit(cache=True, nogil=True)
-def contains(points, tree, found):
+def contains(points: FloatArray, tree: Tree, found: npt.NDArray[np.bool_]) -> None:
     """Fill found: whether a point (n, 3) lies in the union of the solids that the surfaces bound."""
-    nodes = tree.nodes
-    stack = np.empty(STACK, dtype=np.int64)
+    nodes = tree[0]
+    stack = np.empty(_STACK, dtype=np.int64)
     for i in range(points.shape[0]):
         found[i] = True
         for a in range(3):
@@ -280,7 +268,14 @@ def contains(points, tree, found):
 
 
 @nb.njit(cache=True, nogil=True)
-def points_collide(positions, quaternions, boxes, points, radius, hits):
+def points_collide(
+    positions: FloatArray,
+    quaternions: FloatArray,
+    boxes: FloatArray,
+    points: FloatArray,
+    radius: float,
+    hits: npt.NDArray[np.bool_],
+) -> None:
     """Fill hits: whether a ball about one of the points overlaps a box (B, 2, 3: centre, half extents)."""
     r = np.empty((3, 3))
     x = np.empty(3)

@@ -1,8 +1,5 @@
 """Numba kernels: how much of a triangle surface stands between open fingers."""
 
-# Numba infers the types of compiled functions.
-# mypy: allow-untyped-defs
-
 from __future__ import annotations
 
 import numba as nb
@@ -10,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from graspdb_geometry._compiled.convex import _rotation, _to_tool
-from graspdb_geometry._compiled.surface import STACK, next_leaf
+from graspdb_geometry._compiled.surface import _STACK, Tree, _boxes_apart
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -19,7 +16,7 @@ _CORNERS = 9
 
 
 @nb.njit(cache=True)
-def _cut(polygon, count, axis, sign, limit, out):
+def _cut(polygon: FloatArray, count: int, axis: int, sign: float, limit: float, out: FloatArray) -> int:
     """The part of a polygon with ``sign * x[axis] <= limit`` (Sutherland and Hodgman, CACM 17, 1974)."""
     kept = 0
     for i in range(count):
@@ -39,12 +36,14 @@ def _cut(polygon, count, axis, sign, limit, out):
 
 
 @nb.njit(cache=True, nogil=True)
-def surface_extents(positions, quaternions, column, tree, extents):
+def surface_extents(
+    positions: FloatArray, quaternions: FloatArray, column: FloatArray, tree: Tree, extents: FloatArray
+) -> None:
     """Fill extents (n, 2): least and greatest y of the surface inside the column (2, 3: centre, half
     extents) of each pose's tool; NaN where none is."""
-    triangles = tree.triangles
+    nodes, links, triangles = tree
     r = np.empty((3, 3))
-    stack = np.empty(STACK, dtype=np.int64)
+    stack = np.empty(_STACK, dtype=np.int64)
     scratch = np.empty(3)
     polygon = np.empty((_CORNERS + 3, 3))
     other = np.empty((_CORNERS + 3, 3))
@@ -56,8 +55,16 @@ def surface_extents(positions, quaternions, column, tree, extents):
         stack[0] = 0
         depth = 1
         while depth > 0:
-            begin, end, depth = next_leaf(c, h, p, r, tree, stack, depth, scratch)
-            for f in range(begin, end):
+            depth -= 1
+            node = stack[depth]
+            if _boxes_apart(c, h, nodes[node], p, r, scratch):
+                continue
+            if links[node, 0] >= 0:
+                stack[depth] = links[node, 0]
+                stack[depth + 1] = links[node, 1]
+                depth += 2
+                continue
+            for f in range(-1 - links[node, 0], links[node, 1]):
                 for v in range(3):
                     _to_tool(triangles[f, v], p, r, polygon[v])
                 count = 3
