@@ -309,7 +309,7 @@ def test_dense_data_is_ranked_by_a_sample_and_searched_as_well(
     density = GraspDensity.build(se3.Poses.of(*rows), kernel=KERNEL)
     sample = centre_sums(density, None, 1).sample
     assert sample is not None
-    assert 3_000 < sample.data.shape[1] < 8_000
+    assert 3_000 < sample.rows.size < 8_000
     low = np.array([rng.uniform(-0.05, 0.0), -1.0, -1.0])
     approach = rng.standard_normal(3), math.radians(50.0)
     region = Region(
@@ -346,7 +346,7 @@ def test_sampled_centre_sums_are_unbiased_and_extended_alike(
     now = centre_sums(grown, known, 1)
     assert known.sample is not None
     assert now.sample is not None
-    assert 0 < now.sample.data.shape[1] - known.sample.data.shape[1] < 450
+    assert 0 < now.sample.rows.size - known.sample.rows.size < 450
     unit = grown.weights[0] / grown.raw_weights[0] / (exact.weights[0] / exact.raw_weights[0])
     ratio = now.values * unit / truth
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.01)
