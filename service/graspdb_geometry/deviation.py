@@ -1,16 +1,17 @@
-"""How well convex parts follow the mesh they were made from: distances between the two surfaces."""
+"""How well convex parts follow the mesh they were made from: distances between the two surfaces, volumes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import manifold3d
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from graspdb_geometry.mesh_reading.formats import FaceArray, FloatArray
+from graspdb_geometry.mesh_reading.content import FaceArray, FloatArray
 from graspdb_geometry.meshes import Mesh, Part
 
 #: Points on each surface that are compared, and points that find the nearest triangles of the other one.
@@ -77,6 +78,12 @@ def deviation(mesh: Mesh, parts: Sequence[Part], *, seed: int = 0) -> Deviation:
     out = skin_points[some][~_covered(skin_points[some], nobody, parts, planes, 0.0)]
     gap = _distances(out, triangles, face[outer], points[outer])
     return Deviation(float(np.max(bulge)), float(np.max(gap, initial=0.0)))
+
+
+def united_volume(parts: Sequence[Part]) -> float:
+    """Volume in cubic metres of the union of convex parts, which may touch and overlap."""
+    hulls = [manifold3d.Manifold.hull_points(np.ascontiguousarray(vertices)) for vertices, _ in parts]
+    return float(manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add).volume())
 
 
 def _distances(

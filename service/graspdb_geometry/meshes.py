@@ -7,21 +7,19 @@ Reading foreign files takes memory and time that only a process of its own can b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from graspdb_geometry.mesh_reading.formats import (
-    READERS,
-    FaceArray,
-    FloatArray,
-    FormatError,
-    Geometry,
-    read_glb,
-    write_glb,
-)
+from graspdb_geometry.mass import area, mass_properties, share_counted_wrong
+from graspdb_geometry.mesh_reading.bodies import NotSolid, resolve
+from graspdb_geometry.mesh_reading.content import FaceArray, FloatArray, FormatError, Geometry
+from graspdb_geometry.mesh_reading.formats import READERS
+from graspdb_geometry.mesh_reading.gltf.reading import read_glb
+from graspdb_geometry.mesh_reading.gltf.writing import write_glb
 from graspdb_geometry.mesh_reading.repair import repair
+from graspdb_geometry.mesh_reading.touching import is_closed
 
 #: Metres per unit.
 UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -35,6 +33,10 @@ MAX_PARTS = 1024
 MAX_PART_TRIANGLES = 20_000
 #: A part may fall short of its convex hull by this share of the volume: rounding to float32, no real dent.
 CONVEX_TOLERANCE = 1e-3
+#: A surface that encloses more than this share of its volume twice or inside out has no volume to trust.
+MAX_WRONG_SHARE = 2e-3
+#: Volume over area of a surface, as a share of its extent, that is rounding and no thickness.
+_SHEET_SHARE = 1e-9
 #: Volume over area of a part; a plate thinner than twice this can't be simulated.
 _MIN_THICKNESS_M = 1e-6
 
@@ -61,11 +63,17 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True)
 class Mesh:
-    """A checked triangle mesh: vertices (V, 3) in metres, faces (F, 3), and what was mended in reading it."""
+    """A checked triangle mesh: vertices (V, 3) in metres, faces (F, 3), and what was mended in reading it.
+
+    ``bodies`` are the solids that a closed mesh is made of, apart, each with its cavities; they may touch and
+    overlap. ``sound`` is false where a closed surface runs through itself and so encloses no solid.
+    """
 
     vertices: FloatArray
     faces: FaceArray
     warnings: tuple[str, ...] = ()
+    bodies: tuple[Part, ...] = ()
+    sound: bool = True
 
 
 @dataclass(frozen=True)
@@ -77,8 +85,8 @@ class MeshProperties:
     lower, upper : list of 3 floats
         Bounding box, metres.
     watertight : bool
-        At every edge as many triangles run one way as the other, and the volume is positive: a closed
-        surface, or several, which may touch or overlap.
+        At every edge as many triangles run one way as the other, the volume is positive and enclosed once: a
+        closed surface, or several, which may touch.
     convex : bool
         Watertight and equal to its convex hull, so that it is its own convex part.
     volume_m3, centre_of_mass, inertia : float, list, 3x3 list, or None
@@ -105,9 +113,10 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
     """Read a mesh from memory and check it.
 
     Vertices at the same place are merged (STL repeats each of them), triangles that repeat a vertex are
-    dropped with a warning, a solid that is inside out is turned. A surface that is not closed is mended
-    where that is no guess: seams sewn, triangles wound alike, small holes filled; the warnings say what was
-    done, or why it could not be closed.
+    dropped with a warning. A surface that is not closed is mended where that is no guess: seams sewn,
+    triangles wound alike, small holes filled. Bodies that are inside out are turned, those that stand twice
+    count once, overlapping ones are united; cavities stay. The warnings say what was done, or why the mesh
+    could not be closed.
 
     Parameters
     ----------
@@ -134,10 +143,10 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
     if not data:
         raise MeshError("mesh", "the body is empty")
     try:
-        geometries = reader(data, max_triangles)
+        content = reader(data, max_triangles)
     except FormatError as error:
         raise MeshError("mesh", str(error)) from None
-    geometries = [g for g in geometries if len(g.faces)]
+    geometries = [g for g in content.geometries if len(g.faces)]
     if not geometries:
         raise MeshError("mesh", "it has no triangles")
     for geometry in geometries:
@@ -147,25 +156,28 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
     faces = np.concatenate([g.faces + offset for g, offset in zip(geometries, offsets, strict=True)])
     _check_size(vertices[np.unique(faces)], unit)
     mesh = _canonical(vertices, faces)
-    return mesh if _closed(mesh.faces) else _mended(mesh)
+    return _made_solid(replace(mesh, warnings=(*content.notes, *mesh.warnings)))
 
 
 def properties(mesh: Mesh, unit: str = "m") -> MeshProperties:
     """Measure a mesh; ``unit`` is the one it was sent in and serves the warnings only."""
     lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     corners = mesh.vertices[mesh.faces]
-    area = 0.5 * float(
-        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    )
-    volume, centre, inertia = _mass_properties(corners)
-    watertight = _closed(mesh.faces) and volume > 0
-    convex = watertight and _is_hull(mesh.vertices, mesh.faces, volume)
+    solid = mass_properties(corners)
+    closed = is_closed(mesh.faces)
     largest = float((upper - lower).max())
+    watertight = closed and mesh.sound and solid.volume > _SHEET_SHARE * largest * area(corners)
+    convex = watertight and _is_hull(mesh.vertices, mesh.faces, solid.volume)
     warnings = list(mesh.warnings)
-    if not watertight:
+    if not closed:
         warnings.append(
             "the mesh is not watertight: volume and inertia are unknown, and poses wholly inside the object "
             "can't be told from free ones until it has convex parts"
+        )
+    elif not watertight:
+        warnings.append(
+            "volume and inertia are unknown: mend the mesh where it was made (a boolean union of its bodies),"
+            " or give the object's mass_kg and convex parts"
         )
     if unit == "m" and largest > 1.0:
         warnings.append(f"the largest extent is {largest:.3g} m: if the file is in millimetres, send unit=mm")
@@ -182,16 +194,33 @@ def properties(mesh: Mesh, unit: str = "m") -> MeshProperties:
         upper=upper.tolist(),
         watertight=watertight,
         convex=convex,
-        volume_m3=volume if watertight else None,
-        centre_of_mass=centre.tolist() if watertight else None,
-        inertia=inertia.tolist() if watertight else None,
-        area_m2=area,
+        volume_m3=solid.volume if watertight else None,
+        centre_of_mass=solid.centre.tolist() if watertight else None,
+        inertia=solid.inertia.tolist() if watertight else None,
+        area_m2=area(corners),
         triangles=len(mesh.faces),
         warnings=warnings,
     )
 
 
 # ------------------------------------------------------------------------------------- convex parts
+
+
+def convex_bodies(mesh: Mesh) -> list[Part]:
+    """The bodies of a mesh if they are all convex, and so its convex parts as they are; else none."""
+    if not 1 <= len(mesh.bodies) <= MAX_PARTS or not mesh.sound:
+        return []
+    if not all(is_convex(vertices, faces) for vertices, faces in mesh.bodies):
+        return []
+    try:
+        return check_parts(mesh.bodies)
+    except MeshError:  # too fine or too thin for a part
+        return []
+
+
+def is_convex(vertices: FloatArray, faces: FaceArray) -> bool:
+    """Whether a closed surface is that of its convex hull."""
+    return _is_hull(vertices, faces, mass_properties(vertices[faces]).volume)
 
 
 def parts_from_glb(data: bytes) -> list[Part]:
@@ -204,7 +233,7 @@ def parts_from_glb(data: bytes) -> list[Part]:
         finite.
     """
     try:
-        geometries = read_glb(data, MAX_TRIANGLES)
+        geometries = read_glb(data, MAX_TRIANGLES).geometries
     except FormatError as error:
         raise MeshError("parts", str(error)) from None
     if not geometries:
@@ -239,12 +268,13 @@ def check_parts(parts: Sequence[Part]) -> list[Part]:
             raise MeshError(field, f"it lies more than {MAX_COORDINATE_M:g} m from the origin")
         part = _canonical(vertices, faces)
         corners = part.vertices[part.faces]
-        volume, _, _ = _mass_properties(corners)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = 0.5 * float(np.linalg.norm(normals, axis=1).sum())
-        if len(part.faces) < 4 or volume < _MIN_THICKNESS_M * area:
+        volume = mass_properties(corners).volume
+        closed = is_closed(part.faces)
+        if closed and volume < 0:
+            part, volume = replace(part, faces=np.ascontiguousarray(part.faces[:, ::-1])), -volume
+        if len(part.faces) < 4 or volume < _MIN_THICKNESS_M * area(corners):
             raise MeshError(field, "it is flat or not closed: a convex part must enclose a volume")
-        if not _closed(part.faces):
+        if not closed:
             raise MeshError(field, "it is not closed: an edge does not belong to exactly two triangles")
         if not _is_hull(part.vertices, part.faces, volume):
             raise MeshError(field, "it is not convex")
@@ -257,10 +287,11 @@ def check_parts(parts: Sequence[Part]) -> list[Part]:
 
 @dataclass(frozen=True)
 class Inspection:
-    """A checked mesh and its measures."""
+    """A checked mesh, its measures, and its bodies if they are all convex."""
 
     mesh: Mesh
     properties: MeshProperties
+    parts: list[Part]
 
 
 def inspect(
@@ -268,7 +299,7 @@ def inspect(
 ) -> Inspection:
     """Load and measure in this process; for content that is trusted."""
     mesh = load(data, media_type, unit, max_triangles=max_triangles)
-    return Inspection(mesh, properties(mesh, unit))
+    return Inspection(mesh, properties(mesh, unit), convex_bodies(mesh))
 
 
 def readable(media_type: str, unit: str) -> bool:
@@ -304,7 +335,7 @@ def _check_size(used: FloatArray, unit: str) -> None:
 
 
 def _canonical(vertices: FloatArray, faces: FaceArray) -> Mesh:
-    """Merge equal vertices, drop unused ones and collapsed triangles, turn an inside-out solid."""
+    """Merge equal vertices, drop unused ones and collapsed triangles."""
     used, faces_used = np.unique(faces, return_inverse=True)
     points = vertices[used] + 0.0  # -0 and 0 are one place
     order = np.lexsort(points.T[::-1])
@@ -325,56 +356,33 @@ def _canonical(vertices: FloatArray, faces: FaceArray) -> Mesh:
         warnings.append(f"{int(collapsed.sum())} triangles without area were left out")
     if not len(triangles):
         raise MeshError("mesh", "it has no triangle with an area")
-    if _closed(triangles) and _mass_properties(merged[triangles])[0] < 0:
-        triangles = np.ascontiguousarray(triangles[:, ::-1])
-        warnings.append("the surface was inside out and has been turned")
     return Mesh(np.ascontiguousarray(merged), np.ascontiguousarray(triangles), tuple(warnings))
 
 
-def _mended(mesh: Mesh) -> Mesh:
-    """The mesh closed, or as it was with the reasons why it can't be."""
-    mended = repair(mesh.vertices, mesh.faces)
-    if len(mended.faces) and _closed(mended.faces):
-        closed = _canonical(mended.vertices, mended.faces)
-        note = f"the mesh was not watertight and has been mended: {', '.join(mended.done)}"
-        return Mesh(closed.vertices, closed.faces, (*mesh.warnings, note, *closed.warnings))
-    reasons = mended.left or ["its triangles can't be wound alike"]
-    return Mesh(mesh.vertices, mesh.faces, (*mesh.warnings, f"it can't be closed: {', '.join(reasons)}"))
-
-
-def _closed(faces: FaceArray) -> bool:
-    """Every directed edge has exactly one opposite: closed, oriented, two triangles an edge.
-
-    Where several sheets share an edge (parts that touch) each must still be balanced, so a solid put together
-    from closed pieces passes.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    count = int(faces.max()) + 1
-    forward = np.sort(edges[:, 0] * count + edges[:, 1])
-    backward = np.sort(edges[:, 1] * count + edges[:, 0])
-    return bool(np.array_equal(forward, backward))
-
-
-def _mass_properties(corners: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Volume, centre of mass and inertia about it at unit density of the solid within triangles (F, 3, 3).
-
-    Sums over signed tetrahedra from a point near the mesh (Tonon, "Explicit exact formulas for the 3-D
-    tetrahedron inertia tensor", J. Math. Stat. 1, 2005, in covariance form).
-    """
-    origin = corners.reshape(-1, 3).mean(axis=0)  # near the mesh, or distant meshes would cancel badly
-    tetrahedra = corners - origin
-    signed = np.einsum("ij,ij->i", tetrahedra[:, 0], np.cross(tetrahedra[:, 1], tetrahedra[:, 2])) / 6.0
-    volume = float(signed.sum())
-    if volume == 0.0:
-        return 0.0, origin, np.zeros((3, 3))
-    total = tetrahedra.sum(axis=1)
-    centre = np.einsum("i,ij->j", signed, total) / (4.0 * volume)
-    # Integral of x x^T over a tetrahedron with a corner at 0: V / 20 (sum of a a^T over corners + s s^T).
-    second = np.einsum("i,ikj,ikl->jl", signed, tetrahedra, tetrahedra)
-    second += np.einsum("i,ij,il->jl", signed, total, total)
-    covariance = second / 20.0 - volume * np.outer(centre, centre)
-    inertia = np.trace(covariance) * np.eye(3) - covariance
-    return volume, origin + centre, inertia
+def _made_solid(mesh: Mesh) -> Mesh:
+    """The mesh closed and its bodies put right, or as it was with the reasons why that can't be done."""
+    vertices, faces, warnings = mesh.vertices, mesh.faces, list(mesh.warnings)
+    wound = None
+    if not is_closed(faces):
+        mended = repair(vertices, faces)
+        if not len(mended.faces) or not is_closed(mended.faces):
+            reasons = mended.left or ["its triangles can't be wound alike"]
+            return replace(mesh, warnings=(*warnings, f"it can't be closed: {', '.join(reasons)}"))
+        vertices, faces, wound = mended.vertices, mended.faces, mended.wound
+        warnings.append(f"the mesh was not watertight and has been mended: {', '.join(mended.done)}")
+    try:
+        solid = resolve(vertices, faces, wound)
+    except NotSolid as error:
+        warnings.append(f"its surface encloses no solid ({error})")
+        return Mesh(vertices, faces, tuple(warnings), sound=False)
+    warnings += solid.notes
+    wrong = share_counted_wrong(solid.vertices[solid.faces])
+    if wrong > MAX_WRONG_SHARE:
+        warnings.append(
+            f"its surface runs through itself: about {wrong:.1%} of its volume is enclosed twice or"
+            " inside out"
+        )
+    return Mesh(solid.vertices, solid.faces, tuple(warnings), solid.bodies, sound=wrong <= MAX_WRONG_SHARE)
 
 
 def _is_hull(vertices: FloatArray, faces: FaceArray, volume: float) -> bool:
@@ -383,9 +391,7 @@ def _is_hull(vertices: FloatArray, faces: FaceArray, volume: float) -> bool:
         hull = ConvexHull(vertices - vertices.mean(axis=0))
     except QhullError:
         return False
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * float(np.linalg.norm(normals, axis=1).sum())
+    own = area(vertices[faces])
     # The volume alone would let pass a surface that also folds inside the hull.
     same_volume = abs(float(hull.volume) - volume) <= CONVEX_TOLERANCE * float(hull.volume)
-    return bool(same_volume and abs(float(hull.area) - area) <= CONVEX_TOLERANCE * float(hull.area))
+    return bool(same_volume and abs(float(hull.area) - own) <= CONVEX_TOLERANCE * float(hull.area))

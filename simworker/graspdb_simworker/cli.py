@@ -39,7 +39,7 @@ log = logging.getLogger("graspdb.simworker")
 
 def _require_pybullet() -> None:
     """Say in one line what is missing and leave with code 2."""
-    needed = ("pybullet", "numba", "scipy", "trimesh", "PIL")
+    needed = ("pybullet", "numba", "scipy", "manifold3d", "PIL")
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
         typer.echo(
@@ -98,7 +98,7 @@ def run(
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
     ] = False,
     once: Annotated[bool, typer.Option(help="Stop after one job for each process.")] = False,
-    decompose_seconds: DecomposeSeconds = 900.0,
+    decompose_seconds: DecomposeSeconds = 40.0,
     decompose_memory_mib: DecomposeMemory = 4096,
     api_key: ApiKey = None,
     verbose: Annotated[bool, typer.Option(help="Say what is going on.")] = False,
@@ -119,7 +119,7 @@ def run(
         if decomposition.available():
             limits = decomposition.ResourceLimits(decompose_seconds, decompose_memory_mib * 2**20)
         else:
-            log.warning("coacd is missing: meshes that are not convex are left to other workers")
+            log.warning("coacd is missing: meshes of bodies that are not convex are left to other workers")
 
     with (
         _cluster(dask) as cluster,

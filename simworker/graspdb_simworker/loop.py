@@ -14,7 +14,7 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
@@ -27,7 +27,9 @@ from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkR
 log = logging.getLogger("graspdb.simworker")
 
 CAPABILITIES = ("simulate", "lift")
-"""Job kinds, and protocols beyond ``wrench``, that this worker claims."""
+"""Job kinds, and protocols beyond ``wrench``, that this worker's processes claim."""
+DECOMPOSING = ("decompose",)
+"""What it claims besides, one at a time."""
 GLB = "model/gltf-binary"
 MAX_BACKOFF_S = 15.0
 IDLE_S = 2.0
@@ -79,7 +81,8 @@ class Worker:
 
     Give ``transport``, which all threads share, few retries: this loop has its own. ``exit_when_idle``
     returns when there is nothing left to claim, ``once`` after one job for each process. ``decompositions``
-    are the limits of one mesh's; None leaves them to other workers.
+    are the limits of one mesh's; None leaves them to other workers. They have a thread of their own, which
+    the service lists as another worker, so that no chunk that is ready waits for one.
     """
 
     transport: Transport
@@ -98,6 +101,7 @@ class Worker:
         self._done = threading.Event()
         self._lock = threading.Lock()
         self._leases: dict[str, Lease] = {}
+        self._busy: set[str] = set()
         self._parts: dict[str, bytes] = {}
         self._fatal: WorkerFailed | None = None
         self.tally = WorkTally()
@@ -118,6 +122,10 @@ class Worker:
             threading.Thread(target=self._guard, args=(self._slot,), name=f"slot-{number}", daemon=True)
             for number in range(self.processes)
         ]
+        if self.decompositions is not None:
+            slots.append(
+                threading.Thread(target=self._guard, args=(self._decomposer,), name="decomposer", daemon=True)
+            )
         heartbeat.start()
         for slot in slots:
             slot.start()
@@ -188,44 +196,59 @@ class Worker:
     # -- jobs ---------------------------------------------------------------------------------------------
 
     def _slot(self) -> None:
-        failures = 0
         with self.make_runner() as runner:
-            while not self._stop.is_set():
-                try:
-                    job, wait = self._claim()
-                except (errors.Unauthorized, errors.Forbidden) as error:
-                    raise WorkerFailed(f"the service refuses this worker: {error}") from error
-                except errors.InvalidInput as error:
-                    raise WorkerFailed(f"the service does not understand this worker: {error}") from error
-                except errors.GraspDBError as error:
-                    failures += 1
-                    delay = _backoff(failures)
-                    log.warning("can't claim jobs (again in %.1f s): %s", delay, error)
-                    self._stop.wait(delay)
-                    continue
-                failures = 0
-                if job is None:
-                    if self.exit_when_idle or self.once:
-                        return
-                    self._stop.wait(wait)
-                    continue
-                self._work(runner, job)
-                if self.once:
-                    return
+            self._pull(self.name, CAPABILITIES, lambda job: self._work(runner, job))
 
-    def _claim(self) -> tuple[wire.ClaimedJob | None, float]:
-        capabilities = [*CAPABILITIES, *(["decompose"] if self.decompositions else [])]
-        request = wire.ClaimRequest(worker=self.name, capabilities=capabilities, limit=1)
+    def _decomposer(self) -> None:
+        self._pull(f"{self.name}-parts", DECOMPOSING, lambda job: self._work(None, job))
+
+    def _pull(self, name: str, capabilities: Sequence[str], work: Callable[[wire.ClaimedJob], None]) -> None:
+        """Claim and do one job after the other."""
+        failures = 0
+        while not self._stop.is_set():
+            self._note_busy(True)
+            try:
+                job, wait = self._claim(name, capabilities)
+            except (errors.Unauthorized, errors.Forbidden) as error:
+                raise WorkerFailed(f"the service refuses this worker: {error}") from error
+            except errors.InvalidInput as error:
+                raise WorkerFailed(f"the service does not understand this worker: {error}") from error
+            except errors.GraspDBError as error:
+                failures += 1
+                delay = _backoff(failures)
+                log.warning("can't claim jobs (again in %.1f s): %s", delay, error)
+                self._stop.wait(delay)
+                continue
+            failures = 0
+            if job is not None:
+                work(job)
+            elif self._note_busy(False) and self.exit_when_idle:
+                return
+            if self.once:
+                return
+            if job is None:
+                self._stop.wait(wait)
+
+    def _note_busy(self, busy: bool) -> bool:
+        """Note whether this thread claims or works, which may make work for others; whether none does."""
+        with self._lock:
+            (self._busy.add if busy else self._busy.discard)(threading.current_thread().name)
+            return not self._busy
+
+    def _claim(self, name: str, capabilities: Sequence[str]) -> tuple[wire.ClaimedJob | None, float]:
+        request = wire.ClaimRequest(worker=name, capabilities=list(capabilities), limit=1)
         answer = self.transport.model(wire.ClaimResponse, "POST", "/jobs/claim", body=request, retries=0)
         return (answer.jobs[0] if answer.jobs else None), max(0.1, answer.retry_after_s or IDLE_S)
 
-    def _work(self, runner: ChunkRunner, job: wire.ClaimedJob) -> None:
+    def _work(self, runner: ChunkRunner | None, job: wire.ClaimedJob) -> None:
         with self._holding(job) as lease:
             try:
                 payload = job.payload
                 if isinstance(payload, wire.DecomposePayload):
                     self._decompose(payload, lease)
                     return
+                if runner is None:
+                    raise ChunkFailed("chunks were not asked for here")
                 parts = self._parts_of(payload, lease)
                 result = runner.run(payload, parts, wanted=lambda: self._wanted(lease))
             except ChunkCancelled:

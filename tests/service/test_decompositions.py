@@ -37,6 +37,9 @@ def _stl(*parts: meshes.Part) -> bytes:
 
 
 DUMBBELL = [_box((0.04, 0.04, 0.04), (0, 0, z)) for z in (-0.05, 0.05)]
+# A cavity so thin that it changes no measure, but its body is not convex any more.
+_SLIT = _box((0.004, 0.004, 1e-6), (0, 0, -0.05))
+DENTED = [*DUMBBELL, (_SLIT[0], _SLIT[1][:, ::-1])]
 PARTS = meshes.parts_to_glb(DUMBBELL)
 VOLUME = 2 * 0.04**3
 
@@ -44,14 +47,14 @@ VOLUME = 2 * 0.04**3
 def add(http: httpx.Client, slug: str = "bell", **properties: Any) -> str:
     made = http.post("/objects", json={"id": slug, **(properties or {"mass_kg": 0.2})})
     assert made.status_code == 201, made.text
-    stored = http.put(f"/objects/{slug}/mesh", content=_stl(*DUMBBELL), headers=STL)
+    stored = http.put(f"/objects/{slug}/mesh", content=_stl(*DENTED), headers=STL)
     assert stored.status_code == 200, stored.text
     return slug
 
 
 @pytest.fixture
 def bell(http: httpx.Client) -> httpx.Client:
-    """A client of a service with the object ``bell``: two boxes, and nobody has said that they are two."""
+    """A client of a service with the object ``bell``: two boxes, one of them not quite convex."""
     add(http)
     return http
 
@@ -241,6 +244,15 @@ def test_parts_that_miss_the_mesh_are_warned_of(bell: httpx.Client) -> None:
     assert len(parts["warnings"]) == 1
     assert "mm off the mesh's" in parts["warnings"][0]
     assert "175.0%" in parts["warnings"][0]
+
+
+def test_what_parts_add_to_the_volume_is_that_of_their_union(bell: httpx.Client) -> None:
+    start(bell)
+    twice = meshes.parts_to_glb([*DUMBBELL, _box((0.04, 0.04, 0.05), (0, 0, 0.045))])
+    assert put_result(bell, claim(bell)[0], twice).status_code == 200
+    parts = bell.get("/objects/bell").json()["convex_parts"]
+    assert parts["volume_m3"] == pytest.approx(VOLUME + 0.04 * 0.04 * 0.05, rel=1e-5)
+    assert "112.5%" in parts["warnings"][0]
 
 
 def test_a_failed_attempt_is_repeated_and_the_last_one_fails_the_sweeps(bell: httpx.Client) -> None:

@@ -36,6 +36,9 @@ def _stl(*parts: meshes.Part) -> bytes:
 
 BOX = _stl(_box((0.04, 0.06, 0.1)))
 DUMBBELL = [_box((0.04, 0.04, 0.04), (0, 0, z)) for z in (-0.05, 0.05)]
+# A cavity so thin that it changes no measure, but its body is not convex any more.
+_SLIT = _box((0.004, 0.004, 1e-6), (0, 0, -0.05))
+DENTED = [*DUMBBELL, (_SLIT[0], _SLIT[1][:, ::-1])]
 
 
 @pytest.fixture
@@ -81,8 +84,36 @@ def test_convex_mesh_is_its_own_part(box: httpx.Client) -> None:
     assert np.abs(part[0]).max(axis=0) == pytest.approx([0.02, 0.03, 0.05], abs=1e-6)
 
 
+def test_convex_bodies_are_the_parts_of_their_mesh(box: httpx.Client) -> None:
+    info = box.put("/objects/box/mesh", content=_stl(*DUMBBELL), headers=STL).json()
+    assert info["warnings"] == [
+        "it has 2 bodies that do not touch: they are weighed and moved as one rigid object"
+    ]
+    parts = box.get("/objects/box").json()["convex_parts"]
+    assert (parts["parts"], parts["warnings"]) == (2, [])
+    found = meshes.parts_from_glb(box.get("/objects/box/convex-parts").content)
+    assert [part[0].mean(axis=0)[2] for part in found] == pytest.approx([-0.05, 0.05], abs=1e-6)
+    # Nobody needs to make any.
+    box.patch("/objects/box", json={"mass_kg": 0.2})
+    sweep = box.post("/objects/box/sweeps", json={"grid": {"max_poses": 10}}).json()
+    assert sweep["waiting_for"] is None
+
+
+def test_bodies_that_overlap_or_stand_twice_weigh_once(box: httpx.Client) -> None:
+    half = _box((0.04, 0.06, 0.1), (0.02, 0, 0))
+    info = box.put("/objects/box/mesh", content=_stl(_box((0.04, 0.06, 0.1)), half, half), headers=STL).json()
+    assert info["volume_m3"] == pytest.approx(0.06 * 0.06 * 0.1, rel=1e-5)
+    assert info["centre_of_mass"] == pytest.approx([0.01, 0, 0], abs=1e-7)
+    volume = 0.06 * 0.06 * 0.1
+    expected = [volume * s / 12 for s in (0.06**2 + 0.1**2, 0.06**2 + 0.1**2, 2 * 0.06**2)]
+    assert np.diag(info["inertia_m5"]) == pytest.approx(expected, rel=1e-5)
+    assert any("count once" in warning for warning in info["warnings"])
+    assert any("overlap" in warning for warning in info["warnings"])
+    assert box.get("/objects/box").json()["convex_parts"]["parts"] == 2
+
+
 def test_given_parts_are_checked_and_read_back(box: httpx.Client) -> None:
-    box.put("/objects/box/mesh", content=_stl(*DUMBBELL), headers=STL)
+    box.put("/objects/box/mesh", content=_stl(*DENTED), headers=STL)
     assert box.get("/objects/box").json()["convex_parts"] is None
     assert box.get("/objects/box/convex-parts").status_code == 404
     glb = meshes.parts_to_glb(DUMBBELL)
@@ -98,7 +129,7 @@ def test_given_parts_are_checked_and_read_back(box: httpx.Client) -> None:
 
 
 def test_parts_of_another_size_are_warned_of(box: httpx.Client) -> None:
-    box.put("/objects/box/mesh", content=_stl(*DUMBBELL), headers=STL)
+    box.put("/objects/box/mesh", content=_stl(*DENTED), headers=STL)
     wrong = meshes.parts_to_glb([(vertices * 1.1, faces) for vertices, faces in DUMBBELL])
     warnings = box.put("/objects/box/convex-parts", content=wrong, headers=GLB).json()["warnings"]
     assert len(warnings) == 1
@@ -119,11 +150,11 @@ def test_hollow_part_is_refused_by_number(box: httpx.Client) -> None:
 def test_another_mesh_replaces_the_first_and_its_parts(box: httpx.Client) -> None:
     box.put("/objects/box/mesh", content=BOX, headers=STL)
     before = box.get("/objects/box").json()
-    assert box.put("/objects/box/mesh", content=_stl(*DUMBBELL), headers=STL).status_code == 200
+    assert box.put("/objects/box/mesh", content=_stl(*DENTED), headers=STL).status_code == 200
     after = box.get("/objects/box").json()
     assert after["convex_parts"] is None
     assert after["revision"] == after["epoch"] == before["revision"] + 1
-    same = box.put("/objects/box/mesh", content=_stl(*DUMBBELL), headers=STL)
+    same = box.put("/objects/box/mesh", content=_stl(*DENTED), headers=STL)
     assert same.status_code == 200
     assert box.get("/objects/box").json()["revision"] == after["revision"]
 

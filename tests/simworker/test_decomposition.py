@@ -22,6 +22,7 @@ from graspdb.transport import Transport
 from graspdb.wire import DecomposePayload
 from graspdb_geometry import meshes
 from graspdb_geometry.deviation import deviation
+from graspdb_simworker import loop
 from graspdb_simworker.decomposition import supervisor
 from graspdb_simworker.decomposition.supervisor import DecompositionFailed, ResourceLimits
 from graspdb_simworker.loop import Worker
@@ -64,8 +65,10 @@ def test_an_angle_is_split_the_same_every_time() -> None:
     notes: list[str] = []
     first = supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS, progress=notes.append)
     check_parts(first)
-    assert "threshold 0.05" in notes[0]
+    assert "faces in a body" in notes[0]
+    assert "left, at most 120 s" in notes[0]
     assert "mm off" in notes[-1]
+    assert "% volume" in notes[-1]
     assert supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS) == first
 
 
@@ -149,7 +152,7 @@ def test_it_ends_with_a_killed_worker(
     arguments = [PAYLOAD.model_dump_json(), str(tmp_path / "mesh.stl")]
     with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as worker:
         assert worker.stdout is not None
-        assert b"threshold" in worker.stdout.readline()
+        assert b"faces in a body" in worker.stdout.readline()
         time.sleep(np.random.default_rng().uniform(0.0, 1.0))
         worker.kill()
         eventually(lambda: not descendants(), 10)
@@ -211,6 +214,45 @@ def test_a_foreign_mesh_with_a_hole_is_swept_from_end_to_end(url: str) -> None:
         check_parts(http.get("/objects/angle/convex-parts").content)
         best = http.get("/objects/angle/best-grasp").json()
         assert best["status"] == "ok"
+
+
+def test_ready_chunks_of_other_objects_do_not_wait_for_it(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = threading.Event()
+    parts: list[bytes] = []
+
+    def slow(*_: Any, wanted: Callable[[], bool], progress: Callable[[str], None], **__: Any) -> bytes:
+        progress("cutting")
+        while wanted() and not done.wait(0.05):
+            pass
+        return parts[0]
+
+    monkeypatch.setattr(loop, "decompose", slow)
+    with httpx.Client(base_url=url, timeout=60) as http, Transport(url, retries=0) as transport:
+        parts.append(supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS))
+        upload(http, angle_stl())
+        waiting = sweep(http, max_poses=200)
+        assert http.post("/objects", json={"id": "brick", "mass_kg": 0.1}).status_code == 201
+        brick = trimesh.creation.box((0.03, 0.03, 0.1)).export(file_type="stl")
+        stored = http.put("/objects/brick/mesh", content=brick, headers={"Content-Type": "model/stl"})
+        assert stored.status_code == 200
+        ready = http.post("/objects/brick/sweeps", json={"grid": {"max_poses": 200}}).json()
+        assert ready["waiting_for"] is None
+
+        worker = Worker(transport, name="one", exit_when_idle=True, decompositions=LIMITS)
+        thread = threading.Thread(target=worker.run, daemon=True)
+        thread.start()
+        deadline = time.monotonic() + 120.0
+        while http.get(f"/sweeps/{ready['id']}").json()["state"] != "done":
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        waits_for = http.get(f"/sweeps/{waiting['id']}").json()["waiting_for"]
+        assert (waits_for["state"], waits_for["progress"]) == ("running", "cutting")
+        # Idle now but for the decomposition, after which there are chunks again.
+        done.set()
+        thread.join(120.0)
+        assert not thread.is_alive()
+        assert http.get(f"/sweeps/{waiting['id']}").json()["state"] == "done"
+        assert worker.tally.failures == 0
 
 
 def test_a_failed_decomposition_fails_the_sweep_with_its_reason(url: str) -> None:

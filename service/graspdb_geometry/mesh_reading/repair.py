@@ -14,8 +14,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
-from graspdb_geometry.mesh_reading.formats import FaceArray, FloatArray
+from graspdb_geometry.mesh_reading.content import FaceArray, FloatArray
+from graspdb_geometry.mesh_reading.polygons import clip_ears, fan_of_line, flattened, lie_on_a_line
 
+BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 #: Vertices nearer than this share of the mesh's diagonal are one.
@@ -23,16 +25,23 @@ SEAM_SHARE = 1e-5
 #: A hole larger than this share of the surface is no flaw of the mesh.
 HOLE_SHARE = 0.05
 MAX_HOLE_EDGES = 2_000
+#: Where more of a piece's triangles are wound the other way, the rest does not tell which side is out.
+_TELLING_SHARE = 0.1
 #: A hole's rim may leave its plane by this share of its size.
 _FLAT_SHARE = 0.2
 
 
 @dataclass
 class Repaired:
-    """A mended surface, what was done to it, and what was left undone."""
+    """A mended surface, what was done to it, and what was left undone.
+
+    ``wound`` (F,) tells the triangles of pieces whose winding was so mixed that it does not say which side is
+    out.
+    """
 
     vertices: FloatArray
     faces: FaceArray
+    wound: BoolArray
     done: list[str] = field(default_factory=list)
     left: list[str] = field(default_factory=list)
 
@@ -50,14 +59,25 @@ def repair(vertices: FloatArray, faces: FaceArray) -> Repaired:
     Repaired
         ``done`` and ``left`` in words, for the user.
     """
-    mesh = Repaired(np.asarray(vertices), np.asarray(faces, dtype=np.int64))
-    _sew(mesh)
+    first = _repaired(vertices, faces, keep_walls=True)
+    if first.left:
+        # Triangles both ways round may be walls between bodies that touch, not a surface drawn twice.
+        second = _repaired(vertices, faces, keep_walls=False)
+        if not second.left:
+            return second
+    return first
+
+
+def _repaired(vertices: FloatArray, faces: FaceArray, *, keep_walls: bool) -> Repaired:
+    mesh = Repaired(np.asarray(vertices), np.asarray(faces, dtype=np.int64), np.empty(0, dtype=np.bool_))
+    _sew(mesh, keep_walls=keep_walls)
     if len(mesh.faces):
         _wind(mesh)
         _fill(mesh)
         _, count = np.unique(_undirected(_edges(mesh.faces)), return_counts=True)
-        if np.any(count > 2):
-            mesh.left.append(f"{int(np.sum(count > 2))} edges belong to more than two triangles")
+        odd = (count > 2) & (count % 2 == 1)
+        if np.any(odd):
+            mesh.left.append(f"{int(np.sum(odd))} edges belong to more than two triangles")
     return mesh
 
 
@@ -78,8 +98,11 @@ def _areas(vertices: FloatArray, faces: FaceArray) -> FloatArray:
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
-def _sew(mesh: Repaired) -> None:
-    """Merge vertices along seams, drop triangles that collapse or stand twice."""
+def _sew(mesh: Repaired, *, keep_walls: bool) -> None:
+    """Merge vertices along seams, drop triangles that collapse or stand twice.
+
+    Of triangles that stand both ways round one is kept, or with ``keep_walls`` false none.
+    """
     # Only along open edges: elsewhere fine detail may be as small.
     edges = _edges(mesh.faces)
     _, first, count = np.unique(_undirected(edges), return_index=True, return_counts=True)
@@ -98,16 +121,27 @@ def _sew(mesh: Repaired) -> None:
     faces = number[mesh.faces]
     kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces = faces[kept]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    _, first, which = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
     if len(first) < len(faces):
+        if not keep_walls:
+            turns = _turns(faces)
+            both_ways = np.bincount(which.ravel(), turns > 0) * np.bincount(which.ravel(), turns < 0)
+            first = first[both_ways == 0]
         mesh.done.append(f"{len(faces) - len(first)} triangles stood twice")
         faces = faces[np.sort(first)]
     used, faces = np.unique(faces, return_inverse=True)
     mesh.vertices, mesh.faces = mesh.vertices[used], faces.reshape(-1, 3)
+    mesh.wound = np.zeros(len(mesh.faces), dtype=np.bool_)
+
+
+def _turns(faces: FaceArray) -> IntArray:
+    """1 for triangles that go up through their sorted vertices, -1 for those that go down."""
+    a, b, c = faces.T
+    return np.where((a < b).astype(int) + (b < c) + (c < a) == 2, 1, -1)
 
 
 def _wind(mesh: Repaired) -> None:
-    """Wind neighbours alike, and each closed piece that was not outwards."""
+    """Wind neighbours alike, as most of a piece's triangles are."""
     edges = _edges(mesh.faces)
     triangle = np.tile(np.arange(len(mesh.faces)), 3)
     _, which, count = np.unique(_undirected(edges), return_inverse=True, return_counts=True)
@@ -119,25 +153,22 @@ def _wind(mesh: Repaired) -> None:
         return
     size = (len(mesh.faces),) * 2
     graph = coo_matrix((np.ones(len(one)), (one, two)), shape=size).tocsr()
-    parity = coo_matrix((unlike + 1.0, (one, two)), shape=size).tocsr()
-    parity = parity.maximum(parity.T)
+    against = coo_matrix((unlike * 1.0, (one, two)), shape=size).tocsr()
+    graph, against = graph + graph.T, against + against.T
     _, piece = connected_components(graph, directed=False)
     turned = np.zeros(len(mesh.faces), dtype=np.bool_)
     for number in np.unique(piece[one[unlike]]):
         members = np.flatnonzero(piece == number)
         order, before = breadth_first_order(graph, members[0], directed=False)
-        steps = np.asarray(parity[before[order[1:]], order[1:]]).reshape(-1) > 1.5
+        steps = np.asarray(against[before[order[1:]], order[1:]]).reshape(-1) > 0.0
         for at, step in zip(order[1:].tolist(), steps.tolist(), strict=True):
             turned[at] = turned[before[at]] ^ step
-        trial = mesh.faces[members].copy()
-        trial[turned[members]] = trial[turned[members]][:, ::-1]
-        corners = mesh.vertices[trial] - mesh.vertices[trial[0, 0]]
-        volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-        if volume < 0:
+        if 2 * int(turned[members].sum()) > len(members):
             turned[members] ^= True
+        mesh.wound[members] = turned[members].mean() > _TELLING_SHARE
     mesh.faces = mesh.faces.copy()
     mesh.faces[turned] = mesh.faces[turned][:, ::-1]
-    mesh.done.append(f"{int(turned.sum())} triangles turned to face outwards")
+    mesh.done.append(f"{int(turned.sum())} triangles turned to face as their neighbours do")
 
 
 def _fill(mesh: Repaired) -> None:
@@ -160,6 +191,7 @@ def _fill(mesh: Repaired) -> None:
             patches.append(patch)
     if patches:
         mesh.faces = np.concatenate([mesh.faces, *patches])
+        mesh.wound = np.pad(mesh.wound, (0, len(mesh.faces) - len(mesh.wound)))
         mesh.done.append(f"{len(patches)} hole{'s' if len(patches) > 1 else ''} filled")
     if large:
         mesh.left.append(f"{large} of its holes are larger than {HOLE_SHARE:.0%} of the surface")
@@ -198,56 +230,12 @@ def _rims(faces: FaceArray) -> tuple[list[IntArray], int]:
 def _patch(vertices: FloatArray, loop: IntArray) -> FaceArray | None:
     """Triangles over a rim by clipping ears in its plane; None where it is not flat enough for that."""
     points = vertices[loop]
-    centred = points - points.mean(axis=0)
-    # Twice the vector area of the loop (Newell): its normal, whichever way it bends.
-    normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
-    length = float(np.linalg.norm(normal))
-    size = float(np.linalg.norm(centred, axis=1).max())
-    if length < 1e-6 * size * size:
+    plane = flattened(points)
+    if plane is None:
+        # A slit, as where one side of a seam has a vertex more.
+        return fan_of_line(loop) if lie_on_a_line(points) else None
+    ring, heights = plane
+    if float(np.abs(heights).max()) > _FLAT_SHARE * float(np.linalg.norm(ring, axis=1).max()):
         return None
-    normal /= length
-    if float(np.abs(centred @ normal).max()) > _FLAT_SHARE * size:
-        return None
-    u = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    u /= np.linalg.norm(u)
-    flat = np.stack([centred @ u, centred @ np.cross(normal, u)], axis=1)
-    ears = _clip_ears(flat)
+    ears = clip_ears(ring)
     return None if ears is None else loop[ears]
-
-
-def _clip_ears(points: FloatArray) -> IntArray | None:
-    """Triangulate a simple counter-clockwise polygon (n, 2) (Meisters 1975); None if it crosses itself."""
-    left = list(range(len(points)))
-    triangles: list[tuple[int, int, int]] = []
-    while len(left) > 3:
-        best: tuple[float, int] | None = None
-        for k in range(len(left)):
-            i, j, m = left[k - 1], left[k], left[(k + 1) % len(left)]
-            quality = _ear(points, left, i, j, m)
-            if quality is not None and (best is None or quality > best[0]):
-                best = quality, k
-                # Looking for the best each time takes n^3: a good one will do, of many corners any.
-                if quality > 0.3 or len(left) > 60:
-                    break
-        if best is None:
-            return None
-        k = best[1]
-        triangles.append((left[k - 1], left[k], left[(k + 1) % len(left)]))
-        left.pop(k)
-    triangles.append((left[0], left[1], left[2]))
-    return np.array(triangles, dtype=np.int64)
-
-
-def _ear(points: FloatArray, left: list[int], i: int, j: int, m: int) -> float | None:
-    """How good an ear the corner j is: area over squared longest side; None if it is none."""
-    a, b, c = points[i], points[j], points[m]
-    area = float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
-    longest = max(float(np.sum((p - q) ** 2)) for p, q in ((a, b), (b, c), (c, a)))
-    if area <= 1e-9 * longest:
-        return None
-    others = points[[k for k in left if k not in (i, j, m)]]
-    outside = np.zeros(len(others), dtype=np.bool_)
-    for p, q in ((a, b), (b, c), (c, a)):
-        side = (q[0] - p[0]) * (others[:, 1] - p[1]) - (q[1] - p[1]) * (others[:, 0] - p[0])
-        outside |= side < 0
-    return area / longest if bool(np.all(outside)) else None

@@ -1,7 +1,8 @@
 """The process that decomposes a mesh into convex parts: an order and a mesh in, candidates out, best last.
 
-Run as ``python -m graspdb_simworker.decomposition.child`` by :mod:`.supervisor`. CoACD lives here, because it
-takes memory and time that only a process of its own can bound, and can't be interrupted.
+Run as ``python -m graspdb_simworker.decomposition.child`` by :mod:`.supervisor`. The work is done here,
+because it takes memory and time that only a process of its own can bound, and CoACD can't be interrupted. To
+the kernel it is less urgent than the chunks of other objects that are simulated beside it.
 
 Reads one ``CHUNK`` (a line of JSON, then the mesh as it was uploaded); writes ``NOTE`` (how far it is, for a
 person), ``RESULT`` (a candidate as GLB, each finer than the one before) and ``ERROR``.
@@ -14,18 +15,19 @@ import math
 import os
 import resource
 import sys
-import time
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
 from graspdb_simworker.process import channel
+
+NICENESS = 10
 
 
 def main() -> int:
     """Decompose one mesh."""
     source, sink = channel.take_streams()
     os.dup2(0, 2)  # CoACD's log
+    os.nice(NICENESS)
     try:
         _, body = channel.receive(source, poll_s=60.0)
         head, _, content = body.partition(b"\n")
@@ -57,31 +59,18 @@ def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
             sink, channel.ERROR, f"its libraries do not fit into the memory allowed: {error}".encode()
         )
         return
+    limits = convexity.Limits(order["max_parts"], order["seconds"], order["seed"])
     try:
-        for kind, body in _steps(convexity, order, content):
-            channel.send(sink, kind, body)
+        convexity.decompose(
+            convexity.read(content, order["media_type"], order["unit"]),
+            limits,
+            tell=lambda note: channel.send(sink, channel.NOTE, note.encode()),
+            give=lambda found: channel.send(sink, channel.RESULT, found.glb),
+        )
     except convexity.Undecomposable as error:
         channel.send(sink, channel.ERROR, str(error).encode())
     except MemoryError:
         channel.send(sink, channel.ERROR, b"it needs more memory than allowed")
-
-
-def _steps(convexity: Any, order: dict[str, Any], content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    began = time.process_time()
-    mesh = convexity.read(content, order["media_type"], order["unit"])
-    target = convexity.target_m(mesh)
-    best = float("inf")
-    for threshold in convexity.THRESHOLDS:
-        yield channel.NOTE, f"CoACD at threshold {threshold:g}".encode()
-        found = convexity.decompose(mesh, threshold, max_parts=order["max_parts"], seed=order["seed"])
-        if found.deviation_m < best:
-            best = found.deviation_m
-            yield channel.RESULT, found.glb
-        note = f"{found.parts} parts at threshold {threshold:g}, {1000 * found.deviation_m:.2g} mm off"
-        yield channel.NOTE, note.encode()
-        # A finer one takes longer; what there is by now is worth more than nothing at the end.
-        if found.deviation_m <= target or time.process_time() - began > order["seconds"] / 6:
-            return
 
 
 if __name__ == "__main__":

@@ -97,12 +97,18 @@ def main() -> int:
 
 
 def _serialise(inspection: Inspection) -> bytes:
-    """A line of JSON and two arrays."""
-    head = {"properties": asdict(inspection.properties), "mesh_warnings": list(inspection.mesh.warnings)}
+    """A line of JSON and two arrays for the mesh and for each of its parts."""
+    head = {
+        "properties": asdict(inspection.properties),
+        "mesh_warnings": list(inspection.mesh.warnings),
+        "parts": len(inspection.parts),
+    }
     stream = io.BytesIO()
     stream.write(json.dumps(head).encode() + b"\n")
-    np.save(stream, inspection.mesh.vertices, allow_pickle=False)
-    np.save(stream, inspection.mesh.faces, allow_pickle=False)
+    mesh = (inspection.mesh.vertices, inspection.mesh.faces)
+    for vertices, faces in [mesh, *inspection.parts]:
+        np.save(stream, vertices, allow_pickle=False)
+        np.save(stream, faces, allow_pickle=False)
     return stream.getvalue()
 
 
@@ -112,11 +118,12 @@ def _deserialise(data: bytes) -> Inspection:
     if "error" in answer:
         raise MeshError(answer["error"]["field"], answer["error"]["message"])
     stream = io.BytesIO(rest)
-    vertices = np.load(stream, allow_pickle=False)
-    faces = np.load(stream, allow_pickle=False)
-    return Inspection(
-        Mesh(vertices, faces, tuple(answer["mesh_warnings"])), MeshProperties(**answer["properties"])
+    (vertices, faces), *parts = (
+        (np.load(stream, allow_pickle=False), np.load(stream, allow_pickle=False))
+        for _ in range(1 + answer["parts"])
     )
+    mesh = Mesh(vertices, faces, tuple(answer["mesh_warnings"]))
+    return Inspection(mesh, MeshProperties(**answer["properties"]), parts)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 
 from graspdb.wire import BoundingBox, MeshInfo, PartsInfo
 from graspdb_geometry import meshes
-from graspdb_geometry.deviation import deviation
+from graspdb_geometry.deviation import deviation, united_volume
 from graspdb_geometry.meshes import Inspection, Mesh, MeshError, Part
 from graspdb_service.formats.negotiation import GLB
 from graspdb_service.problems import ProblemError, conflict, not_found
@@ -28,12 +28,13 @@ MEDIA_TYPES = meshes.MEDIA_TYPES
 # Parts come from the mesh, rounded or slightly inflated: within this they describe the same object.
 _FIT_M = 1e-3
 _FIT_SHARE = 0.02
-# Surfaces farther apart than this are worth a warning: a decomposition is always a little off.
-_NEAR_SHARE = 0.01
+# Parts are the mesh to rounding: nearer than this, and with no more volume than this added or lost.
+_SAME_SHARE = 1e-4
+_SAME_VOLUME = 1e-3
 
 
 def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
-    """Check and store an object's mesh; a convex one becomes its own convex part.
+    """Check and store an object's mesh; one whose bodies are all convex brings its own convex parts.
 
     413 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
     """
@@ -45,10 +46,7 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
         _refuse_another_mesh(tx, row)
     inspection = _inspect(ctx, content, media, unit)
     info = _mesh_info(inspection, sha256, media, unit, len(content))
-    own = None
-    if inspection.properties.convex:
-        parts: list[Part] = [(inspection.mesh.vertices, inspection.mesh.faces)]
-        own = (meshes.parts_to_glb(parts), parts)
+    own = meshes.parts_to_glb(inspection.parts) if inspection.parts else None
     with ctx.database.write() as tx:
         row = require(tx, slug, lock=True)
         if _is_stored(row, sha256, media, unit):
@@ -58,7 +56,7 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
         assets.put(tx, content, media)
         values: dict[str, Any] = {"mesh_sha256": sha256, "mesh_info": info.model_dump(mode="json")}
         if own is not None:
-            values |= _parts_values(tx, own[0], _parts_info(own[0], own[1], info))
+            values |= _parts_values(tx, own, _parts_info(own, inspection.parts, info))
         elif row.mesh_sha256 is not None:
             # The parts were those of the mesh before.
             values |= {"parts_sha256": None, "parts_info": None}
@@ -113,15 +111,12 @@ def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
             "object-changed", f"The mesh of {row.slug!r} was changed at the same moment: try again"
         )
     own = meshes.load(found[0], mesh.media_type, mesh.unit)
-    apart = ctx.compute.run(lambda: deviation(own, parts)).largest_m
+    apart, volume = ctx.compute.run(lambda: (deviation(own, parts).largest_m, united_volume(parts)))
     longest = max(np.subtract(mesh.bounding_box.upper, mesh.bounding_box.lower))
+    added = 0.0 if mesh.volume_m3 is None else volume / mesh.volume_m3 - 1.0
     warnings = list(info.warnings)
-    if not warnings and apart > _FIT_M + _NEAR_SHARE * longest:
-        share = (
-            ""
-            if mesh.volume_m3 is None
-            else f", their volume is {info.volume_m3 / mesh.volume_m3:.1%} of its"
-        )
+    if not warnings and (apart > _SAME_SHARE * longest or abs(added) > _SAME_VOLUME):
+        share = "" if mesh.volume_m3 is None else f", their volume is {volume / mesh.volume_m3:.1%} of its"
         warnings.append(f"the parts' surface is up to {1000 * apart:.3g} mm off the mesh's{share}")
     return info.model_copy(update={"deviation_m": apart, "warnings": warnings})
 
