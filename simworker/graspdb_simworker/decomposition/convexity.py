@@ -220,7 +220,7 @@ def _remesh(
             give(found)
         tell(str(found))
         # A finer one takes longer; what there is by now is worth more than nothing at the end.
-        if found.deviation_m <= target_m(mesh) or time.process_time() - began > limits.seconds / 6:
+        if found.deviation_m <= target_m(mesh) or time.process_time() - began > limits.seconds / 3:
             return
 
 
