@@ -21,7 +21,7 @@ _TILT = Rotation.from_euler("zyx", [0.3, 0.5, 0.7]).as_matrix()
 _BLOCK = 4_000_000
 
 
-class MassProperties(NamedTuple):
+class SolidMeasures(NamedTuple):
     """Volume (m^3), centre of mass (3,) and inertia (3, 3) about it at unit density (m^5)."""
 
     volume: float
@@ -35,7 +35,7 @@ def area(corners: FloatArray) -> float:
     return 0.5 * float(np.linalg.norm(normals, axis=1).sum())
 
 
-def mass_properties(corners: FloatArray) -> MassProperties:
+def mass_properties(corners: FloatArray) -> SolidMeasures:
     """Of the solid within outward triangles (F, 3, 3), metres.
 
     Sums over signed tetrahedra from a point near the mesh (Tonon, "Explicit exact formulas for the 3-D
@@ -46,7 +46,7 @@ def mass_properties(corners: FloatArray) -> MassProperties:
     signed = np.einsum("ij,ij->i", tetrahedra[:, 0], np.cross(tetrahedra[:, 1], tetrahedra[:, 2])) / 6.0
     volume = float(signed.sum())
     if volume == 0.0:
-        return MassProperties(0.0, origin, np.zeros((3, 3)))
+        return SolidMeasures(0.0, origin, np.zeros((3, 3)))
     total = tetrahedra.sum(axis=1)
     centre = np.einsum("i,ij->j", signed, total) / (4.0 * volume)
     # Integral of x x^T over a tetrahedron with a corner at 0: V / 20 (sum of a a^T over corners + s s^T).
@@ -54,7 +54,7 @@ def mass_properties(corners: FloatArray) -> MassProperties:
     second += np.einsum("i,ij,il->jl", signed, total, total)
     covariance = second / 20.0 - volume * np.outer(centre, centre)
     inertia = np.trace(covariance) * np.eye(3) - covariance
-    return MassProperties(volume, origin + centre, inertia)
+    return SolidMeasures(volume, origin + centre, inertia)
 
 
 def share_counted_wrong(corners: FloatArray, *, seed: int = 0) -> float:

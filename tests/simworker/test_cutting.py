@@ -7,7 +7,13 @@ import pytest
 import trimesh
 
 from graspdb_geometry import meshes
-from graspdb_simworker.decomposition.convexity import Candidate, Limits, Undecomposable, decompose, target_m
+from graspdb_simworker.decomposition.convexity import (
+    Candidate,
+    CuttingLimits,
+    Undecomposable,
+    decompose,
+    target_m,
+)
 
 
 def run(mesh: trimesh.Trimesh, seconds: float = 60.0) -> tuple[Candidate, list[str]]:
@@ -15,7 +21,7 @@ def run(mesh: trimesh.Trimesh, seconds: float = 60.0) -> tuple[Candidate, list[s
     read = meshes.load(mesh.export(file_type="stl"), "model/stl")
     notes: list[str] = []
     found: list[Candidate] = []
-    limits = Limits(max_parts=1024, seconds=seconds, seed=0)
+    limits = CuttingLimits(max_parts=1024, seconds=seconds, seed=0)
     decompose(read, limits, tell=notes.append, give=found.append)
     assert found[-1].deviation_m <= target_m(read), notes
     return found[-1], notes

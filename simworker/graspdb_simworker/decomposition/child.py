@@ -59,7 +59,7 @@ def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
             sink, channel.ERROR, f"its libraries do not fit into the memory allowed: {error}".encode()
         )
         return
-    limits = convexity.Limits(order["max_parts"], order["seconds"], order["seed"])
+    limits = convexity.CuttingLimits(order["max_parts"], order["seconds"], order["seed"])
     try:
         convexity.decompose(
             convexity.read(content, order["media_type"], order["unit"]),

@@ -72,7 +72,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Limits:
+class CuttingLimits:
     """What a decomposition may take: parts, and seconds of the processor's time from its start on."""
 
     max_parts: int
@@ -89,7 +89,7 @@ def read(content: bytes, media_type: str, unit: str) -> Mesh:
 
 
 def decompose(
-    mesh: Mesh, limits: Limits, *, tell: Callable[[str], None], give: Callable[[Candidate], None]
+    mesh: Mesh, limits: CuttingLimits, *, tell: Callable[[str], None], give: Callable[[Candidate], None]
 ) -> None:
     """Split a mesh into convex parts; the same input gives the same parts unless time runs out.
 
@@ -110,7 +110,9 @@ def target_m(mesh: Mesh) -> float:
 # --------------------------------------------------------------------------------------------- solids
 
 
-def _cut(mesh: Mesh, limits: Limits, tell: Callable[[str], None], give: Callable[[Candidate], None]) -> None:
+def _cut(
+    mesh: Mesh, limits: CuttingLimits, tell: Callable[[str], None], give: Callable[[Candidate], None]
+) -> None:
     volume = mass_properties(mesh.vertices[mesh.faces]).volume
     # Without sheets, which no part can follow.
     mesh = _of_bodies(mesh)
@@ -205,7 +207,7 @@ class _Report:
 
 
 def _remesh(
-    mesh: Mesh, limits: Limits, tell: Callable[[str], None], give: Callable[[Candidate], None]
+    mesh: Mesh, limits: CuttingLimits, tell: Callable[[str], None], give: Callable[[Candidate], None]
 ) -> None:
     began = time.process_time()
     best = float("inf")
