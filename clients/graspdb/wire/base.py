@@ -39,16 +39,22 @@ MAX_NESTING = 32
 """How deep a user's metadata may nest: every JSON library on its way can still read and write that."""
 
 
+_DESCRIBED = ConfigDict(use_attribute_docstrings=True)
+"""The docstring under a field is its description in the OpenAPI document: what it is, unit, frame, null."""
+
+
 class Request(BaseModel):
     """Base of what clients send: unknown fields and non-finite numbers are errors."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, validate_default=False)
+    model_config = _DESCRIBED | ConfigDict(
+        extra="forbid", allow_inf_nan=False, frozen=True, validate_default=False
+    )
 
 
 class Response(BaseModel):
     """Base of what the service answers: clients ignore the fields that a newer service adds."""
 
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+    model_config = _DESCRIBED | ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 def _split_commas(value: Any) -> Any:
@@ -102,6 +108,43 @@ Metadata = Annotated[dict[str, Any], AfterValidator(lambda value: _storable(valu
 """Any JSON object of the user's: finite numbers only, at most 64 KiB as text."""
 
 PositiveFloat = Annotated[float, Field(gt=0, le=1e12)]
+
+# -- fields that many models have, described once
+
+ObjectId = Annotated[str, Field(description="Id of the object that this is about.")]
+Revision = Annotated[int, Field(description="Revision of the object that the answer rests on.")]
+StoredRevision = Annotated[int, Field(description="Revision of the object that stored it.")]
+ChosenGripper = Annotated[
+    str | None, Field(description="Gripper whose trials count; null where the trials name none.")
+]
+ChosenProtocol = Annotated[
+    str | None, Field(description="Protocol whose trials count; null where the trials name none.")
+]
+ChosenSource = Annotated[
+    str | None, Field(description="Source whose trials count; null where those of all sources do.")
+]
+OutcomeCounts = Annotated[
+    dict[str, int], Field(description="How many trials had each outcome, by the outcome's name.")
+]
+Warnings = Annotated[list[str], Field(description="What a person should know before relying on this.")]
+IntervalLevel = Annotated[float, Field(description="How probably an interval holds the truth: 0.9 is 90 %.")]
+ToolPosition = Annotated[
+    Triple, Field(description="Origin of the tool frame in the object frame: x, y, z, metres.")
+]
+ToolRotation = Annotated[
+    Quadruple,
+    Field(description="Rotation of the tool frame in the object frame: unit quaternion x, y, z, w."),
+]
+ToolPositions = Annotated[
+    list[Triple],
+    Field(description="Origins of the tool frame in the object frame, one x, y, z a pose, metres."),
+]
+ToolRotations = Annotated[
+    list[Quadruple],
+    Field(
+        description="Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a pose."
+    ),
+]
 
 
 def _no_nul(text: str) -> str:
@@ -203,7 +246,9 @@ class Pose(Request):
     """The tool frame in the object frame: ``{position, quaternion_xyzw}`` or a row-major 4x4 ``{matrix}``."""
 
     position: Position
+    """Origin of the tool frame: x, y, z, metres; in the object frame where nothing else is said."""
     quaternion_xyzw: Quaternion
+    """Rotation of the tool frame: a unit quaternion x, y, z, w; in the same frame as the position."""
 
     @model_validator(mode="before")
     @classmethod
@@ -212,12 +257,16 @@ class Pose(Request):
 
 
 class FieldError(Response):
+    """A field of a request, and what is wrong with it."""
+
     field: str
+    """Path to the field, its names and indices joined by dots, as in ``trials.1.position``."""
     message: str
+    """What is wrong with it, in words."""
 
 
 class Problem(Response):
-    """An RFC 9457 problem: ``type`` is stable, ``title`` says what to do, ``errors`` name the fields.
+    """An RFC 9457 problem.
 
     What else a type of problem has (``calls``, ``kernels``) is in ``model_extra``.
     """
@@ -225,18 +274,26 @@ class Problem(Response):
     model_config = ConfigDict(extra="allow")
 
     type: str
+    """Stable name of the kind of problem, for programs."""
     title: str
+    """What is wrong and what to do about it, for people."""
     status: int
+    """HTTP status of the answer."""
     detail: str | None = None
+    """More about this case; null where the title says it all."""
     request_id: str | None = None
+    """Finds the request in the service's log; null where the answer is not the service's."""
     errors: list[FieldError] = Field(default_factory=list)
+    """The fields of the request that are wrong."""
 
 
 T = TypeVar("T")
 
 
 class Page(Response, Generic[T]):
-    """One page of a list; ``next`` is the cursor of the following page, null at the end."""
+    """One page of a list."""
 
     items: list[T]
+    """What the list holds, in its order."""
     next: str | None = None
+    """Cursor of the following page; null at the end."""

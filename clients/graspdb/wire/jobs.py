@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Base64Bytes, Field
 
-from graspdb.wire.base import Quadruple, Request, Response, Text, Triple
+from graspdb.wire.base import ObjectId, Request, Response, Text, ToolPositions, ToolRotations, Triple
 from graspdb.wire.grippers import GripperProfile
 from graspdb.wire.sweeps import Fidelity, Protocol
 
@@ -17,131 +17,197 @@ JobKind = Literal["simulate", "decompose"]
 
 
 class ClaimRequest(Request):
+    """A worker asks for jobs."""
+
     worker: WorkerName
+    """The worker's name, as ``GET /workers`` lists it."""
     capabilities: Annotated[list[Capability], Field(max_length=32)] = Field(
         default_factory=lambda: ["simulate"]
     )
     """Job kinds the worker can do, and ``lift`` where it has that protocol."""
     limit: Annotated[int, Field(ge=1, le=64)] = 1
+    """How many jobs it takes at most."""
 
 
 class GridPlan(Response):
     """A grid as the worker generates it: see :class:`graspdb_geometry.grids.PoseGrid`."""
 
     lower: Triple
+    """Lower corner of the mesh's bounding box, object frame, metres."""
     upper: Triple
+    """Upper corner of the mesh's bounding box, object frame, metres."""
     position_step_m: float
+    """Distance of neighbouring positions, metres."""
     rotation_step_deg: float
+    """Angle between neighbouring rotations, degrees."""
     margin_m: float
+    """How far positions reach beyond the bounding box, metres."""
     region: tuple[Triple, Triple] | None = None
+    """Lower and upper corner of the box the grid is cut to, object frame, metres; null for none."""
     max_poses: int | None = None
+    """Size of the random part of the grid that is simulated; null for the whole grid."""
     seed: int = 0
+    """Chooses which random part of the grid is simulated."""
     symmetric: bool = True
+    """Whether only one of each pair of poses is simulated that the jaw's half turn makes the same."""
 
 
 class PosePlan(Response):
     """The poses of this chunk only, in order."""
 
-    position: list[Triple]
-    quaternion_xyzw: list[Quadruple]
+    position: ToolPositions
+    quaternion_xyzw: ToolRotations
 
 
 class SimulatePayload(Response):
-    """One chunk: the poses ``start`` to ``stop`` of the plan.
-
-    ``convex_parts`` is the path to fetch them from; their bytes have the SHA-256 ``parts_sha256``.
-    """
+    """One chunk: the poses ``start`` to ``stop`` of a sweep's plan."""
 
     sweep: str
-    object: str
+    """Id of the sweep that the chunk is of."""
+    object: ObjectId
     convex_parts: str
+    """Path of the service to fetch the convex parts from, a GLB in metres."""
     parts_sha256: str
+    """SHA-256 of the convex parts' bytes, in hexadecimal digits."""
     mass_kg: float
+    """Mass of the object, kilograms."""
     friction: float
+    """Coulomb's coefficient of friction of the object, without a unit."""
     gripper: GripperProfile
+    """Profile of the gripper as it was when the sweep was planned."""
     protocol: Protocol
+    """How an outcome is judged: by the contact wrench, or by a lift."""
     fidelity: Fidelity
+    """Time step and iterations of the physics: ``standard``, or ``fine``."""
     grid: GridPlan | None = None
+    """The grid that the chunk is cut from; null where poses are given."""
     poses: PosePlan | None = None
+    """The chunk's own poses, in the object frame; null for a grid."""
     start: int
+    """Index in the plan of the chunk's first pose."""
     stop: int
+    """Index in the plan after the chunk's last pose."""
 
 
 class DecomposePayload(Response):
-    """A mesh to split into convex parts: ``mesh`` is the path to fetch it from.
+    """A mesh to split into convex parts.
 
     The result is a GLB in metres with one geometry a part, sent as ``model/gltf-binary``.
     """
 
-    object: str
+    object: ObjectId
     mesh: str
+    """Path of the service to fetch the mesh from."""
     mesh_sha256: str
+    """SHA-256 of the mesh's bytes, in hexadecimal digits."""
     media_type: str = "model/stl"
+    """Format of the mesh as a media type."""
     unit: str = "m"
+    """Unit of the mesh's coordinates: m, mm, cm or in."""
     max_parts: int = 1024
+    """How many parts there may be at most."""
 
 
 class ClaimedJob(Response):
+    """A job, leased to the worker that claimed it."""
+
     id: str
+    """Id of the job."""
     kind: JobKind
+    """What to do: ``simulate`` a chunk, or ``decompose`` a mesh."""
     lease_id: str
+    """Proves that the job is the worker's, in every call about it."""
     lease_expires_at: datetime
+    """When the lease ends by the service's clock, UTC."""
     lease_s: float
     """Seconds the lease lasts from the answer on: what a worker should count by, its clock may differ."""
     payload: SimulatePayload | DecomposePayload
+    """What the work needs, by its kind."""
 
 
 class ClaimResponse(Response):
+    """The jobs that a worker got."""
+
     jobs: list[ClaimedJob]
+    """The jobs, none where there is nothing to do."""
     retry_after_s: float
+    """Seconds to wait before asking again; 0 where there was a job."""
 
 
 class LeaseRenewed(Response):
+    """A lease goes on, or the job is not wanted any more."""
+
     lease_expires_at: datetime
+    """When the lease ends by the service's clock, UTC."""
     lease_s: float
+    """Seconds the lease lasts from the answer on."""
     cancel: bool = False
+    """Whether the work should stop: nobody wants its result any more."""
 
 
 class ResultRows(Request):
-    """What physics measured, for the poses of the chunk that met it: ascending ``pose_index``."""
+    """What physics measured, for the poses of the chunk that met it, in columns."""
 
     pose_index: list[Annotated[int, Field(ge=0)]]
+    """Index of each pose in the sweep's plan, ascending."""
     width_m: list[Annotated[float, Field(ge=0, le=10)] | None]
+    """Distance between the fingers at the end, metres; null where it was not measured."""
     quality: list[Annotated[float, Field(ge=-1e9, le=1e9)] | None]
+    """Margin by which the protocol was met, without a unit; null where it was not measured."""
 
 
 class SimulateResult(Request):
-    """``outcomes``: base64 of one uint8 code a pose of the chunk (:data:`graspdb.wire.OUTCOME_CODES`)."""
+    """What became of a chunk's poses."""
 
     outcomes: Base64Bytes
+    """One uint8 code of an outcome for every pose of the chunk, in order, as base64."""
     rows: ResultRows
+    """What was measured of the poses that met physics."""
 
 
 class ResultAccepted(Response):
+    """A result is stored and its job done."""
+
     job: str
+    """Id of the job."""
     revision: int
+    """The object's revision now that the result is stored."""
     inserted: int
+    """How many trials were stored as rows."""
 
 
 class FailureReport(Request):
-    """``permanent``: another attempt would end the same way, so none is made."""
+    """A worker could not do a job."""
 
     error: Text
+    """What went wrong, in words."""
     permanent: bool = False
+    """Whether another attempt would end the same way, so that none is made."""
 
 
 class FailureNoted(Response):
-    """``state`` is ``queued`` while attempts are left, then ``failed``."""
+    """What becomes of a job after a failure."""
 
     job: str
+    """Id of the job."""
     state: str
+    """``queued`` while attempts are left, then ``failed``."""
     attempts: int
+    """How many attempts have been made."""
 
 
 class WorkerInfo(Response):
+    """A worker that has asked for jobs."""
+
     worker: str
+    """Name the worker gave itself."""
     capabilities: list[str]
+    """Job kinds it can do, and protocols beyond ``wrench``."""
     last_seen: datetime
+    """When it last called, UTC."""
     jobs_leased: int
+    """How many jobs it holds now."""
     jobs_done: int
+    """How many jobs it has completed."""
     poses_done: int
+    """How many poses it has simulated."""

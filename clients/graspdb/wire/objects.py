@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from graspdb.wire.base import Metadata, Request, Response, Slug, Text, Triple
+from graspdb.wire.base import Metadata, OutcomeCounts, Request, Response, Slug, Text, Triple, Warnings
 
 Mass = Annotated[float, Field(gt=0, le=10_000)]
 MassDensity = Annotated[float, Field(gt=0, le=30_000)]
@@ -15,79 +15,121 @@ Friction = Annotated[float, Field(gt=0, le=5)]
 
 
 class ObjectCreate(Request):
+    """An object to register."""
+
     id: Slug
+    """Id of the object, by which routes and trials name it."""
     name: Text | None = None
+    """A name for people; null for none."""
     mass_kg: Mass | None = None
+    """Mass, kilograms; null if unknown, then density times volume where both are known."""
     density_kg_m3: MassDensity | None = None
+    """Mass density, kg/m^3; null if unknown."""
     friction: Friction | None = None
+    """Coulomb's coefficient of friction, without a unit; null if unknown, then the gripper's counts."""
     metadata: Metadata | None = None
+    """Any JSON object of the user's, which GraspDB keeps as it is; null for none."""
 
 
 class ObjectPatch(Request):
     """What to change; a field left out stays, an explicit null clears it."""
 
     name: Text | None = None
+    """A name for people; null for none."""
     mass_kg: Mass | None = None
+    """Mass, kilograms; null if unknown."""
     density_kg_m3: MassDensity | None = None
+    """Mass density, kg/m^3; null if unknown."""
     friction: Friction | None = None
+    """Coulomb's coefficient of friction, without a unit; null if unknown."""
     metadata: Metadata | None = None
+    """Any JSON object of the user's, which replaces the one before; null for none."""
 
 
 class BoundingBox(Response):
-    """Axis-aligned, object frame, metres."""
+    """A box with edges along the axes of the object frame."""
 
     lower: Triple
+    """Lowest x, y, z of the surface, object frame, metres."""
     upper: Triple
+    """Highest x, y, z of the surface, object frame, metres."""
 
 
 class MeshInfo(Response):
-    """A checked mesh: lengths in metres whatever unit it came in.
-
-    ``inertia_m5`` is the inertia about the centre of mass at unit mass density, object axes; times
-    kg/m^3 it is kg m^2. ``volume_m3`` and it are null where the mesh is not watertight.
-    """
+    """A checked mesh: lengths in metres whatever unit it came in."""
 
     sha256: str
+    """SHA-256 of the file's bytes, in hexadecimal digits."""
     media_type: str
+    """Format of the file as a media type."""
     unit: str
+    """Unit that the file's coordinates are in: m, mm, cm or in."""
     bytes: int
+    """Size of the file in bytes."""
     vertices: int
+    """How many vertices the mesh has."""
     faces: int
+    """How many triangles the mesh has."""
     bounding_box: BoundingBox
+    """The smallest box about the mesh, object frame, metres."""
     volume_m3: float | None
+    """Volume inside the mesh, cubic metres; null where it is not watertight."""
     watertight: bool
+    """Whether the surface is closed, so that inside and outside are known."""
     convex: bool
+    """Whether the mesh is its own convex hull."""
     centre_of_mass: Triple | None
+    """Centre of mass at even mass density, object frame, metres; null where it is not watertight."""
     inertia_m5: list[list[float]] | None
-    warnings: list[str] = Field(default_factory=list)
+    """3x3 inertia about the centre of mass at unit mass density, axes of the object frame, m^5: times kg/m^3
+    it is kg m^2; null where the mesh is not watertight."""
+    warnings: Warnings = Field(default_factory=list)
 
 
 class PartsInfo(Response):
-    """``volume_m3`` is the sum over the parts. ``deviation_m``: how far, in metres, the parts' surface and
-    the mesh's lie apart at most, over points sampled on both; null without a mesh."""
+    """Convex bodies whose union is the object in collision tests and physics."""
 
     sha256: str
+    """SHA-256 of the GLB's bytes, in hexadecimal digits."""
     parts: int
+    """How many convex parts there are."""
     volume_m3: float
+    """Sum of the parts' volumes, cubic metres."""
     bounding_box: BoundingBox
+    """The smallest box about all parts, object frame, metres."""
     deviation_m: float | None = None
-    warnings: list[str] = Field(default_factory=list)
+    """How far the parts' surface and the mesh's lie apart at most, metres, over points sampled on both; null
+    without a mesh."""
+    warnings: Warnings = Field(default_factory=list)
 
 
 class ObjectInfo(Response):
-    """``outcomes`` counts every collected trial by outcome, packed ones included; ``trials`` is their sum."""
+    """An object, its properties, and how many trials it has."""
 
     id: str
+    """Id of the object, by which routes and trials name it."""
     name: str | None = None
+    """A name for people; null where it has none."""
     mass_kg: float | None = None
+    """Mass, kilograms; null if unknown."""
     density_kg_m3: float | None = None
+    """Mass density, kg/m^3; null if unknown."""
     friction: float | None = None
+    """Coulomb's coefficient of friction, without a unit; null if unknown."""
     metadata: Metadata | None = None
+    """The user's own JSON object; null where there is none."""
     revision: int
+    """Rises with every change of trials, mesh, parts or properties."""
     epoch: int
+    """Revision of the last change that was not an append of trials."""
     mesh: MeshInfo | None = None
+    """The mesh as it was checked; null where there is none."""
     convex_parts: PartsInfo | None = None
+    """The convex parts; null where there are none yet."""
     trials: int = 0
-    outcomes: dict[str, int] = Field(default_factory=dict)
+    """How many collected trials there are, packed outcomes included."""
+    outcomes: OutcomeCounts = Field(default_factory=dict)
     created_at: datetime
+    """When it was registered, UTC."""
     updated_at: datetime
+    """When it last changed, UTC."""

@@ -7,18 +7,30 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from graspdb.wire.base import (
+    ChosenGripper,
+    ChosenProtocol,
+    ChosenSource,
     Direction,
+    IntervalLevel,
+    ObjectId,
+    OutcomeCounts,
     Pose,
     Position,
     Quadruple,
     Quaternion,
     Request,
     Response,
+    Revision,
     Slug,
     Source,
+    ToolPosition,
+    ToolPositions,
+    ToolRotation,
+    ToolRotations,
     Triple,
     Vector4,
     Vector7,
+    Warnings,
     _split_commas,
     _unit,
 )
@@ -31,90 +43,130 @@ NoiseDeg = Annotated[float, Field(ge=0, le=60.0)]
 Extent = Annotated[float, Field(gt=0, le=1_000.0)]
 
 
+NamedKernel = Annotated[
+    Slug | None,
+    Field(
+        description="The density's kernel: ``isotropic``, ``anisotropic`` (the newest fitted for object and"
+        " gripper) or a stored kernel's id; by default isotropic."
+    ),
+]
+
+
 class KernelSpec(Request):
-    """A kernel by its widths: standard deviations per axis. ``cutoff`` in sigmas; null means exact."""
+    """A kernel by its widths."""
 
     kind: Literal["isotropic"] = "isotropic"
+    """The kernel's kind: alike in all directions."""
     sigma_position_m: WidthM | None = None
+    """Standard deviation of position along each axis, metres; by default chosen from the trials."""
     sigma_rotation_deg: WidthDeg | None = None
+    """Standard deviation of rotation about each axis, degrees; by default chosen from the trials."""
     cutoff: Annotated[float, Field(ge=2.0, le=20.0)] | None = None
+    """Distance in standard deviations beyond which a kernel is taken as zero; null for none, which is
+    exact."""
 
 
 class TrialSelection(Request):
     """Which trials a question is about."""
 
     gripper: Slug | None = None
+    """Only trials with this gripper, and those that name none; by default the one gripper they name."""
     protocol: Slug | None = None
+    """Only trials judged by this protocol, and those that name none; by default the one they name."""
     source: Source | None = None
+    """Only trials from this source; by default from all."""
 
 
 class Selection(TrialSelection):
     """Which trials a density is built from, and with which kernel."""
 
     kernel: KernelSpec | Slug | None = None
+    """The density's kernel: its widths, ``isotropic``, ``anisotropic`` (the newest fitted for object and
+    gripper) or a stored kernel's id; by default isotropic."""
     sigma_position_m: WidthM | None = None
+    """Standard deviation of the isotropic kernel along each axis, metres; by default chosen from the
+    trials."""
     sigma_rotation_deg: WidthDeg | None = None
+    """Standard deviation of the isotropic kernel about each axis, degrees; by default chosen from the
+    trials."""
 
 
 class SelectionQuery(Selection):
     """A selection in a query string, where a kernel is a name with widths beside it."""
 
-    kernel: Slug | None = None
+    kernel: NamedKernel = None
 
 
 class KernelInfo(Response):
-    """The kernel that answered; ``rule`` says how its widths were chosen.
-
-    Of a stored kernel ``sigma_*`` are those of the isotropic one with equal determinants; ``widths_*`` are
-    its standard deviations along and about x, y and z.
-    """
+    """The kernel that answered."""
 
     kind: str
+    """What it is: ``isotropic``, or a stored kernel's kind."""
     sigma_position_m: float
+    """Standard deviation along each axis, metres; of a stored kernel that of the isotropic one with equal
+    determinant."""
     sigma_rotation_deg: float
+    """Standard deviation about each axis, degrees; of a stored kernel that of the isotropic one with equal
+    determinant."""
     rule: str
+    """How the widths were chosen, in words."""
     id: str | None = None
+    """Id of a stored kernel; null for one by its widths."""
     alignment: str | None = None
+    """Whose axes a stored kernel is along; null for an isotropic one."""
     widths_m: Triple | None = None
+    """Standard deviations along x, y, z of the frame of the alignment, metres; null for an isotropic one."""
     widths_deg: Triple | None = None
+    """Standard deviations about x, y, z of the gripper's frame, degrees; null for an isotropic one."""
 
 
 class WeightsInfo(Response):
-    """How successes were weighted to undo how poses were chosen (eq 1); ``rule`` says it in words.
-
-    ``equal``; ``mixture``: 1 / sum n_k g_k(x) over grids of different regions or steps; ``own``: 1 / g of
-    each trial's own proposal density; ``mixture-and-own``: both, the grids as one strategy. ``poses_tried``
-    counts the grids' distinct poses, collisions included.
-    """
+    """How successes were weighted to undo how poses were chosen (eq 1)."""
 
     kind: Literal["equal", "mixture", "own", "mixture-and-own"]
+    """``equal``; ``mixture``: 1 / sum n_k g_k(x) over grids of different regions or steps; ``own``: 1 / g of
+    each trial's own proposal density; ``mixture-and-own``: both, the grids as one strategy."""
     rule: str
+    """The same in words, with numbers."""
     poses_tried: int | None = None
+    """How many distinct poses the grids tried, collisions included; null without grids."""
     without_proposal_density: int = 0
+    """How many successes have no proposal density and weigh the mean."""
 
 
 class DensityInfo(Response):
-    """``size`` successes shape the density; twins by the jaw's symmetry are implicit and not counted."""
+    """A density and what it is made of."""
 
-    object: str
-    revision: int
+    object: ObjectId
+    revision: Revision
     epoch: int
-    gripper: str | None
-    protocol: str | None
-    source: str | None
+    """Revision of the object's last change that was not an append of trials."""
+    gripper: ChosenGripper
+    protocol: ChosenProtocol
+    source: ChosenSource
     kernel: KernelInfo
+    """The kernel about every success, and the rule that chose its widths."""
     size: int
-    outcomes: dict[str, int]
+    """How many successes shape the density; twins by the jaw's symmetry are implicit and not counted."""
+    outcomes: OutcomeCounts
     effective_sample_size: float
+    """How many successes of equal weight would tell as much."""
     weights: WeightsInfo | None = None
+    """How successes were weighted; null where there are none."""
     unit: str = "1/(m^3 rad^3)"
+    """Unit of every density that is answered."""
     bytes: int
-    warnings: list[str] = Field(default_factory=list)
+    """Memory that the density takes in the service, bytes."""
+    warnings: Warnings = Field(default_factory=list)
 
 
 class PoseColumns(Request):
+    """Poses in columns of equal length."""
+
     position: Annotated[list[Position], Field(min_length=1)]
+    """Origins of the tool frame in the object frame, one x, y, z a pose, metres."""
     quaternion_xyzw: Annotated[list[Quaternion], Field(min_length=1)]
+    """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a pose."""
 
     @model_validator(mode="after")
     def _same_length(self) -> PoseColumns:
@@ -136,35 +188,67 @@ LikelihoodColumn = Literal[
 ]
 
 
+IncludedColumns = Annotated[
+    list[LikelihoodColumn] | None, Field(description="Columns to compute; by default all of them.")
+]
+IncludedScores = Annotated[
+    list[LikelihoodColumn] | None,
+    Field(
+        description="Scores of a grasp to compute; by default all, the success probability where the"
+        " objective needs it or the selection has few enough attempts to give it at once."
+    ),
+]
+
+
 class LikelihoodRequest(Selection):
+    """Poses to say the likelihood of."""
+
     poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns
-    include: list[LikelihoodColumn] | None = None
+    """Poses of the tool frame in the object frame, in a list or in columns; 1 to 1,000,000."""
+    include: IncludedColumns = None
 
 
 class Intervals(Response):
-    level: float
+    """Intervals of the success probability, in columns."""
+
+    level: IntervalLevel
     low: list[float | None]
+    """Lower ends, one a pose; null where the probability is."""
     high: list[float | None]
+    """Upper ends, one a pose; null where the probability is."""
 
 
 class Interval(Response):
-    level: float
+    """The interval of a success probability."""
+
+    level: IntervalLevel
     low: float
+    """Lower end, a probability from 0 to 1."""
     high: float
+    """Upper end, a probability from 0 to 1."""
 
 
 class Likelihoods(Response):
-    """Columns in the poses' order. Density in 1/(m^3 rad^3); the log of an exact zero is null."""
+    """Columns in the poses' order; one that was not asked for is null."""
 
-    revision: int
+    revision: Revision
     kernel: KernelInfo
+    """The kernel of the density that answered."""
     density: list[float] | None = None
+    """Density of successes at each pose, 1/(m^3 rad^3); null if not asked for."""
     log_density: list[float | None] | None = None
+    """Natural logarithm of the density in 1/(m^3 rad^3); null for that of an exact zero, or if not asked
+    for."""
     relative: list[float] | None = None
+    """Density over its global maximum, so that 1 is the best grasp there is; null if not asked for."""
     success_probability: list[float | None] | None = None
+    """How likely each grasp holds, 0 to 1; null where attempts do not tell."""
     interval: Intervals | None = None
+    """Intervals of the success probability; null if not asked for."""
     effective_trials: list[float] | None = None
+    """How many attempts the success probability rests on, weighted by nearness; null if not asked for."""
     collision_free: list[bool | None] | None = None
+    """Whether the open gripper clears the object; null until mesh and gripper are known."""
 
 
 def _object_pose(value: Any) -> Any:
@@ -196,165 +280,228 @@ MAX_EXCLUDED = 1_000
 
 
 class ObstacleBox(Pose):
-    """A box that the gripper must not touch: edge lengths, and the pose of its centre in ``frame``."""
+    """A box that the gripper must not touch."""
 
     size_m: tuple[Extent, Extent, Extent]
+    """Edge lengths along the box's own x, y, z, metres."""
     quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    """Rotation of the box in ``frame``: a unit quaternion x, y, z, w."""
 
 
 class Obstacles(Request):
-    """What else stands around, in ``frame``: boxes, and points of a sensor, each a ball."""
+    """What else stands around."""
 
     boxes: Annotated[list[ObstacleBox], Field(max_length=MAX_OBSTACLE_BOXES)] = Field(default_factory=list)
+    """Boxes that the open gripper must not touch, in the frame of the constraints."""
     points: Annotated[list[Position], Field(max_length=MAX_OBSTACLE_POINTS)] = Field(default_factory=list)
+    """Points of a sensor that the open gripper must not touch, x, y, z in the frame of the constraints,
+    metres."""
     point_radius_m: Annotated[float, Field(ge=0, le=1)] = 0.005
+    """Radius of the ball that each point stands for, metres."""
 
 
 class GraspConstraints(Selection):
     """What a best grasp is chosen by, as far as it fits a query string.
 
     All constraints are in ``frame``: world if ``object_pose`` is given, else object.
-
-    ``objective``: the density; ``success_probability``, which ranks by the lower end of its interval; or
-    ``robust``, the mean of ``robust_of`` (by default the success probability where attempts tell it, else the
-    density) under noise. ``pose_noise_*`` is noise of the object's pose about the centre of its bounding box
-    and acts on the left; ``tool_noise_*`` is the tool's own and acts on the right. Deviations per axis.
-
-    ``include`` limits which scores of a grasp are computed. Without it the success probability comes along
-    where the objective needs it or the selection has few enough attempts to give it at once.
-
-    ``prior``: whether an object with geometry and no success yet may answer from its edges, by the density
-    that proposals of strategy ``edges`` are drawn from; each such grasp is marked ``prior``. By default it
-    does where a gripper is known; true says what is missing where it can't, false leaves it at
-    ``no_successes``.
     """
 
     count: Annotated[int, Field(ge=1, le=1_000)] = 1
+    """How many distinct grasps to answer at most."""
     objective: Objective = "density"
+    """What is best: the ``density``; ``success_probability``, by the lower end of its interval; or
+    ``robust``, the mean of ``robust_of`` under noise."""
     robust_of: Averaged | None = None
+    """What ``robust`` is the mean of; by default the success probability where attempts tell it, else the
+    density."""
     pose_noise_m: NoiseM | None = None
+    """Standard deviation of the object's place along each axis, metres; by default none."""
     pose_noise_deg: NoiseDeg | None = None
+    """Standard deviation of the object's rotation about each axis through the centre of its bounding box,
+    degrees; by default none."""
     tool_noise_m: NoiseM | None = None
+    """Standard deviation of the tool's place along each axis of its frame, metres; by default none."""
     tool_noise_deg: NoiseDeg | None = None
-    include: list[LikelihoodColumn] | None = None
+    """Standard deviation of the tool's rotation about each axis of its frame, degrees; by default none."""
+    include: IncludedScores = None
     prior: bool | None = None
+    """Whether an object with geometry and no success yet may answer from its edges, each grasp marked
+    ``prior``. By default it does where a gripper is known; true says what is missing where it can't, false
+    leaves it at ``no_successes``."""
     box_min: Position | None = None
+    """Lower corner x,y,z of the box that the tool's origin lies in, in ``frame``, metres; by default none."""
     box_max: Position | None = None
+    """Upper corner x,y,z of the box that the tool's origin lies in, in ``frame``, metres; by default none."""
     sphere: Vector4 | None = None
+    """Centre x,y,z and radius r of the ball that the tool's origin lies in, in ``frame``, metres; by default
+    none."""
     above_plane: Vector4 | None = None
+    """nx,ny,nz,d: keeps n.x >= d at the tool's origin x, in ``frame``, d in metres; by default none."""
     approach: Direction | None = None
+    """Direction x,y,z in ``frame`` that the tool's z axis points in; by default any."""
     approach_cone_deg: Angle | None = None
+    """Half angle of the cone about ``approach``, degrees; null without ``approach``, which needs it."""
     closing: Direction | None = None
+    """Direction x,y,z in ``frame`` that the tool's y axis points in, with either sign for a symmetric jaw; by
+    default any."""
     closing_cone_deg: Angle | None = None
+    """Half angle of the cone about ``closing``, degrees; null without ``closing``, which needs it."""
     collision_free: bool | None = None
+    """Whether the open gripper must clear the object; by default it must where mesh and gripper are known."""
     pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
+    """How far back along the approach the open gripper's straight way must be free, metres; by default not at
+    all."""
     max_width_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
+    """How far the fingers may be apart once both touch the object, metres; by default as far as the jaw
+    opens."""
     object_pose: ObjectPose | None = None
+    """Pose of the object frame in the world frame: x,y,z in metres and a unit quaternion x,y,z,w; null if not
+    known, then there is no world."""
     frame: Literal["world", "object"] | None = None
+    """Frame of the constraints; by default the world's if ``object_pose`` is given, else the object's."""
     min_separation_m: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Grasps are distinct from this distance of their origins on, metres; by default 0.01."""
     min_separation_deg: Angle | None = None
+    """Grasps are distinct from this angle between them on, degrees; by default 20."""
 
 
 class BestGraspRequest(GraspConstraints):
-    """The constrained maximum (figure 2).
-
-    ``half_spaces``: rows nx, ny, nz, d that keep n.x >= d at the tool's origin. ``candidates``: only these
-    poses are ranked, as they are; a grasp's ``candidate`` is its place among them. ``exclude``: no grasp
-    within both separations of one of these.
-    """
+    """The constrained maximum (figure 2)."""
 
     half_spaces: Annotated[list[Vector4], Field(max_length=MAX_HALF_SPACES)] | None = None
+    """Rows nx, ny, nz, d that keep n.x >= d at the tool's origin x, in ``frame``, d in metres; by default
+    none."""
     obstacles: Obstacles | None = None
+    """What else the open gripper must not touch, in ``frame``; null for nothing."""
     candidates: Annotated[list[Pose], Field(min_length=1, max_length=MAX_CANDIDATES)] | PoseColumns | None = (
         None
     )
+    """Only these poses, in the object frame, are ranked, as they are; a grasp's ``candidate`` is its place
+    among them; null for any pose."""
     exclude: Annotated[list[Pose], Field(max_length=MAX_EXCLUDED)] | PoseColumns | None = None
+    """No grasp within both separations of one of these poses, in the object frame; null for none."""
 
 
 class WorldPose(Response):
+    """The pose of a tool frame in the world frame."""
+
     position: Triple
+    """Origin of the tool frame in the world frame: x, y, z, metres."""
     quaternion_xyzw: Quadruple
+    """Rotation of the tool frame in the world frame: unit quaternion x, y, z, w."""
 
 
 class Grasp(Response):
-    """A grasp in the object frame, and in the world's where the object's pose was given.
+    """A grasp in the object frame, and in the world's where the object's pose was given."""
 
-    ``score`` is what it was ranked by. ``width_m`` is the jaw's opening once both fingers touch the object,
-    null where geometry or gripper is unknown or nothing is between the fingers. ``prior``: chosen by the
-    object's edges before any success; its density is that of the edges.
-    """
-
-    position: Triple
-    quaternion_xyzw: Quadruple
+    position: ToolPosition
+    quaternion_xyzw: ToolRotation
     world: WorldPose | None = None
+    """The same grasp in the world frame; null unless the object's pose was given."""
     score: float | None = None
+    """What it was ranked by, as ``ranking`` says; null where nothing was ranked."""
     density: float
+    """Density of successes there, 1/(m^3 rad^3); of a ``prior`` grasp that of the edges."""
     log_density: float
+    """Natural logarithm of the density in 1/(m^3 rad^3)."""
     relative: float
+    """Density over its global maximum, so that 1 is the best grasp there is."""
     success_probability: float | None = None
+    """How likely it holds, 0 to 1; null where attempts do not tell, or it was not asked for."""
     interval: Interval | None = None
+    """Interval of the success probability; null where that is."""
     effective_trials: float | None = None
+    """How many attempts the success probability rests on, weighted by nearness; null where it was not asked
+    for."""
     collision_free: bool | None = None
+    """Whether the open gripper clears the object; null until mesh and gripper are known."""
     prior: bool = False
+    """Whether it was chosen by the object's edges, before any success."""
     candidate: int | None = None
+    """Its place among the candidates, from 0; null where none were given."""
     width_m: float | None = None
+    """Distance between the fingers once both touch the object, metres; null where geometry or gripper are
+    unknown or nothing is between the fingers."""
     nearest_trials: list[int] = Field(default_factory=list)
+    """The trials nearest to it, by their ``seq``."""
     active_constraints: list[str] = Field(default_factory=list)
+    """The constraints that hold it where it is: relax one to do better."""
 
 
 class Ranking(Response):
-    """What grasps were ranked by; ``score`` in words, noise as it was taken into account."""
+    """What grasps were ranked by."""
 
     objective: Objective
+    """The objective that was asked for."""
     score: str
+    """What ``score`` is, in words."""
     robust_of: Averaged | None = None
+    """What ``robust`` was the mean of; null for other objectives."""
     pose_noise: str | None = None
+    """Noise of the object's pose as it was taken into account, in words; null for none."""
     tool_noise: str | None = None
+    """Noise of the tool as it was taken into account, in words; null for none."""
 
 
 class BestGrasps(Response):
-    """``fewer``: less than ``count`` distinct grasps exist; ``infeasible``: none within any kernel's reach,
-    and ``nearest`` is the best grasp that ignores the constraints' region but lies closest to it."""
+    """The best distinct grasps within constraints."""
 
     status: Literal["ok", "fewer", "infeasible", "no_successes"]
+    """``ok``; ``fewer``: less than ``count`` distinct grasps exist; ``infeasible``: none within any kernel's
+    reach; or ``no_successes``."""
     grasps: list[Grasp]
+    """The grasps in the object frame, best first."""
     nearest: Grasp | None = None
+    """Where infeasible, the best grasp in the object frame that ignores the constraints' region but lies
+    closest to it; else null."""
     ranking: Ranking | None = None
-    revision: int
+    """What the grasps were ranked by; null where there was nothing to rank."""
+    revision: Revision
     kernel: KernelInfo
+    """The kernel of the density that answered."""
 
 
 class SamplesRequest(Selection):
+    """Poses to draw from a density."""
+
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    """How many poses to draw."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
+    """The same seed and revision give the same poses; by default a new one."""
 
 
 class Samples(Response):
-    """Poses drawn from a density, in columns; sent back with the trial, ``proposal_density`` weights it."""
+    """Poses drawn from a density, in columns."""
 
-    revision: int
+    revision: Revision
     kernel: KernelInfo
+    """The kernel of the density that they were drawn from."""
     seed: int
-    position: list[Triple]
-    quaternion_xyzw: list[Quadruple]
+    """The seed that draws the same poses again."""
+    position: ToolPositions
+    quaternion_xyzw: ToolRotations
     proposal_density: list[float]
+    """Density that each pose was drawn with, 1/(m^3 rad^3); sent back with the trial, it weights it."""
 
 
 Strategy = Literal["density", "uncertainty", "edges"]
 
 
 class ProposalsRequest(SamplesRequest):
-    """Grasps to try next. ``density``: where successes lie. ``uncertainty``: where one more trial teaches
-    most. ``edges``: where the jaw can close on opposed surfaces or edges, before anything is known."""
+    """Grasps to try next."""
 
     strategy: Strategy = "density"
+    """``density``: where successes lie; ``uncertainty``: where one more trial teaches most; ``edges``: where
+    the jaw can close on opposed surfaces or edges, before anything is known."""
 
 
 class Proposals(Samples):
-    """Poses to try, in columns; ``criterion`` says how they were drawn."""
+    """Poses to try, in columns."""
 
     strategy: Strategy
+    """The strategy that was asked for."""
     criterion: str
+    """How they were drawn, in words."""
 
 
 # -- in query strings, and beside poses that are read as arrays
@@ -373,18 +520,20 @@ class LikelihoodQuery(SelectionQuery):
     """One pose in a query string."""
 
     position: Position
+    """Origin of the tool frame in the object frame: x,y,z in metres."""
     quaternion_xyzw: Quaternion
-    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
+    """Rotation of the tool frame in the object frame: a unit quaternion x,y,z,w."""
+    include: Annotated[IncludedColumns, BeforeValidator(_listed)] = None
 
 
 class BestGraspQuery(GraspConstraints):
     """The best grasp's constraints in a query string."""
 
-    kernel: Slug | None = None
-    include: Annotated[list[LikelihoodColumn] | None, BeforeValidator(_listed)] = None
+    kernel: NamedKernel = None
+    include: Annotated[IncludedScores, BeforeValidator(_listed)] = None
 
 
 class LikelihoodOptions(Selection):
     """A likelihood request without its poses, which are read as arrays."""
 
-    include: list[LikelihoodColumn] | None = None
+    include: IncludedColumns = None

@@ -12,7 +12,21 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field
 
-from graspdb.wire.base import Direction, Request, Response, Slug, Triple
+from graspdb.wire.base import (
+    ChosenGripper,
+    ChosenProtocol,
+    ChosenSource,
+    Direction,
+    IntervalLevel,
+    ObjectId,
+    OutcomeCounts,
+    Request,
+    Response,
+    Revision,
+    Slug,
+    Triple,
+    Warnings,
+)
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.queries import KernelInfo, SelectionQuery, TrialSelection, WidthDeg, WidthM
 from graspdb.wire.states import AnyRunState
@@ -32,7 +46,7 @@ Matching = Literal["determinants", "likelihood", "success"]
 
 
 class Report(Response):
-    """What every report says first: of which trials it is, and ``text``, its answer in words.
+    """What every report says first.
 
     A kind of report declares the ``question`` that it answers, and the model of the options it is asked by.
     """
@@ -40,280 +54,371 @@ class Report(Response):
     question: ClassVar[str]
     options: ClassVar[type[Request]]
     report: ReportName
-    object: str
-    revision: int
-    gripper: str | None = None
-    protocol: str | None = None
-    source: str | None = None
+    """Name of the report, as in its path."""
+    object: ObjectId
+    revision: Revision
+    gripper: ChosenGripper = None
+    protocol: ChosenProtocol = None
+    source: ChosenSource = None
     text: str
-    warnings: list[str] = Field(default_factory=list)
+    """The answer in words."""
+    warnings: Warnings = Field(default_factory=list)
 
 
 class ReportRange(Response):
-    """A value with its interval; null where nothing can be said."""
+    """A value with its interval."""
 
     value: float | None
+    """The estimate; null where nothing can be said."""
     low: float | None
+    """Lower end of its interval; null where nothing can be said."""
     high: float | None
+    """Upper end of its interval; null where nothing can be said."""
 
 
 class ConvergencePoint(Response):
-    """Similarity s (eq 9) and the held-out log likelihood (nats of 1/(m^3 rad^3)) at a number of grasps.
-
-    ``deviation`` is the standard deviation over bootstrap replicates, ``log_likelihood_error`` a standard
-    error.
-    """
+    """How good the density is at a number of grasps."""
 
     grasps: int
+    """How many successes the density was made of."""
     similarity: float
+    """Similarity s (eq 9) of densities of as many other successes: 1 is the same."""
     deviation: float
+    """Standard deviation of the similarity over bootstrap replicates."""
     log_likelihood: float
+    """Held-out mean log likelihood, nats of 1/(m^3 rad^3)."""
     log_likelihood_error: float
+    """Standard error of the log likelihood, nats."""
 
 
 class Verdict(Response):
-    """Whether there are enough grasps: ``enough``, ``more`` or ``borderline``.
-
-    ``needed`` are grasps in total for the target, ``more`` those beyond what there is; null where the curve
-    does not rise enough to say.
-    """
+    """Whether there are enough grasps."""
 
     state: Literal["enough", "more", "borderline"]
+    """``enough``, ``more`` are needed, or ``borderline``."""
     grasps: int
+    """How many successes there are."""
     target: float
+    """Similarity that counts as enough."""
     similarity: ReportRange
+    """Similarity with all grasps there are."""
     needed: ReportRange
+    """Grasps in total for the target; null values where the curve does not rise enough to say."""
     more: ReportRange
+    """Grasps needed beyond what there is; null values where the curve does not rise enough to say."""
     extrapolated: bool
+    """Whether the target lies beyond the curve's last point."""
     exponent: float
+    """Exponent a of 1 - s ~ N^-a, by which similarity s nears 1 with N grasps."""
 
 
 class ConvergenceCurve(Response):
+    """Convergence under one kernel."""
+
     label: str
+    """What the kernel is, in words, for a legend."""
     kernel: KernelInfo
+    """The kernel that the densities have."""
     points: list[ConvergencePoint]
+    """Similarity and likelihood at rising numbers of grasps."""
     verdict: Verdict
+    """Whether there are enough grasps, by this curve."""
 
 
 class ConvergenceOptions(SelectionQuery):
-    """``matching`` says how the isotropic kernel beside a stored one is chosen."""
+    """Of which trials, and under which kernel."""
 
     matching: Matching | None = None
+    """How the isotropic kernel beside a stored one is chosen: by equal ``determinants``, equal ``likelihood``
+    of left-out grasps, or equal ``success`` of simulated draws; by default by what is known."""
 
 
 class ConvergenceReport(Report):
-    """Have we tried enough? N counts successes; twins by the jaw's symmetry are not counted.
-
-    With a stored kernel the second curve is the isotropic kernel matched to it (by equal determinants, equal
-    likelihood of left-out grasps, or equal success of draws that were simulated as checks), and ``ratio`` the
-    grasps it needs over those the isotropic one needs. ``method`` says how the numbers were made: which
-    bootstrap, which subsets, and what stays while trials are added.
-    """
+    """Have we tried enough? N counts successes; twins by the jaw's symmetry are not counted."""
 
     question: ClassVar = (
         "Have we tried enough? Similarity and held-out likelihood against the number of successes."
     )
     options: ClassVar = ConvergenceOptions
     report: Literal["convergence"] = "convergence"
-    level: float
+    """Name of the report, as in its path."""
+    level: IntervalLevel
     held_out: int
+    """How many successes were left out to judge the likelihood."""
     subsets: int
+    """How many ways the successes were divided."""
     replicates: int
+    """How many bootstrap replicates the deviation is taken over."""
     method: str = ""
+    """How the numbers were made: which bootstrap, which subsets, and what stays while trials are added."""
     curves: list[ConvergenceCurve]
+    """One curve, or with a stored kernel a second of the isotropic kernel matched to it."""
     matching: Matching | None = None
+    """How the isotropic kernel was matched; null without a stored kernel."""
     matched: bool | None = None
+    """Whether a kernel that matches was found; null without a stored kernel."""
     ratio: ReportRange | None = None
+    """Grasps that the stored kernel needs over those the isotropic one needs; null without a stored
+    kernel."""
 
 
 class AnisotropyHistogram(Response):
-    """P(success) over two displacements, first axis first; null where nothing was tried.
-
-    ``edges`` in metres (x, y) or radians (rx, ry, rz); ``slice_m`` the range of z.
-    """
+    """P(success) over two displacements, first axis first."""
 
     axes: tuple[str, str]
+    """The two axes: x, y, z along, or rx, ry, rz about those of the frame of the alignment."""
     edges: tuple[list[float], list[float]]
+    """Edges of the cells along both axes, metres (x, y, z) or radians (rx, ry, rz)."""
     slice_m: tuple[float, float] | None
+    """Range of the displacement along z, metres; null where it is not cut."""
     probability: list[list[float | None]]
+    """Share of trials that succeeded in each cell; null where nothing was tried."""
     low: list[list[float | None]]
+    """Lower end of each cell's interval; null where nothing was tried."""
     high: list[list[float | None]]
+    """Upper end of each cell's interval; null where nothing was tried."""
     count: list[list[int]]
+    """How many pairs of trials fall in each cell."""
 
 
 class AnisotropyTolerance(Response):
-    """How far a success may be displaced along (x, y, z; metres) or about (rx, ry, rz; radians) one axis
-    until the chance of success falls to one half. ``beyond``: it does not within what was looked at;
-    ``within``: it has at the smallest displacement tried, and ``half_width`` is that one (null where the
-    density's kernel hides it).
-    """
+    """How far a success may be displaced along or about one axis until the chance of success falls to one
+    half."""
 
     axis: str
+    """x, y, z along, or rx, ry, rz about an axis of the frame of the alignment."""
     unit: Literal["m", "rad"]
+    """Unit of every displacement here: metres or radians."""
     half_width: float | None
+    """Displacement at which half of the grasps still hold, in ``unit``; null where it is not known, or the
+    density's kernel hides it."""
     low: float | None
+    """Lower end of its interval, in ``unit``; null where it is not known."""
     high: float | None
+    """Upper end of its interval, in ``unit``; null where it is not known."""
     minus: float | None
+    """The same towards the negative side, in ``unit``; null where it is not known."""
     plus: float | None
+    """The same towards the positive side, in ``unit``; null where it is not known."""
     beyond: bool
+    """Whether success does not fall to one half within what was looked at."""
     within: bool = False
+    """Whether it has at the smallest displacement tried, which ``half_width`` then is."""
     displacement: list[float]
+    """Displacements of the profile, in ``unit``."""
     probability: list[float]
+    """Chance of success at each displacement."""
     profile_low: list[float]
+    """Lower end of the interval at each displacement."""
     profile_high: list[float]
+    """Upper end of the interval at each displacement."""
     count: list[int]
+    """How many pairs of trials lie at each displacement."""
 
 
 class AnisotropyRelation(Response):
-    """How many attempts succeeded that lay alike to a pair the jaw can close on, collisions included.
-
-    ``relation``: ``surfaces`` (two opposite faces), ``coplanar-edges`` (two parallel edges of one face),
-    ``parallel-edges`` (two that point apart), or ``none`` (at no pair). ``angle_deg`` is the range of the
-    angle between the closing axis and the way from one side of the pair to the other. ``free_*`` leave out
-    the attempts that collided.
-    """
+    """How many attempts succeeded that lay alike to a pair the jaw can close on, collisions included."""
 
     relation: str
+    """``surfaces`` (two opposite faces), ``coplanar-edges`` (two parallel edges of one face),
+    ``parallel-edges`` (two that point apart), or ``none`` (at no pair)."""
     angle_deg: tuple[float, float] | None
+    """Range of the angle between the closing axis and the way from one side of the pair to the other,
+    degrees; null at no pair."""
     attempts: int
+    """How many attempts lay so."""
     collisions: int
+    """How many of them collided."""
     successes: int
+    """How many of them succeeded."""
     probability: float | None
+    """Share that succeeded; null where nothing was tried."""
     low: float | None
+    """Lower end of its interval; null where nothing was tried."""
     high: float | None
+    """Upper end of its interval; null where nothing was tried."""
     free_probability: float | None
+    """Share that succeeded of those that did not collide; null where all did."""
     free_low: float | None
+    """Lower end of that share's interval; null where all collided."""
     free_high: float | None
+    """Upper end of that share's interval; null where all collided."""
 
 
 class AnisotropyHypothesis(Response):
-    """An expectation of the paper as a quotient of half widths, above 1 where it holds, with its interval.
-
-    ``x-wide`` and ``z-wide``: x or z over y; ``ry-wide``: turns about y over the wider of the others;
-    ``alignment-sharpens``: widest over narrowest translation, aligned over the gripper's axes. ``bound`` says
-    where a half width reaches beyond what was looked at; null values where nothing can be said.
-    """
+    """An expectation of the paper as a quotient of half widths, above 1 where it holds."""
 
     name: str
+    """``x-wide`` and ``z-wide``: x or z over y; ``ry-wide``: turns about y over the wider of the others;
+    ``alignment-sharpens``: widest over narrowest translation, aligned over the gripper's axes."""
     ratio: float | None
+    """The quotient of half widths; null where nothing can be said."""
     low: float | None
+    """Lower end of its interval; null where nothing can be said."""
     high: float | None
+    """Upper end of its interval; null where nothing can be said."""
     verdict: Literal["confirmed", "denied", "undecided"]
+    """``confirmed`` or ``denied`` where the interval excludes 1, else ``undecided``."""
     bound: Literal["lower", "upper", "both"] | None = None
+    """Where a half width reaches beyond what was looked at, which end the quotient is; null elsewhere."""
 
 
 class AnisotropyOptions(SelectionQuery):
-    """``empirical`` counts pairs of trials; ``density`` compares the density of successes with attempts'."""
+    """Of which trials, by which method, along whose axes."""
 
     method: Method = "empirical"
+    """``empirical`` counts pairs of trials; ``density`` compares the density of successes with attempts'."""
     alignment: Alignment = "gripper"
+    """Whose axes translations are measured along; rotations are about the gripper's."""
 
 
 class AnisotropyReport(Report):
-    """What a success tells about its vicinity, by displacement in the frame of ``alignment``.
-
-    ``aligned`` of the ``grasps`` have axes of that alignment, the others the gripper's.
-    """
+    """What a success tells about its vicinity, by displacement in the frame of ``alignment``."""
 
     question: ClassVar = (
         "How far off may the gripper be? Success by displacement from successes, tolerances by axis."
     )
     options: ClassVar = AnisotropyOptions
     report: Literal["anisotropy"] = "anisotropy"
+    """Name of the report, as in its path."""
     method: Method
+    """How it was counted: by pairs of trials, or by densities."""
     alignment: str
-    level: float
+    """Whose axes translations were measured along: ``gripper``, ``object``, ``edge`` or ``surface-pair``."""
+    level: IntervalLevel
     grasps: int
+    """How many successes displacements were measured from."""
     attempts: int
+    """How many attempts they were measured to."""
     translation_pairs: int
+    """How many pairs tell about translations."""
     rotation_pairs: int
+    """How many pairs tell about rotations."""
     kernel: KernelInfo | None = None
+    """Kernel of the densities; null where pairs were counted."""
     tolerances: list[AnisotropyTolerance]
+    """Half widths and profiles along and about every axis."""
     translations: list[AnisotropyHistogram]
+    """Chance of success over pairs of translations."""
     rotations: list[AnisotropyHistogram]
+    """Chance of success over pairs of rotations."""
     aligned: int | None = None
+    """How many of the grasps have axes of that alignment, the others the gripper's; null for the
+    gripper's."""
     hypotheses: list[AnisotropyHypothesis] = Field(default_factory=list)
+    """Whether the paper's expectations hold; none without half widths."""
     relations: list[AnisotropyRelation] = Field(default_factory=list)
+    """Success by how grasps lie to surfaces and edges; none without mesh and gripper."""
 
 
 class CalibrationBin(Response):
-    """Predictions within ``[lower, upper)`` and how often they came true; null in an empty bin."""
+    """Predictions within ``[lower, upper)`` and how often they came true."""
 
     lower: float
+    """Smallest prediction of the bin, a probability."""
     upper: float
+    """End of the bin, a probability beyond it."""
     count: int
+    """How many attempts it holds."""
     weight: float
+    """Share of all attempts, by weight."""
     predicted: float | None
+    """Mean prediction; null in an empty bin."""
     observed: float | None
+    """Share that succeeded; null in an empty bin."""
     low: float | None
+    """Lower end of the interval of ``observed``; null in an empty bin."""
     high: float | None
+    """Upper end of the interval of ``observed``; null in an empty bin."""
 
 
 class CheckCall(Response):
     """A request that makes what a report lacks: it has workers simulate, which no GET does."""
 
     method: str
+    """HTTP method of the request."""
     path: str
+    """Path of the request on this service."""
     body: dict[str, Any]
+    """JSON body of the request."""
 
 
 class CheckedGrasps(Response):
-    """Grasps that were simulated again as checks, which no prediction rests on.
-
-    ``rate`` is the share that succeeded, ``predicted`` what the mean prediction for them is now; ``bins`` by
-    prediction.
-    """
+    """Grasps that were simulated again as checks, which no prediction rests on."""
 
     grasps: int
+    """How many grasps were simulated again."""
     successes: int
+    """How many of them succeeded."""
     rate: ReportRange
+    """Share that succeeded, with its interval."""
     predicted: float
-    outcomes: dict[str, int]
+    """Mean prediction for them as it is now."""
+    outcomes: OutcomeCounts
     bins: list[CalibrationBin] = Field(default_factory=list)
+    """The same by prediction."""
 
 
 class CalibrationReport(Report):
-    """Whether ``success_probability`` can be believed, on outcomes it has not seen (blocks left out).
-
-    ``skill`` is Brier's: 1 perfect, 0 no better than the share of successes. ``ece`` is over predictions
-    above 0.1. ``auc_*`` is the chance that a success ranks above a failure. ``free_skill`` is the skill over
-    attempts that did not collide. ``checked`` are grasps whose poses were given to checks, as
-    best grasps are that are verified; where there are none, a warning says how to make some.
-    """
+    """Whether ``success_probability`` can be believed, on outcomes it has not seen (blocks left out)."""
 
     question: ClassVar = (
         "Can success probabilities be believed? Judged on outcomes of blocks of space left out."
     )
     options: ClassVar = SelectionQuery
     report: Literal["calibration"] = "calibration"
-    level: float
+    """Name of the report, as in its path."""
+    level: IntervalLevel
     kernel: KernelInfo
+    """The kernel that predicts success."""
     attempts: int
+    """How many attempts the selection has."""
     successes: int
+    """How many of them succeeded."""
     judged: int
+    """How many attempts were left out and predicted."""
     blocks: int
+    """How many blocks of space were left out."""
     block_edge_m: float
+    """Edge of a block of space, metres."""
     folds: int
+    """In how many rounds blocks were left out."""
     collisions_known: bool
+    """Whether the collision test told which attempts collide."""
     share: float
+    """Share of the attempts that succeeded."""
     brier: float
+    """Mean squared error of the predictions (Brier's score): 0 perfect."""
     skill: ReportRange
+    """Brier's skill: 1 perfect, 0 no better than the share of successes."""
     free_skill: ReportRange | None
+    """The skill over attempts that did not collide; null where that is not known."""
     ece: float | None
+    """Expected calibration error over predictions above 0.1; null where there are none."""
     auc_probability: float | None
+    """Chance that a success ranks above a failure by the probability; null without both."""
     auc_density: float | None
+    """Chance that a success ranks above a failure by the density; null without both."""
     bins: list[CalibrationBin]
+    """Predictions and how often they came true."""
     checked: CheckedGrasps | None = None
+    """Grasps whose poses were given to checks, as verified best grasps are; null where there are none, a
+    warning says how to make some."""
 
 
 class ProjectionProfile(Response):
-    """The projected density on one axis of the plane: share of all grasps a metre, with its interval."""
+    """The projected density on one axis of the plane."""
 
     axis: str
+    """Which axis of the plane it is on."""
     at_m: list[float]
+    """Coordinates along the axis, object frame, metres."""
     density_per_m: list[float]
+    """Share of all grasps per metre at each coordinate."""
     low: list[float]
+    """Lower end of the interval at each coordinate, per metre."""
     high: list[float]
+    """Upper end of the interval at each coordinate, per metre."""
 
 
 def _alone(value: Any) -> Any:
@@ -339,131 +444,168 @@ Axis = Annotated[Direction, BeforeValidator(_axis)]
 
 
 class ProjectionOptions(SelectionQuery):
-    """The plane, ``xy``, ``xz`` or ``yz`` or its normal ``nx,ny,nz`` (none: the one that shows most), and
-    which way grasps point: ``approach`` is that of tool z, ``direction`` that of tool x, across the jaw, with
-    either sign; within a cone whose half angle follows.
-    """
+    """Of which trials, onto which plane, and of which grasps."""
 
     plane: Annotated[Literal["xy", "xz", "yz"] | Axis | None, BeforeValidator(_alone)] = None
+    """``xy``, ``xz`` or ``yz`` of the object frame, or its normal nx,ny,nz; by default the one that shows
+    most."""
     approach: Axis | None = None
+    """Only grasps whose tool z points this way in the object frame: x,y,z or an axis as ``-z``; by default
+    all."""
     approach_cone_deg: Annotated[float, Field(gt=0, le=180)] = 30.0
+    """Half angle of the cone about ``approach``, degrees."""
     direction: Axis | None = None
+    """Only grasps whose tool x, across the jaw, points this way in the object frame with either sign: x,y,z
+    or an axis as ``z``; by default all."""
     direction_cone_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
+    """Half angle of the cone about ``direction``, degrees."""
 
 
 class ProjectionReport(Report):
-    """The density on a plane, depth and rotation integrated out; of grasps that point a given way, or of all.
-
-    ``values[i][j]`` over ``across_m[i]`` and ``upward_m[j]`` (edges) is 1 at the highest cell, which is
-    ``peak_per_m2`` (share of all grasps a square metre). ``share`` of the density points the way asked for,
-    ``passing`` of the ``grasps`` do. ``approach`` is the way tool z points, ``direction`` that of tool x,
-    across the jaw, with either sign. ``outline``: the object's silhouette as polygons (metres), one for each
-    convex part, or the hull of its mesh. ``drawn`` grasps were drawn where it could not be computed.
-    """
+    """The density on a plane, depth and rotation integrated out; of grasps that point one way, or of all."""
 
     question: ClassVar = (
         "Where do grasps succeed? The density on a plane, of all grasps or of those that point one way."
     )
     options: ClassVar = ProjectionOptions
     report: Literal["projection"] = "projection"
-    level: float
+    """Name of the report, as in its path."""
+    level: IntervalLevel
     kernel: KernelInfo
+    """The kernel of the density."""
     grasps: int
+    """How many successes there are."""
     passing: int
+    """How many of them point the way asked for."""
     share: ReportRange
+    """Share of the density that points the way asked for."""
     plane: str
+    """The plane: ``xy``, ``xz``, ``yz``, or by its normal."""
     normal: Triple
+    """Normal of the plane, towards who looks, object frame."""
     across: Triple
+    """Unit vector to the right in the picture, object frame."""
     upward: Triple
+    """Unit vector upward in the picture, object frame."""
     approach: Triple | None = None
+    """The way tool z points, object frame; null for any."""
     approach_cone_deg: float | None = None
+    """Half angle of the cone about ``approach``, degrees; null for any."""
     direction: Triple | None = None
+    """The way tool x points, across the jaw, with either sign, object frame; null for any."""
     direction_cone_deg: float | None = None
+    """Half angle of the cone about ``direction``, degrees; null for any."""
     across_m: list[float]
+    """Edges of the cells along ``across``, metres."""
     upward_m: list[float]
+    """Edges of the cells along ``upward``, metres."""
     values: list[list[float]]
+    """``values[i][j]`` over ``across_m[i]`` and ``upward_m[j]``: the density, 1 at the highest cell."""
     peak_per_m2: float
+    """Density of the highest cell: share of all grasps per square metre."""
     profiles: list[ProjectionProfile]
+    """The density on each of the plane's axes."""
     outline: list[list[tuple[float, float]]] = Field(default_factory=list)
+    """The object's silhouette as polygons, object frame, metres: one for each convex part, or the hull of its
+    mesh."""
     drawn: int = 0
+    """How many grasps were drawn where it could not be computed; 0 where it was."""
 
 
 class BandwidthPoint(Response):
-    """How likely left-out grasps are under a pair of widths: mean log density, nats of 1/(m^3 rad^3), and how
-    far below the best pair's it is (standard errors over blocks).
-    """
+    """How likely left-out grasps are under a pair of widths."""
 
     sigma_position_m: float
+    """Standard deviation of position along each axis, metres."""
     sigma_rotation_deg: float
+    """Standard deviation of rotation about each axis, degrees."""
     log_likelihood: float | None
+    """Mean log density of left-out grasps, nats of 1/(m^3 rad^3); null where it was not judged."""
     error: float | None
+    """Its standard error over blocks, nats; null where it was not judged."""
     below_best: float | None
+    """How far below the best pair's it is, nats; null where it was not judged."""
     below_best_error: float | None
+    """Standard error of that over blocks, nats; null where it was not judged."""
 
 
 class SimulatedDraws(Response):
-    """What became of draws from the density under a kernel, simulated as checks; collisions apart.
-
-    ``success`` is the share of all draws that succeeded, ``free_success`` of those that did not collide.
-    """
+    """What became of draws from the density under a kernel, simulated as checks; collisions apart."""
 
     kernel: KernelInfo
+    """The kernel of the density that was drawn from."""
     protocol: str
+    """How their outcomes were judged: ``wrench`` or ``lift``."""
     draws: int
-    outcomes: dict[str, int]
+    """How many draws were simulated."""
+    outcomes: OutcomeCounts
     success: ReportRange
+    """Share of all draws that succeeded."""
     collision: ReportRange
+    """Share of all draws that collided."""
     free_success: ReportRange
+    """Share that succeeded of those that did not collide."""
 
 
 class BandwidthReport(Report):
     """Which widths the kernel should have: those left-out blocks are likeliest under. How often draws
-    succeed.
-
-    ``range_m`` and ``range_deg``: widths of which the trials can't say that they are worse.
-    """
+    succeed."""
 
     question: ClassVar = (
         "How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks."
     )
     options: ClassVar = TrialSelection
     report: Literal["bandwidth"] = "bandwidth"
-    level: float
+    """Name of the report, as in its path."""
+    level: IntervalLevel
     kernel: KernelInfo
+    """The kernel that queries use by default."""
     rows: int
+    """How many successes the widths were judged by."""
     held_out: int
+    """How many of them were left out to judge."""
     grid: list[BandwidthPoint]
+    """The pairs of widths that were judged."""
     recommended: KernelInfo
+    """The kernel that left-out grasps are likeliest under."""
     range_m: tuple[float, float]
+    """Widths in position of which the trials can't say that they are worse, metres."""
     range_deg: tuple[float, float]
+    """Widths in rotation of which the trials can't say that they are worse, degrees."""
     draws: list[SimulatedDraws] = Field(default_factory=list)
+    """What became of draws that were simulated as checks."""
     calls: list[CheckCall] = Field(default_factory=list)
+    """Requests that would simulate the draws that lack."""
 
 
 class SimilarityPoint(Response):
-    """Similarity (Bhattacharyya) of a kernel with so many samples, or of a mixture with so many Gaussians, to
-    the full statistics, with its standard error. Gaussians off the jaw's plane of symmetry come in pairs.
-    """
+    """How like the full statistics a kernel of so many samples, or Gaussians, is."""
 
     count: int
+    """How many samples, or Gaussians; those off the jaw's plane of symmetry come in pairs."""
     similarity: float
+    """Bhattacharyya coefficient to the full statistics: 1 is the same."""
     error: float
+    """Standard error of the similarity."""
 
 
 class KernelSimilarityOptions(TrialSelection):
-    """Which displacements count (a cube's half edge, the largest turn), and the width of a component."""
+    """Of which trials, which displacements count, and how wide a component is."""
 
     window_position_m: Annotated[float, Field(gt=0, le=1.0)] = 0.04
+    """Largest translation along any axis that counts, metres."""
     window_rotation_deg: Annotated[float, Field(gt=0, le=180.0)] = 180.0
+    """Largest angle of rotation that counts, degrees."""
     component_position_m: Annotated[float, Field(ge=0.001, le=0.2)] = 0.01
+    """Standard deviation of a component along each axis, metres."""
     component_rotation_deg: Annotated[float, Field(ge=1.0, le=40.0)] = 10.0
+    """Standard deviation of a component about each axis, degrees."""
 
 
 class KernelSimilarityReport(Report):
     """Figure 13: how many samples, or Gaussians, the kernel needs to be like the statistics it comes from.
 
-    It has a meaning only with its window and with the width of the components. ``reference`` displacements
-    stand for the full statistics.
+    It has a meaning only with its window and with the width of the components.
     """
 
     question: ClassVar = (
@@ -471,64 +613,91 @@ class KernelSimilarityReport(Report):
     )
     options: ClassVar = KernelSimilarityOptions
     report: Literal["kernel-similarity"] = "kernel-similarity"
-    level: float
+    """Name of the report, as in its path."""
+    level: IntervalLevel
     window_position_m: float
+    """Largest translation along any axis that counts, metres."""
     window_rotation_deg: float
+    """Largest angle of rotation that counts, degrees."""
     component_position_m: float
+    """Standard deviation of a component along each axis, metres."""
     component_rotation_deg: float
+    """Standard deviation of a component about each axis, degrees."""
     successes: int
+    """How many successes the displacements lie between."""
     displacements: int
+    """How many displacements lie in the window."""
     reference: int
+    """How many of them stand for the full statistics."""
     samples: list[SimilarityPoint]
+    """Similarity by the number of samples."""
     mixtures: list[SimilarityPoint]
+    """Similarity by the number of Gaussians."""
 
 
 class SourceSimilarity(Response):
-    """Similarity (Bhattacharyya) of two sources' densities under one kernel, and what as many grasps drawn
-    from simulation would have had: below that range, the sources differ by more than chance.
-    """
+    """How alike two sources' densities are under one kernel."""
 
     kernel: KernelInfo
+    """The kernel of both densities."""
     value: float
+    """Their Bhattacharyya coefficient: 1 is the same."""
     error: float
+    """Standard error of the coefficient."""
     expected: ReportRange
+    """What as many grasps drawn from simulation would have had: below that range, the sources differ by more
+    than chance."""
 
 
 class SourceComparison(Response):
-    """One source of real trials against simulation.
-
-    ``successes`` over ``trials`` is its own share, ``predicted`` the mean of what simulation predicts at its
-    poses. ``agreement`` is the share of trials where simulation says more than one half and it held, or less
-    and it did not; ``confusion`` counts those by (simulation, trial). Null where the source posts successes
-    only, or has too few.
-    """
+    """One source of real trials against simulation."""
 
     source: str
+    """The source that is compared: ``robot``, ``human`` or ``import``."""
     protocols: list[str]
+    """The protocols that its trials name."""
     trials: int
+    """How many trials it has."""
     successes: int
-    outcomes: dict[str, int]
+    """How many of them succeeded."""
+    outcomes: OutcomeCounts
     share: ReportRange
+    """Share of its trials that succeeded."""
     predicted: float | None
+    """Mean of what simulation predicts at its poses; null where it predicts nothing there."""
     predicted_at_successes: float | None
+    """Mean of what simulation predicts where it succeeded; null where it predicts nothing there."""
     within_reach: int
+    """How many of its trials lie where simulation predicts."""
     agreement: ReportRange | None = None
+    """Share of trials where simulation says more than one half and it held, or less and it did not; null
+    where the source posts successes only, or has too few."""
     confusion: dict[str, int] | None = None
+    """Trials counted by (simulation, trial); null where the agreement is."""
     brier: float | None = None
+    """Mean squared error of the predictions; null where the agreement is."""
     skill: ReportRange | None = None
+    """Brier's skill of the predictions; null where the agreement is."""
     auc: float | None = None
+    """Chance that a success ranks above a failure; null where the agreement is."""
     bins: list[CalibrationBin] = Field(default_factory=list)
+    """Predictions and how often they came true."""
     similarity: SourceSimilarity | None = None
+    """How alike its density and simulation's are; null where it has too few."""
 
 
 class SourcesOptions(Request):
-    """The gripper, the protocol of the simulated trials, and the widths of the kernel that predicts."""
+    """The simulated trials that predict, and the widths of their kernel."""
 
     source: ClassVar[Literal["simulation"]] = "simulation"
     gripper: Slug | None = None
+    """Only trials with this gripper; by default the one that they name."""
     protocol: Slug | None = None
+    """Only simulated trials judged by this protocol; by default the one that they name."""
     sigma_position_m: WidthM | None = None
+    """Standard deviation of the kernel along each axis, metres; by default chosen from the trials."""
     sigma_rotation_deg: WidthDeg | None = None
+    """Standard deviation of the kernel about each axis, degrees; by default chosen from the trials."""
 
 
 ReportOptions = TrialSelection | SourcesOptions
@@ -542,51 +711,66 @@ class SourcesReport(Report):
     )
     options: ClassVar = SourcesOptions
     report: Literal["sources"] = "sources"
-    level: float
+    """Name of the report, as in its path."""
+    level: IntervalLevel
     kernel: KernelInfo
+    """The kernel that predicts."""
     attempts: int
+    """How many simulated attempts predict."""
     successes: int
-    simulation_outcomes: dict[str, int]
+    """How many of them succeeded."""
+    simulation_outcomes: OutcomeCounts
     collisions_known: bool
+    """Whether the collision test told which attempts collide."""
     sources: list[SourceComparison]
+    """Every source of real trials against simulation."""
 
 
 class SummaryRate(Response):
-    """Successes as a share of what ``rule`` counts as a trial, with its interval."""
+    """Successes as a share of what a rule counts as a trial."""
 
     rule: str
+    """Name of the rule, explained under ``rules``."""
     trials: int
+    """How many trials the rule counts."""
     rate: ReportRange
+    """Share that succeeded, with its interval."""
 
 
 class SummaryRow(Response):
-    """The trials of an object with one gripper, protocol and source, by outcome.
+    """The trials of an object with one gripper, protocol and source, by outcome."""
 
-    ``doubled_*``: successes and failures with each trial's twin under the jaw's half turn counted, too.
-    """
-
-    object: str
-    revision: int
-    gripper: str | None
-    protocol: str | None
-    source: str | None
-    outcomes: dict[str, int]
+    object: ObjectId
+    revision: Revision
+    gripper: ChosenGripper
+    protocol: ChosenProtocol
+    source: ChosenSource
+    outcomes: OutcomeCounts
     trials: int
+    """How many trials there are, packed outcomes included."""
     successes: int
+    """How many of them succeeded."""
     rates: list[SummaryRate]
+    """Success rates by each way of counting."""
     doubled_successes: int
+    """Successes with each one's twin under the jaw's half turn counted, too."""
     doubled_failures: int
+    """Failures with each one's twin under the jaw's half turn counted, too."""
 
 
 class SummaryReport(Response):
     """Every object's trials by outcome, and success rates by each way of counting (table I)."""
 
     report: Literal["summary"] = "summary"
+    """Name of the report, as in its path."""
     text: str
-    level: float
+    """The answer in words."""
+    level: IntervalLevel
     rules: dict[str, str]
+    """What each way of counting counts as a trial, in words."""
     rows: list[SummaryRow]
-    warnings: list[str] = Field(default_factory=list)
+    """A row for every object, gripper, protocol and source."""
+    warnings: Warnings = Field(default_factory=list)
 
 
 REPORTS: Mapping[str, type[Report]] = {
@@ -604,19 +788,25 @@ REPORTS: Mapping[str, type[Report]] = {
 
 
 class ReportRun(Response):
-    """A report's computation; ``result`` once it is done, ``problem`` where it failed.
-
-    ``kernel`` instead of a report's name: a kernel that is being fitted (:class:`StoredKernel` once it is).
-    """
+    """The computation of a report, or of a kernel that is being fitted (:class:`StoredKernel` once it is)."""
 
     id: str
-    object: str
+    """Id of the run."""
+    object: ObjectId
     report: ReportName | Literal["kernel"]
-    revision: int
+    """Name of the report; ``kernel`` for a kernel that is being fitted."""
+    revision: Revision
     parameters: dict[str, Any]
+    """What the report was asked with."""
     state: AnyRunState
+    """``running``, ``done``, ``failed`` or ``cancelled``."""
     progress: float
+    """How far it is, from 0 to 1."""
     result: dict[str, Any] | None = None
+    """The report, or the kernel; null until it is done."""
     problem: dict[str, Any] | None = None
+    """The problem it failed with; null where it did not."""
     created_at: datetime
+    """When it was asked for, UTC."""
     finished_at: datetime | None = None
+    """When it ended, UTC; null before."""

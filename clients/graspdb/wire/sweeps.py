@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from graspdb.wire.base import Pose, Position, Quadruple, Request, Response, Slug, Triple
+from graspdb.wire.base import (
+    ObjectId,
+    OutcomeCounts,
+    Pose,
+    Position,
+    Request,
+    Response,
+    Slug,
+    ToolPositions,
+    ToolRotations,
+)
 from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
 
@@ -17,10 +27,12 @@ Purpose = Literal["collect", "check"]
 
 
 class Region(Request):
-    """A box of tool positions, object frame, metres."""
+    """A box of tool positions."""
 
     lower: Position
+    """Lower corner x, y, z, object frame, metres."""
     upper: Position
+    """Upper corner x, y, z, object frame, metres."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Region:
@@ -31,41 +43,55 @@ class Region(Request):
 
 class GridSpec(Request):
     """Positions at integer multiples of the step within the mesh's bounding box plus a margin, times Hopf
-    rotations. ``max_poses`` takes the prefix of a seeded permutation of the same grid."""
+    rotations."""
 
     position_step_m: Annotated[float, Field(gt=1e-4, le=1.0)] = 0.01
+    """Distance of neighbouring positions, metres."""
     rotation_step_deg: Annotated[float, Field(ge=2.0, le=60.0)] = 15.0
+    """Angle between neighbouring rotations, degrees."""
     margin_m: Annotated[float, Field(ge=0, le=1.0)] = 0.02
+    """How far positions reach beyond the mesh's bounding box, metres."""
     region: Region | None = None
+    """Box that positions are cut to, object frame, metres; null for the whole grid."""
     max_poses: Annotated[int, Field(ge=1)] | None = None
+    """Takes so many first poses of a seeded permutation of the same grid; null for all."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    """Chooses the permutation that ``max_poses`` cuts."""
 
 
 class SampleSpec(Request):
-    """Draws from the object's density for the sweep's gripper; ``protocol`` names whose trials it is built
-    from, where there are several. ``kernel``: by its widths, ``anisotropic``, or a stored kernel's id."""
+    """Draws from the object's density for the sweep's gripper."""
 
     kernel: KernelSpec | Slug | None = None
+    """The density's kernel: by its widths, ``anisotropic``, or a stored kernel's id; by default isotropic."""
     protocol: Slug | None = None
+    """Protocol whose trials the density is built from; by default the one they name."""
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    """How many poses to draw."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    """The same seed and revision draw the same poses."""
 
 
 class SweepCreate(Request):
-    """Exactly one of ``grid``, ``poses`` and ``sample``; none of them means the default grid.
-
-    ``protocol`` ``wrench``: the contact forces can counter gravity in every direction; ``lift``: still held
-    after a lift and a shake. ``purpose`` ``check``: outcomes are stored but enter no density.
-    """
+    """Exactly one of ``grid``, ``poses`` and ``sample``; none of them means the default grid."""
 
     grid: GridSpec | None = None
+    """Simulate a grid about the object; null for another plan."""
     poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns | None = None
+    """Simulate exactly these poses of the tool frame in the object frame; null for another plan."""
     sample: SampleSpec | None = None
+    """Simulate draws from the density; null for another plan."""
     gripper: Slug = "pg70"
+    """Id of the gripper that grasps."""
     protocol: Protocol = "wrench"
+    """``wrench``: the contact forces can counter gravity in every direction; ``lift``: still held after a
+    lift and a shake."""
     fidelity: Fidelity = "standard"
+    """Time step and iterations of the physics: ``standard``, or ``fine``."""
     purpose: Purpose = "collect"
+    """``collect``, or ``check``: outcomes are stored but enter no density."""
     chunk_poses: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """How many poses one job simulates; by default the service decides."""
 
     @model_validator(mode="after")
     def _one_plan(self) -> SweepCreate:
@@ -75,63 +101,98 @@ class SweepCreate(Request):
 
 
 class WaitingFor(Response):
-    """The job that a sweep's chunks wait for: ``decompose`` makes the object's convex parts.
-
-    ``progress`` is what its worker says of it, ``error`` why it or its last attempt failed.
-    """
+    """The job that a sweep's chunks wait for."""
 
     kind: Literal["decompose"]
+    """What the job does: ``decompose`` makes the object's convex parts."""
     job: str
+    """Id of the job."""
     state: AnySweepState
+    """How far the job is, as a sweep's state."""
     attempts: int
+    """How many attempts have been made."""
     worker: str | None = None
+    """Name of the worker that has it; null while none has."""
     progress: str | None = None
+    """What its worker says of it, in words; null while it says nothing."""
     error: str | None = None
+    """Why it or its last attempt failed; null where none did."""
 
 
 class FailedChunk(Response):
+    """A chunk of a sweep that failed for good."""
+
     chunk: int
+    """Number of the chunk in the sweep, from 0."""
     attempts: int
+    """How many attempts were made."""
     error: str
+    """What went wrong the last time."""
 
 
 class SweepInfo(Response):
-    """``poses`` counts what is simulated (one of each jaw-symmetric pair); ``rate_poses_s`` over the last
-    minutes; ``time_left_s`` by that rate."""
+    """A sweep and how far it has come."""
 
     id: str
-    object: str
+    """Id of the sweep."""
+    object: ObjectId
     batch: str
+    """Id of the batch that its outcomes are stored in."""
     gripper: str
+    """Id of the gripper that grasps."""
     protocol: str
+    """How an outcome is judged: ``wrench`` or ``lift``."""
     fidelity: str
+    """Time step and iterations of the physics: ``standard``, or ``fine``."""
     purpose: str
+    """``collect``, or ``check``: outcomes enter no density."""
     plan: Literal["grid", "poses", "sample"]
+    """Whether it simulates a grid, given poses or draws from the density."""
     grid: GridSpec | None = None
+    """The grid as it was asked for; null for other plans."""
     seed: int | None = None
+    """Seed of the draws or of the random part of the grid; null for given poses."""
     state: AnySweepState
+    """``queued``, ``running``, ``done``, ``failed`` or ``cancelled``."""
     chunks: int
+    """How many chunks it is cut into, each a job."""
     chunks_done: int
+    """How many chunks are simulated and stored."""
     chunks_failed: int
+    """How many chunks failed for good."""
     poses: int
+    """How many poses are simulated, one of each jaw-symmetric pair."""
     poses_done: int
+    """How many poses are simulated and stored."""
     full_grid_poses: int | None = None
+    """How many poses the whole grid has; null for other plans."""
     waiting_for: WaitingFor | None = None
-    outcomes: dict[str, int] = Field(default_factory=dict)
+    """The job that its chunks wait for; null where they wait for nothing but a worker."""
+    outcomes: OutcomeCounts = Field(default_factory=dict)
     rate_poses_s: float | None = None
+    """Poses a second over the last minutes; null where nothing was done in them."""
     time_left_s: float | None = None
+    """Seconds it will take by that rate; null where the rate is."""
     failed_chunks: list[FailedChunk] = Field(default_factory=list)
+    """Chunks that failed for good, and why."""
     created_at: datetime
+    """When it was planned, UTC."""
     started_at: datetime | None = None
+    """When a worker took its first chunk, UTC; null before."""
     finished_at: datetime | None = None
+    """When its last chunk ended, UTC; null before."""
 
 
 class SweepOutcomes(Response):
-    """Columns: every pose of the finished chunks, collisions included, ascending within a chunk."""
+    """Every pose of the finished chunks, collisions included, in columns, ascending within a chunk."""
 
     sweep: str
+    """Id of the sweep."""
     pose_index: list[int]
-    position: list[Triple]
-    quaternion_xyzw: list[Quadruple]
+    """Index of each pose in the sweep's plan."""
+    position: ToolPositions
+    quaternion_xyzw: ToolRotations
     outcome: list[str]
+    """What became of each pose, by name."""
     next: str | None = None
+    """Cursor of the following page; null at the end."""

@@ -9,16 +9,19 @@ from pydantic import BeforeValidator, Field
 
 from graspdb.wire.base import (
     Metadata,
+    ObjectId,
     Outcome,
+    OutcomeCounts,
     Pose,
     Position,
-    Quadruple,
     Quaternion,
     Request,
     Response,
     Slug,
     Source,
-    Triple,
+    StoredRevision,
+    ToolPosition,
+    ToolRotation,
 )
 
 
@@ -41,87 +44,139 @@ class TrialDefaults(Request):
     """What may stand once beside ``trials`` or ``columns`` for every trial that does not say it itself."""
 
     gripper: Slug | None = None
+    """Id of the gripper that grasped; null if unknown: the trial then fits every gripper."""
     source: Source | None = None
+    """Who tried: ``simulation``, ``robot``, ``human`` or ``import``; null if unknown."""
     protocol: Slug | None = None
+    """How the outcome was judged, in the user's words or as sweeps do; null if unknown."""
     proposal_density: ProposalDensity | None = None
+    """Density that the pose was drawn with, 1/(m^3 rad^3), which weights the trial; null if unknown."""
     metadata: Metadata | None = None
+    """Any JSON object of the user's; null for none."""
 
 
 class TrialIn(Pose, TrialDefaults):
-    """One attempt.
-
-    ``proposal_density`` is in 1/(m^3 rad^3); ``pose_covariance`` 6x6, translation first, tool frame.
-    """
+    """One attempt."""
 
     outcome: OutcomeIn
+    """What became of it, by name; true and false mean success and failure."""
     quality: Quality | None = None
+    """Any score of the user's, without a unit; null for none."""
     width_m: Width | None = None
+    """Distance between the fingers at the end, metres; null if unknown."""
     pose_covariance: Matrix6 | None = None
+    """6x6, of the pose in the tool frame, translation in metres first, then rotation vector in radians; null
+    if unknown."""
     measured_at: datetime | None = None
+    """When it was tried; a time without a zone is UTC; null if unknown."""
 
 
 class TrialsIn(TrialDefaults):
+    """Trials in a list, and what holds for all of them."""
+
     trials: Annotated[list[TrialIn], Field(min_length=1)]
+    """The trials, stored as one batch."""
 
 
 class TrialColumns(Request):
     """Trials as columns of equal length: position (N, 3), quaternion_xyzw (N, 4), outcome (N,), ..."""
 
     position: list[Position]
+    """Origins of the tool frame in the object frame, one x, y, z a trial, metres."""
     quaternion_xyzw: list[Quaternion]
+    """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a trial."""
     outcome: list[OutcomeIn]
+    """What became of each, by name; true and false mean success and failure."""
     gripper: list[Slug | None] | None = None
+    """Id of the gripper of each; null if unknown."""
     source: list[Source | None] | None = None
+    """Who tried each; null if unknown."""
     protocol: list[Slug | None] | None = None
+    """How each outcome was judged; null if unknown."""
     proposal_density: list[ProposalDensity | None] | None = None
+    """Density that each pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: list[Quality | None] | None = None
+    """Any score of each, without a unit; null for none."""
     width_m: list[Width | None] | None = None
+    """Distance between the fingers at the end of each, metres; null if unknown."""
     pose_covariance: list[Matrix6 | None] | None = None
+    """6x6 of each pose in the tool frame, translation in metres first, then rotation vector in radians; null
+    if unknown."""
     measured_at: list[datetime | None] | None = None
+    """When each was tried; a time without a zone is UTC; null if unknown."""
     metadata: list[Metadata | None] | None = None
+    """Any JSON object of the user's of each; null for none."""
 
 
 class TrialColumnsIn(TrialDefaults):
+    """Trials in columns, and what holds for all of them."""
+
     columns: TrialColumns
+    """The trials' columns, stored as one batch."""
 
 
 class TrialOut(Response):
-    """A stored trial. ``seq`` numbers an object's trials in commit order; ``revision`` stored it."""
+    """A stored trial."""
 
     seq: int
-    revision: int
+    """Numbers the object's trials in commit order."""
+    revision: StoredRevision
     batch: str
-    position: Triple
-    quaternion_xyzw: Quadruple
+    """Id of the batch that it arrived in."""
+    position: ToolPosition
+    quaternion_xyzw: ToolRotation
     outcome: Outcome
+    """What became of it, by name."""
     gripper: str | None = None
+    """Id of the gripper that grasped; null if unknown."""
     source: str | None = None
+    """Who tried: ``simulation``, ``robot``, ``human`` or ``import``; null if unknown."""
     protocol: str | None = None
+    """How the outcome was judged; null if unknown."""
     proposal_density: float | None = None
+    """Density that the pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: float | None = None
+    """Any score of the user's, of a sweep the protocol's margin, without a unit; null for none."""
     width_m: float | None = None
+    """Distance between the fingers at the end, metres; null if unknown."""
     pose_covariance: list[list[float]] | None = None
+    """6x6, of the pose in the tool frame, translation in metres first, then rotation vector in radians; null
+    if unknown."""
     measured_at: datetime | None = None
+    """When it was tried, UTC; null if unknown."""
     metadata: Metadata | None = None
+    """The user's own JSON object; null where there is none."""
     sweep: str | None = None
+    """Id of the sweep that simulated it; null for a posted trial."""
     pose_index: int | None = None
+    """Its index in that sweep's plan; null for a posted trial."""
 
 
 class BatchReceipt(Response):
+    """What was stored."""
+
     batch: str
+    """Id of the batch, which deletes it as one."""
     inserted: int
-    revision: int
+    """How many trials were stored."""
+    revision: StoredRevision
 
 
 class BatchInfo(Response):
-    """A batch: the trials of one POST, or all one sweep wrote (``packed`` counts its packed outcomes)."""
+    """A batch: the trials of one POST, or all one sweep wrote."""
 
     batch: str
-    object: str
-    revision: int
+    """Id of the batch."""
+    object: ObjectId
+    revision: StoredRevision
     inserted: int
+    """How many trials it holds as rows."""
     packed: int = 0
+    """How many outcomes of a sweep it holds packed, without rows."""
     sweep: str | None = None
+    """Id of the sweep that wrote it; null for posted trials."""
     metadata: Metadata | None = None
-    outcomes: dict[str, int] = Field(default_factory=dict)
+    """What was posted with it as metadata of all; null where nothing was."""
+    outcomes: OutcomeCounts = Field(default_factory=dict)
     created_at: datetime
+    """When it was stored, UTC."""

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from graspdb.wire import GripperCreate, GripperInfo, Page
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Creating, Ctx
+from graspdb_service.api.routing.parameters import Creating, Ctx, GripperId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import grippers
 
@@ -28,6 +28,6 @@ def list_grippers(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[G
 
 
 @router.get("/grippers/{gripper}", response_model=GripperInfo, **scope("read"))
-def get_gripper(ctx: Ctx, gripper: str, request: Request) -> Response:
+def get_gripper(ctx: Ctx, gripper: GripperId, request: Request) -> Response:
     """One gripper's profile."""
     return tagged_json(request, grippers.get(ctx.database, gripper))

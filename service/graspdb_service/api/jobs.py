@@ -18,7 +18,7 @@ from graspdb.wire import (
 )
 from graspdb.wire.jobs import FailureNoted
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
-from graspdb_service.api.routing.parameters import Ctx, RawBody
+from graspdb_service.api.routing.parameters import Ctx, JobId, RawBody
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import BINARY, GLB, JSON, media_type, unsupported
@@ -29,7 +29,6 @@ router = APIRouter(tags=["jobs"])
 LeaseId = Annotated[
     str, Query(min_length=1, max_length=64, pattern=r"^[\x21-\x7e]+$", description="As the claim gave it.")
 ]
-JobId = str
 _RESULTS = {JSON: SimulateResult, GLB: BINARY}
 ProgressText = Annotated[
     str | None,

@@ -12,7 +12,7 @@ from graspdb.wire.kernels import KernelCreate, StoredKernel
 from graspdb.wire.reports import ReportRun
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
-from graspdb_service.api.routing.parameters import Creating, Ctx
+from graspdb_service.api.routing.parameters import Creating, Ctx, KernelId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases.kernels import stored
 
@@ -52,12 +52,12 @@ def list_kernels(
 
 
 @router.get("/kernels/{id}", response_model=StoredKernel, **scope("read"))
-def get_kernel(ctx: Ctx, id: str, request: Request) -> Response:
+def get_kernel(ctx: Ctx, id: KernelId, request: Request) -> Response:
     """One kernel: components, widths, and what it was fitted on."""
     return tagged_json(request, stored.get(ctx, id))
 
 
 @router.delete("/kernels/{id}", status_code=204, **scope("admin"))
-def delete_kernel(ctx: Ctx, id: str) -> None:
+def delete_kernel(ctx: Ctx, id: KernelId) -> None:
     """Delete a kernel; queries that name it are answered 404 from then on."""
     stored.remove(ctx, id)

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import MeshInfo, PartsInfo
 from graspdb_service.api.routing.caching import not_modified
-from graspdb_service.api.routing.parameters import Ctx, RawBody
+from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import BINARY, GLB, one_of
 from graspdb_service.usecases.geometry import meshes
 
 router = APIRouter(tags=["objects"])
 
+MeshUnit = Annotated[
+    Literal["m", "mm", "cm", "in"], Query(description="Unit of the mesh's coordinates; kept in metres.")
+]
 _MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, BINARY)
 
 
 @router.put("/objects/{id}/mesh", **scope("admin", body=_MESH_BODY))
-def put_mesh(
-    ctx: Ctx, id: str, request: Request, body: RawBody, unit: Literal["m", "mm", "cm", "in"] = "m"
-) -> MeshInfo:
+def put_mesh(ctx: Ctx, id: ObjectId, request: Request, body: RawBody, unit: MeshUnit = "m") -> MeshInfo:
     """Store the mesh: STL, OBJ, PLY or GLB as the raw body, said by Content-Type."""
     return meshes.put_mesh(ctx, id, body, media=one_of(request, *meshes.MEDIA_TYPES), unit=unit)
 
@@ -32,13 +33,13 @@ def put_mesh(
     responses={200: {"content": {media: {"schema": BINARY} for media in meshes.MEDIA_TYPES}}},
     **scope("jobs:work"),
 )
-def get_mesh(ctx: Ctx, id: str, request: Request) -> Response:
+def get_mesh(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     """The mesh's bytes as they came."""
     return _bytes(request, *meshes.get_mesh(ctx, id))
 
 
 @router.put("/objects/{id}/convex-parts", **scope("admin", body={GLB: BINARY}))
-def put_convex_parts(ctx: Ctx, id: str, request: Request, body: RawBody) -> PartsInfo:
+def put_convex_parts(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> PartsInfo:
     """Store the convex parts: a GLB in metres with one geometry a part, object frame."""
     one_of(request, GLB)
     return meshes.put_parts(ctx, id, body)
@@ -50,7 +51,7 @@ def put_convex_parts(ctx: Ctx, id: str, request: Request, body: RawBody) -> Part
     responses={200: {"content": {GLB: {"schema": BINARY}}}},
     **scope("jobs:work"),
 )
-def get_convex_parts(ctx: Ctx, id: str, request: Request) -> Response:
+def get_convex_parts(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     """The convex parts' bytes."""
     return _bytes(request, *meshes.get_parts(ctx, id))
 

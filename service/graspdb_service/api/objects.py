@@ -7,7 +7,7 @@ from fastapi import APIRouter, Request, Response
 from graspdb.wire import ObjectCreate, ObjectInfo, ObjectPatch, Page
 from graspdb_service.api.routing.caching import etag, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Creating, Ctx
+from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import objects
 
@@ -28,19 +28,19 @@ def list_objects(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[Ob
 
 
 @router.get("/objects/{id}", response_model=ObjectInfo, **scope("read"))
-def get_object(ctx: Ctx, id: str, request: Request) -> Response:
+def get_object(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     """One object: properties, mesh, and how many trials it has by outcome."""
     row, info = objects.get(ctx.database, id)
     return tagged_json(request, info, tag=etag(row.id, row.revision))
 
 
 @router.patch("/objects/{id}", **scope("admin"))
-def change_object(ctx: Ctx, id: str, request: ObjectPatch) -> ObjectInfo:
+def change_object(ctx: Ctx, id: ObjectId, request: ObjectPatch) -> ObjectInfo:
     """Change properties: a field left out stays, an explicit null clears it."""
     return objects.change(ctx.database, id, request)
 
 
 @router.delete("/objects/{id}", status_code=204, **scope("admin"))
-def delete_object(ctx: Ctx, id: str) -> None:
+def delete_object(ctx: Ctx, id: ObjectId) -> None:
     """Delete an object, its trials, densities and sweeps; 409 while a sweep of it runs."""
     objects.remove(ctx.database, id)

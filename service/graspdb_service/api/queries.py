@@ -34,7 +34,7 @@ from graspdb_density.se3 import Poses
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing.caching import etag, not_modified
-from graspdb_service.api.routing.parameters import Ctx, RawBody
+from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.columns import columns_arrow, columns_json
 from graspdb_service.formats.json_bodies import read_object, validated
@@ -50,7 +50,9 @@ Q = TypeVar("Q", bound=Selection)
 
 
 @router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read"))
-def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQuery, Query()]) -> Response:
+def get_density(
+    ctx: Ctx, id: ObjectId, request: Request, query: Annotated[SelectionQuery, Query()]
+) -> Response:
     """The density of a selection of trials: kernel, widths and their rule, counts, effective sample size."""
 
     def answer(query: SelectionQuery) -> Response:
@@ -62,7 +64,7 @@ def get_density(ctx: Ctx, id: str, request: Request, query: Annotated[SelectionQ
 
 @router.get("/objects/{id}/likelihood", response_model=Likelihoods, **scope("read"))
 def get_likelihood(
-    ctx: Ctx, id: str, request: Request, query: Annotated[LikelihoodQuery, Query()]
+    ctx: Ctx, id: ObjectId, request: Request, query: Annotated[LikelihoodQuery, Query()]
 ) -> Response:
     """How likely one grasp is; columns of length one."""
     pose = Poses(np.array([query.position]), np.array([query.quaternion_xyzw]))
@@ -81,7 +83,7 @@ def get_likelihood(
     responses={200: {"content": {ARROW: {"schema": BINARY}}}},
     **scope("read", body={"application/json": LikelihoodRequest, ARROW: BINARY}),
 )
-def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
+def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> Response:
     """How likely each of many grasps is: columns in the poses' order.
 
     As an Arrow stream (`application/vnd.apache.arrow.stream`, by Content-Type and by Accept) the poses are
@@ -104,7 +106,7 @@ def post_likelihood(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
 
 @router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
 def get_best_grasp(
-    ctx: Ctx, id: str, request: Request, query: Annotated[BestGraspQuery, Query()]
+    ctx: Ctx, id: ObjectId, request: Request, query: Annotated[BestGraspQuery, Query()]
 ) -> Response:
     """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
 
@@ -120,7 +122,7 @@ def get_best_grasp(
     response_model=BestGrasps,
     **scope("read", body={"application/json": BestGraspRequest}),
 )
-def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Response:
+def post_best_grasp(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> Response:
     """As GET, the constraints as JSON; also half spaces, obstacles, candidates and poses to exclude."""
     query = validated(read_object(request, body), BestGraspRequest, most=MAX_OBSTACLE_POINTS)
     answer, _ = best_grasps(ctx, id, query)
@@ -128,14 +130,14 @@ def post_best_grasp(ctx: Ctx, id: str, request: Request, body: RawBody) -> Respo
 
 
 @router.post("/objects/{id}/samples", response_model=Samples, **scope("read"))
-def post_samples(ctx: Ctx, id: str, query: SamplesRequest) -> Response:
+def post_samples(ctx: Ctx, id: ObjectId, query: SamplesRequest) -> Response:
     """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
     drawn = samples.draw(ctx, id, query, query.count, query.seed)
     return _drawn(drawn, {})
 
 
 @router.post("/objects/{id}/proposals", response_model=Proposals, **scope("read"))
-def post_proposals(ctx: Ctx, id: str, query: ProposalsRequest) -> Response:
+def post_proposals(ctx: Ctx, id: ObjectId, query: ProposalsRequest) -> Response:
     """Grasps to try next; sent back with the trial, ``proposal_density`` weights it.
 
     ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges`` needs

@@ -14,7 +14,7 @@ from graspdb.wire.states import RunState
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing.caching import etag, not_modified
-from graspdb_service.api.routing.parameters import Ctx
+from graspdb_service.api.routing.parameters import Ctx, ObjectId, RunId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import JSON, PNG, SVG, accepted
 from graspdb_service.problems import ProblemError
@@ -34,7 +34,7 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
 
 
 def _add_route(name: str, report: type[Report]) -> None:
-    def get_report(ctx: Ctx, id: str, request: Request, query: ReportOptions) -> Response:
+    def get_report(ctx: Ctx, id: ObjectId, request: Request, query: ReportOptions) -> Response:
         return _answer(ctx, id, name, request, query)
 
     get_report.__annotations__["query"] = Annotated[report.options, Query()]
@@ -64,13 +64,13 @@ def get_summary(ctx: Ctx, request: Request) -> Response:
 
 
 @router.get("/report-runs/{id}", **scope("read"))
-def get_run(ctx: Ctx, id: str) -> ReportRun:
+def get_run(ctx: Ctx, id: RunId) -> ReportRun:
     """A report's computation: state, progress, and the report once it is done."""
     return runs.model(ctx.runs.get(id))
 
 
 @router.post("/report-runs/{id}/cancel", **scope("read"))
-def cancel_run(ctx: Ctx, id: str) -> ReportRun:
+def cancel_run(ctx: Ctx, id: RunId) -> ReportRun:
     """Stop computing; a run that has ended stays as it is."""
     return runs.model(ctx.runs.cancel(id))
 

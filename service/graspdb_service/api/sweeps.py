@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.states import AnySweepState
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Creating, Ctx
+from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId, SweepId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
@@ -30,7 +30,7 @@ PosesLimit = Annotated[
     response_model=SweepInfo,
     **scope("admin", body={"application/json": SweepCreate}),
 )
-def create_sweep(ctx: Ctx, id: str, request: Request, sent: Creating) -> object:
+def create_sweep(ctx: Ctx, id: ObjectId, request: Request, sent: Creating) -> object:
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
     draws from its density. Workers take its chunks."""
     spec = read_model(request, sent.body or b"{}", SweepCreate)
@@ -53,19 +53,19 @@ def list_sweeps(
 
 
 @router.get("/sweeps/{id}", **scope("read"))
-def get_sweep(ctx: Ctx, id: str) -> SweepInfo:
+def get_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     """How far a sweep has come, what it found, how long it will take, and what failed."""
     return sweeps.get(ctx.database, id)
 
 
 @router.post("/sweeps/{id}/cancel", **scope("admin"))
-def cancel_sweep(ctx: Ctx, id: str) -> SweepInfo:
+def cancel_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     """Stop a sweep; what is stored stays. A finished one is left as it is."""
     return sweeps.cancel(ctx.database, id)
 
 
 @router.post("/sweeps/{id}/retry", **scope("admin"))
-def retry_sweep(ctx: Ctx, id: str) -> SweepInfo:
+def retry_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     """Queue a sweep's failed and cancelled chunks again. 409 once its batch was deleted."""
     return sweeps.retry(ctx.database, id)
 
@@ -77,7 +77,7 @@ def retry_sweep(ctx: Ctx, id: str) -> SweepInfo:
     **scope("read"),
 )
 def get_outcomes(
-    ctx: Ctx, id: str, request: Request, limit: PosesLimit = None, cursor: Cursor = None
+    ctx: Ctx, id: SweepId, request: Request, limit: PosesLimit = None, cursor: Cursor = None
 ) -> Response:
     """Every pose of the finished chunks with its outcome, collisions included, in columns.
 

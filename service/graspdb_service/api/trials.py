@@ -10,7 +10,7 @@ from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, T
 from graspdb.wire.trials import TrialColumnsIn
 from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
-from graspdb_service.api.routing.parameters import Creating, Ctx
+from graspdb_service.api.routing.parameters import BatchId, Creating, Ctx, ObjectId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
 from graspdb_service.formats.trials import page_response, stream_response
@@ -32,7 +32,7 @@ BODY = {
     response_model=BatchReceipt,
     **scope("trials:write", body=BODY),
 )
-def add_trials(ctx: Ctx, id: str, request: Request, sent: Creating) -> object:
+def add_trials(ctx: Ctx, id: ObjectId, request: Request, sent: Creating) -> object:
     """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all."""
     return sent.answered(posting.add(ctx, id, sent, media_type(request)))
 
@@ -45,13 +45,21 @@ def add_trials(ctx: Ctx, id: str, request: Request, sent: Creating) -> object:
 )
 def list_trials(
     ctx: Ctx,
-    id: str,
+    id: ObjectId,
     request: Request,
-    outcome: Outcome | None = None,
-    source: Source | None = None,
-    gripper: Slug | None = None,
-    protocol: Slug | None = None,
-    batch: Annotated[str | None, Query(max_length=64)] = None,
+    outcome: Annotated[
+        Outcome | None, Query(description="Only trials that ended so; by default all.")
+    ] = None,
+    source: Annotated[
+        Source | None, Query(description="Only trials from this source; by default all.")
+    ] = None,
+    gripper: Annotated[
+        Slug | None, Query(description="Only trials with this gripper; by default all.")
+    ] = None,
+    protocol: Annotated[Slug | None, Query(description="Only trials judged so; by default all.")] = None,
+    batch: Annotated[
+        str | None, Query(max_length=64, description="Only trials of this batch; by default all.")
+    ] = None,
     since_revision: Annotated[
         int | None, Query(ge=0, lt=2**63, description="Only what was stored after this revision.")
     ] = None,
@@ -79,19 +87,21 @@ def list_trials(
 
 
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))
-def list_batches(ctx: Ctx, id: str, request: Request, limit: Limit = 100, cursor: Cursor = None) -> Response:
+def list_batches(
+    ctx: Ctx, id: ObjectId, request: Request, limit: Limit = 100, cursor: Cursor = None
+) -> Response:
     """An object's batches in the order of their making."""
     items, after = batches.page(ctx.database, id, after=number_cursor(cursor), limit=limit)
     return tagged_json(request, Page[BatchInfo](items=items, next=encode_cursor(after)))
 
 
 @router.get("/objects/{id}/batches/{batch}", response_model=BatchInfo, **scope("read"))
-def get_batch(ctx: Ctx, id: str, batch: str, request: Request) -> Response:
+def get_batch(ctx: Ctx, id: ObjectId, batch: BatchId, request: Request) -> Response:
     """One batch, with everything it holds by outcome."""
     return tagged_json(request, batches.get(ctx.database, id, batch))
 
 
 @router.delete("/objects/{id}/batches/{batch}", status_code=204, **scope("trials:write"))
-def delete_batch(ctx: Ctx, id: str, batch: str) -> None:
+def delete_batch(ctx: Ctx, id: ObjectId, batch: BatchId) -> None:
     """Delete a batch and its trials; 409 while its sweep runs."""
     batches.remove(ctx.database, id, batch)

@@ -13,7 +13,9 @@ from fastapi import Query
 from graspdb_service.problems import ProblemError, invalid
 
 Limit = Annotated[int, Query(ge=1, le=1_000, description="At most this many items.")]
-Cursor = Annotated[str | None, Query(max_length=500, description="`next` of the page before.")]
+Cursor = Annotated[
+    str | None, Query(max_length=500, description="`next` of the page before; by default the first page.")
+]
 
 
 def encode_cursor(position: int | str | None) -> str | None:

@@ -1,4 +1,4 @@
-"""What routes take beside their own parameters: the context, a body's bytes, what a creation takes."""
+"""What routes take in common: the context, ids in paths, a body's bytes, what a creation takes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Annotated
 
-from fastapi import Depends, Header, Request, Response
+from fastapi import Depends, Header, Path, Request, Response
 
 from graspdb_service.api.context import Context
 from graspdb_service.problems import invalid
@@ -22,7 +22,24 @@ def context(request: Request) -> Context:
 Ctx = Annotated[Context, Depends(context)]
 
 
-def _key(idempotency_key: Annotated[str | None, Header()] = None) -> str | None:
+ObjectId = Annotated[str, Path(description="Id of the object, as it was registered.")]
+GripperId = Annotated[str, Path(description="Id of the gripper, as `GET /grippers` lists it.")]
+BatchId = Annotated[str, Path(description="Id of the batch, as posting its trials answered it.")]
+KernelId = Annotated[str, Path(description="Id of the kernel, as fitting or storing it answered it.")]
+RunId = Annotated[str, Path(description="Id of the run, as the 202 that started it answered it.")]
+SweepId = Annotated[str, Path(description="Id of the sweep, as planning it answered it.")]
+JobId = Annotated[str, Path(description="Id of the job, as the claim answered it.")]
+
+_KeyHeader = Annotated[
+    str | None,
+    Header(
+        description="1 to 200 printable ASCII characters, best a UUID: the same request with the same key"
+        " again is answered the same and stores nothing twice."
+    ),
+]
+
+
+def _key(idempotency_key: _KeyHeader = None) -> str | None:
     if idempotency_key is not None and not re.fullmatch(r"[\x21-\x7e]{1,200}", idempotency_key):
         raise invalid("Idempotency-Key", "1 to 200 printable ASCII characters, best a UUID")
     return idempotency_key
