@@ -54,7 +54,12 @@ def _require_pybullet() -> None:
 ObjectName = Annotated[
     str, typer.Argument(help="An object of the service, or without --url an example: cone, mug, ...")
 ]
-ServiceUrl = Annotated[str | None, typer.Option(help="Take object and gripper from this service.")]
+ServiceUrl = Annotated[
+    str | None,
+    typer.Option(
+        envvar="GRASPDB_URL", help="Take object and gripper from this service; --url '' means the examples."
+    ),
+]
 GripperName = Annotated[str, typer.Option(help="A gripper of the service; without --url pg70 or panda.")]
 ApiKey = Annotated[
     str | None, typer.Option(envvar="GRASPDB_API_KEY", help="With the scope jobs:work, to run; else read.")
@@ -204,8 +209,8 @@ def verify(
 
     with _explained():
         if sweep is not None:
-            if url is None:
-                raise ValueError("--sweep needs --url, the service that has it")
+            if not url:
+                raise ValueError("--sweep needs --url or GRASPDB_URL, the service that has it")
             with _progress("poses read") as progress:
                 info, stored = stored_outcomes.sample_of(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress

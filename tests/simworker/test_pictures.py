@@ -62,6 +62,16 @@ def test_show_names_what_is_wrong() -> None:
         assert "Traceback" not in done.stderr
 
 
+def test_show_takes_the_service_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its objects and not the examples, which an empty address means."""
+    monkeypatch.setenv("GRASPDB_URL", "http://127.0.0.1:9")
+    done = CliRunner().invoke(cli.app, ["show", "teapot"])
+    assert done.exit_code == 1
+    assert "no answer from http://127.0.0.1:9" in done.stderr
+    done = CliRunner().invoke(cli.app, ["show", "teapot", "--url", ""])
+    assert "screwdriver" in done.stderr
+
+
 def test_a_film_shows_the_object_swing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "FRAME_S", 0.2)  # a frame takes a second to draw
     film = tmp_path / "cone.gif"

@@ -34,12 +34,14 @@ def load(
 ) -> tuple[SimulatePayload, Sequence[Part]]:
     """Payload of an object's default grid (10 mm, 15 degrees, 20 mm margin), and its convex parts.
 
+    They come from the service at ``url``, or without one from the examples.
+
     ValueError for an unknown example, gripper or protocol, or an object that can't be simulated yet.
     """
     if protocol not in get_args(Protocol):
         raise ValueError(f"no protocol {protocol!r}; there are {', '.join(get_args(Protocol))}")
     parts: Sequence[Part]
-    if url is None:
+    if not url:
         thing = example(name)
         profile = _built_in(gripper)
         parts, mass, friction = thing.parts, thing.mass_kg, thing.friction
