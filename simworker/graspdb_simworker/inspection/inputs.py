@@ -48,8 +48,13 @@ def load(
     else:
         with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
             info = transport.model(ObjectInfo, "GET", f"/objects/{name}")
-            if info.mass_kg is None or info.convex_parts is None:
-                raise ValueError(f"{name} needs mass_kg and convex parts before it can be simulated")
+            if info.mass_kg is None:
+                raise ValueError(f"{name} has no mass: graspdb objects change {name} --mass-kg ...")
+            if info.convex_parts is None:
+                raise ValueError(
+                    f"{name} has no convex parts yet: its first sweep has a worker make them, or"
+                    f" graspdb objects set-convex-parts {name} FILE stores yours"
+                )
             profile = transport.model(GripperInfo, "GET", f"/grippers/{gripper}").profile
             parts = meshes.parts_from_glb(transport.request("GET", f"/objects/{name}/convex-parts").content)
         mass = info.mass_kg
