@@ -16,6 +16,7 @@ from graspdb import __version__
 from graspdb.cli import kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
 from graspdb.cli.options import Commands
+from graspdb.cli.wording import in_commands
 from graspdb.demo import demo
 from graspdb.errors import GraspDBError
 
@@ -85,7 +86,8 @@ def main() -> None:
     except (GraspDBError, ValueError, ImportError, OSError) as error:
         # TimeoutError is an OSError. Anything else is a bug, and a traceback is what helps then.
         notes = getattr(error, "__notes__", [])
-        ERRORS.print(f"[bold red]Error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        message = in_commands(str(error))
+        ERRORS.print(f"[bold red]Error:[/] {escape(message)}", highlight=False, soft_wrap=True)
         for note in notes:
-            ERRORS.print(escape(note), highlight=False, soft_wrap=True)
+            ERRORS.print(escape(in_commands(note)), highlight=False, soft_wrap=True)
         sys.exit(1)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ERRORS, ObjectId, State, Yes, flat, out, show_rows
+from graspdb.cli.common import ERRORS, ObjectId, State, Yes, out, show_rows
 from graspdb.cli.options import Commands
 from graspdb.errors import Conflict
 from graspdb.examples import EXAMPLES
@@ -61,6 +61,13 @@ def create_object(
     state.show(item.info, item.summary())
 
 
+@objects.command("change")
+def change_object(state: State, id: ObjectId, properties: ObjectProperties) -> None:
+    """Change properties of an object; those not given stay."""
+    item = state.db.objects.get(id).patch(**properties)
+    state.show(item.info, item.summary())
+
+
 @objects.command("set-mesh")
 def set_mesh(
     state: State,
@@ -71,6 +78,20 @@ def set_mesh(
     """Upload an object's mesh."""
     item = state.db.objects.get(id)
     info = item.upload_mesh(mesh, unit=unit)
+    state.show(info, item.summary())
+
+
+@objects.command("set-convex-parts")
+def set_convex_parts(
+    state: State,
+    id: ObjectId,
+    parts: Annotated[
+        Path, typer.Argument(help="GLB with one convex geometry a part, metres.", show_default=False)
+    ],
+) -> None:
+    """Upload an object's convex parts."""
+    item = state.db.objects.get(id)
+    info = item.upload_convex_parts(parts)
     state.show(info, item.summary())
 
 
@@ -125,23 +146,29 @@ def list_grippers(state: State) -> None:
 
 @grippers.command("show")
 def show_gripper(state: State, id: GripperId) -> None:
-    """Show one gripper profile."""
+    """Show one gripper profile, as the JSON file that `grippers create` takes."""
     found = state.db.grippers.get(id)
     name = {"name": found.name} if found.name else {}
-    state.show(found, {"gripper": found.id, **name, **flat(found.profile.model_dump(mode="json"))})
+    profile = found.profile.model_dump(mode="json", exclude_none=True)
+    state.show(found, json.dumps({**name, **profile}, indent=2, ensure_ascii=False))
 
 
 @grippers.command("create")
 def create_gripper(
     state: State,
     id: GripperId,
-    file: Annotated[Path, typer.Argument(help="JSON file with the profile's fields.", show_default=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(help="JSON file with the profile, as `grippers show` prints it.", show_default=False),
+    ],
     name: Annotated[str | None, typer.Option(help="A name for people.")] = None,
 ) -> None:
     """Create a gripper profile from a JSON file."""
-    profile = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(profile, dict):
+    given = json.loads(file.read_text(encoding="utf-8"))
+    if not isinstance(given, dict):
         raise ValueError(f"{file} holds no JSON object")
+    # With --json `grippers show` prints the service's answer, which has the profile in it.
+    profile = {"name": given.get("name"), **given["profile"]} if "profile" in given else given
     fields = {**profile, **({"name": name} if name else {}), "id": id}
     created = state.db.grippers.create(**fields)
     state.show(created, f"Gripper {created.id} is created.")

@@ -27,7 +27,7 @@ from graspdb.cli.common import State
 from graspdb.files.trials import read_poses
 from graspdb.options import Corners, Option, PoseFile, Vector
 
-__all__ = ["Commands", "Numbers", "vector_option"]
+__all__ = ["Commands", "Numbers", "option_names", "vector_option"]
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -64,6 +64,13 @@ class Commands(typer.Typer):
             return function
 
         return add
+
+
+def option_names(*keywords: type[Any]) -> frozenset[str]:
+    """Names of the parameters that options of these TypedDicts set, underscores and all."""
+    return frozenset(
+        option.name for model in keywords for field in _fields(model) for option in field.options()
+    )
 
 
 def _command(function: Callable[..., None]) -> Callable[..., None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import attrgetter
@@ -13,6 +12,7 @@ import typer
 
 from graspdb import wire
 from graspdb.cli.common import ERRORS, ObjectId, State, out, run_bar, show_rows, show_table
+from graspdb.cli.wording import in_commands
 from graspdb.errors import ChecksNeeded
 from graspdb.figures import FILE_FORMATS
 from graspdb.figures.style import number, widths
@@ -76,8 +76,11 @@ def report(
         out(found.raw)
         return
     _show(found)
+    calls = getattr(found.raw, "calls", [])
+    if calls:
+        ERRORS.print(_simulation_told(id, name, len(calls)))
     for warning in found.warnings:
-        ERRORS.print(f"Mind: {warning}")
+        ERRORS.print(f"Mind: {in_commands(warning)}", markup=False)
     if figure is not None:
         ERRORS.print(f"Figure: {figure}")
 
@@ -92,6 +95,7 @@ def _computed(state: State, id: str, name: str, options: Options, simulate: bool
         calls = getattr(found.raw, "calls", [])
     except ChecksNeeded as error:
         if not simulate:
+            error.add_note(_simulation_told(id, name, len(error.calls)))
             raise
         calls = error.calls
     if not simulate or not calls:
@@ -99,6 +103,10 @@ def _computed(state: State, id: str, name: str, options: Options, simulate: bool
     for sweep in reports.simulate(calls):
         sweep.wait(progress=not state.json)
     return _asked(reports, id, name, options)
+
+
+def _simulation_told(id: str, name: str, sweeps: int) -> str:
+    return f"`graspdb report {id} {name} --simulate` makes the {sweeps} sweeps that lack and waits for them."
 
 
 def _asked(reports: Reports, id: str, name: str, options: Options) -> Any:
@@ -116,10 +124,6 @@ def _show(found: Any) -> None:
     show_rows(rows)
     for items, columns in _TABLES[raw.report](raw) if raw.report in _TABLES else ():
         show_table(items, columns, empty="Nothing.")
-    for call in getattr(raw, "calls", []):
-        ERRORS.print(
-            f"Missing: {call.method} {call.path} {json.dumps(call.body)}", soft_wrap=True, markup=False
-        )
 
 
 def _scores(raw: wire.reports.CalibrationReport) -> dict[str, str]:

@@ -119,7 +119,7 @@ class GraspQueries(Resource):
         if len(grasps):
             return self._simulated(grasps, given, verify_timeout_s) if verify else grasps
         if grasps.status == "no_successes":
-            way_out = "; with a mesh, name a gripper to choose by its edges"
+            way_out = "; with a mesh, name a gripper (gripper=) to choose by its edges"
             raise Infeasible(
                 f"{self.id} has no successful trial yet, so there is no grasp to choose from"
                 f"{'' if given.get('prior') is False else way_out}"

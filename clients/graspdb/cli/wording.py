@@ -1,0 +1,122 @@
+"""What the service says to those who call it over HTTP, in the words of the command line.
+
+The service's problems and warnings name a way out: a request, a parameter. Here is the command that makes
+that request, and the option that sets that parameter.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from graspdb.cli.options import option_names
+from graspdb.reports import (
+    AnisotropyOptions,
+    ConvergenceOptions,
+    KernelSimilarityOptions,
+    ProjectionOptions,
+)
+from graspdb.resources.kernels import KernelOptions
+from graspdb.resources.objects import ObjectProperties
+from graspdb.resources.selection import Constraints
+from graspdb.resources.sweeps import SweepOptions
+from graspdb.resources.trials import TrialFilters, Upload
+
+COMMANDS: Mapping[str, str] = {
+    "GET /objects": "objects list",
+    "POST /objects": "objects create",
+    "PATCH /objects/OBJECT": "objects change OBJECT",
+    "PUT /objects/OBJECT/mesh": "objects set-mesh OBJECT FILE",
+    "PUT /objects/OBJECT/convex-parts": "objects set-convex-parts OBJECT FILE",
+    "POST /objects/OBJECT/trials": "trials add OBJECT FILE",
+    "GET /objects/OBJECT/batches": "batches list OBJECT",
+    "POST /objects/OBJECT/best-grasp": "best-grasp OBJECT",
+    "POST /objects/OBJECT/sweeps": "sweep OBJECT",
+    "GET /grippers": "grippers list",
+    "POST /grippers": "grippers create",
+    "GET /kernels": "kernels list",
+    "POST /kernels": "kernels fit OBJECT",
+    "GET /sweeps": "sweeps list",
+    "POST /sweeps/SWEEP/cancel": "sweeps cancel SWEEP",
+    "POST /sweeps/SWEEP/retry": "sweeps retry SWEEP",
+}
+"""The command of every request that the service names as a way out; ids in capitals."""
+
+_PLACES = {"objects": "OBJECT", "sweeps": "SWEEP"}
+_PARAMETERS = option_names(
+    *(Constraints, SweepOptions, KernelOptions, ObjectProperties, TrialFilters, Upload),
+    *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions),
+) | {"unit", "mesh"}
+_CALL = re.compile(r"\b(GET|POST|PUT|DELETE|PATCH) (/[\w{}./-]*[\w}])(?:\?([\w=]+)(?:=\.\.\.|\.\.\.)?)?")
+_PARAMETER = re.compile(r"(?<![\w.\-])(?:\w+\([^()]*\)|([a-z_]+)=([\w.-]*)|([a-z]+(?:_[a-z]+)+))")
+
+
+def in_commands(text: str) -> str:
+    """The text with commands in the place of requests, and options in that of parameters."""
+    said, at = "", 0
+    for call in _CALL.finditer(text):
+        if call.start() < at:
+            continue
+        command = _command(call[1], call[2])
+        if command is None:
+            continue
+        body, end = _body(text, call.end())
+        options = [*_options(body), *([f"--{call[3].rstrip('=')} ..."] if call[3] else [])]
+        command = command.replace("OBJECT", str(body.get("object", "OBJECT")))
+        said += in_options(text[at : call.start()]) + " ".join(("`graspdb", command, *options)) + "`"
+        at = end
+    return said + in_options(text[at:])
+
+
+def in_options(text: str) -> str:
+    """The text with options in the place of parameters: ``gripper=`` and ``max_poses`` are ours, too."""
+    return _PARAMETER.sub(_option, text)
+
+
+def _command(method: str, path: str) -> str | None:
+    """The command that makes a request, with the ids that its path has."""
+    noun, *rest = path.strip("/").split("/")
+    if not rest or noun not in _PLACES:
+        return COMMANDS.get(f"{method} {path}")
+    place, named = _PLACES[noun], rest[0]
+    command = COMMANDS.get(f"{method} /{'/'.join((noun, place, *rest[1:]))}")
+    return command if command is None or "{" in named else command.replace(place, named)
+
+
+def _body(text: str, at: int) -> tuple[dict[str, Any], int]:
+    """The JSON object that follows a request, and where it ends; ``[...]`` in it stands for a file."""
+    if not text.startswith(" {", at):
+        return {}, at
+    end = text.find("}", at) + 1
+    while end and text.count("{", at, end) > text.count("}", at, end):
+        end = text.find("}", end) + 1
+    try:
+        body = json.loads(text[at:end].replace("[...]", '"FILE"'))
+    except ValueError:
+        return {}, at
+    return body, end
+
+
+def _options(body: Mapping[str, Any]) -> Iterator[str]:
+    """A request's fields as options of its command."""
+    for name, value in body.items():
+        if name == "sample":
+            yield f"--sample {value['count']}"
+        elif isinstance(value, Mapping):
+            yield from _options(value)
+        elif name != "object":
+            yield f"{_flag(name)} {value}"
+
+
+def _option(found: re.Match[str]) -> str:
+    name = found[1] or found[3]
+    if name not in _PARAMETERS:
+        return found[0]
+    flag = _flag(name)
+    return f"{flag} {found[2]}" if found[2] else flag
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
