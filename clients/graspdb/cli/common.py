@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import functools
 import json
@@ -15,6 +16,7 @@ import numpy as np
 import typer
 from pydantic import BaseModel
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -86,6 +88,15 @@ def out(value: Any) -> None:
     sys.stdout.write(json.dumps(plain(value), allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def out_csv(columns: Mapping[str, Any]) -> None:
+    """Equally long columns as CSV on standard output, under their names; an empty cell is not known."""
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(columns)
+    # NaN, which differs from itself, is not known either.
+    cells = [["" if x != x else x for x in np.asarray(column).tolist()] for column in columns.values()]
+    writer.writerows(zip(*cells, strict=True))
+
+
 def flat(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values, those of a mapping in it as ``name.key``."""
     return {
@@ -96,12 +107,12 @@ def flat(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def show_rows(rows: Mapping[str, Any]) -> None:
-    """Names and values below each other."""
+    """Names and values below each other; brackets, as those of units, are no markup."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows.items():
-        table.add_row(name, str(value))
+        table.add_row(escape(name), escape(str(value)))
     console().print(table)
 
 
@@ -115,9 +126,9 @@ def show_table(items: Sequence[T], columns: Mapping[str, Callable[[T], Any]], *,
     table = Table(header_style="bold", box=None, pad_edge=False)
     for index, name in enumerate(columns):
         numeric = all(isinstance(row[index], (int, float)) or row[index] == "" for row in body)
-        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+        table.add_column(escape(name), justify="right" if numeric else "left", overflow="fold")
     for row in body:
-        table.add_row(*(f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in row))
+        table.add_row(*(f"{cell:,}" if isinstance(cell, int) else escape(str(cell)) for cell in row))
     console().print(table)
 
 

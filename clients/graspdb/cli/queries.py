@@ -8,13 +8,16 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
-from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, show_rows, show_table
+from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, out_csv, show_rows, show_table
 from graspdb.cli.options import Numbers, vector_option
+from graspdb.cli.wording import in_commands
 from graspdb.errors import Infeasible
 from graspdb.figures.style import widths
 from graspdb.files.trials import read_poses
-from graspdb.resources.results import Grasp, Grasps, SampledPoses
+from graspdb.poses import as_poses
+from graspdb.resources.results import Grasp, Grasps, SampledPoses, pose_columns
 from graspdb.resources.selection import Constraints, Selection
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
@@ -35,7 +38,9 @@ def density(state: State, id: ObjectId, selection: Selection) -> None:
         "outcomes": ", ".join(f"{n:,} {name}" for name, n in found.outcomes.items()) or "none",
         "memory": f"{found.bytes / 2**20:.1f} MiB",
     }
-    rows |= {f"warning {number}": warning for number, warning in enumerate(found.warnings, start=1)}
+    rows |= {
+        f"warning {number}": in_commands(warning) for number, warning in enumerate(found.warnings, start=1)
+    }
     state.show(found, rows)
 
 
@@ -47,10 +52,12 @@ def best_grasp(
     verify: Annotated[
         bool, typer.Option("--verify", help="Simulate the grasps at the fine step first (needs a worker).")
     ] = False,
+    csv: Annotated[bool, typer.Option("--csv", help="CSV with all scores; poses in both frames.")] = False,
 ) -> None:
     """Find the best grasp within constraints.
 
-    All constraints are in the world's frame if --object-pose is given, else in the object's.
+    All constraints are in the world's frame if --object-pose is given, else in the object's; --frame object
+    keeps them in the object's. A table of several grasps has their poses in that frame.
     """
     try:
         found = state.db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
@@ -62,31 +69,53 @@ def best_grasp(
     if state.json:
         names = ("status", "ranking", "revision", "kernel")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
+    elif csv:
+        out_csv(found.columns())
     elif count == 1:
-        show_rows(found[0].summary())
+        show_rows({**found[0].summary(), **_ranked_by(found)})
     else:
-        _show_grasps(found)
+        _show_grasps(found, in_world=found[0].world is not None and constraints.get("frame") != "object")
 
 
-def _show_grasps(found: Grasps) -> None:
+def _ranked_by(found: Grasps) -> dict[str, str]:
+    """The score of the best grasp and what it is, unless it is the density, which is shown anyhow."""
+    best, ranking = found[0], found.ranking
+    if best.score is None or ranking is None or ranking.objective == "density":
+        return {}
+    return {"ranked by": f"{ranking.score}: {best.score:.4g}"}
+
+
+def _show_grasps(found: Grasps, *, in_world: bool) -> None:
+    frame = "world " if in_world else ""
     columns: dict[str, Callable[[Grasp], Any]] = {
         "": lambda g: 1 + found.index(g),
-        "position [m]": lambda g: numbers(g.position),
-        "quaternion xyzw": lambda g: numbers(g.quaternion_xyzw),
-        "in the world [m]": lambda g: None if g.world is None else numbers(g.world[:3, 3]),
+        f"{frame}position [m]": lambda g: numbers(_matrix(g, in_world)[:3, 3]),
+        f"{frame}quaternion xyzw": lambda g: numbers(as_poses(_matrix(g, in_world)).quaternion_xyzw[0]),
+        f"{frame}approach": lambda g: numbers(_matrix(g, in_world)[:3, 2], digits=2),
         "density": lambda g: f"{g.density:.4g}",
         "relative": lambda g: f"{g.relative:.3f}",
+        "success probability": lambda g: g.chance(),
+        "score": lambda g: None if g.score is None else f"{g.score:.4g}",
         "simulated": lambda g: g.simulated,
     }
-    if found[0].world is None:
-        del columns["in the world [m]"]
+    ranked_by = _ranked_by(found)
+    if not ranked_by:
+        del columns["score"]
+    if all(g.success_probability is None for g in found):
+        del columns["success probability"]
     if found[0].simulated is None:
         del columns["simulated"]
     show_table(found, columns, empty="No grasp.")
+    if found.ranking is not None and ranked_by:
+        ERRORS.print(f"The score that they are ranked by is the {found.ranking.score}.", soft_wrap=True)
     if found[0].prior:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
         ERRORS.print(f"Only {len(found)} distinct grasps exist.")
+
+
+def _matrix(grasp: Grasp, in_world: bool) -> NDArray[np.float64]:
+    return grasp.world if in_world and grasp.world is not None else grasp.matrix
 
 
 def likelihood(
@@ -97,7 +126,8 @@ def likelihood(
         str | None, typer.Argument(help="Poses: .csv (x,y,z,qx,qy,qz,qw), .npy, .json, NDJSON.")
     ] = None,
     pose: Annotated[Numbers | None, vector_option("One pose instead.", "--pose", "x,y,z,qx,qy,qz,qw")] = None,
-    limit: Annotated[int, typer.Option(min=1, help="Rows of the table; --json gives all.")] = 20,
+    limit: Annotated[int, typer.Option(min=1, help="Rows of the table; --json and --csv give all.")] = 20,
+    csv: Annotated[bool, typer.Option("--csv", help="CSV: every pose and what is known of it.")] = False,
 ) -> None:
     """Say how likely grasps are."""
     if (file is None) == (pose is None):
@@ -107,13 +137,16 @@ def likelihood(
     if state.json:
         out(found)
         return
+    if csv:
+        out_csv(pose_columns(as_poses(poses)) | found.columns())
+        return
     columns: dict[str, Callable[[int], Any]] = {"": int, "position [m]": lambda row: numbers(poses[row, :3])}
     for name in ("density", "log_density", "relative", "success_probability", "collision_free"):
         if (values := getattr(found, name)) is not None:
             columns[name.replace("_", " ")] = partial(_cell, values)
     show_table(range(min(limit, len(poses))), columns, empty="No poses.")
     if len(poses) > limit:
-        ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json gives all.")
+        ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json and --csv give all.")
 
 
 def _cell(values: Any, row: int) -> str:
@@ -152,9 +185,7 @@ def proposals(
 
 def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
     if csv:
-        typer.echo("x,y,z,qx,qy,qz,qw,proposal_density")
-        for row, weight in zip(found.poses.tolist(), found.proposal_density.tolist(), strict=True):
-            typer.echo(",".join(repr(value) for value in (*row, weight)))
+        out_csv(found.columns())
     elif state.json:
         out(found)
     else:

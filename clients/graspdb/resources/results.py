@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb import wire
-from graspdb.poses import Poses, matrices
+from graspdb.poses import Poses, as_poses, matrices
 
 Floats = NDArray[np.float64]
 
@@ -114,23 +114,35 @@ class Grasp:
         """(3,) direction in which the fingers close: the tool's y axis, object frame."""
         return self.matrix[:3, 1]
 
+    def chance(self) -> str:
+        """The success probability in words: never without its interval and the trials it rests on."""
+        if self.success_probability is None or self.interval is None or self.effective_trials is None:
+            return "unknown"
+        ends = f"{self.interval.low:.2f} to {self.interval.high:.2f}"
+        return f"{self.success_probability:.2f} ({ends}), {self.effective_trials:.1f} trials"
+
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
         rows = {
             "position [m]": _vector(self.position),
             "quaternion xyzw": _vector(self.quaternion_xyzw),
             "approach": _vector(self.approach, 2),
+        }
+        if self.world is not None:
+            world = as_poses(self.world)
+            rows |= {
+                "position in the world [m]": _vector(world.position[0]),
+                "quaternion in the world xyzw": _vector(world.quaternion_xyzw[0]),
+                "approach in the world": _vector(self.world[:3, 2], 2),
+            }
+        rows |= {
             "density [1/(m³ rad³)]": f"{self.density:.4g}",
             "relative": f"{self.relative:.3f}",
         }
         if self.prior:
             rows["chosen by"] = "the object's edges: nothing has succeeded yet"
-        if self.world is not None:
-            rows["position in the world [m]"] = _vector(self.world[:3, 3])
         if self.success_probability is not None:
-            rows["success probability"] = f"{self.success_probability:.2f}" + (
-                f" ({self.interval.low:.2f} to {self.interval.high:.2f})" if self.interval else ""
-            )
+            rows["success probability"] = self.chance()
         if self.collision_free is not None:
             rows["collision-free"] = "yes" if self.collision_free else "no"
         if self.simulated is not None:
@@ -193,16 +205,35 @@ class Grasps(Sequence[Grasp]):
         """(N, 4, 4) tool frames in the object frame."""
         return np.array([grasp.matrix for grasp in self._grasps]).reshape(-1, 4, 4)
 
-    def to_pandas(self) -> Any:
-        """A DataFrame with a row a grasp (extra ``pandas``)."""
+    @property
+    def worlds(self) -> Floats | None:
+        """(N, 4, 4) tool frames in the world frame; None unless the query gave the object's pose."""
+        worlds = [grasp.world for grasp in self._grasps if grasp.world is not None]
+        return np.array(worlds) if worlds else None
+
+    def columns(self) -> dict[str, Any]:
+        """Equally long columns by name: the pose in the object frame, ``world_x`` to ``world_qw`` that in the
+        world frame where the query gave the object's pose, then scores; ``low`` and ``high`` are the ends of
+        the success probability's interval.
+        """
         poses = Poses(
             np.array([g.position for g in self]).reshape(-1, 3),
             np.array([g.quaternion_xyzw for g in self]).reshape(-1, 4),
         )
+        columns: dict[str, Any] = dict(pose_columns(poses))
+        worlds = self.worlds
+        if worlds is not None:
+            columns |= {f"world_{name}": x for name, x in pose_columns(as_poses(worlds)).items()}
         names = ["score", "density", "log_density", "relative", "success_probability", "effective_trials"]
         names += ["collision_free", "width_m", "candidate", "simulated"]
-        columns = {name: [getattr(g, name) for g in self] for name in names}
-        return to_pandas(pose_columns(poses) | columns)
+        columns |= {name: [getattr(grasp, name) for grasp in self] for name in names}
+        for end in ("low", "high"):
+            columns[end] = [g.interval and getattr(g.interval, end) for g in self]
+        return columns
+
+    def to_pandas(self) -> Any:
+        """A DataFrame with a row a grasp (extra ``pandas``): see :meth:`columns`."""
+        return to_pandas(self.columns())
 
     def __repr__(self) -> str:
         lines = "".join(f"\n  {grasp!r}," for grasp in self._grasps)
@@ -219,6 +250,10 @@ class Columns:
 
     def _columns(self) -> dict[str, Any]:
         raise NotImplementedError
+
+    def columns(self) -> dict[str, Any]:
+        """Equally long columns by name."""
+        return self._columns()
 
     def to_pandas(self) -> Any:
         """A DataFrame with a row a pose (extra ``pandas``)."""
