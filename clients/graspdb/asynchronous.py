@@ -133,6 +133,7 @@ class AsyncSweep(Mirror[Sweep]):
     refresh = _chained(Sweep.refresh)
     cancel = _chained(Sweep.cancel)
     retry = _chained(Sweep.retry)
+    waits_for = _awaited(Sweep.waits_for)
     hint = _awaited(Sweep.hint)
     outcomes = _awaited(Sweep.outcomes)
 

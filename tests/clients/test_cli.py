@@ -46,6 +46,9 @@ def test_objects_from_creation_to_deletion(run: Run, fresh_id: str, tmp_path: Pa
     assert fresh_id in run("objects", "list")[1]
     code, out, _ = run("--json", "objects", "show", fresh_id)
     assert json.loads(out)["mass_kg"] == 0.2
+    assert run("objects", "change", fresh_id, "--mass-kg", "0.3")[0] == 0
+    changed = json.loads(run("--json", "objects", "show", fresh_id)[1])
+    assert (changed["mass_kg"], changed["mesh"]["unit"]) == (0.3, "mm")
     assert run("objects", "delete", fresh_id, "--yes")[0] == 0
     code, out, err = run("objects", "show", fresh_id)
     assert (code, out) == (1, "")
@@ -96,6 +99,79 @@ def test_trials_density_and_queries(run: Run, fresh_id: str, trials_file: str, t
     code, out, _ = run("likelihood", fresh_id, "--pose", "0,0,0.06,1,0,0,0")
     assert code == 0
     assert "relative" in out
+
+
+@pytest.fixture
+def tried(run: Run, fresh_id: str, tmp_path: Path, clusters: Callable[..., np.ndarray]) -> str:
+    """An object of whose trials about two poses every third failed."""
+    poses = clusters([([0, 0, 0.06], [1, 0, 0, 0]), ([-0.08, 0, 0], [0, 0.5**0.5, 0, 0.5**0.5])], 60)
+    file = tmp_path / "tried.csv"
+    held = ["success" if row % 3 else "slipped" for row in range(len(poses))]
+    rows = [",".join((*map(repr, pose), outcome)) for pose, outcome in zip(poses.tolist(), held, strict=True)]
+    file.write_text("\n".join(["x,y,z,qx,qy,qz,qw,outcome", *rows]) + "\n")
+    run("objects", "create", fresh_id)
+    assert run("trials", "add", fresh_id, str(file), "--gripper", "panda", "--source", "robot")[0] == 0
+    return fresh_id
+
+
+def test_best_grasps_show_what_they_are_ranked_by(run: Run, tried: str) -> None:
+    ranked = ("--objective", "success_probability", "--count", "2", "--min-separation-m", "0.05")
+    code, out, err = run("best-grasp", tried, *ranked)
+    assert code == 0, err
+    header, *rows = out.strip().splitlines()
+    assert "success probability" in header
+    assert "score" in header
+    assert "lower end of the success probability's" in err
+    found = json.loads(run("--json", "best-grasp", tried, *ranked)[1])["grasps"]
+    assert len(rows) == len(found) == 2
+    for row, grasp in zip(rows, found, strict=True):
+        ends = f"({grasp['interval']['low']:.2f} to {grasp['interval']['high']:.2f})"
+        trials = f"{grasp['effective_trials']:.1f} trials"
+        assert f"{grasp['success_probability']:.2f} {ends}, {trials}" in row
+        assert f"{grasp['score']:.4g}" in row
+    single = run("best-grasp", tried, *ranked[:2])[1]
+    assert f"interval: {found[0]['score']:.4g}" in single
+
+
+def test_best_grasps_have_world_poses_in_the_frame_asked_for(run: Run, tried: str) -> None:
+    """The object stands half a metre away and turned by a quarter about z, which takes x to y."""
+    moved = ("--object-pose", "0.5,0,0.1,0,0,0.70710678,0.70710678")
+    turned = ("--count", "2", "--min-separation-m", "0.05", *moved)
+    single = run("best-grasp", tried, *moved)[1]
+    for name in ("position", "quaternion", "approach"):
+        assert f"{name} in the world" in single
+    header, *rows = run("best-grasp", tried, *turned)[1].strip().splitlines()
+    for name in ("position [m]", "quaternion xyzw", "approach"):
+        assert f"world {name}" in header
+    assert "world" not in run("best-grasp", tried, *turned, "--frame", "object")[1]
+
+    table = list(csv.DictReader(io.StringIO(run("best-grasp", tried, *turned, "--csv")[1])))
+    assert len(table) == len(rows) == 2
+    for row in table:
+        x, y, z = (float(row[name]) for name in "xyz")
+        world = [float(row[f"world_{name}"]) for name in "xyz"]
+        assert world == pytest.approx([0.5 - y, x, 0.1 + z])
+        turn, pose = ([float(row[f"{of}q{name}"]) for name in "xyzw"] for of in ("world_", ""))
+        assert abs(np.dot(turn, _product([0, 0, 0.5**0.5, 0.5**0.5], pose))) == pytest.approx(1.0)
+    assert {"score", "density", "success_probability", "low", "high", "effective_trials"} <= set(table[0])
+
+
+def _product(a: list[float], b: list[float]) -> list[float]:
+    """The quaternion (x, y, z, w) of rotation ``b`` and then ``a``."""
+    vector = a[3] * np.array(b[:3]) + b[3] * np.array(a[:3]) + np.cross(a[:3], b[:3])
+    return [*vector.tolist(), a[3] * b[3] - float(np.dot(a[:3], b[:3]))]
+
+
+def test_likelihood_as_csv(run: Run, tried: str, tmp_path: Path) -> None:
+    drawn = tmp_path / "drawn.csv"
+    drawn.write_text(run("samples", tried, "--count", "30", "--seed", "1", "--csv")[1])
+    table = list(csv.DictReader(io.StringIO(run("likelihood", tried, str(drawn), "--csv")[1])))
+    given = list(csv.DictReader(io.StringIO(drawn.read_text())))
+    assert len(table) == len(given) == 30
+    for row, pose in zip(table, given, strict=True):
+        assert float(row["qw"]) == pytest.approx(float(pose["qw"]))
+        assert float(row["density"]) == pytest.approx(float(pose["proposal_density"]), rel=1e-3)
+        assert float(row["low"] or 0) <= float(row["success_probability"] or 0.5) <= float(row["high"] or 1)
 
 
 def test_no_grasp_is_one_message_and_exit_code_1(run: Run, fresh_id: str, trials_file: str) -> None:
@@ -154,6 +230,49 @@ def test_grippers(run: Run, fresh_id: str, tmp_path: Path) -> None:
     file.write_text(json.dumps({k: v for k, v in profile.items() if v is not None} | {"force_n": 5}))
     assert run("grippers", "create", fresh_id, str(file), "--name", "Weak")[0] == 0
     assert "Weak" in run("grippers", "show", fresh_id)[1]
+
+
+@pytest.mark.parametrize("as_json", [(), ("--json",)])
+def test_a_gripper_as_shown_can_be_created_again(
+    run: Run, fresh_id: str, tmp_path: Path, as_json: tuple[str, ...]
+) -> None:
+    file = tmp_path / "gripper.json"
+    file.write_text(run(*as_json, "grippers", "show", "panda")[1])
+    assert run("grippers", "create", fresh_id, str(file))[0] == 0
+    ours, theirs = (json.loads(run("--json", "grippers", "show", name)[1]) for name in (fresh_id, "panda"))
+    assert (ours["profile"], ours["name"]) == (theirs["profile"], theirs["name"])
+
+
+def test_a_sweep_says_what_it_waits_for(run: Run, fresh_id: str, tmp_path: Path) -> None:
+    """Two balls that overlap are not convex: a worker has to make their parts first."""
+    balls = trimesh.util.concatenate(
+        [trimesh.creation.icosphere(1, 0.02).apply_translation((x, 0, 0)) for x in (-0.015, 0.015)]
+    )
+    balls.export(tmp_path / "balls.stl")
+    run("objects", "create", fresh_id, "--mesh", str(tmp_path / "balls.stl"), "--mass-kg", "0.1")
+    code, out, err = run("sweep", fresh_id, "--max-poses", "100")
+    assert code == 0, err
+    (waiting,) = [line for line in out.splitlines() if line.startswith("waits for")]
+    assert "convex parts: " in waiting
+    (sweep,) = json.loads(run("--json", "sweeps", "list", "--object", fresh_id)[1])
+    try:
+        assert "convex parts: " in run("sweeps", "show", sweep["id"])[1]
+        assert "convex parts: " in run("sweeps", "list", "--object", fresh_id)[1]
+        ended, _, err = run("sweeps", "wait", sweep["id"], "--timeout", "0.1")
+        assert ended == 1
+        assert f"graspdb sweeps cancel {sweep['id']}" in err
+    finally:
+        assert "waits for" not in run("sweeps", "cancel", sweep["id"])[1]
+
+
+def test_parts_are_set_after_the_mesh(run: Run, fresh_id: str, tmp_path: Path) -> None:
+    run("objects", "create", fresh_id)
+    parts = trimesh.Scene([trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.2, 0.05, 0.05))])
+    parts.export(tmp_path / "parts.glb")
+    code, out, err = run("objects", "set-convex-parts", fresh_id, str(tmp_path / "parts.glb"))
+    assert code == 0, err
+    assert json.loads(run("--json", "objects", "show", fresh_id)[1])["convex_parts"]["parts"] == 2
+    assert "convex parts" in out
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,11 @@ from typing import Annotated, Any
 
 import typer
 
-from graspdb.cli.common import ObjectId, State, flat, out
+from graspdb.cli.common import ERRORS, ObjectId, State, flat, out, out_csv
 from graspdb.cli.options import Commands
-from graspdb.resources.sweeps import Sweep, SweepOptions
+from graspdb.errors import SweepFailed
+from graspdb.resources.sweeps import Sweep, SweepOptions, convex_parts_told
+from graspdb.wire import SweepInfo
 
 sweeps = Commands(no_args_is_help=True, help="List, show, cancel and retry sweeps.")
 
@@ -25,7 +27,7 @@ def sweep(
     """Have workers simulate grasps of an object: the whole grid, or what the options say."""
     made = state.db.objects.get(id).sweep(**options)
     if wait:
-        made.wait(progress=not state.json, timeout=timeout)
+        _wait(state, made, timeout)
     _show(state, made)
 
 
@@ -36,12 +38,13 @@ def list_sweeps(
     state: Annotated[str | None, typer.Option(help="Only in this state.")] = None,
 ) -> None:
     """List sweeps."""
+    found = list(options.db.sweeps.list(object=object, state=state))
     options.show_list(
-        [item.info for item in options.db.sweeps.list(object=object, state=state)],
+        [item.info for item in found],
         {
             "sweep": lambda i: i.id,
             "object": lambda i: i.object,
-            "state": lambda i: i.state,
+            "state": _state,
             "poses": lambda i: i.poses,
             "done": lambda i: f"{100 * i.poses_done / max(i.poses, 1):.0f} %",
             "successes": lambda i: i.outcomes.get("success", 0),
@@ -50,6 +53,10 @@ def list_sweeps(
         },
         empty="No sweeps yet.",
     )
+    queued = [item for item in found if item.state == "queued"]
+    hint = queued[0].hint() if queued and not options.json else None
+    if hint is not None:
+        ERRORS.print(f"Mind: {hint}")
 
 
 @sweeps.command("show")
@@ -65,7 +72,9 @@ def wait_for_sweep(
     timeout: Annotated[float | None, typer.Option(help="Seconds to wait at most.")] = None,
 ) -> None:
     """Wait until a sweep has finished."""
-    _show(state, state.db.sweeps.get(id).wait(progress=not state.json, timeout=timeout))
+    found = state.db.sweeps.get(id)
+    _wait(state, found, timeout)
+    _show(state, found)
 
 
 @sweeps.command("cancel")
@@ -87,9 +96,7 @@ def sweep_outcomes(state: State, id: SweepId) -> None:
     if state.json:
         out(found)
         return
-    typer.echo("pose_index,x,y,z,qx,qy,qz,qw,outcome")
-    for index, pose, outcome in zip(found.pose_index, found.poses.tolist(), found.outcome, strict=True):
-        typer.echo(",".join((str(index), *(repr(value) for value in pose), str(outcome))))
+    out_csv(found.columns())
 
 
 def workers(state: State) -> None:
@@ -114,5 +121,27 @@ def info(state: State) -> None:
     state.show(answer, flat(answer))
 
 
+def _wait(state: State, found: Sweep, timeout: float | None) -> None:
+    try:
+        found.wait(progress=not state.json, timeout=timeout)
+    except SweepFailed as error:
+        error.add_note(f"`graspdb sweeps retry {found.id}` queues its failed chunks again.")
+        raise
+    except TimeoutError as error:
+        error.add_note(
+            f"`graspdb sweeps wait {found.id}` waits on; `graspdb sweeps cancel {found.id}` stops it."
+        )
+        raise
+
+
+def _state(info: SweepInfo) -> str:
+    waits = info.waiting_for if info.state == "queued" else None
+    return info.state if waits is None else f"{info.state}, {convex_parts_told(waits)}"
+
+
 def _show(state: State, found: Sweep) -> None:
-    state.show(found.info, found.summary())
+    rows = found.summary()
+    waits_for = None if state.json else found.waits_for()
+    if waits_for is not None:
+        rows["waits for"] = waits_for
+    state.show(found.info, rows)

@@ -160,6 +160,15 @@ class Sweep(Resource):
                 failed_chunks=list(self.info.failed_chunks),
             )
 
+    def waits_for(self) -> str | None:
+        """What it waits for, in words; None once it runs. Asks the service for its workers."""
+        if self.info.state != "queued":
+            return None
+        parts = self.info.waiting_for
+        told = "a worker" if parts is None else convex_parts_told(parts)
+        hint = self.hint()
+        return told if hint is None else f"{told}; {hint}"
+
     def hint(self) -> str | None:
         """Why nothing happens, if that is for want of a worker."""
         if self.info.state != "queued":
@@ -265,6 +274,15 @@ def create_sweep(transport: Transport, path: str, options: SweepOptions) -> Swee
     return Sweep(transport, info)
 
 
+def convex_parts_told(waiting: wire.sweeps.WaitingFor) -> str:
+    """How far the decomposition is that a sweep waits for, in words."""
+    told = f"convex parts: {waiting.progress or waiting.state}"
+    if waiting.worker is not None:
+        told += f", on {waiting.worker}"
+    last = (waiting.error or "").strip().splitlines()
+    return f"{told} (the last attempt: {last[-1]})" if last else told
+
+
 def duration(seconds: float) -> str:
     """Seconds for people: ``45 s``, ``3 min 20 s``, ``2 h 05 min``."""
     whole = round(seconds)
@@ -317,7 +335,7 @@ class SweepBar(AbstractContextManager[ProgressCallback]):
         if self._hint:
             left = self._hint
         elif info.waiting_for is not None and info.state == "queued":
-            left = f"convex parts: {info.waiting_for.progress or info.waiting_for.state}"
+            left = convex_parts_told(info.waiting_for)
         elif info.state in FINISHED or info.state == "queued":
             left = info.state
         elif info.time_left_s is not None:
