@@ -13,6 +13,7 @@ import shlex
 import shutil
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -40,6 +41,20 @@ settings.register_profile(
     "graspdb", deadline=None, derandomize=not os.environ.get("HYPOTHESIS_RANDOM"), print_blob=True
 )
 settings.load_profile("graspdb")
+
+#: Seconds a test's client waits for an answer: a machine with other work is no failure of the code either.
+PATIENCE_S = 240.0
+_COMPILE = """
+from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.runtime.warmup import warm_up
+warm_up(Compute(1))
+"""
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the loops before several processes would each compile them all, with tests waiting for that."""
+    if getattr(session.config.option, "numprocesses", None):
+        subprocess.run([sys.executable, "-c", _COMPILE], check=True)
 
 
 class PostgresServer:
@@ -283,12 +298,12 @@ def serve_module() -> Iterator[Serve]:
 @pytest.fixture
 def http(database_url: str, serve: Serve) -> Iterator[httpx.Client]:
     """A client of a real server over SQLite, then over PostgreSQL."""
-    with httpx.Client(base_url=serve(database_url), timeout=60) as client:
+    with httpx.Client(base_url=serve(database_url), timeout=PATIENCE_S) as client:
         yield client
 
 
 @pytest.fixture
 def sqlite_http(sqlite_url: str, serve: Serve) -> Iterator[httpx.Client]:
     """A client of a real server over SQLite: for what does not depend on the database."""
-    with httpx.Client(base_url=serve(sqlite_url), timeout=60) as client:
+    with httpx.Client(base_url=serve(sqlite_url), timeout=PATIENCE_S) as client:
         yield client
