@@ -90,13 +90,15 @@ class BatchOrigin(NamedTuple):
 class TrialBatch:
     """Checked trials of one request, ready to store.
 
-    ``field_of_gripper`` names the field that a gripper came in, for what only the database can tell.
+    ``field_of_gripper`` names the field that a gripper came in, ``field_of`` that of a trial's place and
+    name, for what only the database can tell.
     """
 
     columns: TrialColumns
     provenances: Sequence[Provenance]
     metadata: dict[str, Any] | None
     field_of_gripper: Callable[[str], str]
+    field_of: Callable[[int, str], str]
 
 
 @dataclass(frozen=True, eq=False)

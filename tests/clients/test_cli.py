@@ -174,6 +174,35 @@ def test_likelihood_as_csv(run: Run, tried: str, tmp_path: Path) -> None:
         assert float(row["low"] or 0) <= float(row["success_probability"] or 0.5) <= float(row["high"] or 1)
 
 
+def test_doubtful_trials_are_told_and_mended(run: Run, fresh_id: str, tmp_path: Path) -> None:
+    mesh, file = tmp_path / "box.stl", tmp_path / "mm.json"
+    trimesh.creation.box((40, 60, 100)).export(mesh)
+    run("objects", "create", fresh_id, "--mesh", str(mesh), "--unit", "mm")
+    across = [0.0, 0.5**0.5, 0.5**0.5, 0.0]
+    trials = [
+        {"position": [x, 0, 45], "quaternion_xyzw": across, "outcome": True}
+        for x in np.linspace(-5, 5, 12).tolist()
+    ]
+    file.write_text(json.dumps({"gripper": "panda", "trials": trials}))
+    add = ("trials", "add", fresh_id, str(file), "--quaternion-order", "wxyz")
+    code, _, err = run(*add)
+    assert code == 1
+    assert "--unit mm" in err
+    code, out, _ = run(*add, "--unit", "mm")
+    assert code == 0
+    assert "Doubtful" not in out
+    code, out, err = run(*add, "--unit", "mm")
+    assert code == 0
+    assert "Doubtful (posted-before): 12 of 12 trials" in out
+    assert err == ""
+    batch = json.loads(run("--json", "batches", "list", fresh_id)[1])[-1]
+    assert "posted-before" in run("batches", "list", fresh_id)[1]
+    assert "delete one of the batches" in run("batches", "show", fresh_id, batch["batch"])[1]
+    assert "Doubtful (posted-before)" in run("density", fresh_id)[1]
+    assert run(*add, "--accept-implausible")[0] == 0
+    assert run(*add, "--unit", "feet")[0] == 2
+
+
 def test_no_grasp_is_one_message_and_exit_code_1(run: Run, fresh_id: str, trials_file: str) -> None:
     run("objects", "create", fresh_id)
     assert "no successful trial" in run("best-grasp", fresh_id)[2]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspdb.files.trials import read_poses, read_trials
+from graspdb.files.trials import as_stated, read_poses, read_trials
 
 HEADER = "x,y,z,qx,qy,qz,qw"
 POSE = {"position": [0.1, 0.2, 0.3], "quaternion_xyzw": [0, 0, 0, 1]}
@@ -39,6 +39,24 @@ def _file(folder: Path, name: str, content: object) -> str:
 )
 def test_json_in_every_form(tmp_path: Path, content: object) -> None:
     assert read_trials(_file(tmp_path, "t.json", content)) == ([{**POSE, "outcome": "success"}], {})
+
+
+def test_another_unit_and_order_are_brought_to_ours() -> None:
+    matrix = [[1.0, 0, 0, 100], [0, 1, 0, 200], [0, 0, 1, 300], [0, 0, 0, 1]]
+    records = [
+        {"position": [100, 200, 300], "quaternion_xyzw": [1, 0, 0, 0], "outcome": True},
+        {"matrix": matrix, "outcome": True},
+        {"position": "nowhere", "outcome": True},
+    ]
+    first, second, third = as_stated(records, unit="mm", quaternion_order="wxyz")
+    assert first == {**POSE, "position": pytest.approx([0.1, 0.2, 0.3]), "outcome": True}
+    assert [row[3] for row in second["matrix"]] == pytest.approx([0.1, 0.2, 0.3, 1])
+    # The service names what is no pose.
+    assert third == records[2]
+    assert records[0]["position"] == [100, 200, 300]
+    for wrong in ({"unit": "feet"}, {"quaternion_order": "zyxw"}):
+        with pytest.raises(ValueError, match="expected"):
+            as_stated(records, **wrong)
 
 
 def test_shared_values_stay_beside(tmp_path: Path) -> None:

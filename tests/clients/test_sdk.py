@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from graspdb.errors import (
 )
 from graspdb.poses import as_poses, matrices
 from graspdb.resources.objects import GraspObject
+from graspdb.resources.trials import DoubtfulTrials
 
 DOWN = [1.0, 0.0, 0.0, 0.0]
 SIDE = [0.0, 0.5**0.5, 0.0, 0.5**0.5]
@@ -182,6 +184,30 @@ def test_a_big_upload_goes_in_batches_and_repeats_safely(
     assert {b.batch for b in item.batches} == set(receipt.batches) - {receipt.batches[1]}
     with pytest.raises(Conflict):  # the deleted batch's key does not bring it back
         item.trials.add(poses, False, **send)
+
+
+def test_doubtful_trials_are_warned_of_and_counted_from_the_first(
+    db: Client, fresh_id: str, clusters: Callable[..., np.ndarray]
+) -> None:
+    item = db.objects.create(fresh_id)
+    poses, east = clusters([(ABOVE, DOWN)], 20), np.eye(7)[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert item.trials.add(poses, True).findings == ()
+    with pytest.warns(DoubtfulTrials, match="posted before") as told:
+        receipt = item.trials.add(np.concatenate([poses[:5] + 0.001 * east, poses[5:]]), True, chunk=10)
+    assert told[0].filename == __file__
+    assert [(f.code, f.count, f.first_indices[0]) for f in receipt.findings] == [
+        ("posted-before", 5, 5),
+        ("posted-before", 10, 10),
+    ]
+    upload_mesh = trimesh.creation.box((0.04, 0.06, 0.1))
+    item.upload_mesh(upload_mesh)
+    far = poses + 50.0 * east
+    with pytest.raises(InvalidInput, match="accept_implausible"):
+        item.trials.add(far, True)
+    with pytest.warns(DoubtfulTrials, match="ten times its size"):
+        item.trials.add(far, True, accept_implausible=True)
 
 
 def test_one_pose_is_a_trial_too(db: Client, fresh_id: str) -> None:

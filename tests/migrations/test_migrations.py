@@ -18,8 +18,11 @@ from sqlalchemy import inspect, text
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database, UnsupportedDatabase
 from graspdb_service.storage.tables import metadata
+from graspdb_service.storage.trials import findings
+from graspdb_service.usecases.trials import batches
 
 ROOT = Path(__file__).parents[2]
+KEY = "00000000-0000-4000-8000-000000000001"
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
@@ -71,6 +74,39 @@ def test_downgrade_leaves_nothing_and_upgrade_comes_back(empty_url: str) -> None
     assert _tables(database) == {"alembic_version"}
     schema.upgrade(database)
     schema.check(database)
+    database.dispose()
+
+
+@pytest.mark.parametrize("version", ["0001", "0002"])
+def test_data_of_every_earlier_version_is_read_on(empty_url: str, version: str) -> None:
+    """Batches from before findings have none, and go as before."""
+    database = Database(empty_url)
+    schema.upgrade(database, version)
+    now = "'2026-01-01 00:00:00'"
+    statements = (
+        f"INSERT INTO objects (id, slug, revision, epoch, last_seq, created_at, updated_at)"
+        f" VALUES (1, 'mug', 1, 0, 2, {now}, {now})",
+        "INSERT INTO provenances (id, object_id, source) VALUES (1, 1, 'robot')",
+        "INSERT INTO tallies (provenance_id, outcome, row_count, packed_count) VALUES (1, 1, 2, 0)",
+        "INSERT INTO batches"
+        " (id, key, object_id, revision, first_seq, last_seq, inserted, packed, created_at)"
+        f" VALUES (1, '{KEY}', 1, 1, 1, 2, 2, 0, {now})",
+        *(
+            "INSERT INTO trials (object_id, seq, revision, batch_id, provenance_id, outcome,"
+            f" px, py, pz, qx, qy, qz, qw) VALUES (1, {seq}, 1, 1, 1, 1, 0, 0, 0.1, 1, 0, 0, 0)"
+            for seq in (1, 2)
+        ),
+    )
+    with database.write() as tx:
+        for statement in statements:
+            tx.execute(text(statement))
+    schema.upgrade(database)
+    schema.check(database)
+    found = batches.get(database, "mug", KEY)
+    assert (found.outcomes, found.sources, found.findings) == ({"success": 2}, ["robot"], [])
+    with database.read() as tx:
+        assert findings.totals(tx, 1, [1]) == []
+    batches.remove(database, "mug", KEY)
     database.dispose()
 
 

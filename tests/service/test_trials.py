@@ -41,7 +41,7 @@ def test_one_trial(mug: httpx.Client) -> None:
     answer = mug.post("/objects/mug/trials", json=GRASP)
     assert answer.status_code == 201, answer.text
     receipt = answer.json()
-    assert receipt == {"batch": receipt["batch"], "inserted": 1, "revision": 1}
+    assert receipt == {"batch": receipt["batch"], "inserted": 1, "revision": 1, "findings": []}
     assert answer.headers["location"] == f"/objects/mug/batches/{receipt['batch']}"
     page = mug.get("/objects/mug/trials").json()
     assert page["next"] is None

@@ -8,7 +8,7 @@ import functools
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any, TypeVar
 
@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from graspdb.client import Client
+from graspdb.wire import Finding
 from graspdb.wire.reports import ReportRun
 
 ERRORS = Console(stderr=True)
@@ -130,6 +131,13 @@ def show_table(items: Sequence[T], columns: Mapping[str, Callable[[T], Any]], *,
     for row in body:
         table.add_row(*(f"{cell:,}" if isinstance(cell, int) else escape(str(cell)) for cell in row))
     console().print(table)
+
+
+def show_findings(findings: Iterable[Finding]) -> None:
+    """What is doubtful about trials, and what to do about it."""
+    for finding in findings:
+        # Plain: a message may hold brackets, which rich would take for markup.
+        typer.echo(f"Doubtful ({finding.code}): {finding.message}.\n  {finding.remedy}.")
 
 
 def numbers(values: Any, digits: int = 4) -> str:

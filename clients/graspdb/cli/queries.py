@@ -10,7 +10,17 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, out_csv, show_rows, show_table
+from graspdb.cli.common import (
+    ERRORS,
+    ObjectId,
+    State,
+    numbers,
+    out,
+    out_csv,
+    show_findings,
+    show_rows,
+    show_table,
+)
 from graspdb.cli.options import Numbers, vector_option
 from graspdb.cli.wording import in_commands
 from graspdb.errors import Infeasible
@@ -42,6 +52,8 @@ def density(state: State, id: ObjectId, selection: Selection) -> None:
         f"warning {number}": in_commands(warning) for number, warning in enumerate(found.warnings, start=1)
     }
     state.show(found, rows)
+    if not state.json:
+        show_findings(found.findings)
 
 
 def best_grasp(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ObjectId, State, Yes, numbers
+from graspdb.cli.common import ObjectId, State, Yes, numbers, show_findings
 from graspdb.cli.options import Commands
-from graspdb.files.trials import read_trials
-from graspdb.resources.trials import TrialFilters, Upload
+from graspdb.files.trials import as_stated, read_trials
+from graspdb.resources.trials import DoubtfulTrials, TrialFilters, Upload
 
 trials = Commands(no_args_is_help=True, help="Add and list grasp trials.")
 batches = Commands(no_args_is_help=True, help="List and delete what arrived together.")
@@ -28,19 +29,32 @@ def add_trials(
     gripper: Annotated[str | None, typer.Option(help="Gripper of all trials that name none.")] = None,
     source: Annotated[str | None, typer.Option(help="simulation, robot, human or import.")] = None,
     protocol: Annotated[str | None, typer.Option(help="How the trials were judged.")] = None,
+    unit: Annotated[str, typer.Option(help="What the file's positions are in: m, cm, mm or in.")] = "m",
+    quaternion_order: Annotated[
+        str, typer.Option(help="The order of the file's quaternions: xyzw, or wxyz whatever their names say.")
+    ] = "xyzw",
 ) -> None:
-    """Store the trials of a file.
+    """Store the trials of a file, and say what looks doubtful about them.
 
     CSV has the columns x,y,z,qx,qy,qz,qw,outcome and optionally gripper, source, protocol,
     proposal_density, quality, width_m, measured_at.
     """
     records, shared = read_trials(file)
+    try:
+        records = as_stated(records, unit=unit, quaternion_order=quaternion_order)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
     given = {"gripper": gripper, "source": source, "protocol": protocol}
     shared |= {name: value for name, value in given.items() if value is not None}
     upload["progress"] = not state.json and len(records) > 1_000
-    receipt = state.db.objects.get(id).trials.add_records(records, **upload, **shared)
+    with warnings.catch_warnings():
+        # They are told below.
+        warnings.simplefilter("ignore", DoubtfulTrials)
+        receipt = state.db.objects.get(id).trials.add_records(records, **upload, **shared)
     stored = f"{receipt.inserted:,} trials stored in batch {', '.join(receipt.batches)}"
     state.show(receipt, f"{stored}; {id} is at revision {receipt.revision}.")
+    if not state.json:
+        show_findings(receipt.findings)
 
 
 @trials.command("list")
@@ -77,7 +91,12 @@ def list_batches(state: State, id: ObjectId) -> None:
             "revision": lambda b: b.revision,
             "rows": lambda b: b.inserted,
             "packed": lambda b: b.packed,
+            "gripper": lambda b: ", ".join(b.grippers),
+            "source": lambda b: ", ".join(b.sources),
+            "protocol": lambda b: ", ".join(b.protocols),
+            "outcomes": lambda b: ", ".join(f"{number:,} {name}" for name, number in b.outcomes.items()),
             "sweep": lambda b: b.sweep,
+            "doubtful": lambda b: ", ".join(finding.code for finding in b.findings),
             "created": lambda b: f"{b.created_at:%Y-%m-%d %H:%M}",
         },
         empty="No batches yet.",
@@ -88,7 +107,10 @@ def list_batches(state: State, id: ObjectId) -> None:
 def show_batch(state: State, id: ObjectId, batch: BatchId) -> None:
     """Show one batch."""
     found = state.db.objects.get(id).batches.get(batch)
-    state.show(found, {k: v for k, v in found.model_dump(mode="json").items() if v is not None})
+    rows = found.model_dump(mode="json", exclude={"findings"}, exclude_none=True)
+    state.show(found, {name: ", ".join(v) if isinstance(v, list) else v for name, v in rows.items()})
+    if not state.json:
+        show_findings(found.findings)
 
 
 @batches.command("delete")

@@ -12,6 +12,7 @@ import csv
 import json
 import math
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,10 @@ from graspdb.poses import as_poses
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at"})
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
+
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres per unit that positions in a file may be in."""
 
 
 class FileProblem(ValueError):
@@ -49,6 +54,35 @@ def read_trials(path: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     if not records:
         raise FileProblem(f"{path} has no trials")
     return records, shared
+
+
+def as_stated(
+    records: list[dict[str, Any]], *, unit: str = "m", quaternion_order: str = "xyzw"
+) -> list[dict[str, Any]]:
+    """Trials with positions in metres and quaternions xyzw, from those in another unit (:data:`METRES`) or
+    with w first (``wxyz``). What is no pose is left for the service to name; ValueError for an unknown unit
+    or order.
+    """
+    if unit not in METRES:
+        raise ValueError(f"unit is {unit!r}; expected one of {', '.join(METRES)}")
+    if quaternion_order not in ("xyzw", "wxyz"):
+        raise ValueError(f"quaternion_order is {quaternion_order!r}; expected xyzw or wxyz")
+    converted = []
+    for record in records:
+        changed = dict(record)
+        with suppress(KeyError, TypeError, ValueError, IndexError):
+            changed["position"] = [float(x) * METRES[unit] for x in record["position"]]
+        with suppress(KeyError, TypeError, ValueError, IndexError):
+            rows = [list(row) for row in record["matrix"]]
+            for row in rows[:3]:
+                row[3] = float(row[3]) * METRES[unit]
+            changed["matrix"] = rows
+        if quaternion_order == "wxyz":
+            with suppress(KeyError, TypeError, ValueError):
+                w, x, y, z = record["quaternion_xyzw"]
+                changed["quaternion_xyzw"] = [x, y, z, w]
+        converted.append(changed)
+    return converted
 
 
 def read_poses(path: str) -> NDArray[np.float64]:

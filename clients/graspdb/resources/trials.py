@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import uuid
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,11 +32,16 @@ ProgressCallback = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Receipt:
-    """What an upload stored: its batches (one a request), the number of trials, the object's revision."""
+    """What an upload stored: its batches (one a request), the number of trials, the object's revision.
+
+    ``findings`` are what the service found doubtful about the trials, a batch's after the other's, their
+    ``first_indices`` counted from the upload's first trial.
+    """
 
     batches: tuple[str, ...]
     inserted: int
     revision: int
+    findings: tuple[wire.Finding, ...] = ()
 
     @property
     def batch(self) -> str:
@@ -45,10 +51,15 @@ class Receipt:
         return self.batches[0]
 
 
+class DoubtfulTrials(UserWarning):
+    """The service stored trials and found something doubtful about them: see ``Receipt.findings``."""
+
+
 class Upload(TypedDict, total=False):
     """How trials are sent, ``chunk`` a request; each is stored wholly or not at all, as its own batch.
 
     Repeat a failed upload with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice.
+    Trials too far from a known object to be grasps of it are refused, unless ``accept_implausible``.
     ``progress=True`` shows a bar; a function is called with trials stored and total.
     """
 
@@ -56,6 +67,14 @@ class Upload(TypedDict, total=False):
         str | None, Option("Repeat a failed upload with the same key: nothing is stored twice.")
     ]
     chunk: Annotated[int, Option("Trials a request, each a batch.", min=1, default=CHUNK_TRIALS)]
+    accept_implausible: Annotated[
+        bool,
+        Option(
+            "Store trials, too, that lie too far from the object to be grasps of it.",
+            flag="--accept-implausible",
+            default=False,
+        ),
+    ]
     progress: bool | ProgressCallback
 
 
@@ -101,6 +120,9 @@ class Trials(Resource):
     ) -> Receipt:
         """Store grasp trials; how they are sent: :class:`Upload`. ValueError if shapes or poses are wrong.
 
+        What the service finds doubtful about them is in the receipt's ``findings``, and warned of as
+        :class:`DoubtfulTrials`.
+
         - ``poses``: tool frames in the object frame: (N, 4, 4) matrices or (N, 7) rows x y z qx qy qz qw, or
           one pose; a :class:`~graspdb.resources.results.Grasp` or samples are taken too.
         - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
@@ -139,6 +161,7 @@ class Trials(Resource):
         *,
         chunk: int = CHUNK_TRIALS,
         idempotency_key: str | None = None,
+        accept_implausible: bool = False,
         progress: bool | ProgressCallback = False,
         **shared: Any,
     ) -> Receipt:
@@ -150,7 +173,12 @@ class Trials(Resource):
         trials = [dict(record) for record in records]
         if not trials:
             raise ValueError("give at least one trial")
-        upload: Upload = {"chunk": chunk, "idempotency_key": idempotency_key, "progress": progress}
+        upload: Upload = {
+            "chunk": chunk,
+            "idempotency_key": idempotency_key,
+            "accept_implausible": accept_implausible,
+            "progress": progress,
+        }
         return self._send(lambda start, stop: {"trials": trials[start:stop]}, shared, len(trials), upload)
 
     def _send(
@@ -166,18 +194,25 @@ class Trials(Resource):
             raise ValueError("chunk must be at least 1")
         key = upload.get("idempotency_key") or str(uuid.uuid4())
         shared = {name: value for name, value in shared.items() if value is not None}
+        params = {"accept_implausible": "true"} if upload.get("accept_implausible") else None
         receipts: list[wire.BatchReceipt] = []
+        findings: list[wire.Finding] = []
         with _upload_bar(upload.get("progress", False)) as report:
             for number, start in enumerate(range(0, count, chunk)):
                 stop = min(start + chunk, count)
                 try:
                     body = {**shared, **part(start, stop)}
                     own = key if count <= chunk else f"{key}-{number}"
-                    receipts.append(
-                        self._transport.model(
-                            wire.BatchReceipt, "POST", self._path, body=body, idempotency_key=own
-                        )
+                    receipt = self._transport.model(
+                        wire.BatchReceipt,
+                        "POST",
+                        self._path,
+                        body=body,
+                        params=params,
+                        idempotency_key=own,
                     )
+                    receipts.append(receipt)
+                    findings += [_from_row(finding, start) for finding in receipt.findings]
                 except GraspDBError as error:
                     if start:
                         error.add_note(
@@ -187,10 +222,14 @@ class Trials(Resource):
                         )
                     raise
                 report(stop, count)
+        for finding in findings:
+            # To whoever called add, which called this.
+            warnings.warn(f"{finding.message}. {finding.remedy}", DoubtfulTrials, stacklevel=3)
         return Receipt(
             batches=tuple(receipt.batch for receipt in receipts),
             inserted=sum(receipt.inserted for receipt in receipts),
             revision=receipts[-1].revision,
+            findings=tuple(findings),
         )
 
     def list(self, **filters: Unpack[TrialFilters]) -> TrialListing:
@@ -223,6 +262,11 @@ class Batches(Resource):
     def delete(self, batch: str) -> None:
         """Delete a batch with all its trials (and, a sweep's, its packed outcomes)."""
         self._transport.request("DELETE", f"{self._path}/{segment(batch)}")
+
+
+def _from_row(finding: wire.Finding, start: int) -> wire.Finding:
+    """A finding of the request whose first trial is the upload's number ``start``."""
+    return finding.model_copy(update={"first_indices": [start + index for index in finding.first_indices]})
 
 
 def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:

@@ -34,6 +34,7 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
+from graspdb.wire.trials import Finding
 
 WidthM = Annotated[float, Field(gt=0, le=1.0)]
 WidthDeg = Annotated[float, Field(gt=0, le=90.0)]
@@ -158,6 +159,8 @@ class DensityInfo(Response):
     bytes: int
     """Memory that the density takes in the service, bytes."""
     warnings: Warnings = Field(default_factory=list)
+    findings: list[Finding] = Field(default_factory=list)
+    """What was doubtful about the selected trials when they came, over all batches."""
 
 
 class PoseColumns(Request):

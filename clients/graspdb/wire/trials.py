@@ -152,6 +152,25 @@ class TrialOut(Response):
     """Its index in that sweep's plan; null for a posted trial."""
 
 
+class Finding(Response):
+    """Something doubtful about trials that were posted: they are stored, but look at them."""
+
+    code: str
+    """What it is, stable, such as ``closes-on-nothing``."""
+    count: int
+    """How many of the examined trials it concerns."""
+    examined: int
+    """How many trials were looked at: a sample where looking is costly."""
+    first_indices: list[int] = Field(default_factory=list)
+    """The first such trials: their places in the batch from 0, in a density their ``seq``."""
+    message: str
+    """What was seen, for a person."""
+    remedy: str
+    """What to check or to do."""
+    batches: list[str] = Field(default_factory=list)
+    """Ids of earlier batches that hold the same rows, where the code says so."""
+
+
 class BatchReceipt(Response):
     """What was stored."""
 
@@ -160,6 +179,8 @@ class BatchReceipt(Response):
     inserted: int
     """How many trials were stored."""
     revision: StoredRevision
+    findings: list[Finding] = Field(default_factory=list)
+    """What is doubtful about the trials; empty where nothing is."""
 
 
 class BatchInfo(Response):
@@ -178,5 +199,13 @@ class BatchInfo(Response):
     metadata: Metadata | None = None
     """What was posted with it as metadata of all; null where nothing was."""
     outcomes: OutcomeCounts = Field(default_factory=dict)
+    grippers: list[str] = Field(default_factory=list)
+    """Ids of the grippers that its trials name."""
+    sources: list[str] = Field(default_factory=list)
+    """Sources that its trials name."""
+    protocols: list[str] = Field(default_factory=list)
+    """Protocols that its trials name."""
+    findings: list[Finding] = Field(default_factory=list)
+    """What was doubtful about its trials when they came."""
     created_at: datetime
     """When it was stored, UTC."""

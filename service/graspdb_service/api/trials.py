@@ -32,9 +32,23 @@ BODY = {
     response_model=BatchReceipt,
     **scope("trials:write", body=BODY),
 )
-def add_trials(ctx: Ctx, id: ObjectId, request: Request, sent: Creating) -> object:
-    """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all."""
-    return sent.answered(posting.add(ctx, id, sent, media_type(request)))
+def add_trials(
+    ctx: Ctx,
+    id: ObjectId,
+    request: Request,
+    sent: Creating,
+    accept_implausible: Annotated[
+        bool, Query(description="Store trials, too, that lie too far from the object to be grasps of it.")
+    ] = False,
+) -> object:
+    """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all.
+
+    What is doubtful about them against mesh and gripper is answered as findings; trials farther from a known
+    object than ten times its size and the gripper's together are refused (`implausible-poses`).
+    """
+    media = media_type(request)
+    made = posting.add(ctx, id, ctx.scenes, sent, media, accept_implausible=accept_implausible)
+    return sent.answered(made)
 
 
 @router.get(

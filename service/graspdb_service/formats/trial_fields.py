@@ -123,6 +123,7 @@ def check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         provenances,
         defaults.metadata,
         lambda gripper: _field_of_gripper(fields, gripper),
+        fields.place,
     )
 
 

@@ -210,6 +210,35 @@ trials = Table(
     sqlite_with_rowid=False,
 )
 
+# What was doubtful about a batch's trials when they came. Who is numbered by `provenance_id` has no foreign
+# key: provenances leave with their object only, as the batch does.
+findings = Table(
+    "findings",
+    metadata,
+    Column("batch_id", ForeignKey("batches.id", ondelete="CASCADE"), primary_key=True),
+    Column("number", SmallInteger, primary_key=True, autoincrement=False),
+    # Whose trials it is about; null: any of the batch.
+    Column("provenance_id", BigInteger),
+    Column("code", String(40), nullable=False),
+    # What the code leaves open: a distance, an axis.
+    Column("detail", String(40), nullable=False),
+    Column("trial_count", BigInteger, nullable=False),
+    Column("examined", BigInteger, nullable=False),
+    Column("first_indices", JSON, nullable=False),
+    # The earlier batch that holds the same rows: without it there is nothing to find.
+    Column("other_batch_id", ForeignKey("batches.id", ondelete="CASCADE"), index=True),
+)
+
+# Digests of some of the rows that were posted, always the same ones of the same rows: the next batch is
+# compared with them.
+fingerprints = Table(
+    "fingerprints",
+    metadata,
+    Column("digest", BigInteger, primary_key=True, autoincrement=False),
+    Column("batch_id", ForeignKey("batches.id", ondelete="CASCADE"), primary_key=True, index=True),
+    sqlite_with_rowid=False,
+)
+
 jobs = Table(
     "jobs",
     metadata,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -109,6 +108,14 @@ def origins(tx: Tx, ids: Iterable[int]) -> dict[int, BatchOrigin]:
     return {int(number): BatchOrigin(*origin) for number, *origin in rows}
 
 
+def keys(tx: Tx, ids: Collection[int]) -> dict[int, str]:
+    """Keys of batches by internal id."""
+    if not ids:
+        return {}
+    rows = tx.execute(select(batches.c.id, batches.c.key).where(batches.c.id.in_(sorted(set(ids)))))
+    return {int(number): str(key) for number, key in rows}
+
+
 def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
     """Trial rows of a batch by (provenance, outcome code)."""
     if batch.first_seq is None:
@@ -121,16 +128,16 @@ def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
     return {(int(p), int(outcome)): int(n) for p, outcome, n in tx.execute(query)}
 
 
-def outcome_counts(tx: Tx, batch: BatchRow) -> dict[int, int]:
-    """Everything a batch holds by outcome code: rows, and the packed outcomes of its sweep."""
-    counts: Counter[int] = Counter()
-    if batch.sweep_id is not None:
-        if batch.purpose == "check":
-            return _packed_codes(tx, batch.sweep_id)
+def outcome_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
+    """Everything a batch holds by (provenance, outcome code): rows, and the packed outcomes of its sweep."""
+    counts = row_counts(tx, batch)
+    if batch.sweep_id is not None and batch.provenance_id is not None:
         # Not every code of the packed outcomes: poses that another sweep had stored before count there.
-        counts.update(outcomes.packed_counts(tx, batch.sweep_id))
-    for (_, outcome), number in row_counts(tx, batch).items():
-        counts[outcome] += number
+        check = batch.purpose == "check"
+        packed = _packed_codes(tx, batch.sweep_id) if check else outcomes.packed_counts(tx, batch.sweep_id)
+        for outcome, number in packed.items():
+            place = batch.provenance_id, outcome
+            counts[place] = counts.get(place, 0) + number
     return counts
 
 

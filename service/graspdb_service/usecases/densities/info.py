@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from graspdb.wire import DensityInfo, Selection
 from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
+from graspdb_service.storage.trials import findings
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.trials.findings.words import of_selection
 
 
 def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, int]:
@@ -20,6 +22,8 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
             f"the weights are very uneven: {size} successes count like {effective:.0f};"
             " check the proposal densities of the trials"
         )
+    with ctx.database.read() as tx:
+        doubtful = findings.totals(tx, built.object_row.id, list(selected.provenances))
     info = DensityInfo(
         object=slug,
         revision=built.revision,
@@ -34,5 +38,6 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
         weights=built.weights_info,
         bytes=built.nbytes,
         warnings=warnings,
+        findings=of_selection(doubtful),
     )
     return info, built.object_row.id

@@ -13,6 +13,7 @@ from graspdb_density.se3 import Poses
 from graspdb_geometry import meshes
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.plausibility import Target
 from graspdb_service.problems import conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
@@ -91,6 +92,19 @@ class Scenes:
         if selected.profile is None:
             reasons.append("no trial names its gripper (name one: gripper=)")
         raise conflict("collision-unknown", "Collisions can't be tested: " + "; ".join(reasons))
+
+    def target(self, row: ObjectRow, profile: GripperProfile | None) -> Target | None:
+        """The object for posted trials to be looked at against; None without mesh and parts. Its geometry is
+        prepared where there is a gripper to test against it.
+        """
+        info = row.mesh_info or row.parts_info
+        if info is None:
+            return None
+        box = info["bounding_box"]
+        lower, upper = np.array(box["lower"], dtype=np.float64), np.array(box["upper"], dtype=np.float64)
+        if profile is None:
+            return Target(lower, upper)
+        return Target(lower, upper, self._solid(row), shape_of(profile))
 
     def _solid(self, row: ObjectRow) -> Solid | None:
         if row.parts_sha256 is not None:

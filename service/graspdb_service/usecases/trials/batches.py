@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
 from graspdb.wire import OUTCOMES, BatchInfo
 from graspdb_service.problems import busy, conflict, found
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.storage.trials import batches
+from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.trials import batches, findings, provenances
 from graspdb_service.storage.trials.batches import BatchRow
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.trials import batch_removal
+from graspdb_service.usecases.trials.findings import words
+from graspdb_service.usecases.trials.selection import distinct
 
 #: Sweeps over one grid that finish chunks meanwhile make a deletion look again.
 _MAX_LOOKS = 20
@@ -20,7 +26,7 @@ def get(database: Database, slug: str, key: str) -> BatchInfo:
     """One batch, with everything it holds by outcome."""
     with database.read() as tx:
         row = require(tx, slug)
-        return _info(tx, slug, _require(tx, row.id, key))
+        return _infos(tx, row, [_require(tx, row.id, key)])[0]
 
 
 def page(database: Database, slug: str, *, after: int, limit: int) -> tuple[list[BatchInfo], int | None]:
@@ -28,7 +34,7 @@ def page(database: Database, slug: str, *, after: int, limit: int) -> tuple[list
     with database.read() as tx:
         row = require(tx, slug)
         rows = batches.page(tx, row.id, after=after, limit=limit + 1)
-        items = [_info(tx, slug, batch) for batch in rows[:limit]]
+        items = _infos(tx, row, rows[:limit])
     return items, rows[limit - 1].id if len(rows) > limit else None
 
 
@@ -66,8 +72,27 @@ def _require(tx: Tx, object_id: int, key: str) -> BatchRow:
     return found(batch, "batch", key, "GET /objects/{id}/batches lists them")
 
 
-def _info(tx: Tx, slug: str, batch: BatchRow) -> BatchInfo:
-    counts = batches.outcome_counts(tx, batch)
-    outcomes = {OUTCOMES[code]: number for code, number in sorted(counts.items()) if number}
-    told = {"batch": batch.key, "object": slug, "sweep": batch.sweep_id, "outcomes": outcomes}
-    return BatchInfo.model_validate({**vars(batch), **told})
+def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInfo]:
+    """Batches of one object, as the wire has them."""
+    stored = findings.of_batches(tx, [batch.id for batch in several])
+    keys = batches.keys(tx, words.earlier_batches(item for items in stored.values() for item in items))
+    names = provenances.of_object(tx, row.id)
+    infos = []
+    for batch in several:
+        counts = batches.outcome_counts(tx, batch)
+        outcomes: Counter[int] = Counter()
+        for (_, code), number in counts.items():
+            outcomes[code] += number
+        items = [names[number] for number in {number for number, _ in counts}]
+        told = {
+            "batch": batch.key,
+            "object": row.slug,
+            "sweep": batch.sweep_id,
+            "outcomes": {OUTCOMES[code]: number for code, number in sorted(outcomes.items()) if number},
+            "grippers": distinct(item.gripper for item in items),
+            "sources": distinct(item.source for item in items),
+            "protocols": distinct(item.protocol for item in items),
+            "findings": words.of_batch(stored.get(batch.id, []), batch.inserted, keys),
+        }
+        infos.append(BatchInfo.model_validate({**vars(batch), **told}))
+    return infos

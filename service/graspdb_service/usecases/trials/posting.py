@@ -2,46 +2,97 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from graspdb.wire import BatchReceipt
 from graspdb_service.formats.trials import parse
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.trials import batches, provenances, rows
+from graspdb_service.storage.trials import batches, findings, provenances, rows
 from graspdb_service.trial_columns import TrialBatch
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
+from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runtime import Runtime
+from graspdb_service.usecases.trials.findings import inspection, words
+from graspdb_service.usecases.trials.findings.inspection import Concern, Geometries
 
 
-def add(ctx: Runtime, slug: str, sent: Sent, media: str) -> Created:
-    """Store the trials of one request as a batch."""
+def add(
+    ctx: Runtime, slug: str, geometries: Geometries, sent: Sent, media: str, *, accept_implausible: bool
+) -> Created:
+    """Store the trials of one request as a batch, and say what is doubtful about them.
+
+    422 ``implausible-poses`` for trials that can't be of the object, unless they are accepted.
+    """
+    scope = f"POST /objects/{slug}/trials"
+    meant = Sent(sent.key, media.encode() + b"\n" + sent.body)
     with ctx.database.read() as tx:
         require(tx, slug)
+    # What was stored once is answered so again, whatever is known of the object by now.
+    earlier = replayed(ctx.database, scope, meant)
+    if earlier is not None:
+        return earlier
     batch = parse(sent.body, media, limit=ctx.settings.max_batch_trials)
+    with ctx.database.read() as tx:
+        known = require(tx, slug)
+        profiles = inspection.profiles_of(tx, batch)
+    concerns = inspection.inspect(ctx.compute, geometries, known, profiles, batch)
+    if not accept_implausible:
+        _refuse_implausible(batch, concerns)
+    return replay_or(ctx.database, scope, meant, lambda tx: _store(tx, slug, batch, concerns))
+
+
+def _store(tx: Tx, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) -> Created:
+    row = require(tx, slug)
+    _refuse_unknown_grippers(tx, batch)
     count = len(batch.columns)
+    revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
+    ids = np.array([provenances.ensure(tx, row.id, item) for item in batch.provenances])
+    batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
+    columns = replace(batch.columns, provenance=ids[batch.columns.provenance])
+    rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first_seq)
+    last_seq = first_seq + count - 1
+    batches.grow(tx, batch_id, first_seq=first_seq, last_seq=last_seq, inserted=count, packed=0)
+    told = [concern.stored(ids) for concern in concerns]
+    told += inspection.repeats(tx, row.id, batch_id, batch, ids)
+    findings.add(tx, batch_id, told)
+    receipt = BatchReceipt(
+        batch=batch_key,
+        inserted=count,
+        revision=revision,
+        findings=words.of_batch(told, count, batches.keys(tx, words.earlier_batches(told))),
+    )
+    return Created(
+        receipt.model_dump(mode="json"),
+        location=f"/objects/{slug}/batches/{batch_key}",
+        batch_key=batch_key,
+    )
 
-    def make(tx: Tx) -> Created:
-        row = require(tx, slug)
-        _refuse_unknown_grippers(tx, batch)
-        revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
-        ids = np.array([provenances.ensure(tx, row.id, item) for item in batch.provenances])
-        batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
-        columns = replace(batch.columns, provenance=ids[batch.columns.provenance])
-        rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first_seq)
-        last_seq = first_seq + count - 1
-        batches.grow(tx, batch_id, first_seq=first_seq, last_seq=last_seq, inserted=count, packed=0)
-        return Created(
-            {"batch": batch_key, "inserted": count, "revision": revision},
-            location=f"/objects/{slug}/batches/{batch_key}",
-            batch_key=batch_key,
-        )
 
-    meant = Sent(sent.key, media.encode() + b"\n" + sent.body)
-    return replay_or(ctx.database, f"POST /objects/{slug}/trials", meant, make)
+def _refuse_implausible(batch: TrialBatch, concerns: Sequence[Concern]) -> None:
+    """422 naming trials too far from the object, with what they look like."""
+    impossible = [concern for concern in concerns if concern.code == "implausible-poses"]
+    if not impossible:
+        return
+    ids = np.arange(len(batch.provenances))
+    told = words.of_batch([concern.stored(ids) for concern in concerns], len(batch.columns), {})
+    message = next(finding.message for finding in told if finding.code == "implausible-poses")
+    raise ProblemError(
+        422,
+        "implausible-poses",
+        f"{message[0].upper()}{message[1:]}; none was stored",
+        detail=words.why_refused(told),
+        errors=[
+            (batch.field_of(int(place), "position"), f"more than {concern.detail} from the object")
+            for concern in impossible
+            for place in concern.rows[: inspection.FIRST]
+        ],
+        extra={"findings": [finding.model_dump(mode="json") for finding in told]},
+    )
 
 
 def _refuse_unknown_grippers(tx: Tx, batch: TrialBatch) -> None:

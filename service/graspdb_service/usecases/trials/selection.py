@@ -111,7 +111,7 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
         and (asked.protocol is None or item.protocol in (None, asked.protocol))
     }
     items = candidates.values()
-    named = {name: _distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
+    named = {name: distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
     ambiguous = [name for name, values in named.items() if len(values) > 1 and getattr(asked, name) is None]
     if ambiguous:
         told = "; ".join(f"{name}: {', '.join(named[name])}" for name in ambiguous)
@@ -177,5 +177,6 @@ def _profile(tx: Tx, name: str) -> GripperProfile:
     return GripperProfile.model_validate(row.profile)
 
 
-def _distinct(values: Iterable[str | None]) -> list[str]:
+def distinct(values: Iterable[str | None]) -> list[str]:
+    """The names there are, sorted."""
     return sorted({value for value in values if value is not None})
