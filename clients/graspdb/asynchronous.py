@@ -179,6 +179,9 @@ class AsyncTrials(Mirror[Trials]):
 
     add = _awaited(Trials.add)
     add_records = _awaited(Trials.add_records)
+    get = _awaited(Trials.get)
+    withdraw = _awaited(Trials.withdraw)
+    correct = _awaited(Trials.correct)
     to_pandas = _awaited(Trials.to_pandas)
     list = _at_once(Trials.list, AsyncTrialListing)
     __aiter__ = _iterated(Trials.list, _same)

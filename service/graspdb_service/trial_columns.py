@@ -21,6 +21,10 @@ def _floats() -> Floats:
     return np.empty(0)
 
 
+def _flags() -> NDArray[np.bool_]:
+    return np.empty(0, dtype=np.bool_)
+
+
 def _ints() -> Ints:
     return np.empty(0, dtype=np.int64)
 
@@ -38,7 +42,7 @@ class TrialColumns:
     list that comes with the columns, once stored its id. ``proposal_density`` 1/(m^3 rad^3), ``quality`` and
     ``width_m`` are NaN where a trial has none, ``pose_index`` -1 where it is of no sweep. ``measured_at``
     (aware), ``pose_covariance`` (6x6 nested lists) and ``metadata`` are a value or None a trial. ``seq`` is
-    ascending, ``batch`` internal.
+    ascending, ``batch`` internal, ``withdrawn`` (n,) whether it counts no more.
     """
 
     position: Floats
@@ -55,6 +59,7 @@ class TrialColumns:
     seq: Ints = field(default_factory=_ints)
     revision: Ints = field(default_factory=_ints)
     batch: Ints = field(default_factory=_ints)
+    withdrawn: NDArray[np.bool_] = field(default_factory=_flags)
 
     def __len__(self) -> int:
         return len(self.position)

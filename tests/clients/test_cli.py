@@ -203,6 +203,25 @@ def test_doubtful_trials_are_told_and_mended(run: Run, fresh_id: str, tmp_path: 
     assert run(*add, "--unit", "feet")[0] == 2
 
 
+def test_a_trial_is_withdrawn_and_corrected(run: Run, fresh_id: str, trials_file: str) -> None:
+    run("objects", "create", fresh_id)
+    run("trials", "add", fresh_id, trials_file)
+    assert "Trial 7 is withdrawn" in run("trials", "withdraw", fresh_id, "7", "--reason", "wrong object")[1]
+    assert "success (withdrawn)" in run("trials", "list", fresh_id)[1]
+    assert json.loads(run("--json", "trials", "list", fresh_id, "--withdrawn")[1])[0]["seq"] == 7
+    assert json.loads(run("--json", "objects", "show", fresh_id)[1])["trials"] == 119
+    _, out, _ = run("trials", "correct", fresh_id, "7", "--reinstate", "--outcome", "slipped")
+    assert "withdrawn False, until" in out
+    assert "(wrong object)" in out
+    assert "slipped" in out
+    assert json.loads(run("--json", "trials", "show", fresh_id, "7")[1])["history"][1]["before"] == {
+        "outcome": "success",
+        "withdrawn": True,
+    }
+    assert run("trials", "correct", fresh_id, "7")[0] == 2
+    assert run("trials", "withdraw", fresh_id, "777")[0] == 1
+
+
 def test_no_grasp_is_one_message_and_exit_code_1(run: Run, fresh_id: str, trials_file: str) -> None:
     run("objects", "create", fresh_id)
     assert "no successful trial" in run("best-grasp", fresh_id)[2]

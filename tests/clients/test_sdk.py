@@ -210,6 +210,21 @@ def test_doubtful_trials_are_warned_of_and_counted_from_the_first(
         item.trials.add(far, True, accept_implausible=True)
 
 
+def test_a_trial_is_withdrawn_and_corrected(db: Client, fresh_id: str) -> None:
+    item = db.objects.create(fresh_id)
+    item.trials.add([[*ABOVE, *DOWN], [*ABOVE[:2], 0.2, *DOWN]], True)
+    item.trials.withdraw(1, reason="slipped before")
+    assert item.trials.get(1).history[0].reason == "slipped before"
+    assert item.refresh().info.outcomes == {"success": 1}
+    assert [trial.seq for trial in item.trials.list(withdrawn=False)] == [2]
+    found = item.trials.correct(2, outcome="dropped", metadata={"by": "me"})
+    assert (found.outcome, found.metadata) == ("dropped", {"by": "me"})
+    assert not item.trials.correct(1, withdrawn=False).withdrawn
+    assert item.refresh().info.outcomes == {"success": 1, "dropped": 1}
+    with pytest.raises(NotFound):
+        item.trials.withdraw(3)
+
+
 def test_one_pose_is_a_trial_too(db: Client, fresh_id: str) -> None:
     item = db.objects.create(fresh_id)
     item.trials.add(matrices(ABOVE, DOWN), True)

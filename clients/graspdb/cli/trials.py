@@ -11,10 +11,13 @@ from graspdb.cli.common import ObjectId, State, Yes, numbers, show_findings
 from graspdb.cli.options import Commands
 from graspdb.files.trials import as_stated, read_trials
 from graspdb.resources.trials import DoubtfulTrials, TrialFilters, Upload
+from graspdb.wire import TrialInfo
 
 trials = Commands(no_args_is_help=True, help="Add and list grasp trials.")
 batches = Commands(no_args_is_help=True, help="List and delete what arrived together.")
 
+Seq = Annotated[int, typer.Argument(help="The trial's number: trials list shows it.", show_default=False)]
+Reason = Annotated[str | None, typer.Option(help="Why, for the history.")]
 BatchId = Annotated[str, typer.Argument(show_default=False)]
 
 
@@ -71,7 +74,7 @@ def list_trials(
             "seq": lambda t: t.seq,
             "position [m]": lambda t: numbers(t.position),
             "quaternion xyzw": lambda t: numbers(t.quaternion_xyzw),
-            "outcome": lambda t: t.outcome,
+            "outcome": lambda t: f"{t.outcome} (withdrawn)" if t.withdrawn else t.outcome,
             "gripper": lambda t: t.gripper,
             "source": lambda t: t.source,
             "protocol": lambda t: t.protocol,
@@ -79,6 +82,47 @@ def list_trials(
         },
         empty="No trials match.",
     )
+
+
+@trials.command("show")
+def show_trial(state: State, id: ObjectId, seq: Seq) -> None:
+    """Show one trial and what it was before."""
+    _show_trial(state, state.db.objects.get(id).trials.get(seq))
+
+
+@trials.command("withdraw")
+def withdraw_trial(state: State, id: ObjectId, seq: Seq, reason: Reason = None) -> None:
+    """Take a trial out of every count and estimate; it is kept, marked."""
+    state.db.objects.get(id).trials.withdraw(seq, reason=reason)
+    state.show({"withdrawn": seq}, f"Trial {seq} is withdrawn; graspdb trials correct --reinstate undoes it.")
+
+
+@trials.command("correct")
+def correct_trial(
+    state: State,
+    id: ObjectId,
+    seq: Seq,
+    outcome: Annotated[str | None, typer.Option(help="What became of it after all.")] = None,
+    reinstate: Annotated[bool, typer.Option("--reinstate", help="Take it back in where withdrawn.")] = False,
+    reason: Reason = None,
+) -> None:
+    """Correct a trial; what it was stays in its history."""
+    if outcome is None and not reinstate:
+        raise typer.BadParameter("give --outcome or --reinstate")
+    found = state.db.objects.get(id).trials.correct(
+        seq, outcome=outcome, withdrawn=False if reinstate else None, reason=reason
+    )
+    _show_trial(state, found)
+
+
+def _show_trial(state: State, found: TrialInfo) -> None:
+    rows = found.model_dump(mode="json", exclude={"history"}, exclude_none=True)
+    for change in found.history:
+        before = ", ".join(f"{name} {value}" for name, value in change.before.items())
+        why = f" ({change.reason})" if change.reason else ""
+        when = f"until {change.changed_at:%Y-%m-%d %H:%M}"
+        rows[f"before revision {change.revision}"] = f"{before}, {when}{why}"
+    state.show(found, rows)
 
 
 @batches.command("list")
@@ -91,6 +135,7 @@ def list_batches(state: State, id: ObjectId) -> None:
             "revision": lambda b: b.revision,
             "rows": lambda b: b.inserted,
             "packed": lambda b: b.packed,
+            "withdrawn": lambda b: b.withdrawn,
             "gripper": lambda b: ", ".join(b.grippers),
             "source": lambda b: ", ".join(b.sources),
             "protocol": lambda b: ", ".join(b.protocols),

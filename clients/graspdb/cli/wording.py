@@ -30,8 +30,10 @@ COMMANDS: Mapping[str, str] = {
     "PATCH /objects/OBJECT": "objects change OBJECT",
     "PUT /objects/OBJECT/mesh": "objects set-mesh OBJECT FILE",
     "PUT /objects/OBJECT/convex-parts": "objects set-convex-parts OBJECT FILE",
+    "GET /objects/OBJECT/trials": "trials list OBJECT",
     "POST /objects/OBJECT/trials": "trials add OBJECT FILE",
     "GET /objects/OBJECT/batches": "batches list OBJECT",
+    "DELETE /objects/OBJECT/batches/BATCH": "batches delete OBJECT BATCH",
     "POST /objects/OBJECT/best-grasp": "best-grasp OBJECT",
     "POST /objects/OBJECT/sweeps": "sweep OBJECT",
     "GET /grippers": "grippers list",
@@ -44,7 +46,6 @@ COMMANDS: Mapping[str, str] = {
 }
 """The command of every request that the service names as a way out; ids in capitals."""
 
-_PLACES = {"objects": "OBJECT", "sweeps": "SWEEP"}
 _PARAMETERS = option_names(
     *(Constraints, SweepOptions, KernelOptions, ObjectProperties, TrialFilters, Upload),
     *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions),
@@ -77,12 +78,19 @@ def in_options(text: str) -> str:
 
 def _command(method: str, path: str) -> str | None:
     """The command that makes a request, with the ids that its path has."""
-    noun, *rest = path.strip("/").split("/")
-    if not rest or noun not in _PLACES:
-        return COMMANDS.get(f"{method} {path}")
-    place, named = _PLACES[noun], rest[0]
-    command = COMMANDS.get(f"{method} /{'/'.join((noun, place, *rest[1:]))}")
-    return command if command is None or "{" in named else command.replace(place, named)
+    parts = path.strip("/").split("/")
+    for request, command in COMMANDS.items():
+        verb, pattern = request.split(" /")
+        places = pattern.split("/")
+        alike = len(places) == len(parts) and all(
+            place.isupper() or place == part for place, part in zip(places, parts, strict=True)
+        )
+        if verb == method and alike:
+            for place, part in zip(places, parts, strict=True):
+                if place.isupper() and "{" not in part:
+                    command = command.replace(place, part)
+            return command
+    return None
 
 
 def _body(text: str, at: int) -> tuple[dict[str, Any], int]:

@@ -421,7 +421,7 @@ class TrialArrays(TriedPoses):
 
     def _columns(self) -> dict[str, Any]:
         names = ["gripper", "source", "protocol", "batch", "sweep", "pose_index", "quality", "width_m"]
-        names += ["proposal_density", "measured_at", "revision"]
+        names += ["proposal_density", "measured_at", "revision", "withdrawn"]
         columns = {"seq": self.seq, **pose_columns(self), "outcome": self.outcome}
         return columns | {name: [getattr(t, name) for t in self.trials] for name in names}
 

@@ -79,11 +79,14 @@ class Upload(TypedDict, total=False):
 
 
 class TrialFilters(TrialSelection, total=False):
-    """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch`` and ``since_revision``."""
+    """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch``, ``since_revision`` and
+    ``withdrawn``.
+    """
 
     outcome: Annotated[str | None, Option("Only this outcome.")]
     batch: Annotated[str | None, Option("Only this batch.")]
-    since_revision: Annotated[int | None, Option("Only what came after this revision.")]
+    since_revision: Annotated[int | None, Option("Only what came or was changed after this revision.")]
+    withdrawn: Annotated[bool | None, Option("Only withdrawn trials, or none of them; else all, marked.")]
 
 
 class TrialListing(Listing[wire.TrialOut]):
@@ -231,6 +234,35 @@ class Trials(Resource):
             revision=receipts[-1].revision,
             findings=tuple(findings),
         )
+
+    def get(self, seq: int) -> wire.TrialInfo:
+        """One trial, and in ``history`` what it was before it was corrected."""
+        return self._transport.model(wire.TrialInfo, "GET", f"{self._path}/{int(seq)}")
+
+    def withdraw(self, seq: int, *, reason: str | None = None) -> None:
+        """Take a trial out of every count and estimate; Conflict for a trial of a sweep.
+
+        It is kept, marked, and :meth:`correct` takes it back in.
+        """
+        params = None if reason is None else {"reason": reason}
+        self._transport.request("DELETE", f"{self._path}/{int(seq)}", params=params)
+
+    def correct(
+        self,
+        seq: int,
+        *,
+        outcome: str | bool | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        withdrawn: bool | None = None,
+        reason: str | None = None,
+    ) -> wire.TrialInfo:
+        """Change a trial's outcome or metadata, withdraw it or take it back; what is None stays.
+
+        What it was stays in its ``history``, with the ``reason``. Conflict for a trial of a sweep.
+        """
+        given = {"outcome": outcome, "metadata": metadata, "withdrawn": withdrawn, "reason": reason}
+        body = {name: value for name, value in given.items() if value is not None}
+        return self._transport.model(wire.TrialInfo, "PATCH", f"{self._path}/{int(seq)}", body=body)
 
     def list(self, **filters: Unpack[TrialFilters]) -> TrialListing:
         """The stored trials that match, read page by page as they are iterated."""

@@ -79,7 +79,10 @@ from graspdb.wire.sweeps import SweepOutcomes as SweepOutcomes
 from graspdb.wire.trials import BatchInfo as BatchInfo
 from graspdb.wire.trials import BatchReceipt as BatchReceipt
 from graspdb.wire.trials import Finding as Finding
+from graspdb.wire.trials import TrialChange as TrialChange
 from graspdb.wire.trials import TrialColumns as TrialColumns
 from graspdb.wire.trials import TrialIn as TrialIn
+from graspdb.wire.trials import TrialInfo as TrialInfo
 from graspdb.wire.trials import TrialOut as TrialOut
+from graspdb.wire.trials import TrialPatch as TrialPatch
 from graspdb.wire.trials import TrialsIn as TrialsIn

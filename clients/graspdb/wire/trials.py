@@ -20,6 +20,7 @@ from graspdb.wire.base import (
     Slug,
     Source,
     StoredRevision,
+    Text,
     ToolPosition,
     ToolRotation,
 )
@@ -150,6 +151,41 @@ class TrialOut(Response):
     """Id of the sweep that simulated it; null for a posted trial."""
     pose_index: int | None = None
     """Its index in that sweep's plan; null for a posted trial."""
+    withdrawn: bool = False
+    """Whether it is kept, but out of every count and estimate."""
+
+
+class TrialPatch(Request):
+    """What to correct of a trial; what is left out stays, and so does what is null, metadata apart."""
+
+    outcome: OutcomeIn | None = None
+    """What became of it after all; null leaves it."""
+    metadata: Metadata | None = None
+    """Replaces the trial's own; null: only the batch's, if any."""
+    withdrawn: bool | None = None
+    """True takes it out of every count and estimate, false takes it back in; null leaves it."""
+    reason: Text | None = None
+    """Why, for the history; null for no reason given."""
+
+
+class TrialChange(Response):
+    """A change of a trial."""
+
+    revision: int
+    """The object's revision that made the change."""
+    before: dict[str, Any]
+    """The values that it replaced: of ``outcome``, ``metadata`` and ``withdrawn``."""
+    reason: str | None = None
+    """Why, where somebody said so; null otherwise."""
+    changed_at: datetime
+    """When it was changed, UTC."""
+
+
+class TrialInfo(TrialOut):
+    """A stored trial and what it was before."""
+
+    history: list[TrialChange] = Field(default_factory=list)
+    """Its corrections and withdrawals, oldest first."""
 
 
 class Finding(Response):
@@ -194,6 +230,8 @@ class BatchInfo(Response):
     """How many trials it holds as rows."""
     packed: int = 0
     """How many outcomes of a sweep it holds packed, without rows."""
+    withdrawn: int = 0
+    """How many of its trials are withdrawn: they are in no count by outcome."""
     sweep: str | None = None
     """Id of the sweep that wrote it; null for posted trials."""
     metadata: Metadata | None = None

@@ -4,9 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 
-from graspdb.wire import BatchInfo, BatchReceipt, Outcome, Page, Slug, Source, TrialIn, TrialOut, TrialsIn
+from graspdb.wire import (
+    BatchInfo,
+    BatchReceipt,
+    Outcome,
+    Page,
+    Slug,
+    Source,
+    TrialIn,
+    TrialInfo,
+    TrialOut,
+    TrialPatch,
+    TrialsIn,
+)
 from graspdb.wire.trials import TrialColumnsIn
 from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
@@ -15,9 +27,11 @@ from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
 from graspdb_service.formats.trials import page_response, stream_response
 from graspdb_service.usecases import objects
-from graspdb_service.usecases.trials import batches, listing, posting
+from graspdb_service.usecases.trials import batches, corrections, listing, posting
 
 router = APIRouter(tags=["trials"])
+
+Seq = Annotated[int, Path(ge=1, lt=2**63, description="The trial's number in its object.")]
 
 BODY = {
     JSON: (TrialIn, TrialsIn, TrialColumnsIn),
@@ -75,7 +89,13 @@ def list_trials(
         str | None, Query(max_length=64, description="Only trials of this batch; by default all.")
     ] = None,
     since_revision: Annotated[
-        int | None, Query(ge=0, lt=2**63, description="Only what was stored after this revision.")
+        int | None,
+        Query(
+            ge=0, lt=2**63, description="Only what was stored, corrected or withdrawn after this revision."
+        ),
+    ] = None,
+    withdrawn: Annotated[
+        bool | None, Query(description="Only withdrawn trials, or none; both, marked, if not given.")
     ] = None,
     limit: Annotated[
         int | None,
@@ -85,7 +105,7 @@ def list_trials(
 ) -> Response:
     """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) or an Arrow
     stream (`Accept: application/vnd.apache.arrow.stream`) all of them."""
-    chosen = listing.TrialFilter(outcome, source, gripper, protocol, batch, since_revision)
+    chosen = listing.TrialFilter(outcome, source, gripper, protocol, batch, since_revision, withdrawn)
     kind = accepted(request, JSON, NDJSON, ARROW)
     after = number_cursor(cursor)
     row, _ = objects.get(ctx.database, id)
@@ -98,6 +118,35 @@ def list_trials(
         return stream_response(listing.pages(ctx.database, id, chosen, after=after), kind, headers)
     page, last = listing.page(ctx.database, id, chosen, after=after, limit=limit or 100)
     return page_response(page, encode_cursor(last), kind, headers)
+
+
+@router.get("/objects/{id}/trials/{seq}", response_model=TrialInfo, **scope("read"))
+def get_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: Request) -> Response:
+    """One trial, and what it was before it was corrected."""
+    return tagged_json(request, corrections.get(ctx.database, id, seq))
+
+
+@router.delete("/objects/{id}/trials/{seq}", status_code=204, **scope("trials:write"))
+def withdraw_trial(
+    ctx: Ctx,
+    id: ObjectId,
+    seq: Seq,
+    reason: Annotated[str | None, Query(max_length=4_000, description="Why, for the history.")] = None,
+) -> None:
+    """Withdraw one trial: it is kept, marked, and out of every count and estimate; `PATCH` takes it back.
+
+    409 for a trial of a sweep.
+    """
+    corrections.withdraw(ctx.database, id, seq, reason=reason)
+
+
+@router.patch("/objects/{id}/trials/{seq}", **scope("trials:write"))
+def correct_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: TrialPatch) -> TrialInfo:
+    """Correct a trial's outcome or metadata, withdraw it or take it back; what it was stays in its history.
+
+    409 for a trial of a sweep.
+    """
+    return corrections.correct(ctx.database, id, seq, request)
 
 
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))

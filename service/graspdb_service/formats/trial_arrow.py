@@ -118,6 +118,7 @@ def _schema(told: dict[str, Any] | None = None) -> Any:
             ("metadata", pa.string()),
             ("sweep", pa.string()),
             ("pose_index", pa.int64()),
+            ("withdrawn", pa.bool_()),
         ],
         told,
     )

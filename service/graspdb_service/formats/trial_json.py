@@ -187,6 +187,7 @@ def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
         "metadata": [batch.metadata if value is None else value for value, batch in own],
         "sweep": [batch.sweep for batch in batches],
         "pose_index": columns.pose_index,
+        "withdrawn": columns.withdrawn,
     }
 
 

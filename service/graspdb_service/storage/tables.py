@@ -199,6 +199,8 @@ trials = Table(
     Column("measured_at", UtcDateTime),
     Column("pose_covariance", JSON(none_as_null=True)),
     Column("metadata", JSON(none_as_null=True)),
+    # True: kept, and out of every count and estimate. Null otherwise, so that rows from before need no value.
+    Column("withdrawn", Boolean),
     # Successes are what densities are built of and few among the trials: found without reading the rest.
     Index(
         "ix_trials_successes",
@@ -208,6 +210,18 @@ trials = Table(
         postgresql_where=text("outcome = 1"),
     ),
     sqlite_with_rowid=False,
+)
+
+# What a trial was before it was corrected or withdrawn: the values that each change replaced.
+trial_changes = Table(
+    "trial_changes",
+    metadata,
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), primary_key=True, autoincrement=False),
+    Column("seq", BigInteger, primary_key=True, autoincrement=False),
+    Column("revision", BigInteger, primary_key=True, autoincrement=False),
+    Column("before", JSON, nullable=False),
+    Column("reason", Text),
+    Column("changed_at", UtcDateTime, nullable=False),
 )
 
 # What was doubtful about a batch's trials when they came. Who is numbered by `provenance_id` has no foreign

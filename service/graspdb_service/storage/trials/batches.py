@@ -9,11 +9,18 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Select, case, delete, func, insert, or_, select, update
+from sqlalchemy import Select, and_, case, delete, distinct, func, insert, or_, select, update
 
 from graspdb_service.storage.database import Tx, all_as, first_as
 from graspdb_service.storage.simulation import outcomes
-from graspdb_service.storage.tables import batches, idempotency_keys, packed_outcomes, sweeps, trials
+from graspdb_service.storage.tables import (
+    batches,
+    idempotency_keys,
+    packed_outcomes,
+    sweeps,
+    trial_changes,
+    trials,
+)
 from graspdb_service.storage.trials import provenances
 from graspdb_service.trial_columns import BatchOrigin
 
@@ -116,13 +123,29 @@ def keys(tx: Tx, ids: Collection[int]) -> dict[int, str]:
     return {int(number): str(key) for number, key in rows}
 
 
+def withdrawn_count(tx: Tx, batch: BatchRow) -> int:
+    """Trials of a batch that count no more."""
+    if batch.first_seq is None:
+        return 0
+    changed = trial_changes.join(
+        trials, and_(trials.c.object_id == trial_changes.c.object_id, trials.c.seq == trial_changes.c.seq)
+    )
+    # Only what was changed can be withdrawn, and few are.
+    query = (
+        select(func.count(distinct(trials.c.seq)))
+        .select_from(changed)
+        .where(*_rows(batch), *_changes(batch), trials.c.withdrawn.is_(True))
+    )
+    return int(tx.execute(query).scalar_one())
+
+
 def row_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
-    """Trial rows of a batch by (provenance, outcome code)."""
+    """Trial rows of a batch by (provenance, outcome code), withdrawn ones apart."""
     if batch.first_seq is None:
         return {}
     query = (
         select(trials.c.provenance_id, trials.c.outcome, func.count())
-        .where(*_rows(batch))
+        .where(*_rows(batch), trials.c.withdrawn.is_(None))
         .group_by(trials.c.provenance_id, trials.c.outcome)
     )
     return {(int(p), int(outcome)): int(n) for p, outcome, n in tx.execute(query)}
@@ -154,6 +177,8 @@ def remove(tx: Tx, batch: BatchRow) -> None:
             provenances.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items()})
         tx.execute(delete(packed_outcomes).where(packed_outcomes.c.sweep_id == batch.sweep_id))
     if batch.first_seq is not None:
+        changed = select(trials.c.seq).where(*_rows(batch))
+        tx.execute(delete(trial_changes).where(*_changes(batch), trial_changes.c.seq.in_(changed)))
         tx.execute(delete(trials).where(*_rows(batch)))
     for (provenance_id, outcome), number in rows.items():
         provenances.add_tally(tx, provenance_id, outcome, rows=-number)
@@ -166,6 +191,13 @@ def _rows(batch: BatchRow) -> tuple[Any, ...]:
         trials.c.object_id == batch.object_id,
         trials.c.seq.between(batch.first_seq, batch.last_seq),
         trials.c.batch_id == batch.id,
+    )
+
+
+def _changes(batch: BatchRow) -> tuple[Any, ...]:
+    return (
+        trial_changes.c.object_id == batch.object_id,
+        trial_changes.c.seq.between(batch.first_seq, batch.last_seq),
     )
 
 

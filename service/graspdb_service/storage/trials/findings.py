@@ -10,10 +10,12 @@ from sqlalchemy import (
     ColumnElement,
     Join,
     bindparam,
+    delete,
     func,
     insert,
     or_,
     select,
+    update,
 )
 
 from graspdb_service.storage.database import Tx
@@ -108,6 +110,25 @@ def _first_seqs(tx: Tx, joined: Join, concerned: tuple[ColumnElement[bool], ...]
     )
     first_seq, indices = tx.execute(query).one()
     return [int(first_seq) + index for index in indices]
+
+
+def drop_trial(tx: Tx, object_id: int, seq: int) -> None:
+    """Count a trial no more in the findings that name it, and drop those that were about it alone."""
+    query = (
+        select(batches.c.first_seq, *findings.c)
+        .select_from(findings.join(batches, batches.c.id == findings.c.batch_id))
+        .where(batches.c.object_id == object_id, batches.c.first_seq <= seq, batches.c.last_seq >= seq)
+    )
+    for row in tx.execute(query).all():
+        index = seq - row.first_seq
+        if index not in row.first_indices:
+            continue
+        place = findings.c.batch_id == row.batch_id, findings.c.number == row.number
+        if row.trial_count == 1:
+            tx.execute(delete(findings).where(*place))
+            continue
+        left = [other for other in row.first_indices if other != index]
+        tx.execute(update(findings).where(*place).values(trial_count=row.trial_count - 1, first_indices=left))
 
 
 def seen_in(tx: Tx, digests: Ints) -> list[tuple[int, int]]:

@@ -126,7 +126,7 @@ _READ = ("seq", *_POSE, "proposal_density", "provenance_id", "outcome")
 
 
 def successes(tx: Tx, object_id: int, provenance_ids: Collection[int], *, after_seq: int = 0) -> TrialColumns:
-    """Successes after a sequence number, ascending ``seq``, with the batch each came in."""
+    """Successes after a sequence number, ascending ``seq``, with the batch each came in; none withdrawn."""
     # Said literally, as the partial index has it.
     return _read(tx, object_id, provenance_ids, after_seq, (*_READ, "batch_id"), f"outcome = {SUCCESS}")
 
@@ -139,7 +139,9 @@ def posted(
     after_seq: int = 0,
     without: Collection[int] = (),
 ) -> TrialColumns:
-    """Trials that no sweep stored, ascending ``seq``, but for those with the outcome codes ``without``."""
+    """Trials that no sweep stored, ascending ``seq``, but for those with the outcome codes ``without`` and
+    those withdrawn.
+    """
     codes = ", ".join(str(int(code)) for code in without)
     # Only a sweep's trials have a place in a plan.
     conditions = ["pose_index IS NULL", *([f"outcome NOT IN ({codes})"] if codes else [])]
@@ -154,7 +156,7 @@ def _read(
     columns: Sequence[str],
     *conditions: str,
 ) -> TrialColumns:
-    where = [*_after(object_id, after_seq), *conditions, _of_provenances(provenance_ids)]
+    where = [*_after(object_id, after_seq), "withdrawn IS NULL", *conditions, _of_provenances(provenance_ids)]
     # NULL would make an array of Python objects; no proposal density is negative.
     names = ", ".join(f"coalesce({name}, -1.0)" if name == "proposal_density" else name for name in columns)
     query = f"SELECT {names} FROM trials WHERE {' AND '.join(where)} ORDER BY seq"
@@ -218,7 +220,7 @@ def _fetch(tx: Tx, query: str) -> list[Any]:
 
 _ALL = (
     "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, "proposal_density", "quality",
-    "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS,
+    "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS, "withdrawn IS NOT NULL",
 )  # fmt: skip
 
 
@@ -233,8 +235,11 @@ def page(
     provenance_ids: Sequence[int] | None = None,
     batch_id: int | None = None,
     since_revision: int | None = None,
+    withdrawn: bool | None = None,
 ) -> TrialColumns:
-    """Up to ``limit`` trials after a sequence number; ``since_revision`` keeps what was stored after it."""
+    """Up to ``limit`` trials after a sequence number; ``since_revision`` keeps what was stored, corrected or
+    withdrawn after it.
+    """
     where = _after(object_id, after_seq)
     if provenance_ids is not None:
         where.append(_of_provenances(provenance_ids))
@@ -247,6 +252,8 @@ def page(
     ):
         if value is not None:
             where.append(f"{condition} {int(value)}")
+    if withdrawn is not None:
+        where.append(f"withdrawn IS {'NOT NULL' if withdrawn else 'NULL'}")
     rows = _fetch(
         tx,
         f"SELECT {', '.join(_ALL)} FROM trials WHERE {' AND '.join(where)} ORDER BY seq LIMIT {int(limit)}",
@@ -270,6 +277,7 @@ def page(
         measured_at=[_time(value) for value in cells[16]],
         pose_covariance=[_document(value) for value in cells[17]],
         metadata=[_document(value) for value in cells[18]],
+        withdrawn=np.array(cells[19], dtype=np.bool_),
     )
 
 

@@ -88,6 +88,7 @@ def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInf
             "batch": batch.key,
             "object": row.slug,
             "sweep": batch.sweep_id,
+            "withdrawn": batches.withdrawn_count(tx, batch),
             "outcomes": {OUTCOMES[code]: number for code, number in sorted(outcomes.items()) if number},
             "grippers": distinct(item.gripper for item in items),
             "sources": distinct(item.source for item in items),

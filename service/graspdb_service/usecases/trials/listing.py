@@ -18,7 +18,9 @@ STREAM_ROWS = 5_000
 
 @dataclass(frozen=True)
 class TrialFilter:
-    """Which rows to read: exact names, and ``since_revision`` for what was stored after it."""
+    """Which rows to read: exact names, ``since_revision`` for what was stored or changed after it, and
+    withdrawn ones or not (None: both).
+    """
 
     outcome: str | None = None
     source: str | None = None
@@ -26,6 +28,7 @@ class TrialFilter:
     protocol: str | None = None
     batch: str | None = None
     since_revision: int | None = None
+    withdrawn: bool | None = None
 
 
 def page(
@@ -84,5 +87,6 @@ def _read(
         provenance_ids=passing if any(wanted) else None,
         batch_id=batch_id,
         since_revision=chosen.since_revision,
+        withdrawn=chosen.withdrawn,
     )
     return TrialPage(columns, names, batches.origins(tx, columns.batch.tolist()))
