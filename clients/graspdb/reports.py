@@ -108,8 +108,15 @@ class Anisotropy(Report[wire.reports.AnisotropyReport]):
 
     @property
     def forgives(self) -> dict[str, float | None]:
-        """Half width by axis, metres and radians; None where nothing was tried."""
+        """Half width by axis, metres and radians; None where too little was tried. Where its ``beyond`` is
+        set it is at least so much, for nothing was tried beyond.
+        """
         return {axis: item.half_width for axis, item in self.tolerances.items()}
+
+    @property
+    def tried(self) -> dict[str, tuple[float, float]]:
+        """How far trials lie apart along or about every axis, towards minus and plus, metres and radians."""
+        return {axis: item.tried or (0.0, 0.0) for axis, item in self.tolerances.items()}
 
 
 class Calibration(Report[wire.reports.CalibrationReport]):

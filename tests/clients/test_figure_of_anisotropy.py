@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graspdb.figures import draw, render
-from graspdb.wire.reports import AnisotropyReport
+from graspdb.wire.reports import AnisotropyReport, AnisotropyTolerance
 
 
 def histogram(axes: tuple[str, str], edges: np.ndarray, slice_m: list[float] | None) -> dict[str, Any]:
@@ -145,6 +145,37 @@ def test_what_can_not_be_told_is_left_out() -> None:
     nothing = tolerance("x", half_width=None, displacement=[], probability=[], profile_low=[],
                         profile_high=[], count=[], low=None, high=None, minus=None, plus=None)  # fmt: skip
     assert "nothing tried" in words(draw(report(tolerances=[nothing])))
+
+
+def test_bounds_are_told_and_what_was_not_tried_is_hatched() -> None:
+    told: dict[str, dict[str, Any]] = {
+        "x": {"beyond": True, "half_width": 0.03, "low": 0.012, "high": 0.03, "tried": [-0.03, 0.03]},
+        "y": {"within": True, "half_width": 0.01, "low": None, "high": None, "tried": [-0.06, 0.06]},
+        "z": {"beyond": True, "half_width": 0.024, "low": 0.02, "high": 0.03, "tried": [-0.026, 0.044]},
+        "rz": {"beyond": True, "half_width": 0.5, "low": 0.5, "high": 0.5, "tried": [-0.5, 0.5]},
+    }
+    items = [AnisotropyTolerance.model_validate(tolerance(axis, **more)) for axis, more in told.items()]
+    assert [item.in_words() for item in items] == [
+        "at least 12 mm (tried to 30)",
+        "less than 10 mm",
+        "at least 20 mm (tried -26 to 44)",
+        "at least 29 deg",
+    ]
+    figure = draw(report(tolerances=[tolerance(axis, **more) for axis, more in told.items()]))
+    profiles = {axes.get_xlabel(): axes for axes in figure.axes if axes.get_title().startswith("forgives")}
+    for label, ends in (("along x [mm]", (-30.0, 30.0)), ("along y [mm]", (-60.0, 60.0))):
+        hatched = [fill for fill in profiles[label].collections if fill.get_hatch()]
+        corners = [fill.get_paths()[0].vertices[:, 0] for fill in hatched]
+        assert max(corners[0]) == pytest.approx(ends[0])
+        assert min(corners[1]) == pytest.approx(ends[1])
+    assert profiles["along x [mm]"].get_xlim() == profiles["along y [mm]"].get_xlim()
+
+
+def test_an_expectation_without_data_is_undecided() -> None:
+    unknown = {"name": "ry-wide", "ratio": None, "low": None, "high": None, "verdict": "undecided"}
+    told = words(draw(report(hypotheses=[HYPOTHESES[0], unknown])))
+    assert "these trials do not tell:\nundecided" in told
+    assert "turns about y forgive more" in told
 
 
 def test_the_files_are_what_they_are_called_and_alike_every_time() -> None:

@@ -65,6 +65,9 @@ def test_reports_have_words_arrays_and_figures(thing: GraspObject, tmp_path: Pat
     assert y is not None
     assert x > 1.5 * y
     assert "forgives" in repr(anisotropy)
+    for axis, (low, high) in anisotropy.tried.items():
+        assert low < 0 < high
+        assert (anisotropy.forgives[axis] or 0.0) <= max(-low, high)
 
     calibration = thing.reports.calibration()
     assert calibration.skill is not None
@@ -118,6 +121,8 @@ def test_projections(thing: GraspObject, run: Run) -> None:
     code, _, err = run("report", thing.id, "calibration", "--plane", "xz")
     assert (code, "no such option" in err) == (2, True)
     assert run("report", thing.id)[0] == 2
+    code, out, err = run("report", thing.id, "anisotropy")
+    assert (code, "along x" in out, "about z" in out, "tried" in out) == (0, True, True, True), err
 
 
 def test_widths_and_the_summary_of_all_objects(

@@ -434,7 +434,8 @@ def test_a_profile_that_stays_high_is_a_lower_bound() -> None:
         ("x", "y", "z"), probability, np.ones_like(probability, dtype=np.float32), np.tile(n, 3),
         np.tile(moved, 3), step=0.005, level=0.9,
     )  # fmt: skip
-    assert all(t.beyond and t.half_width == pytest.approx(0.0825) for t in found)
+    # As far as pairs lie, on the mean of the last bin's, and no farther.
+    assert all(t.beyond and t.half_width == pytest.approx(0.08) for t in found)
 
 
 def test_too_little_is_refused_with_what_is_needed(box: Trials) -> None:

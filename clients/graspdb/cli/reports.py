@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import attrgetter
@@ -142,6 +143,22 @@ def _scores(raw: wire.reports.CalibrationReport) -> dict[str, str]:
     return rows
 
 
+def _anisotropy(raw: wire.reports.AnisotropyReport) -> Iterator[Table]:
+    columns: Columns = {
+        "a good grasp": lambda t: f"about {t.axis[1:]}" if t.unit == "rad" else f"along {t.axis}",
+        "forgives": lambda t: t.in_words(),
+        "tried": _tried,
+        "pairs" if raw.method == "empirical" else "evaluations": lambda t: sum(t.count),
+    }
+    yield raw.tolerances, columns
+
+
+def _tried(item: wire.reports.AnisotropyTolerance) -> str:
+    factor, unit = (math.degrees(1.0), "°") if item.unit == "rad" else (1e3, " mm")
+    low, high = (factor * at for at in item.tried or (0.0, 0.0))
+    return f"{low:.0f} to {high:.0f}{unit}"
+
+
 def _convergence(raw: wire.reports.ConvergenceReport) -> Iterator[Table]:
     for curve in raw.curves:
         columns: Columns = {
@@ -229,6 +246,7 @@ def _rate(rule: str, row: wire.reports.SummaryRow) -> str:
 
 
 _TABLES: dict[str, Callable[[Any], Iterator[Table]]] = {
+    "anisotropy": _anisotropy,
     "bandwidth": _bandwidth,
     "calibration": _calibration,
     "convergence": _convergence,

@@ -50,7 +50,7 @@ def draw_anisotropy(report: AnisotropyReport) -> Figure:
     frame = "gripper" if report.alignment == "gripper" else f"{report.alignment}'s axes"
     figure.set_size_inches(_WIDTH, 10.0)
     lines = title(figure, report, f"what a success tells about its vicinity ({report.method}, {frame})")
-    judged = [item for item in report.hypotheses if item.ratio is not None]
+    judged = report.hypotheses if any(item.ratio is not None for item in report.hypotheses) else []
     related = [item for item in report.relations if item.probability is not None]
     flat = _span(len(report.translations))
     heights = [flat, _SQUARE, *(_PROFILE for _ in range(0, len(report.tolerances), 3))]
@@ -77,10 +77,12 @@ def draw_anisotropy(report: AnisotropyReport) -> Figure:
     bar.ax.tick_params(labelsize=8)
     below -= _SQUARE + _BELOW
     step = (_WIDTH - _LEFT - _RIGHT + 0.25) / 3
+    reach = {unit: _reach([t for t in report.tolerances if t.unit == unit]) for unit in ("m", "rad")}
     for i, item in enumerate(report.tolerances):
         if i % 3 == 0:
             below -= _ABOVE if i == 0 else _PROFILE + _BELOW + _ABOVE
-        _profile(placed(_LEFT + i % 3 * step, step - 0.25, _PROFILE), item, report.level, first=i % 3 == 0)
+        axes = placed(_LEFT + i % 3 * step, step - 0.25, _PROFILE)
+        _profile(axes, item, reach[item.unit], report.level, first=i % 3 == 0)
     below -= _PROFILE + _BELOW
     panels: list[tuple[list[Any], float, Callable[[Axes, list[Any], float], None]]] = [
         (judged, len(judged) * 1.6, _forest),
@@ -153,7 +155,14 @@ def _heat(axes: Axes, histogram: AnisotropyHistogram, factor: float) -> Any:
     return image
 
 
-def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool) -> None:
+def _reach(items: list[AnisotropyTolerance]) -> float:
+    """How far the profiles of a unit are shown: as far as was tried, turns a quarter at least."""
+    ends = [abs(at) for item in items for at in (*item.displacement, *(item.tried or ()))]
+    ends += [0.5 * math.pi for item in items if item.unit == "rad"]
+    return max(ends, default=0.0)
+
+
+def _profile(axes: Axes, item: AnisotropyTolerance, reach: float, level: float, *, first: bool) -> None:
     turn = item.unit == "rad"
     factor, unit = (180.0 / math.pi, "deg") if turn else (1e3, "mm")
     name = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
@@ -175,17 +184,13 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
         if item.axis == "x":
             axes.legend(fontsize=7, loc="lower center", framealpha=0.9)
     axes.axhline(0.5, color=GREY, linestyle="--", linewidth=0.8)
-    if item.half_width is None:
-        words = "hidden by the kernel" if item.within else "nothing tried"
-    else:
-        more = "> " if item.beyond else "< " if item.within else ""
-        words = f"{more}{factor * item.half_width:.0f} {unit}"
-        if item.low is not None and item.high is not None and not more:
-            words += f" ({factor * item.low:.0f} to {factor * item.high:.0f})"
+    if item.tried is not None:
+        _hatch_untried(axes, *(factor * at for at in (*item.tried, max(1.05 * reach, 1e-6))))
+    if item.half_width is not None:
         for end, sign in ((item.minus, -1.0), (item.plus, 1.0)):
             if end is not None:
                 axes.axvline(sign * factor * end, color=ORANGE, linestyle=":", linewidth=1.2)
-    axes.set_title(f"forgives {name}: {words}\nn = {sum(item.count):,}", fontsize=8)
+    axes.set_title(f"forgives {name}: {item.in_words()}\nn = {sum(item.count):,}", fontsize=8)
     axes.set_ylim(0.0, 1.02)
     axes.set_xlabel(f"{name} [{unit}]", fontsize=8)
     if turn:
@@ -197,13 +202,28 @@ def _profile(axes: Axes, item: AnisotropyTolerance, level: float, *, first: bool
     show_grid(axes)
 
 
+def _hatch_untried(axes: Axes, low: float, high: float, reach: float) -> None:
+    """What lies farther than was tried, to either side."""
+    for begin, end in ((-reach, low), (high, reach)):
+        axes.fill_between(
+            [begin, end], 0.0, 1.02, facecolor="white", edgecolor="0.8", hatch="////", linewidth=0, zorder=0.5
+        )
+    axes.set_xlim(-reach, reach)
+
+
 def _forest(axes: Axes, found: list[AnisotropyHypothesis], level: float) -> None:
     """Quotients with their intervals on a scale of ratios; the verdict in words, marker and colour."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     ends: list[float] = [0.5, 2.0]
     for i, item in enumerate(found):
-        ratio = item.ratio or 1.0
+        if item.ratio is None:
+            axes.annotate(
+                "these trials do not tell:\nundecided", (1.02, i), xycoords=("axes fraction", "data"),
+                fontsize=8, va="center", color="0.15",
+            )  # fmt: skip
+            continue
+        ratio = item.ratio
         low, high = item.low or ratio, item.high or ratio
         ends += [0.8 * low, 1.25 * high]
         colour, marker, face = _VERDICTS[item.verdict]

@@ -6,6 +6,7 @@ the SDK and the command line follow.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from datetime import datetime
 from typing import Annotated, Any, ClassVar, Literal, get_args
@@ -201,9 +202,13 @@ class AnisotropyTolerance(Response):
     plus: float | None
     """The same towards the positive side, in ``unit``; null where it is not known."""
     beyond: bool
-    """Whether success does not fall to one half within what was looked at."""
+    """Whether success does not fall to one half within what was tried: ``half_width`` is at least so much."""
     within: bool = False
     """Whether it has at the smallest displacement tried, which ``half_width`` then is."""
+    tried: tuple[float, float] | None = None
+    """The farthest displacements that a pair of trials had, the others nearly unchanged, towards minus (0 or
+    less) and plus (0 or more), as far as was looked at, in ``unit``; 0 where nothing was tried that way.
+    ``half_width``, ``minus`` and ``plus`` do not go beyond."""
     displacement: list[float]
     """Displacements of the profile, in ``unit``."""
     probability: list[float]
@@ -214,6 +219,26 @@ class AnisotropyTolerance(Response):
     """Upper end of the interval at each displacement."""
     count: list[int]
     """How many pairs of trials lie at each displacement."""
+
+    def in_words(self) -> str:
+        """The half width, mm or degrees, with its interval or as the bound that it is."""
+        factor, unit = (math.degrees(1.0), "deg") if self.unit == "rad" else (1e3, "mm")
+        if self.half_width is None:
+            some = "too little tried" if any(self.tried or ()) else "nothing tried"
+            return "hidden by the kernel" if self.within else some
+        width, low, high = (factor * (value or 0.0) for value in (self.half_width, self.low, self.high))
+        if self.within:
+            return f"less than {width:.0f} {unit}"
+        if self.beyond:
+            # Surely so much; of what lies beyond what was tried nothing is known.
+            least = round(width if self.low is None else low)
+            ends = [round(factor * at) for at in self.tried or (0.0, 0.0)]
+            tried = f"to {ends[1]}" if ends[0] == -ends[1] else f"{ends[0]} to {ends[1]}"
+            return f"at least {least} {unit}" + (
+                f" (tried {tried})" if max(-ends[0], ends[1]) > least else ""
+            )
+        between = "" if self.low is None or self.high is None else f" ({low:.0f} to {high:.0f})"
+        return f"{width:.0f} {unit}{between}"
 
 
 class AnisotropyRelation(Response):
@@ -260,7 +285,8 @@ class AnisotropyHypothesis(Response):
     verdict: Literal["confirmed", "denied", "undecided"]
     """``confirmed`` or ``denied`` where the interval excludes 1, else ``undecided``."""
     bound: Literal["lower", "upper", "both"] | None = None
-    """Where a half width reaches beyond what was looked at, which end the quotient is; null elsewhere."""
+    """Where a half width reaches beyond what was tried, or is less than the nearest of it, which end the
+    quotient is; null elsewhere."""
 
 
 class AnisotropyOptions(SelectionQuery):
@@ -510,6 +536,9 @@ class ProjectionReport(Report):
     mesh."""
     drawn: int = 0
     """How many grasps were drawn where it could not be computed; 0 where it was."""
+    outside: int = 0
+    """Successful grasps so far from all others that the picture leaves them out; a warning names them.
+    ``share``, ``passing`` and the shares a metre count them."""
 
 
 class BandwidthPoint(Response):

@@ -92,12 +92,15 @@ class Tally(NamedTuple):
         Observations.
     moved : (bins,)
         The sum of their displacements, so that a profile knows where its data lie.
+    farthest : (bins,)
+        The largest of them in amount, so that it knows where they end.
     """
 
     tried: NDArray[np.float32]
     won: NDArray[np.float32]
     pairs: NDArray[np.int64]
     moved: Floats
+    farthest: Floats
 
 
 @inlined
@@ -126,13 +129,14 @@ def _to_profile(lines, apart, bin_, bins, axis, at, success, weights):
     """A pair into its bin of an axis' profile; whether it has one."""
     if bin_ < 0 or bin_ >= bins:
         return False
-    tried, won, pairs, moved = lines
+    tried, won, pairs, moved, farthest = lines
     place = axis * bins + bin_
     if apart:
         pairs[place] += 1
     else:
         _add(tried, won, pairs, place, success, weights)
     moved[place] += at
+    farthest[place] = max(farthest[place], abs(at))
     return True
 
 
@@ -153,7 +157,7 @@ def translation_pairs(trials, displaced, bins, symmetric, least_cosine, planes, 
     positions, quaternions, success, order = trials
     grasps, frames, weights, first, runs = displaced
     extent, slices, slice_m, across, profile_m, profile_bins, off_axis_m = bins
-    tried, won, pairs, _ = planes
+    tried, won, pairs, _, _ = planes
     used = 0
     half_depth = 0.5 * slices * slice_m
     middle = profile_bins // 2
@@ -250,7 +254,7 @@ def rotation_pairs(trials, displaced, bins, symmetric, reach_m, planes, lines, n
     positions, quaternions, success, order = trials
     grasps, _, weights, first, runs = displaced
     circle, profile_step, profile_bins, off_axis = bins
-    tried, won, pairs, _ = planes
+    tried, won, pairs, _, _ = planes
     used = 0
     sine = math.sin(off_axis)
     least = math.cos(0.5 * off_axis) ** 2

@@ -230,7 +230,7 @@ class _Pairs:
 
 def _empty(bins: int, columns: int) -> Tally:
     counted = np.zeros((bins, columns), dtype=np.float32)
-    return Tally(counted, counted.copy(), np.zeros(bins, dtype=np.int64), np.zeros(bins))
+    return Tally(counted, counted.copy(), np.zeros(bins, dtype=np.int64), np.zeros(bins), np.zeros(bins))
 
 
 def _some(displaced: Displaced, begin: int) -> Displaced:
@@ -241,8 +241,14 @@ def _some(displaced: Displaced, begin: int) -> Displaced:
 
 def _mirrored(tally: Tally, image: NDArray[np.int64], sign: Floats) -> Tally:
     """With what was counted in every bin's mirror image."""
-    tried, won, pairs, moved = tally
-    return Tally(tried + tried[image], won + won[image], pairs + pairs[image], moved + sign * moved[image])
+    tried, won, pairs, moved, farthest = tally
+    return Tally(
+        tried + tried[image],
+        won + won[image],
+        pairs + pairs[image],
+        moved + sign * moved[image],
+        np.maximum(farthest, farthest[image]),
+    )
 
 
 def _in_order(trials: Trials, grasps: NDArray[np.int64]) -> tuple[Trials, NDArray[np.int64]]:
@@ -274,4 +280,5 @@ def _of_lattice(
         (np.nan_to_num(share) * weight).astype(np.float32),
         lines.pairs,
         np.tile(at, 3) * lines.pairs,
+        lines.farthest,
     )

@@ -217,8 +217,9 @@ def summary(
         (about[1], ("rx", "ry", "rz"), layout.profile),
     ):
         lines += tolerances(
-            names, _probability(tally), tally.tried, tally.pairs, tally.moved, step=step, level=level
-        )
+            names, _probability(tally), tally.tried, tally.pairs, tally.moved, step=step, level=level,
+            farthest=tally.farthest,
+        )  # fmt: skip
     return translations, rotations, tuple(lines)
 
 

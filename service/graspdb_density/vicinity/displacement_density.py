@@ -1,4 +1,8 @@
-"""The paper's way to measure a grasp's vicinity: the density of successes in the place of a trial."""
+"""The paper's way to measure a grasp's vicinity: the density of successes in the place of a trial.
+
+Where nobody tried there is nothing to compare with: a displaced pose that no attempt but A itself lies near
+is unknown, not a failure, and profiles end where pairs of attempts do.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +27,14 @@ from .displacement_bins import (
     check_enough,
     summary,
 )
+from .tried_range import tried_range
 
 __all__ = ["density_anisotropy"]
 
 #: Attempts per m^3 rad^3: everywhere the same, or a function of poses.
 Attempts = float | Callable[[Poses], Floats]
+#: A pose is tried where attempts there are worth one within three standard deviations of a kernel.
+_TRIED = math.exp(-4.5)
 
 
 # long: the options of the report, explained one by one.
@@ -35,6 +42,7 @@ def density_anisotropy(
     successes: GraspDensity,
     attempts: Attempts,
     *,
+    tried: Poses | None = None,
     alignment: Alignment = "gripper",
     frames: Frames | None = None,
     bins: Bins | None = None,
@@ -55,6 +63,9 @@ def density_anisotropy(
     attempts : float or callable
         Attempts per m^3 rad^3, twins sharing one attempt: for a grid its attempts / (8 pi^2 times its
         volume); or a function of poses, such as their number times their density.
+    tried : M or None
+        The attempts, the successes among them, or many of them: beyond them nothing is known, and A does not
+        count as an attempt at poses near its own. None: everything was tried.
     alignment, frames
         As for `empirical_anisotropy`; frames (N, 3, 3) are those of the rows of ``successes``.
     max_grasps : int
@@ -84,12 +95,33 @@ def density_anisotropy(
     values = np.empty((count, len(low)))
     for number, a in enumerate(grasps):
         moves = low + (high - low) * rng.random(low.shape)
-        values[number] = _shares(successes, attempts, int(a), axes[number], alignment, moves, rng, threads)
+        values[number] = _shares(
+            successes,
+            attempts,
+            int(a),
+            axes[number],
+            alignment,
+            moves,
+            rng,
+            threads,
+            everywhere=tried is None,
+        )
         if progress is not None:
             progress((number + 1) / count)
     bounds = np.cumsum([len(first) for first, _ in corners])[:-1]
     parts = zip(np.split(values, bounds, axis=1), np.split(0.5 * (low + high), bounds), strict=True)
     planes, lines, turned_planes, turned_lines = (_mean_tally(part, share, middle) for part, middle in parts)
+    if tried is not None:
+        kernel, twins = successes.kernel, bool(successes.symmetric.all())
+        found = tried_range(
+            tried, successes.poses[grasps], axes,
+            off_axis_m=kernel.sigma_position_m, off_axis=kernel.sigma_rotation,
+            reach_m=layout.reach_m + 0.5 * layout.profile_m, reach=layout.reach + 0.5 * layout.profile,
+            twins=twins,
+            mirrored=alignment == "edge" or (twins and alignment in ("gripper", "surface-pair")),
+        )  # fmt: skip
+        lines = _within(lines, found.along, layout.profile_m)
+        turned_lines = _within(turned_lines, found.about, layout.profile)
     return Anisotropy(
         "density",
         alignment,
@@ -146,8 +178,12 @@ def _shares(
     moves: Floats,
     rng: np.random.Generator,
     threads: int,
+    *,
+    everywhere: bool,
 ) -> Floats:
-    """``min(1, n d(T(A)) / rho)`` for one A and one displacement in every bin."""
+    """``min(1, n d(T(A)) / rho)`` for one A and a displacement in every bin: nan where nothing was tried, 0
+    where everything was ``everywhere``.
+    """
     twin = bool(successes.symmetric[row])
     own = successes.quaternions_xyzw[row]
     # Either twin may be the one displaced: for frames that turn with the jaw that mirrors x and y.
@@ -171,16 +207,39 @@ def _shares(
         turned_centre = Poses(successes.positions[row], se3.jaw_twin(own))
         mine = 0.5 * (mine + np.exp(kernel.log_kernel(poses, turned_centre)))
     rest = np.maximum(density - successes.weights[row] * mine, 0.0) * successes.size
-    rho = attempts(poses) if callable(attempts) else attempts
-    with np.errstate(divide="ignore", invalid="ignore"):
-        quotient = np.where(rest > 0.0, rest / rho, 0.0)
+    rho = attempts(poses) if callable(attempts) else np.full(len(moves), attempts)
+    if not everywhere:
+        rho = np.maximum(rho - mine, 0.0)
+        # What one attempt is worth at its own pose, which a symmetric jaw shares with its twin.
+        least = _TRIED * math.exp(kernel.log_peak) * (0.5 if twin else 1.0)
+        rho = np.where(rho >= least, rho, np.nan)
+    quotient = np.divide(rest, rho, out=np.zeros_like(rest), where=(rho > 0.0) | np.isnan(rho))
     return np.asarray(np.minimum(1.0, quotient), dtype=np.float64)
 
 
 def _mean_tally(values: Floats, share: NDArray[np.float32], middle: Floats) -> Tally:
-    """Tally of shares (A, bins) in the place of successes; ``middle`` (bins, 6) of the displacements."""
-    bins = values.shape[1]
-    tried = np.broadcast_to(share.sum(axis=0), (bins, share.shape[1])).astype(np.float32)
-    won = (values.T @ share.astype(np.float64)).astype(np.float32)
-    pairs = np.full(bins, len(values), dtype=np.int64)
-    return Tally(tried, won, pairs, middle.sum(axis=1) * pairs)
+    """Tally of shares (A, bins) in the place of successes, nan where nothing was tried; ``middle`` (bins, 6)
+    of the displacements.
+    """
+    known = np.isfinite(values)
+    tried = (known.T.astype(np.float64) @ share.astype(np.float64)).astype(np.float32)
+    won = (np.where(known, values, 0.0).T @ share.astype(np.float64)).astype(np.float32)
+    pairs = known.sum(axis=0)
+    moved = middle.sum(axis=1)
+    return Tally(tried, won, pairs, moved * pairs, np.abs(moved))
+
+
+def _within(lines: Tally, reach: Floats, step: float) -> Tally:
+    """Profiles (3 n bins) without what lies farther than ``reach`` (3, 2) towards minus and plus."""
+    count = len(lines.pairs) // 3
+    middle = (np.arange(count) - count // 2) * step
+    away = np.where(middle > 0.0, reach[:, 1:], reach[:, :1]).ravel()
+    inside = np.tile(np.abs(middle) < 0.5 * step, 3) | (lines.farthest - 0.5 * step < away)
+    pairs, farthest = np.where(inside, lines.pairs, 0), np.minimum(lines.farthest, away)
+    return Tally(
+        np.where(inside[:, None], lines.tried, 0.0).astype(np.float32),
+        np.where(inside[:, None], lines.won, 0.0).astype(np.float32),
+        pairs,
+        np.tile(np.sign(middle), 3) * farthest * pairs,
+        farthest,
+    )

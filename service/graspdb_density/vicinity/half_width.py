@@ -1,4 +1,8 @@
-"""How far a grasp may be off along or about one axis: where the chance of success falls to one half."""
+"""How far a grasp may be off along or about one axis: where the chance of success falls to one half.
+
+Only what was tried counts. A profile ends at the farthest pair of trials on either side, and where the chance
+has not fallen to one half by then, that far is a lower bound: the half width is at least so much.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,12 @@ from scipy.optimize import isotonic_regression
 
 from ..se3 import Floats
 
-__all__ = ["HALF", "Tolerance", "quantiles", "tolerances"]
+__all__ = ["HALF", "LEAST_PAIRS", "Tolerance", "quantiles", "tolerances"]
 
 HALF = 0.5
+#: Pairs on a side that tell where half of them succeed, at least: as many that all fare alike are by chance
+#: with less than 7 %.
+LEAST_PAIRS = 5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -24,12 +31,19 @@ class Tolerance:
     ----------
     axis : x, y, z (metres) or rx, ry, rz (radians)
     half_width, low, high : float
-        Half the distance between the two sides' ends, with its interval; nan without data.
+        Half the distance between the two sides' ends, with its interval; nan where a side has fewer than
+        `LEAST_PAIRS` pairs.
     minus, plus : float
-        How far P stays above one half towards either side.
+        How far P stays above one half towards either side; nan for a side with too few pairs.
     beyond : bool
-        P does not fall to one half within what was looked at on at least one side: the numbers are lower
-        bounds.
+        P does not fall to one half within what was tried on at least one side: the numbers are lower bounds.
+    within : bool
+        It has where the nearest trials are: the half width is at most ``nearest``.
+    nearest : float
+        The smallest displacement tried towards either side, mean of its bin; nan where there is none.
+    tried : (float, float)
+        The farthest displacements tried towards minus, not above 0, and plus, not below 0; 0 where there is
+        none.
     displacement : (n,)
         Mean displacement of the pairs in each bin of the profile (on a grid the bin's middle), rising; bins
         without pairs are left out.
@@ -46,6 +60,9 @@ class Tolerance:
     minus: float
     plus: float
     beyond: bool
+    within: bool
+    nearest: float
+    tried: tuple[float, float]
     displacement: Floats
     probability: Floats
     profile_low: Floats
@@ -78,6 +95,7 @@ def tolerances(
     *,
     step: float,
     level: float,
+    farthest: Floats | None = None,
 ) -> list[Tolerance]:
     """Profiles of three axes to tolerances.
 
@@ -85,72 +103,123 @@ def tolerances(
     ----------
     probability, tried : (3 n, 1 + resamples)
         Column 0 as observed; nan where nothing was tried.
-    pairs, moved : (3 n,)
-        Pairs and the sum of their displacements.
+    pairs, moved, farthest : (3 n,)
+        Pairs, the sum of their displacements, and the largest of these in amount (None: their mean).
     step : float
-        Width of a bin; the middle one is about 0.
+        Width of a bin; the middle one is about 0, and its pairs do not count as displaced.
     """
     count = len(probability) // 3
-    tail = 0.5 * (1.0 - level)
+    middle: Floats = (np.arange(count, dtype=np.float64) - count // 2) * step
     result = []
     for number, name in enumerate(names):
         part = slice(number * count, (number + 1) * count)
-        value, weight, n = probability[part], tried[part], pairs[part]
-        nominal = (np.arange(count) - count // 2) * step
-        at = np.where(n > 0, moved[part] / np.maximum(n, 1), nominal)
-        known = n > 0
-        reach = (count // 2 + 0.5) * step
-        ends = np.array([_ends(at, value[:, r], weight[:, r], reach) for r in range(value.shape[1])])
-        minus, plus = ends[0, 0], ends[0, 1]
-        width = 0.5 * (ends[:, 0] + ends[:, 1])
-        resampled = width[1:][np.isfinite(width[1:])]
-        has = np.isfinite(width[0]) and resampled.size > 0
-        low, high = np.quantile(resampled, [tail, 1.0 - tail]) if has else (np.nan, np.nan)
-        least, most = quantiles(value[known, 1:], level)
-        result.append(
-            Tolerance(
-                axis=name,
-                half_width=float(width[0]),
-                low=float(low),
-                high=float(high),
-                minus=float(minus),
-                plus=float(plus),
-                beyond=bool(has and max(minus, plus) >= reach * (1.0 - 1e-9)),
-                displacement=at[known],
-                probability=value[known, 0],
-                profile_low=np.fmin(least, value[known, 0]),
-                profile_high=np.fmax(most, value[known, 0]),
-                count=n[known],
-                resampled=width[1:],
-            )
-        )
+        n = pairs[part]
+        at: Floats = np.where(n > 0, moved[part] / np.maximum(n, 1), middle)
+        reached = np.where(n > 0, np.abs(at) if farthest is None else farthest[part], 0.0)
+        sides = tuple(_Side.of(sign * middle, sign * at, n, reached) for sign in (-1.0, 1.0))
+        result.append(_tolerance(name, sides, at, probability[part], tried[part], n, level))
     return result
 
 
-def _ends(at: Floats, value: Floats, weight: NDArray[np.float32], reach: float) -> tuple[float, float]:
-    """Where P falls to one half on the two sides of 0; nan for a side without data."""
-    found = []
-    for sign in (-1.0, 1.0):
-        distance = sign * at
-        chosen = np.isfinite(value) & (distance > 0.0)
-        if not chosen.any():
-            found.append(np.nan)
-            continue
-        order = np.flatnonzero(chosen)[np.argsort(distance[chosen])]
-        found.append(_crossing(distance[order], value[order], weight[order].astype(np.float64), reach))
-    return found[0], found[1]
+def _tolerance(
+    name: str,
+    sides: tuple[_Side, ...],
+    at: Floats,
+    value: Floats,
+    weight: NDArray[np.float32],
+    pairs: NDArray[np.int64],
+    level: float,
+) -> Tolerance:
+    """That of one profile (n, 1 + resamples), from its two sides."""
+    known, tail = pairs > 0, 0.5 * (1.0 - level)
+    ends = np.array([side.ends(value, weight) for side in sides])
+    width = 0.5 * (ends[0] + ends[1])
+    resampled = width[1:][np.isfinite(width[1:])]
+    has = bool(np.isfinite(width[0])) and resampled.size > 0
+    low, high = np.quantile(resampled, [tail, 1.0 - tail]) if has else (np.nan, np.nan)
+    least, most = quantiles(value[known, 1:], level)
+    beyond = has and any(side.open(value, weight) for side in sides)
+    nearest = min((side.nearest for side in sides if side.rows.size), default=np.nan)
+    return Tolerance(
+        axis=name,
+        half_width=float(width[0]),
+        low=float(low),
+        high=float(high),
+        minus=float(ends[0, 0]),
+        plus=float(ends[1, 0]),
+        beyond=beyond,
+        within=has and not beyond and bool(width[0] < nearest),
+        nearest=float(nearest),
+        tried=(0.0 - sides[0].reach, sides[1].reach),
+        displacement=at[known],
+        probability=value[known, 0],
+        profile_low=np.fmin(least, value[known, 0]),
+        profile_high=np.fmax(most, value[known, 0]),
+        count=pairs[known],
+        resampled=width[1:],
+    )
 
 
-def _crossing(distance: Floats, value: Floats, weight: Floats, reach: float) -> float:
-    """First distance at which the falling fit to a profile that starts at 1 passes one half.
+@dataclass(frozen=True, eq=False, slots=True)
+class _Side:
+    """What was tried towards one side.
 
-    The fit is isotonic: a bin that happens to lie high or low between others does not decide alone.
+    Attributes
+    ----------
+    rows : (m,)
+        Bins from the nearest to the farthest that pairs are in, those between included.
+    distance, reached : (m,)
+        Of each: the mean of its pairs, and the farthest pair up to it.
+    pairs, nearest, reach : int, float, float
+        Pairs in all, the distance of the nearest of them (mean of its bin) and of the farthest; 0 without.
     """
-    fit = isotonic_regression(value, weights=weight, increasing=False).x
-    below = np.flatnonzero(fit < HALF)
-    if not below.size:
-        return reach
-    i = int(below[0])
-    x0, y0 = (0.0, 1.0) if i == 0 else (float(distance[i - 1]), float(fit[i - 1]))
-    x1, y1 = float(distance[i]), float(fit[i])
-    return x0 + (y0 - HALF) / (y0 - y1) * (x1 - x0)
+
+    rows: NDArray[np.intp]
+    distance: Floats
+    reached: Floats
+    pairs: int
+    nearest: float
+    reach: float
+
+    @classmethod
+    def of(cls, nominal: Floats, at: Floats, pairs: NDArray[np.int64], reached: Floats) -> _Side:
+        """The side on which the bins' middles ``nominal`` (n,) are positive."""
+        # Bins rise or fall; in the middle one pairs hardly differ.
+        rows = np.flatnonzero(nominal > 0.0)
+        rows = rows[np.argsort(nominal[rows])]
+        filled = np.flatnonzero(pairs[rows] > 0)
+        if not filled.size:
+            return cls(rows[:0], np.empty(0), np.empty(0), 0, 0.0, 0.0)
+        rows = rows[filled[0] : filled[-1] + 1]
+        distance, farthest = at[rows], np.maximum.accumulate(reached[rows])
+        return cls(rows, distance, farthest, int(pairs[rows].sum()), float(distance[0]), float(farthest[-1]))
+
+    def ends(self, value: Floats, weight: NDArray[np.float32]) -> Floats:
+        """Where P falls to one half (columns,): the farthest pair where it does not, nan without data."""
+        if self.pairs < LEAST_PAIRS:
+            return np.full(value.shape[1], np.nan)
+        return np.array([self._end(value[:, r], weight[:, r])[0] for r in range(value.shape[1])])
+
+    def open(self, value: Floats, weight: NDArray[np.float32]) -> bool:
+        """Whether P, as observed, stays above one half as far as was tried."""
+        return self.pairs >= LEAST_PAIRS and self._end(value[:, 0], weight[:, 0])[1]
+
+    def _end(self, value: Floats, weight: NDArray[np.float32]) -> tuple[float, bool]:
+        """First distance at which the falling fit to a profile that starts at 1 passes one half, and whether
+        it does not.
+
+        The fit is isotonic: a bin that happens to lie high or low between others does not decide alone.
+        """
+        v, w = value[self.rows], weight[self.rows].astype(np.float64)
+        known = np.isfinite(v) & (w > 0.0)
+        if not known.any():
+            return np.nan, False
+        distance, reach = self.distance[known], float(self.reached[known][-1])
+        fit = isotonic_regression(v[known], weights=w[known], increasing=False).x
+        below = np.flatnonzero(fit < HALF)
+        if not below.size:
+            return reach, True
+        i = int(below[0])
+        x0, y0 = (0.0, 1.0) if i == 0 else (float(distance[i - 1]), float(fit[i - 1]))
+        x1, y1 = float(distance[i]), float(fit[i])
+        return min(x0 + (y0 - HALF) / (y0 - y1) * (x1 - x0), reach), False

@@ -4,16 +4,19 @@ It expects that x (along an edge), z (the approach) and turns about y (the closi
 others, and that this shows more when displacements follow the object's structure (section III-A, figures 7 to
 12). Each expectation is a quotient of half widths. Resamples of the grasps are shared by all axes and
 alignments, so the quotient's interval is that of pairs. With its whole interval above 1 it is confirmed,
-below 1 denied, else undecided; a half width that is only a lower bound decides nothing it could overturn.
+below 1 denied, else undecided. Without trials along an axis nothing is said of it; a half width that is only
+a bound, because nothing was tried beyond or the nearest trials fail, decides nothing it could overturn.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..se3 import Floats
 from .displacement_bins import Anisotropy
@@ -37,7 +40,8 @@ class Hypothesis:
         Quotient and its interval; nan where nothing can be said.
     verdict : ``confirmed``, ``denied`` or ``undecided``
     bound : ``lower``, ``upper`` or ``both``, or None
-        Which way the quotient is only a bound, because a half width reaches beyond what was looked at.
+        Which way the quotient is only a bound, because a half width reaches beyond what was tried or is less
+        than the nearest of it.
     """
 
     name: str
@@ -55,9 +59,9 @@ def wide_axes(found: Anisotropy) -> list[Hypothesis]:
     """
     by = {item.axis: item for item in found.tolerances}
     return [
-        _judged("x-wide", [by["x"]], [by["y"]], found.level),
-        _judged("z-wide", [by["z"]], [by["y"]], found.level),
-        _judged("ry-wide", [by["ry"]], [by["rx"], by["rz"]], found.level),
+        _judged("x-wide", [by["x"]], [by["y"]], found),
+        _judged("z-wide", [by["z"]], [by["y"]], found),
+        _judged("ry-wide", [by["ry"]], [by["rx"], by["rz"]], found),
     ]
 
 
@@ -72,53 +76,85 @@ def sharpened(aligned: Anisotropy, gripper: Anisotropy) -> Hypothesis:
     ValueError
         Where the two were not measured on the same number of grasps and resamples.
     """
-    ours, theirs = (list(found.tolerances[:3]) for found in (aligned, gripper))
     if (aligned.method, aligned.grasps) != (gripper.method, gripper.grasps):
         raise ValueError("alignments are compared on the same grasps, by the same method")
-    index = [_spread(items) for items in (ours, theirs)]
-    value = index[0][0] / index[1][0]
-    resampled = index[0][1] / index[1][1]
-    # Beyond what was looked at the widest is a lower bound: of ours it may hide sharpening, of theirs it may
-    # feign it.
+    ours, theirs = (_Widths.of(found.tolerances[:3], found.method) for found in (aligned, gripper))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread, blurred = (w.values.max(axis=0) / w.values.min(axis=0) for w in (ours, theirs))
+        quotients = spread / blurred
+    at_least, at_most = ours.spread_bounds()
+    blurred_at_least, blurred_at_most = theirs.spread_bounds()
     return _verdict(
         "alignment-sharpens",
-        value,
-        resampled,
+        quotients,
         aligned.level,
-        lower=any(item.beyond for item in ours),
-        upper=any(item.beyond for item in theirs),
+        lower=at_least or blurred_at_most,
+        upper=at_most or blurred_at_least,
     )
 
 
-def _spread(items: list[Tolerance]) -> tuple[float, Floats]:
-    """Widest over narrowest half width, as observed and in the resamples."""
-    value = np.array([item.half_width for item in items])
-    again = np.stack([item.resampled for item in items])
+@dataclass(frozen=True, eq=False, slots=True)
+class _Widths:
+    """Half widths as far as they are known.
+
+    Attributes
+    ----------
+    values : (axes, 1 + resamples)
+        As observed, then in the resamples: where trials fail from the nearest on, the distance of those; nan
+        without data.
+    beyond, within : (axes,) bool
+        Whether they are lower, or upper bounds: both where a density's kernel hides how wide it is.
+    """
+
+    values: Floats
+    beyond: NDArray[np.bool_]
+    within: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, items: Sequence[Tolerance], method: str) -> _Widths:
+        rows = []
+        for item in items:
+            row = np.concatenate([[item.half_width], item.resampled])
+            rows.append(np.maximum(row, item.nearest) if item.within else row)
+        within = np.array([item.within for item in items])
+        beyond = np.array([item.beyond for item in items])
+        return cls(np.array(rows), beyond | within if method == "density" else beyond, within)
+
+    def widest_bounds(self) -> tuple[bool, bool]:
+        """Whether the widest is a lower bound, and whether it is an upper one."""
+        return bool(self.beyond.any()), bool(self.within[np.argmax(self.values[:, 0])])
+
+    def spread_bounds(self) -> tuple[bool, bool]:
+        """Whether the widest over the narrowest is a lower bound, and whether it is an upper one.
+
+        What reaches beyond what was tried may be the widest of all, and what is narrower than that the
+        narrowest; where the narrowest reaches beyond, or the widest is narrower, it may be less, too.
+        """
+        widest, narrowest = np.argmax(self.values[:, 0]), np.argmin(self.values[:, 0])
+        at_least = bool(self.beyond.any() or self.within.any())
+        return at_least, bool(self.beyond[narrowest] or self.within[widest])
+
+
+def _judged(name: str, wide: list[Tolerance], narrow: list[Tolerance], found: Anisotropy) -> Hypothesis:
+    over, under = (_Widths.of(items, found.method) for items in (wide, narrow))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return float(value.max() / value.min()), np.asarray(again.max(axis=0) / again.min(axis=0))
-
-
-def _judged(name: str, wide: list[Tolerance], narrow: list[Tolerance], level: float) -> Hypothesis:
-    over, under = (
-        (np.max([item.half_width for item in items]), np.max([item.resampled for item in items], axis=0))
-        for items in (wide, narrow)
+        quotients = over.values.max(axis=0) / under.values.max(axis=0)
+    (over_at_least, over_at_most), (under_at_least, under_at_most) = (
+        side.widest_bounds() for side in (over, under)
     )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio, resampled = over[0] / under[0], over[1] / under[1]
     return _verdict(
         name,
-        float(ratio),
-        np.asarray(resampled, dtype=np.float64),
-        level,
-        lower=any(item.beyond for item in wide),
-        upper=any(item.beyond for item in narrow),
+        quotients,
+        found.level,
+        lower=over_at_least or under_at_most,
+        upper=over_at_most or under_at_least,
     )
 
 
-def _verdict(
-    name: str, ratio: float, resampled: Floats, level: float, *, lower: bool, upper: bool
-) -> Hypothesis:
-    known = resampled[np.isfinite(resampled)]
+def _verdict(name: str, quotients: Floats, level: float, *, lower: bool, upper: bool) -> Hypothesis:
+    """Of a quotient as observed and in the resamples (1 + R,), and which way it is a bound."""
+    ratio = float(quotients[0])
+    known = quotients[1:][np.isfinite(quotients[1:])]
     if not math.isfinite(ratio) or len(known) < _LEAST_RESAMPLES:
         return Hypothesis(name, math.nan, math.nan, math.nan, "undecided", None)
     tail = 0.5 * (1.0 - level)

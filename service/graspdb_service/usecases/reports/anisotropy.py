@@ -22,7 +22,7 @@ from graspdb_density.se3 import Poses
 from graspdb_density.vicinity.anisotropy import empirical_anisotropy
 from graspdb_density.vicinity.displacement_bins import Anisotropy, Frames, check_enough
 from graspdb_density.vicinity.displacement_density import density_anisotropy
-from graspdb_density.vicinity.half_width import Tolerance
+from graspdb_density.vicinity.half_width import LEAST_PAIRS, Tolerance
 from graspdb_density.vicinity.hypotheses import Hypothesis, sharpened, wide_axes
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities import stored_kernel
@@ -58,8 +58,12 @@ _EXPECTED = {
     "ry-wide": "turns about y are forgiven {} as much as about x or z",
     "alignment-sharpens": "the widest differs from the narrowest {} as much as along the gripper's axes",
 }
-#: The middle bin of a profile, whose pairs hardly differ, ends before this share of its reach.
-_MIDDLE = 0.03
+_COMPARED = {
+    "x-wide": "x against y",
+    "z-wide": "z against y",
+    "ry-wide": "turns about y against those about x and z",
+    "alignment-sharpens": "what alignment changes",
+}
 
 
 def anisotropy_report(
@@ -115,10 +119,11 @@ def _measure(
     if method == "density":
         density = built.density
         assert density is not None
-        local = _local_attempts(everything, density.kernel)
+        local, tried = _local_attempts(everything, density.kernel)
         return lambda alignment, frames, progress: density_anisotropy(
             density,
             local,
+            tried=tried,
             alignment=alignment,
             frames=frames,
             level=LEVEL,
@@ -126,7 +131,8 @@ def _measure(
             progress=progress,
         )
     weights = None
-    if not np.isnan(everything.proposal).all() and np.nanstd(everything.proposal[everything.success]) > 0.0:
+    known = everything.proposal[everything.success & np.isfinite(everything.proposal)]
+    if known.size and np.ptp(known) > 0.0:
         weights = importance_weights(everything.proposal)
     keys = everything.keys
     symmetric = bool(everything.symmetric.all())
@@ -154,13 +160,7 @@ def _tolerances(found: Anisotropy, built: Built) -> tuple[list[AnisotropyToleran
             item.model_copy(update={"half_width": None, "minus": None, "plus": None}) if item.within else item
             for item in tolerances
         ]
-    unknown = [item.axis for item in tolerances if item.half_width is None and item.axis not in hidden]
-    warnings = []
-    if unknown:
-        warnings.append(
-            f"nothing was tried displaced along or about {', '.join(unknown)} alone: a grid's trials, or many"
-            " more, tell that"
-        )
+    warnings = _untold([item for item in tolerances if item.axis not in hidden])
     if hidden:
         kernel = built.kernel
         warnings.append(
@@ -171,21 +171,44 @@ def _tolerances(found: Anisotropy, built: Built) -> tuple[list[AnisotropyToleran
     return tolerances, warnings
 
 
-def _local_attempts(everything: AllTrials, kernel: IsotropicKernel) -> Callable[[Poses], Floats]:
-    """Attempts per m^3 rad^3 around poses, from at most so many drawn at random."""
+def _local_attempts(
+    everything: AllTrials, kernel: IsotropicKernel
+) -> tuple[Callable[[Poses], Floats], Poses]:
+    """Attempts per m^3 rad^3 around poses, from at most so many drawn at random, and those."""
     density = everything.density(kernel, everything.some(_LOCAL_ATTEMPTS))
-    return lambda poses: len(everything) * density.density(poses)
+    return lambda poses: len(everything) * density.density(poses), density.poses
+
+
+def _untold(tolerances: list[AnisotropyTolerance]) -> list[str]:
+    """Along and about which axes, and which way, too little was tried to tell anything."""
+    nothing, few = [], []
+    for item in tolerances:
+        if item.half_width is not None:
+            continue
+        low, high = item.tried or (0.0, 0.0)
+        if not low and not high:
+            nothing.append(item.axis)
+        elif low and high:
+            few.append(item.axis)
+        else:
+            nothing.append(f"{'-' if high else '+'}{item.axis}")
+    more = "a grid's trials, or many more, tell that"
+    warnings = []
+    if nothing:
+        warnings.append(f"nothing was tried displaced along or about {', '.join(nothing)} alone: {more}")
+    if few:
+        warnings.append(
+            f"fewer than {LEAST_PAIRS} pairs of trials differ each way along or about {', '.join(few)}"
+            f" alone: {more}"
+        )
+    return warnings
 
 
 def _tolerance(item: Tolerance) -> AnisotropyTolerance:
     # Where even the nearest trials mostly fail the crossing lies between them and the grasp itself.
-    distance = np.abs(item.displacement)
-    off = distance > _MIDDLE * distance.max(initial=0.0)
-    nearest = float(distance[off].min()) if off.any() else math.nan
-    within = bool(math.isfinite(item.half_width) and item.half_width < nearest)
-    shown = {"half_width": finite(nearest), "low": None, "high": None} if within else {}
+    shown = {"half_width": finite(item.nearest), "low": None, "high": None} if item.within else {}
     unit = "rad" if item.axis.startswith("r") else "m"
-    return as_model(AnisotropyTolerance, item, unit=unit, within=within, **shown)
+    return as_model(AnisotropyTolerance, item, unit=unit, **shown)
 
 
 def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> str:
@@ -193,23 +216,21 @@ def _tolerances_text(tolerances: list[AnisotropyTolerance], alignment: str) -> s
     for item in tolerances:
         if item.half_width is None:
             continue
-        turn = item.unit == "rad"
-        factor, unit = (180.0 / math.pi, "deg") if turn else (1e3, "mm")
-        more = "more than " if item.beyond else "less than " if item.within else ""
-        between = ""
-        if item.low is not None and item.high is not None and not more:
-            between = f" ({factor * item.low:.0f} to {factor * item.high:.0f})"
-        way = f"about {item.axis[1:]}" if turn else f"along {item.axis}"
-        parts.append(f"{more}{factor * item.half_width:.0f} {unit}{between} {way}")
+        way = f"about {item.axis[1:]}" if item.unit == "rad" else f"along {item.axis}"
+        parts.append(f"{item.in_words()} {way}")
     if not parts:
-        return "No tolerance can be told from these trials; the warnings say why."
+        return f"No tolerance can be told from these trials, the warnings say why ({_AXES[alignment]})."
     return f"A good grasp forgives {', '.join(parts)} ({_AXES[alignment]})."
 
 
 def _hypotheses_text(found: list[Hypothesis]) -> str:
-    parts = []
+    judged, untold = [], []
     for item in found:
-        if math.isfinite(item.ratio):
-            times = f"{item.ratio:.2g} times ({item.low:.2g} to {item.high:.2g})"
-            parts.append(f"{_EXPECTED[item.name].format(times)} ({item.verdict})")
-    return f" What grasps are expected to do: {'; '.join(parts)}." if parts else ""
+        if not math.isfinite(item.ratio):
+            untold.append(_COMPARED[item.name])
+            continue
+        bound = {"lower": "at least ", "upper": "at most ", "both": "about "}.get(item.bound or "", "")
+        times = f"{bound}{item.ratio:.2g} times ({item.low:.2g} to {item.high:.2g})"
+        judged.append(f"{_EXPECTED[item.name].format(times)} ({item.verdict})")
+    text = f" What grasps are expected to do: {'; '.join(judged)}." if judged else ""
+    return text + (f" Undecided, for these trials do not tell: {'; '.join(untold)}." if untold else "")
