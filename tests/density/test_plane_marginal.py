@@ -134,3 +134,30 @@ def test_fewer_grasps_have_wider_intervals(density: GraspDensity) -> None:
     many, one = marginal(density, PLANE, SIDE), marginal(few, PLANE, SIDE)
     assert one.share_high - one.share_low > 1.5 * (many.share_high - many.share_low)
     assert many.share_low < many.share < many.share_high
+
+
+def test_one_far_grasp_leaves_the_picture_as_it_was() -> None:
+    rng = np.random.default_rng(0)
+    p, q = rng.normal(scale=0.02, size=(200, 3)), se3.random_quaternions(201, rng)
+    alone = marginal(GraspDensity.build(Poses.of(p, q[:200]), kernel=KERNEL), PLANE, Orientation())
+    far = np.concatenate([p, [[20.0, 5.0, 3.0]]])
+    found = marginal(GraspDensity.build(Poses.of(far, q), kernel=KERNEL), PLANE, Orientation())
+    assert (found.outside, alone.outside) == (1, 0)
+    np.testing.assert_allclose(found.across_edges, alone.across_edges, atol=1e-9)
+    np.testing.assert_allclose(found.value, alone.value * 200 / 201, rtol=1e-6, atol=1e-6 * alone.value.max())
+    assert found.share == pytest.approx(1.0)
+    assert found.value.sum() * area(found) == pytest.approx(200 / 201, abs=0.01)
+    for item, other in zip(found.profiles, alone.profiles, strict=True):
+        np.testing.assert_allclose(item.value, other.value * 200 / 201, rtol=1e-6, atol=1e-6)
+
+
+def test_cells_wider_than_the_kernel_hold_the_same_share() -> None:
+    """Two grasps 9 m apart: no smoothing is left to do."""
+    p = np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    density = GraspDensity.build(Poses.of(p, np.tile(se3.IDENTITY, (2, 1))), kernel=KERNEL)
+    found = marginal(density, Plane.facing(np.array([0.0, -1.0, 0.0])), Orientation())
+    assert found.outside == 0
+    assert found.value.sum() * area(found) == pytest.approx(1.0)
+    step = float(np.diff(found.profiles[0].at)[0])
+    assert found.profiles[0].value.sum() * step == pytest.approx(1.0)
+    assert np.all(np.isfinite(found.profiles[1].high))

@@ -93,6 +93,8 @@ def _profile(axes: Axes, item: ProjectionProfile, *, upright: bool) -> None:
 
 def _key(report: ProjectionReport) -> str:
     lines = [f"n = {report.passing:,} of {report.grasps:,}", "successful grasps"]
+    if report.outside:
+        lines.append(f"{report.outside:,} far away, not shown")
     for name, vector, cone in (
         ("approach (tool z)", report.approach, report.approach_cone_deg),
         ("direction (tool x)", report.direction, report.direction_cone_deg),

@@ -16,13 +16,14 @@ from .. import se3
 from ..kde.density import SearchedDensity
 from ..kde.isotropic import GraspDensity
 from ..se3 import Floats
+from .far_rows import far_rows
 
-__all__ = ["Marginal", "Orientation", "Plane", "Profile", "marginal"]
+__all__ = ["MARGIN", "Marginal", "Orientation", "Plane", "Profile", "marginal"]
 
 #: Cells along the longer side.
 _CELLS = 128
 #: The picture reaches this many position widths beyond the outermost rows.
-_MARGIN = 3.0
+MARGIN = 3.0
 #: Rotations drawn from a kernel to tell which share of it points a given way: so many in all, and a row.
 _TURNS, _LEAST_TURNS, _MOST_TURNS = 4_000_000, 8, 256
 #: ... taken from so many.
@@ -125,6 +126,8 @@ class Marginal:
     profiles : across, upward
     drawn : int
         Draws it was estimated from; 0 where it was computed.
+    outside : int
+        Rows far from all others, which the cells do not hold: see `far_rows`.
     """
 
     across_edges: Floats
@@ -137,6 +140,7 @@ class Marginal:
     passing: int
     profiles: tuple[Profile, Profile]
     drawn: int
+    outside: int
 
 
 def marginal(
@@ -150,7 +154,7 @@ def marginal(
 
     Under an isotropic kernel the projection is computed: every row has the share of its rotations that
     passes, and its position is smoothed by the kernel. A kernel whose position widths turn with the grasp is
-    drawn from instead.
+    drawn from instead. Cells hold all rows but a few that are far from all others.
 
     Parameters
     ----------
@@ -159,38 +163,41 @@ def marginal(
     """
     rng = np.random.default_rng(0)
     own = density.isotropic
+    sides = np.stack([plane.across, plane.upward], axis=1)
+    far = far_rows(own.positions @ sides, least=MARGIN * own.kernel.sigma_position_m)
     if own is density:
         p, q, w = own.positions, own.quaternions_xyzw, own.weights
         sigma, drawn = own.kernel.sigma_position_m, 0
         passing = int(orientation.holds(q).sum())
-        share = _passing_shares(own, orientation, rng)
+        share, inside = _passing_shares(own, orientation, rng), ~far
     else:
         passing = int(orientation.holds(own.quaternions_xyzw).sum())
         p, q, w = _drawn(density, rng)
         drawn = len(p)
-        share = orientation.holds(q).astype(np.float64)
+        share, inside = orientation.holds(q).astype(np.float64), np.repeat(~far, drawn // own.size)
         # Draws carry the kernel already: what is added only joins them.
         sigma = 0.2 * own.kernel.sigma_position_m
-    at = np.stack([p @ plane.across, p @ plane.upward])
-    edges = _edges(at, sigma)
+    at = (p @ sides).T
+    edges = _edges(at[:, inside], sigma)
     cell = float(edges[0][1] - edges[0][0])
-    weight = w * share
-    raw = _spread(at, weight, edges)
+    shown = w * share * inside
+    raw = _spread(at, shown, edges)
     # A weight shared between neighbouring cells is smoothed by a triangle of variance h^2 / 6 already.
     smooth = math.sqrt(max(sigma**2 - cell**2 / 6.0, 0.0)) / cell
     value = gaussian_filter(raw, smooth, mode="constant", truncate=5.0) / cell**2
-    total, profiles = _profiles(at, w, share, edges, smooth, rng, level)
+    total, profiles = _profiles(at, w, share, inside, edges, smooth, rng, level)
     return Marginal(
         across_edges=edges[0],
         upward_edges=edges[1],
         value=value,
-        share=float(weight.sum()),
+        share=float((w * share).sum()),
         share_low=total[0],
         share_high=total[1],
         rows=density.size,
         passing=passing,
         profiles=profiles,
         drawn=drawn,
+        outside=int(far.sum()),
     )
 
 
@@ -223,7 +230,7 @@ def _drawn(density: SearchedDensity, rng: np.random.Generator) -> tuple[Floats, 
 
 def _edges(at: Floats, sigma: float) -> tuple[Floats, Floats]:
     """Edges of square cells that hold every row and the reach of its kernel."""
-    low, high = at.min(axis=1) - _MARGIN * sigma, at.max(axis=1) + _MARGIN * sigma
+    low, high = at.min(axis=1) - MARGIN * sigma, at.max(axis=1) + MARGIN * sigma
     cell = max(float((high - low).max()) / _CELLS, 1e-6)
     counts = np.maximum(np.ceil((high - low) / cell - 1e-9).astype(int), 1)
     middle = 0.5 * (low + high)
@@ -255,6 +262,7 @@ def _profiles(
     at: Floats,
     w: Floats,
     share: Floats,
+    inside: NDArray[np.bool_],
     edges: tuple[Floats, Floats],
     smooth: float,
     rng: np.random.Generator,
@@ -277,9 +285,11 @@ def _profiles(
         last = np.minimum(lower + 1, cells - 1)
         table = np.zeros(groups * cells)
         for place, part in ((lower, 1.0 - upper), (last, upper)):
-            table += np.bincount(group * cells + place, weights=passed * part, minlength=len(table))
+            shown = passed * part * inside
+            table += np.bincount(group * cells + place, weights=shown, minlength=len(table))
         lines = (counts @ table.reshape(groups, cells)) / totals[:, None]
-        lines = gaussian_filter1d(lines, smooth, axis=1, mode="constant", truncate=5.0)
+        if smooth > 0.0:
+            lines = gaussian_filter1d(lines, smooth, axis=1, mode="constant", truncate=5.0)
         lines /= edges[axis][1] - edges[axis][0]
         low, high = np.quantile(lines[1:], [tail, 1.0 - tail], axis=0)
         middle = 0.5 * (edges[axis][1:] + edges[axis][:-1])

@@ -10,13 +10,14 @@ from scipy.spatial import ConvexHull, QhullError
 from graspdb.wire.base import Triple
 from graspdb.wire.reports import ProjectionOptions, ProjectionProfile, ProjectionReport
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_density.statistics.plane_marginal import Marginal, Orientation, Plane, marginal
+from graspdb_density.statistics.far_rows import far_rows
+from graspdb_density.statistics.plane_marginal import MARGIN, Marginal, Orientation, Plane, marginal
 from graspdb_geometry import meshes
 from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.trial_columns import Floats
+from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, interval
 
@@ -24,6 +25,8 @@ from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, i
 PLANES = {"xy": (0.0, 0.0, 1.0), "xz": (0.0, -1.0, 0.0), "yz": (1.0, 0.0, 0.0)}
 #: Fewer grasps than this make a picture, but no statement.
 _FEW = 50
+#: So many grasps far from the others are named.
+_NAMED = 5
 
 
 def projection_report(
@@ -36,7 +39,8 @@ def projection_report(
             "A projection needs at least 1 successful trial, and there is none: post trials"
             f" (POST /objects/{built.object_row.slug}/trials) or sweep a grid first",
         )
-    name, plane = _plane(options.plane, built.density.positions)
+    near = ~_far(built, np.eye(3))
+    name, plane = _plane(options.plane, built.density.positions[near])
     approach, direction = _vector(options.approach), _vector(options.direction)
     wanted = Orientation(
         approach=approach,
@@ -53,10 +57,10 @@ def projection_report(
             f"None of the {built.density.size:,} successful grasps points that way: widen approach_cone_deg"
             " or direction_cone_deg, or leave approach or direction out",
         )
-    few = found.passing < _FEW
+    away = np.flatnonzero(_far(built, np.stack([plane.across, plane.upward], axis=1)))
     report = ProjectionReport(
         **head(built),
-        warnings=[f"the picture rests on {found.passing:,} grasps: single ones show"] if few else [],
+        warnings=_warnings(built, found, away),
         kernel=built.kernel,
         grasps=built.density.size,
         passing=found.passing,
@@ -76,8 +80,39 @@ def projection_report(
         profiles=_profiles(found, plane),
         outline=_outline(inputs, built, plane),
         drawn=found.drawn,
+        outside=len(away),
     )
     return report.model_copy(update={"text": _text(report, found)})
+
+
+def _far(built: Built, sides: Floats) -> Bools:
+    """Which successful grasps lie far from all others along some axes (3, n), by the cells' own rule."""
+    assert built.density is not None
+    return far_rows(built.density.positions @ sides, least=MARGIN * built.density.kernel.sigma_position_m)
+
+
+def _warnings(built: Built, found: Marginal, away: Ints) -> list[str]:
+    """What to mind of the picture; ``away`` are the grasps outside it."""
+    assert built.density is not None
+    positions, width = built.density.positions, built.density.kernel.sigma_position_m
+    warnings = []
+    if found.passing < _FEW:
+        warnings.append(f"the picture rests on {found.passing:,} grasps: single ones show")
+    if len(away):
+        distance = np.linalg.norm(positions[away] - np.median(positions, axis=0), axis=1)
+        lie, trials = ("lies", "trial") if len(away) == 1 else ("lie", "trials")
+        named = ", ".join([*map(str, built.seq[away[:_NAMED]]), *(["..."] if len(away) > _NAMED else [])])
+        warnings.append(
+            f"{len(away):,} of {len(positions):,} successful grasps {lie} up to {distance.max():.3g} m from"
+            f" the middle of all, outside the picture ({trials} {named}): posted in another unit, perhaps"
+        )
+    cell = float(found.across_edges[1] - found.across_edges[0])
+    if cell > width and not found.drawn:
+        warnings.append(
+            f"the grasps lie so far apart that a cell of the picture, {1e3 * cell:.0f} mm, is wider than the"
+            f" kernel, {1e3 * width:.1f} mm: it shows single grasps as squares"
+        )
+    return warnings
 
 
 def _plane(given: str | Triple | None, positions: Floats) -> tuple[str, Plane]:
