@@ -7,10 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from degenerate_trials import KINDS
 from graspdb_density import IsotropicKernel, se3
 from graspdb_density.bandwidth.component_count import mixture_curve
-from graspdb_density.bandwidth.mixture_fit import Displacements
+from graspdb_density.bandwidth.mixture_fit import Displacements, displacements
 from graspdb_density.kde.bhattacharyya import DisplacementWindow
+from graspdb_density.kde.rows import Rows
 
 COMPONENTS = IsotropicKernel(0.005, math.radians(6.0))
 WINDOW = DisplacementWindow(0.06, math.radians(90.0))
@@ -65,3 +67,19 @@ def test_weights_decide_what_counts() -> None:
         fitted=1_000, reference=1_500,
     )  # fmt: skip
     assert found[1].value == pytest.approx(0.985, abs=0.015)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_displacements_that_fill_no_volume_have_a_curve(kind: str) -> None:
+    rows = Rows.of(KINDS[kind](40, np.random.default_rng(0)).poses)
+    found = displacements(rows, window=WINDOW, rng=np.random.default_rng(1))
+    if len(found.vectors) < 10:
+        assert kind in ("two trials", "huge")
+        return
+    sizes = {"reference": 300, "fitted": 100, "points": 400}
+    rng = np.random.default_rng(2)
+    curve = mixture_curve(found, components=COMPONENTS, window=WINDOW, rng=rng, counts=(1, 2, 4), **sizes)
+    assert all(0.0 <= found.value <= 1.0 and found.standard_error >= 0.0 for found in curve.values())
+    if kind in ("identical", "tiny"):
+        assert curve[1].value == pytest.approx(1.0, abs=1e-3)

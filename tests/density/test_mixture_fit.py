@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from degenerate_trials import KINDS
 from graspdb_density import IsotropicKernel, se3
-from graspdb_density.bandwidth.mixture_fit import displacements, fit_kernel
+from graspdb_density.bandwidth.mixture_fit import displacements, fit_kernel, mixture_parts
 from graspdb_density.kde.bhattacharyya import DisplacementWindow
 from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
@@ -141,3 +142,19 @@ def test_too_little_is_said_with_numbers() -> None:
             widths=NARROW,
             compared=COMPARED,
         )
+
+
+@pytest.mark.parametrize("kind", ["planar", "one rotation", "one position", "identical", "two poses", "tiny"])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_does_not_spread_has_a_floor(kind: str) -> None:
+    """Successes that differ along some axes only: Gaussians as wide as a component along the others."""
+    rows = Rows.of(KINDS[kind](60, np.random.default_rng(0)).poses)
+    found = displacements(rows, window=WINDOW, rng=np.random.default_rng(1))
+    for count in (1, 2, 5):
+        _, means, covariances = mixture_parts(found.vectors, count, found.weights)
+        assert np.isfinite(means).all()
+        assert np.linalg.eigvalsh(covariances).min() > -1e-12
+    kernel = fit_kernel(rows, window=WINDOW, widths=NARROW, compared=COMPARED, components=2).kernel
+    assert np.isfinite(kernel.log_peaks).all()
+    # Scaled by no less than the least factor.
+    assert np.sqrt(np.diagonal(kernel.covariances, axis1=1, axis2=2)[:, :3]).min() > 0.001

@@ -110,3 +110,9 @@ def test_errors_fall_with_the_number_of_grasps(shell: Shell) -> None:
         score_widths(Rows.of(Poses.of(*rows))),
     )
     assert np.mean([item.error for item in many]) < np.mean([item.error for item in few])
+
+
+def test_where_no_block_can_be_left_out_the_default_stays() -> None:
+    p, q = np.tile([0.0, 0.0, 0.05], (400, 1)), np.tile([1.0, 0.0, 0.0, 0.0], (400, 1))
+    choice = choose_widths(Rows.of(Poses.of(p, q)))
+    assert (choice.kernel, choice.rule, choice.rows) == (DEFAULT_KERNEL, "default", 400)

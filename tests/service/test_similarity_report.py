@@ -44,3 +44,6 @@ def test_the_curve_its_window_and_what_is_missing(
     assert narrow.status_code == 409
     assert "widen window_position_m" in narrow.json()["title"]
     assert http.get(PATH + "?window_position_m=0").status_code == 422
+    wide = http.get(PATH + "?window_position_m=0.004&component_position_m=0.2")
+    assert (wide.status_code, wide.json()["type"].rpartition(":")[2]) == (409, "window-too-narrow")
+    assert "narrow the components" in wide.json()["title"]

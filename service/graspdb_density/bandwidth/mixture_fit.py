@@ -49,10 +49,15 @@ LEAST_SUCCESSES, LEAST_DISPLACEMENTS = 50, 200
 _TRIED_COMPONENTS, _GIVEN_UP, _WORTH = (1, 2, 3, 4, 6, 8, 12, 16), 2, 0.02
 _FACTORS = tuple(float(f) for f in np.geomspace(0.3, 1.7, 9))
 _ITERATIONS, _ENOUGH = 60, 1e-5
+#: Share of all that a component stands for at least: what none is near keeps its place.
+_LEAST_MASS = 1e-12
 #: Successes that displacements start from, and displacements from one, drawn at random and weighted for the
 #: rest.
 _STARTS_MOST, _EACH_MOST = 2_000, 200
 _FITTED_MOST, _SCALED_MOST, _JUDGED_MOST = 8_000, 5_000, 600
+#: What a fitted Gaussian spreads at least, of all displacements, and in metres and radians where those do not
+#: spread at all along or about some axis: all grasps from one height, or at one rotation.
+_LEAST_OF_ALL, _LEAST_SPREAD = 1e-3, np.repeat([1e-5, 1e-4], 3)
 #: Share of a uniform density mixed in, so that a grasp without neighbours counts as an outlier and no more.
 _UNIFORM_SHARE = 1e-3
 _SAMPLES = 900
@@ -413,11 +418,12 @@ def _expectation_maximisation(
 ) -> tuple[Floats, Floats, Floats]:
     """A mixture of mirrored pairs: component c stands for N(m, S) and N(A m, A S A) with half its weight."""
     a = mirror("gripper")
-    floor = 1e-3 * np.diag(np.diag(second))
+    floor = np.diag(np.maximum(_LEAST_OF_ALL * np.diag(second), _LEAST_SPREAD**2))
     weights = np.full(count, 1.0 / count)
     # Nested to begin with, and apart along the widest direction.
     scales = np.geomspace(0.3, 1.5, count)
-    widest = np.linalg.eigh(second)[1][:, -1] * math.sqrt(np.linalg.eigvalsh(second)[-1])
+    values, vectors = np.linalg.eigh(second)
+    widest = vectors[:, -1] * math.sqrt(max(values[-1], 0.0))
     means = np.linspace(0.0, 0.5, count)[:, None] * widest
     covariances = scales[:, None, None] * second + floor
     both = np.stack([x, x * a])
@@ -429,7 +435,7 @@ def _expectation_maximisation(
         logs = np.log(weights) - 0.5 * logdet - 0.5 * np.einsum("snci,cij,sncj->snc", off, inverse, off)
         total = logsumexp(logs, axis=(0, 2))
         share = np.exp(logs - total[None, :, None]) * v[None, :, None]
-        mass = share.sum(axis=(0, 1))
+        mass = np.maximum(share.sum(axis=(0, 1)), _LEAST_MASS * v.sum())
         means = np.einsum("snc,sni->ci", share, both) / mass[:, None]
         off = both[:, :, None, :] - means
         covariances = np.einsum("snc,snci,sncj->cij", share, off, off) / mass[:, None, None] + floor

@@ -57,7 +57,8 @@ class WidthChoice:
     rule
         ``default`` or ``leave-one-block-out``.
     rows
-        Rows the choice was made from, the first ones in commit order.
+        Rows the choice was made from, the first ones in commit order; by default from none, or from rows of
+        which none could be left out.
     log_likelihood
         Mean held-out log density, nats of 1/(m^3 rad^3), nan for the default.
     """
@@ -81,17 +82,20 @@ def widths_prefix(count: int) -> int:
 
 
 def choose_widths(rows: Rows, *, threads: int = 1) -> WidthChoice:
-    """Choose widths for N grasps in commit order."""
+    """Choose widths for N grasps in commit order; by default where all lie in one block of every width."""
     count = widths_prefix(len(rows))
     if count == 0:
         return WidthChoice(DEFAULT_KERNEL, "default", 0, math.nan)
     first = rows[:count]
     best: tuple[float, IsotropicKernel] | None = None
     for kernel, held, values in _scored(first, threads):
-        value = float(np.average(values, weights=first.weights[held])) if held.size else -math.inf
+        if not held.size:
+            continue
+        value = float(np.average(values, weights=first.weights[held]))
         if best is None or value > best[0]:
             best = value, kernel
-    assert best is not None
+    if best is None:
+        return WidthChoice(DEFAULT_KERNEL, "default", count, math.nan)
     return WidthChoice(best[1], "leave-one-block-out", count, best[0])
 
 

@@ -363,8 +363,8 @@ def assign_blocks(positions: ArrayLike, *, edge_m: float, folds: int = 5, seed: 
     sizes = np.bincount(block)
     if len(sizes) < 2:
         raise ValueError(
-            f"all positions lie in one block of {edge_m:g} m: held-out checks need smaller blocks or "
-            "positions further apart"
+            f"all positions lie in one block of {edge_m:g} m: held-out checks need smaller blocks (a "
+            "narrower kernel) or positions further apart"
         )
     made = min(folds, len(sizes))
     filled = np.zeros(made, dtype=np.int64)

@@ -324,6 +324,8 @@ def _choose(grasps: Grasps, proposal: Floats, count: int, threads: int) -> Kerne
     rows = Rows.of(grasps.poses[first], weights, grasps.symmetric[first])
     found = choose_widths(rows, threads=threads)
     rule = f"default: {found.rule} likelihood of the first {found.rows} successes"
+    if found.rule == "default":
+        rule = f"default: the first {found.rows} successes lie in one block, so that none can be left out"
     return stored_kernel.isotropic_info(found.kernel, rule)
 
 

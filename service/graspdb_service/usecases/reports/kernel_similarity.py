@@ -18,12 +18,15 @@ from graspdb_density.bandwidth.mixture_fit import (
 )
 from graspdb_density.kde.bhattacharyya import Coefficient, DisplacementWindow, sampled_kernel_curve
 from graspdb_density.kde.weighted_sums import Progress
-from graspdb_service.problems import too_few_trials
+from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.reports.common import ReportInputs, head
 
 #: Displacements that stand for the full statistics, and what the paper limits a kernel to.
 _REFERENCE, _PAPER = 20_000, 900
+#: Root mean squares of displacements that are none but for rounding, metres and radians, and the axes' names.
+_LEAST_SPREAD = np.repeat([1e-6, 1e-6], 3)
+_AXES = ("along x", "along y", "along z", "about x", "about y", "about z")
 
 
 def kernel_similarity_report(
@@ -33,6 +36,41 @@ def kernel_similarity_report(
     widths = IsotropicKernel(options.component_position_m, math.radians(options.component_rotation_deg))
     found = _displacements(built, window)
     progress(0.1)
+    try:
+        samples, mixtures = _curves(found, window, widths, inputs.threads, progress)
+    except ValueError as error:
+        raise conflict(
+            "window-too-narrow",
+            f"Kernels with components this wide can't be compared inside the window ({error}): widen the"
+            " window or narrow the components",
+        ) from None
+    report = KernelSimilarityReport(
+        **head(built),
+        warnings=_warnings(found),
+        **options.model_dump(exclude=set(TrialSelection.model_fields)),
+        successes=built.selected.successes,
+        displacements=len(found.vectors),
+        reference=min(_REFERENCE, len(found.vectors)),
+        samples=[_point(*item) for item in samples.items()],
+        mixtures=[_point(*item) for item in mixtures.items()],
+    )
+    return report.model_copy(update={"text": _text(report, window, widths)})
+
+
+def _curves(
+    found: Displacements,
+    window: DisplacementWindow,
+    widths: IsotropicKernel,
+    threads: int,
+    progress: Progress,
+) -> tuple[dict[int, Coefficient], dict[int, Coefficient]]:
+    """Similarity of sampled kernels, and of mixtures, to all displacements.
+
+    Raises
+    ------
+    ValueError
+        Where a kernel has next to nothing inside the window.
+    """
     rng = np.random.default_rng(0)
     share = found.weights / found.weights.sum()
     kept = rng.choice(len(share), size=min(2 * _REFERENCE, len(share)), replace=False, p=share)
@@ -42,7 +80,7 @@ def kernel_similarity_report(
         window=window,
         rng=rng,
         reference=_REFERENCE,
-        threads=inputs.threads,
+        threads=threads,
     )
     progress(0.4)
     mixtures = mixture_curve(
@@ -51,19 +89,10 @@ def kernel_similarity_report(
         window=window,
         rng=rng,
         reference=_REFERENCE,
-        threads=inputs.threads,
+        threads=threads,
         progress=lambda done: progress(0.4 + 0.6 * done),
     )
-    report = KernelSimilarityReport(
-        **head(built),
-        **options.model_dump(exclude=set(TrialSelection.model_fields)),
-        successes=built.selected.successes,
-        displacements=len(found.vectors),
-        reference=min(_REFERENCE, len(found.vectors)),
-        samples=[_point(*item) for item in samples.items()],
-        mixtures=[_point(*item) for item in mixtures.items()],
-    )
-    return report.model_copy(update={"text": _text(report, window, widths)})
+    return samples, mixtures
 
 
 def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
@@ -82,6 +111,20 @@ def _displacements(built: Built, window: DisplacementWindow) -> Displacements:
             " window_rotation_deg, or add trials",
         )
     return found
+
+
+def _warnings(found: Displacements) -> list[str]:
+    """Along and about which of the gripper's axes no success differs from another."""
+    spread = np.sqrt(np.average(found.vectors**2, axis=0, weights=found.weights))
+    if not (spread >= _LEAST_SPREAD).any():
+        return ["all successes inside the window are at one pose: one Gaussian is like any of their kernels"]
+    names = [name for name, at, least in zip(_AXES, spread, _LEAST_SPREAD, strict=True) if at < least]
+    if not names:
+        return []
+    return [
+        f"no success differs from another {', '.join(names)} of the gripper: nothing is said of how kernels"
+        " are like each other there"
+    ]
 
 
 def _point(count: int, found: Coefficient) -> SimilarityPoint:
