@@ -138,3 +138,24 @@ def test_bad_arguments_are_refused() -> None:
         expected(density.density, samples=0)
     with pytest.raises(ValueError, match="the score answered shape"):
         ModeSearch(density).maxima(score=lambda poses: np.zeros(1 + len(poses)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-8])
+def test_of_equal_scores_the_densest_is_best(noise: float) -> None:
+    """A score that is flat but for rounding: the density's maximum, told with the score itself."""
+    rng = np.random.default_rng(0)
+    p = rng.normal(size=(60, 3)) * 0.004 + [0.02, -0.01, 0.05]
+    q = se3.from_rotation_vector(rng.normal(size=(60, 3)) * 0.05)
+    density = GraspDensity.build(Poses.of(p, q), kernel=KERNEL)
+    search = ModeSearch(density)
+
+    def score(poses: Poses) -> se3.Floats:
+        # Rounding that has its own favourites.
+        return np.asarray(0.75 + noise * np.sin(1e4 * poses.positions.sum(axis=1)))
+
+    (found,) = search.maxima(score=score, resolution=1e-5)
+    assert found.log_density == pytest.approx(search.global_maximum().log_density, abs=0.01)
+    assert found.score == pytest.approx(0.75, abs=2.0 * noise)
+    several = search.maxima(score=score, resolution=1e-5, count=3)
+    logs = [item.log_density for item in several]
+    assert logs == sorted(logs, reverse=True)

@@ -8,15 +8,25 @@ evolution strategies that learn how the score falls off.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from cmaes import CMA
 
 from .. import se3
 from ..se3 import Floats, Poses
-from .multi_start import Indices, MultiStart
-from .scored_poses import Admissible, Bools, Maximum, Pull, Score, ScoredPoses, Separation, distinct_from
+from .multi_start import REACH, Indices, MultiStart
+from .scored_poses import (
+    Admissible,
+    Bools,
+    Maximum,
+    Pull,
+    Score,
+    ScoredPoses,
+    Separation,
+    distinct_from,
+    ranked_by_density_where_flat,
+)
 
 __all__ = ["EvolutionSearch"]
 
@@ -34,6 +44,8 @@ _RUNNER_UP, _RUNNERS_UP = ((1, 20),), 8
 #: Draws around centres in reach, and how many of them may join the starts: where the nearest poses of centres
 #: are refused, others may not be.
 _DRAWN, _JOINING = 2048, 64
+#: As many equal scores, the highest of those that random search passed, make a plateau.
+_FLAT = 16
 #: Steps in kernel widths.
 _FIRST_STEP, _LAST_STEP = 0.6, 0.4
 
@@ -56,27 +68,38 @@ class EvolutionSearch(MultiStart):
         Nearly the score but faster: ranks starts and leads the random search.
     pull
         Brings poses nearer to where they are admissible; random steps end where it puts them.
+    resolution
+        See `ranked_by_density_where_flat`; the density is the isotropic one that is started from, asked only
+        where the best scores of the random search are equal.
     """
 
     score: Score
     rough: Score
     pull: Pull | None
+    resolution: float = 0.0
+    flat: bool = field(default=False, init=False)
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
         """The best distinct grasps."""
         starts = self.all_starts(max(_CANDIDATES, 3 * count), count, separation)
         if not len(starts):
             return []
+        passed = self.random_search(starts)
+        self.flat = self.is_flat(passed.scores)
+        if self.flat:
+            passed = ScoredPoses(passed.poses, self.told_apart(passed.scores, passed.poses)).ranked()
         # More than are wanted: those that go on drive out others on their way.
-        best = self.choose(self.random_search(starts), max(2 * count, _FINALISTS), separation)
-        best = ScoredPoses(best.poses, self.values(self.score, best.poses)).ranked()
+        best = self.choose(passed, max(2 * count, _FINALISTS), separation)
+        scores = self.told_apart(self.values(self.score, best.poses), best.poses)
+        best = ScoredPoses(best.poses, scores).ranked()
         best = ScoredPoses.joined(best, self.evolve(best, _PLAN)).ranked()
         best = self.choose(best, count, separation)
         for place in range(1, min(len(best), _RUNNERS_UP)):
             others = best.poses[np.arange(len(best)) != place]
             apart = distinct_from(others, separation, twins=self.twins)
             best.put(place, self.evolve(best[place : place + 1], _RUNNER_UP, apart), 0)
-        return self.maxima(best, best.scores)
+        best = best.ranked()
+        return self.maxima(best, self.values(self.score, best.poses) if self.flat else best.scores)
 
     def values(self, score: Score, poses: Poses) -> Floats:
         """A score at poses (K,)."""
@@ -84,6 +107,18 @@ class EvolutionSearch(MultiStart):
         if values.shape != (len(poses),):
             raise ValueError(f"the score answered shape {values.shape} for {len(poses)} poses")
         return values
+
+    def is_flat(self, scores: Floats) -> bool:
+        """Whether the best of some scores (K,) differ by less than means anything."""
+        return len(scores) >= _FLAT and bool(np.ptp(np.partition(scores, -_FLAT)[-_FLAT:]) < self.resolution)
+
+    def told_apart(self, scores: Floats, poses: Poses) -> Floats:
+        """What poses (K,) are ranked by: their scores, and the density where those are flat."""
+        if not self.flat or not len(poses):
+            return scores
+        sums = self.density.kernel_sums(poses, cutoff=REACH, threads=self.threads)
+        logs = np.log(np.maximum(sums, np.finfo(np.float64).tiny))
+        return ranked_by_density_where_flat(scores, logs, float(self.ranking.centres[0, 7]), self.resolution)
 
     # -- starts
 
@@ -199,5 +234,5 @@ class EvolutionSearch(MultiStart):
                 allowed[allowed] = refuses(poses[allowed])
         values = np.full(len(poses), -np.inf)
         if allowed.any():
-            values[allowed] = self.values(self.score, poses[allowed])
+            values[allowed] = self.told_apart(self.values(self.score, poses[allowed]), poses[allowed])
         return ScoredPoses(poses, values)

@@ -109,6 +109,7 @@ class ModeSearch:
         score: Score | None = None,
         rough: Score | None = None,
         pull: Pull | None = None,
+        resolution: float = 0.0,
         threads: int = 1,
     ) -> list[Maximum]:
         """The ``count`` best distinct grasps, best first; fewer where there are no more, none where no centre
@@ -124,8 +125,8 @@ class ModeSearch:
             Called with K poses, answers (K,) bool. Never is a pose returned that it refused.
         score
             What is best. None: the density.
-        rough, pull
-            See `EvolutionSearch`.
+        rough, pull, resolution
+            See `EvolutionSearch`; where the density is best they say nothing.
         threads
 
         Raises
@@ -147,7 +148,7 @@ class ModeSearch:
         if climbing:
             return MeanShiftSearch(*common).run(count, separation)
         score = score or log_density
-        return EvolutionSearch(*common, score, rough or score, pull).run(count, separation)
+        return EvolutionSearch(*common, score, rough or score, pull, resolution).run(count, separation)
 
     def global_maximum(self, threads: int = 1) -> Maximum:
         """The highest point of the whole density, computed once."""

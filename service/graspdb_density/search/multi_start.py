@@ -218,12 +218,12 @@ class MultiStart:
         return ends, moved
 
     def maxima(self, best: ScoredPoses, scores: Floats | None = None) -> list[Maximum]:
-        """The answer, best first by ``scores``, or by log density."""
+        """The answer, best first by log density; in the order given where ``scores`` are told instead."""
         if not len(best):
             return []
         logs = self.log_density(best.poses)
+        order = np.argsort(-logs, kind="stable") if scores is None else np.arange(len(best))
         scores = logs if scores is None else scores
-        order = np.argsort(-scores, kind="stable")
         p, q = best.poses.positions[order], se3.canonical(best.poses.quaternions_xyzw[order])
         return [
             Maximum(p[i], q[i], float(logs[row]), self.region.active(p[i], q[i]), float(scores[row]))

@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from .. import se3
 from ..se3 import Floats, Poses
 
-__all__ = ["Admissible", "Maximum", "Pull", "Score", "ScoredPoses", "Separation", "distinct_from"]
+__all__ = [
+    "Admissible",
+    "Maximum",
+    "Pull",
+    "Score",
+    "ScoredPoses",
+    "Separation",
+    "distinct_from",
+    "ranked_by_density_where_flat",
+]
 
 Bools = NDArray[np.bool_]
 #: Whether poses are free of what a region can't express, collisions for one: (K,) bool.
@@ -22,6 +31,8 @@ Admissible = Callable[[Poses], Bools]
 Score = Callable[[Poses], Floats]
 #: Moves poses.
 Pull = Callable[[Poses], Poses]
+#: Densities this many e-folds below the highest are as low as any where they decide between equal scores.
+_DEEPEST = 30.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -87,6 +98,26 @@ class ScoredPoses:
         self.poses.positions[rows] = other.poses.positions[others]
         self.poses.quaternions_xyzw[rows] = other.poses.quaternions_xyzw[others]
         self.scores[rows] = other.scores[others]
+
+
+def ranked_by_density_where_flat(
+    scores: Floats, log_density: Floats, highest: float, resolution: float
+) -> Floats:
+    """What scores (K,) are ranked by, so that of equal ones the densest is best.
+
+    Around a pose tried again and again a success probability is the same everywhere but for rounding, which
+    must not choose.
+
+    Parameters
+    ----------
+    log_density : (K,)
+        In the unit of ``highest``, which is about the highest there is.
+    resolution : float
+        Differences of scores that mean nothing: what an e-fold of density is worth. 0: scores rank alone.
+    """
+    if not resolution:
+        return scores
+    return np.asarray(scores - resolution * np.minimum(highest - log_density, _DEEPEST))
 
 
 def distinct_from(poses: Poses, separation: Separation, *, twins: bool) -> Admissible:

@@ -20,6 +20,8 @@ from graspdb_service.usecases.grasps.search import ScoreSearch
 
 #: Draws of the noise that a mean is taken over, and while searching.
 _NOISE_DRAWS, _FEW_DRAWS = 256, 16
+#: Differences of a success probability that mean nothing.
+_RESOLUTION = 1e-5
 
 
 def by_density(search: ModeSearch, threads: int) -> tuple[ScoreSearch, Ranking]:
@@ -35,7 +37,7 @@ def by_success(
     rough = score if model.quick is model.whole else success_score(model.quick, "low", test, threads)
     told = f"lower end of the success probability's {LEVEL:.0%} interval"
     ranking = Ranking(objective="success_probability", score=told)
-    return ScoreSearch(search, threads, score, rough, pull), ranking
+    return ScoreSearch(search, threads, score, rough, pull, _RESOLUTION), ranking
 
 
 def by_mean(
@@ -75,7 +77,8 @@ def by_mean(
             **told,
         }
     )
-    return ScoreSearch(search, threads, score, rough, pull), ranking
+    resolution = 0.0 if averaged == "density" else _RESOLUTION
+    return ScoreSearch(search, threads, score, rough, pull, resolution), ranking
 
 
 def success_score(

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from graspdb_density import Maximum, ModeSearch, Region, Separation, se3
 from graspdb_density.se3 import Poses
-from graspdb_density.search.scored_poses import Admissible, Pull, Score, distinct_from
+from graspdb_density.search.scored_poses import (
+    Admissible,
+    Pull,
+    Score,
+    distinct_from,
+    ranked_by_density_where_flat,
+)
 from graspdb_service.trial_columns import Floats
 
 #: Poses shown to the collision test at a time while looking for the nearest admissible one.
@@ -48,7 +54,8 @@ class Engine(Protocol):
 @dataclass(frozen=True, eq=False)
 class ScoreSearch:
     """Where a score is highest, from the density's centres; without one the density's own modes, that of
-    successes or a prior. ``rough`` is nearly the score and much faster.
+    successes or a prior. ``rough`` is nearly the score and much faster. Differences of scores below
+    ``resolution`` mean nothing: there the density decides.
     """
 
     search: ModeSearch
@@ -56,6 +63,7 @@ class ScoreSearch:
     score: Score | None = None
     rough: Score | None = None
     pull: Pull | None = None
+    resolution: float = 0.0
 
     def best(self, bounds: Bounds) -> list[Maximum]:
         return self.search.maxima(
@@ -66,6 +74,7 @@ class ScoreSearch:
             score=self.score,
             rough=self.rough,
             pull=self.pull,
+            resolution=self.resolution,
             threads=self.threads,
         )
 
@@ -99,7 +108,9 @@ class CandidateRanking:
         logs, scores = self.scored(poses)
         twins = bool(self.by.search.centres.symmetric.all())
         chosen: list[int] = []
-        for i in np.argsort(-scores, kind="stable"):
+        highest = float(logs.max()) if np.isfinite(logs).any() else 0.0
+        ranks = ranked_by_density_where_flat(scores, logs, highest, self.by.resolution)
+        for i in np.argsort(-ranks, kind="stable"):
             if len(chosen) == bounds.count:
                 break
             if self.separated and chosen:
