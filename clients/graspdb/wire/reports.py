@@ -207,8 +207,8 @@ class AnisotropyTolerance(Response):
     """Whether it has at the smallest displacement tried, which ``half_width`` then is."""
     tried: tuple[float, float] | None = None
     """The farthest displacements that a pair of trials had, the others nearly unchanged, towards minus (0 or
-    less) and plus (0 or more), as far as was looked at, in ``unit``; 0 where nothing was tried that way.
-    ``half_width``, ``minus`` and ``plus`` do not go beyond."""
+    less) and plus (0 or more), as far as was looked at, in ``unit``; 0 where nothing was tried that way, null
+    in a report of an earlier version. ``half_width``, ``minus`` and ``plus`` do not go beyond."""
     displacement: list[float]
     """Displacements of the profile, in ``unit``."""
     probability: list[float]
