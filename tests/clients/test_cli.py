@@ -292,12 +292,9 @@ def test_a_gripper_as_shown_can_be_created_again(
 
 
 def test_a_sweep_says_what_it_waits_for(run: Run, fresh_id: str, tmp_path: Path) -> None:
-    """Two balls that overlap are not convex: a worker has to make their parts first."""
-    balls = trimesh.util.concatenate(
-        [trimesh.creation.icosphere(1, 0.02).apply_translation((x, 0, 0)) for x in (-0.015, 0.015)]
-    )
-    balls.export(tmp_path / "balls.stl")
-    run("objects", "create", fresh_id, "--mesh", str(tmp_path / "balls.stl"), "--mass-kg", "0.1")
+    """A ring is not convex: a worker has to make its parts first."""
+    trimesh.creation.annulus(0.02, 0.03, 0.02).export(tmp_path / "ring.stl")
+    run("objects", "create", fresh_id, "--mesh", str(tmp_path / "ring.stl"), "--mass-kg", "0.1")
     code, out, err = run("sweep", fresh_id, "--max-poses", "100")
     assert code == 0, err
     (waiting,) = [line for line in out.splitlines() if line.startswith("waits for")]
