@@ -13,7 +13,8 @@ from .search.mode_search import ModeSearch
 from .search.pose_noise import PoseNoise, expected
 from .search.region import Region
 from .search.scored_poses import Maximum, Separation
-from .success.kernel_regression import SuccessEstimate, SuccessModel
+from .success.kernel_regression import NearestAttempts, SuccessEstimate, SuccessModel
+from .success.reach import Reach, validate_reach
 
 __all__ = [
     "DEFAULT_KERNEL",
@@ -25,7 +26,9 @@ __all__ = [
     "Maximum",
     "MixtureDensity",
     "ModeSearch",
+    "NearestAttempts",
     "PoseNoise",
+    "Reach",
     "Region",
     "SampledKernel",
     "Separation",
@@ -37,5 +40,6 @@ __all__ = [
     "expected",
     "importance_weights",
     "se3",
+    "validate_reach",
     "widths_prefix",
 ]

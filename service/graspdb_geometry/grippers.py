@@ -7,7 +7,7 @@ Tool frame: z is the approach, y the closing direction, the origin midway betwee
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -101,6 +101,20 @@ class GripperShape:
         opening = self._checked_opening(opening_m)
         half_extents = np.array([self.finger_width_m / 2, opening / 2, self.finger_length_m / 2])
         return half_extents, np.array([0.0, 0.0, self.tip_offset_m - self.finger_length_m / 2])
+
+    def slimmer(self, margin_m: float) -> GripperShape:
+        """The same with the fingers' pads smaller by a margin at either side and at the tip, metres.
+
+        That is at most a quarter of a pad's width, and half of what the tips are ahead of the tool origin.
+        What lies between these fingers is more than grazed by the others.
+        """
+        margin = min(margin_m, self.finger_width_m / 4, self.tip_offset_m / 2)
+        return replace(
+            self,
+            finger_width_m=self.finger_width_m - 2 * margin,
+            finger_length_m=self.finger_length_m - margin,
+            tip_offset_m=self.tip_offset_m - margin,
+        )
 
     def _checked_opening(self, opening_m: float | None) -> float:
         opening = self.max_opening_m if opening_m is None else float(opening_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -220,6 +221,38 @@ def test_a_trial_is_withdrawn_and_corrected(run: Run, fresh_id: str, trials_file
     }
     assert run("trials", "correct", fresh_id, "7")[0] == 2
     assert run("trials", "withdraw", fresh_id, "777")[0] == 1
+
+
+def test_no_probability_is_shown_without_its_interval_and_trials(
+    run: Run, fresh_id: str, tmp_path: Path, clusters: Callable[..., np.ndarray]
+) -> None:
+    poses = clusters([([0, 0, 0.06], [1, 0, 0, 0])], 80)
+    path = tmp_path / "tried.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["x", "y", "z", "qx", "qy", "qz", "qw", "outcome"])
+        rows = enumerate(poses.tolist())
+        writer.writerows([*row, "success" if place % 3 else "slipped"] for place, row in rows)
+    run("objects", "create", fresh_id)
+    run("trials", "add", fresh_id, str(path))
+    told = re.compile(r"\d\.\d\d \(\d\.\d\d to \d\.\d\d\), \d+\.\d trials")
+    for count in ("1", "2"):
+        out = run("best-grasp", fresh_id, "--count", count, "--min-separation-m", "0.005")[1]
+        assert "success probability" in out
+        assert len(told.findall(out)) == int(count)
+    out = run("likelihood", fresh_id, "--pose", "0,0,0.06,1,0,0,0")[1]
+    assert told.search(out)
+    # From the side nothing was tried: no probability, and why.
+    side = ("--approach", "1,0,0", "--approach-cone-deg", "20")
+    out = run("best-grasp", fresh_id, *side)[1]
+    assert "unknown: the nearest attempt is" in " ".join(out.split())
+    assert not told.search(out)
+    code, out, err = run("likelihood", fresh_id, "--pose", "0,0,0.06,0,0.7071068,0,0.7071068")
+    assert code == 0
+    assert "unknown" in out
+    assert "from the nearest attempt" in " ".join(err.split())
+    assert run("best-grasp", fresh_id, *side, "--min-success-probability", "0.1")[0] == 1
+    assert "nearest attempt" in run("samples", fresh_id, "--seed", "1")[1]
 
 
 def test_no_grasp_is_one_message_and_exit_code_1(run: Run, fresh_id: str, trials_file: str) -> None:

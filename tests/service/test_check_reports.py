@@ -183,7 +183,7 @@ def test_calibration_judges_grasps_that_were_simulated_again(filled: httpx.Clien
     assert (again["grasps"], again["successes"]) == (200, won)
     assert again["rate"]["low"] < won / 200 < again["rate"]["high"]
     assert sum(item["count"] for item in again["bins"]) == 200
-    # Predictions are those that queries answer.
+    # Predictions are those that queries answer, which tell none where nothing near was tried.
     answer = ok(
         http.post(
             "/objects/thing/likelihood",
@@ -193,7 +193,9 @@ def test_calibration_judges_grasps_that_were_simulated_again(filled: httpx.Clien
             },
         )
     )
-    assert again["predicted"] == pytest.approx(np.mean(answer["success_probability"]), abs=2e-3)
+    told = [chance for chance in answer["success_probability"] if chance is not None]
+    assert len(told) > 150
+    assert again["predicted"] == pytest.approx(np.mean(told), abs=2e-3 if len(told) == 200 else 0.05)
     assert f"Simulated again, {won} of 200 given grasps succeed" in body["text"]
     png = http.get(PATH + "calibration", headers={"Accept": "image/png"})
     assert png.content.startswith(b"\x89PNG")

@@ -24,10 +24,18 @@ from graspdb.cli.common import (
 from graspdb.cli.options import Numbers, vector_option
 from graspdb.cli.wording import in_commands
 from graspdb.errors import Infeasible
-from graspdb.figures.style import widths
+from graspdb.figures.style import number, widths
 from graspdb.files.trials import read_poses
 from graspdb.poses import as_poses
-from graspdb.resources.results import Grasp, Grasps, SampledPoses, pose_columns
+from graspdb.resources.results import (
+    Grasp,
+    Grasps,
+    LikelihoodArrays,
+    SampledPoses,
+    SupportArrays,
+    chance,
+    pose_columns,
+)
 from graspdb.resources.selection import Constraints, Selection
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
@@ -106,20 +114,28 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
         f"{frame}approach": lambda g: numbers(_matrix(g, in_world)[:3, 2], digits=2),
         "density": lambda g: f"{g.density:.4g}",
         "relative": lambda g: f"{g.relative:.3f}",
-        "success probability": lambda g: g.chance(),
+        "success probability": lambda g: "unknown" if g.success_probability is None else g.chance(),
+        "by geometry": lambda g: number(g.prior_success_probability),
+        "nearest attempt": _nearest,
         "score": lambda g: None if g.score is None else f"{g.score:.4g}",
         "simulated": lambda g: g.simulated,
     }
     ranked_by = _ranked_by(found)
     if not ranked_by:
         del columns["score"]
-    if all(g.success_probability is None for g in found):
-        del columns["success probability"]
     if found[0].simulated is None:
         del columns["simulated"]
+    if all(g.support is None for g in found):
+        del columns["success probability"]
+    if all(_nearest(g) is None for g in found):
+        del columns["nearest attempt"]
+    if all(g.prior_success_probability is None for g in found):
+        del columns["by geometry"]
     show_table(found, columns, empty="No grasp.")
     if found.ranking is not None and ranked_by:
         ERRORS.print(f"The score that they are ranked by is the {found.ranking.score}.", soft_wrap=True)
+    if found.reach is not None and any(g.support is not None and not g.support.enough for g in found):
+        ERRORS.print(f"Success probabilities are told {found.reach.rule}.", soft_wrap=True)
     if found[0].prior:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
@@ -128,6 +144,17 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
 
 def _matrix(grasp: Grasp, in_world: bool) -> NDArray[np.float64]:
     return grasp.world if in_world and grasp.world is not None else grasp.matrix
+
+
+def _nearest(grasp: Grasp) -> str | None:
+    if grasp.support is None or grasp.support.nearest_attempt is None:
+        return None
+    nearest = grasp.support.nearest_attempt
+    return _distance(nearest.position_m, nearest.rotation_deg)
+
+
+def _distance(position_m: float, rotation_deg: float) -> str:
+    return f"{1e3 * position_m:.1f} mm, {rotation_deg:.0f}°" if np.isfinite(position_m) else "none"
 
 
 def likelihood(
@@ -153,12 +180,30 @@ def likelihood(
         out_csv(pose_columns(as_poses(poses)) | found.columns())
         return
     columns: dict[str, Callable[[int], Any]] = {"": int, "position [m]": lambda row: numbers(poses[row, :3])}
-    for name in ("density", "log_density", "relative", "success_probability", "collision_free"):
+    for name in ("density", "log_density", "relative", "collision_free", "prior_success_probability"):
         if (values := getattr(found, name)) is not None:
             columns[name.replace("_", " ")] = partial(_cell, values)
+    if found.support is not None:
+        columns["success probability"] = partial(_chance, found)
+        columns["nearest attempt"] = partial(_nearest_of, found.support)
     show_table(range(min(limit, len(poses))), columns, empty="No poses.")
+    if found.reach is not None and found.support is not None and not found.support.enough.all():
+        ERRORS.print(f"Success probabilities are told {found.reach.rule}.", soft_wrap=True)
     if len(poses) > limit:
         ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json and --csv give all.")
+
+
+def _chance(found: LikelihoodArrays, row: int) -> str:
+    """A probability with its interval and effective trials, never without."""
+    likely, ends, trials = found.success_probability, found.interval, found.effective_trials
+    if likely is None or ends is None or trials is None:
+        return "unknown"
+    return chance(likely[row], ends.low[row], ends.high[row], trials[row])
+
+
+def _nearest_of(support: SupportArrays, row: int) -> str:
+    near = support.nearest_attempt
+    return _distance(near.position_m[row], near.rotation_deg[row])
 
 
 def _cell(values: Any, row: int) -> str:
@@ -206,4 +251,7 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
             "quaternion xyzw": lambda row: numbers(found.quaternion_xyzw[row]),
             "density": lambda row: f"{found.proposal_density[row]:.4g}",
         }
+        if found.support is not None:
+            columns["nearest attempt"] = partial(_nearest_of, found.support)
+            columns["within reach"] = partial(_cell, found.support.enough)
         show_table(range(len(found)), columns, empty="No samples.")

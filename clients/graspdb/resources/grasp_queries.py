@@ -60,7 +60,8 @@ class GraspQueries(Resource):
 
         ``poses`` are (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples, sent ``chunk`` a
         request. ``include`` are the columns to compute: ``density``, ``log_density``, ``relative``,
-        ``success_probability``, ``interval``, ``effective_trials``, ``collision_free``; by default all.
+        ``success_probability``, ``interval``, ``effective_trials``, ``collision_free``, ``support``,
+        ``prior_success_probability``; by default all.
         """
         options = known_keywords(Selection, selection, "likelihood")
         given = as_poses(poses)

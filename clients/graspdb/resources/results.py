@@ -47,6 +47,21 @@ def _vector(values: Any, digits: int = 4) -> str:
     return "[" + ", ".join(f"{float(v):.{digits}f}" for v in values) + "]"
 
 
+def chance(probability: float, low: float, high: float, trials: float) -> str:
+    """A success probability in words; unknown where it is NaN."""
+    if not np.isfinite(probability):
+        return f"unknown, {trials:.1f} trials"
+    return f"{probability:.2f} ({low:.2f} to {high:.2f}), {trials:.1f} trials"
+
+
+def distance(nearest: wire.NearestAttempt) -> str:
+    """How far an attempt is, in words."""
+    return (
+        f"{1e3 * nearest.position_m:.1f} mm and {nearest.rotation_deg:.0f}° away"
+        f" ({nearest.kernel_widths:.1f} kernel widths)"
+    )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Grasp:
     """A grasp: the pose of the tool frame in the object frame, metres and unit xyzw, and what is known of it.
@@ -56,7 +71,10 @@ class Grasp:
     - ``density``, ``log_density``: in 1/(m^3 rad^3), and its natural logarithm.
     - ``relative``: density over the density's global maximum: 1 at the best grasp there is.
     - ``success_probability``, ``interval``, ``effective_trials``: the estimate, its interval and the trials
-      it rests on; None where the service gives none.
+      it rests on; None where the service gives none, as too far from every attempt.
+    - ``support``: how far the nearest attempt is, whether that is near ``enough`` for a success probability,
+      and the ``reason`` where it is not.
+    - ``prior_success_probability``: what mesh and gripper alone tell where it is not.
     - ``collision_free``: None until mesh and gripper are known.
     - ``prior``: chosen by the object's edges before any success; its density is that of the edges.
     - ``candidate``: its place among the candidates that were given.
@@ -75,6 +93,8 @@ class Grasp:
     success_probability: float | None = None
     interval: wire.Interval | None = None
     effective_trials: float | None = None
+    support: wire.Support | None = None
+    prior_success_probability: float | None = None
     collision_free: bool | None = None
     width_m: float | None = None
     nearest_trials: tuple[int, ...] = ()
@@ -117,9 +137,10 @@ class Grasp:
     def chance(self) -> str:
         """The success probability in words: never without its interval and the trials it rests on."""
         if self.success_probability is None or self.interval is None or self.effective_trials is None:
-            return "unknown"
-        ends = f"{self.interval.low:.2f} to {self.interval.high:.2f}"
-        return f"{self.success_probability:.2f} ({ends}), {self.effective_trials:.1f} trials"
+            reason = None if self.support is None else self.support.reason
+            return "unknown" if reason is None else f"unknown: {reason}"
+        low, high = self.interval.low, self.interval.high
+        return chance(self.success_probability, low, high, self.effective_trials)
 
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
@@ -141,8 +162,14 @@ class Grasp:
         }
         if self.prior:
             rows["chosen by"] = "the object's edges: nothing has succeeded yet"
-        if self.success_probability is not None:
+        if self.success_probability is not None or self.support is not None:
             rows["success probability"] = self.chance()
+        if self.prior_success_probability is not None:
+            rows["by geometry alone"] = f"{self.prior_success_probability:.2f}"
+        if self.support is not None:
+            rows["effective trials"] = f"{self.support.effective_trials:.1f}"
+        if self.support is not None and self.support.nearest_attempt is not None:
+            rows["nearest attempt"] = distance(self.support.nearest_attempt)
         if self.collision_free is not None:
             rows["collision-free"] = "yes" if self.collision_free else "no"
         if self.simulated is not None:
@@ -168,8 +195,8 @@ class Grasps(Sequence[Grasp]):
 
     ``status`` is ``ok``, or ``fewer`` if less than the asked number exist, or ``infeasible`` or
     ``no_successes`` if there is none; ``nearest`` is then the closest grasp outside the constraints.
-    ``ranking`` says what they are ranked by. Where they were simulated before they were answered
-    (``verify=True``), those that held come first.
+    ``ranking`` says what they are ranked by, ``reach`` how far from an attempt success probabilities are
+    told. Where they were simulated before they were answered (``verify=True``), those that held come first.
     """
 
     def __init__(self, answer: wire.BestGrasps) -> None:
@@ -177,6 +204,8 @@ class Grasps(Sequence[Grasp]):
         self.revision = answer.revision
         self.kernel = answer.kernel
         self.ranking = answer.ranking
+        self.reach = answer.reach
+        self.estimator = answer.estimator
         self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest)
         self._grasps = tuple(Grasp.from_wire(grasp) for grasp in answer.grasps)
 
@@ -225,10 +254,11 @@ class Grasps(Sequence[Grasp]):
         if worlds is not None:
             columns |= {f"world_{name}": x for name, x in pose_columns(as_poses(worlds)).items()}
         names = ["score", "density", "log_density", "relative", "success_probability", "effective_trials"]
-        names += ["collision_free", "width_m", "candidate", "simulated"]
+        names += ["prior_success_probability", "collision_free", "width_m", "candidate", "simulated"]
         columns |= {name: [getattr(grasp, name) for grasp in self] for name in names}
         for end in ("low", "high"):
             columns[end] = [g.interval and getattr(g.interval, end) for g in self]
+        columns["enough"] = [None if g.support is None else g.support.enough for g in self]
         return columns
 
     def to_pandas(self) -> Any:
@@ -242,7 +272,14 @@ class Grasps(Sequence[Grasp]):
         )
 
 
-_COLUMNS = ("density", "log_density", "relative", "success_probability", "effective_trials")
+_COLUMNS = (
+    "density",
+    "log_density",
+    "relative",
+    "success_probability",
+    "effective_trials",
+    "prior_success_probability",
+)
 
 
 class Columns:
@@ -269,12 +306,60 @@ class IntervalArrays:
     high: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class NearestAttemptArrays:
+    """How far the nearest attempt is: metres, degrees, standard deviations of the kernel, each (N,); NaN
+    before any attempt.
+    """
+
+    position_m: Floats
+    rotation_deg: Floats
+    kernel_widths: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SupportArrays:
+    """What answers rest on: the nearest attempt, the effective trials (N,), and whether it is near ``enough``
+    (N,) for a success probability.
+    """
+
+    nearest_attempt: NearestAttemptArrays
+    effective_trials: Floats
+    enough: NDArray[np.bool_]
+
+    @classmethod
+    def from_wire(cls, parts: Sequence[wire.SupportColumns]) -> SupportArrays:
+        """From the answers to consecutive parts of the poses."""
+        nearest = [part.nearest_attempt for part in parts]
+        names = ("position_m", "rotation_deg", "kernel_widths")
+        distances = {
+            name: np.array([x for part in nearest for x in getattr(part, name)], dtype=np.float64)
+            for name in names
+        }
+        return cls(
+            nearest_attempt=NearestAttemptArrays(**distances),
+            effective_trials=np.array([x for part in parts for x in part.effective_trials], dtype=np.float64),
+            enough=np.array([x for part in parts for x in part.enough], dtype=np.bool_),
+        )
+
+    def columns(self) -> dict[str, Any]:
+        """Equally long columns by name, the effective trials left out."""
+        nearest = self.nearest_attempt
+        return {
+            "nearest_position_m": nearest.position_m,
+            "nearest_rotation_deg": nearest.rotation_deg,
+            "nearest_kernel_widths": nearest.kernel_widths,
+            "enough": self.enough,
+        }
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class LikelihoodArrays(Columns):
     """Answers for N poses, in their order; a column not asked for or not known is None.
 
     ``density`` in 1/(m^3 rad^3); ``log_density`` natural, minus infinity where the density is exactly
-    zero; ``relative`` to the density's global maximum.
+    zero; ``relative`` to the density's global maximum. ``success_probability`` and ``interval`` are NaN where
+    ``support.enough`` is False; ``reach`` says how far from an attempt they are told, and why no farther.
     """
 
     revision: int
@@ -286,6 +371,10 @@ class LikelihoodArrays(Columns):
     interval: IntervalArrays | None = None
     effective_trials: Floats | None = None
     collision_free: NDArray[np.bool_] | None = None
+    support: SupportArrays | None = None
+    prior_success_probability: Floats | None = None
+    reach: wire.ReachInfo | None = None
+    estimator: wire.EstimatorInfo | None = None
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -301,9 +390,13 @@ class LikelihoodArrays(Columns):
         if intervals:
             ends = ([x for i in intervals for x in getattr(i, end)] for end in ("low", "high"))
             interval = IntervalArrays(intervals[0].level, *(np.array(end, dtype=float) for end in ends))
+        support = [a.support for a in answers if a.support is not None]
         return cls(
             revision=answers[-1].revision,
             kernel=answers[-1].kernel,
+            support=SupportArrays.from_wire(support) if len(support) == len(answers) else None,
+            reach=answers[-1].reach,
+            estimator=answers[-1].estimator,
             interval=interval,
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
             **columns,
@@ -314,6 +407,8 @@ class LikelihoodArrays(Columns):
         columns = {name: getattr(self, name) for name in names}
         if self.interval is not None:
             columns |= {"low": self.interval.low, "high": self.interval.high}
+        if self.support is not None:
+            columns |= self.support.columns()
         return columns
 
     def __len__(self) -> int:
@@ -328,8 +423,10 @@ def _joined(answers: Sequence[wire.Likelihoods], name: str) -> list[Any] | None:
     if any(column is None for column in columns):
         return None
     joined = [value for column in columns for value in column]
-    # A column of nothing but nulls says that the service does not know; minus infinity is no such null.
-    return None if name != "log_density" and all(v is None for v in joined) else joined
+    # A column of nothing but nulls says that the service does not know; minus infinity is no such null, nor
+    # is a probability where no attempt is near enough.
+    known = name == "log_density" or (name == "success_probability" and answers[-1].reach is not None)
+    return None if not known and all(v is None for v in joined) else joined
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -372,7 +469,8 @@ class TriedPoses(PoseArrays):
 class SampledPoses(PoseArrays):
     """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials.
 
-    ``criterion`` says how proposals were drawn; None for plain samples.
+    ``criterion`` says how proposals were drawn; None for plain samples. ``support`` says how far each is from
+    what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial.
     """
 
     proposal_density: Floats
@@ -380,6 +478,8 @@ class SampledPoses(PoseArrays):
     revision: int
     kernel: wire.KernelInfo
     criterion: str | None = None
+    support: SupportArrays | None = None
+    prior: bool = False
 
     @classmethod
     def from_wire(cls, answer: wire.Samples) -> SampledPoses:
@@ -392,10 +492,13 @@ class SampledPoses(PoseArrays):
             revision=answer.revision,
             kernel=answer.kernel,
             criterion=answer.criterion if isinstance(answer, wire.Proposals) else None,
+            support=None if answer.support is None else SupportArrays.from_wire([answer.support]),
+            prior=answer.prior,
         )
 
     def _columns(self) -> dict[str, Any]:
-        return {**pose_columns(self), "proposal_density": self.proposal_density}
+        columns = {**pose_columns(self), "proposal_density": self.proposal_density}
+        return columns if self.support is None else columns | self.support.columns()
 
     def __repr__(self) -> str:
         return f"SampledPoses({len(self)} poses, seed={self.seed}, revision={self.revision})"

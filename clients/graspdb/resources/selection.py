@@ -61,6 +61,8 @@ class Constraints(Selection, total=False):
       what the open gripper must not touch either.
     - ``pregrasp_distance_m``: the straight approach is free from this far back.
     - ``max_width_m``: how far apart the fingers are at most, once both touch the object.
+    - ``min_success_probability``, ``min_effective_trials``: how likely a grasp is at least, and from how many
+      effective trials; one too far from every attempt for a success probability fails either.
     - ``candidates``: rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is its place.
     - ``exclude``: poses to stay away from, by the separation.
     - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``.
@@ -97,6 +99,8 @@ class Constraints(Selection, total=False):
     obstacles: wire.Obstacles | Mapping[str, Any] | None
     pregrasp_distance_m: Annotated[float | None, Option("The straight approach is free from this far back.")]
     max_width_m: Annotated[float | None, Option("Fingers at most this far apart.")]
+    min_success_probability: Annotated[float | None, Option("At least so likely to succeed.")]
+    min_effective_trials: Annotated[float | None, Option("... from at least so many effective trials.")]
     candidates: Annotated[
         ArrayLike | Any | None, PoseFile("Rank these poses: a file as `likelihood` reads it.")
     ]

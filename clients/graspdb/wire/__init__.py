@@ -70,6 +70,12 @@ from graspdb.wire.queries import SamplesRequest as SamplesRequest
 from graspdb.wire.queries import Selection as Selection
 from graspdb.wire.queries import WeightsInfo as WeightsInfo
 from graspdb.wire.queries import WorldPose as WorldPose
+from graspdb.wire.support import EstimatorInfo as EstimatorInfo
+from graspdb.wire.support import NearestAttempt as NearestAttempt
+from graspdb.wire.support import NearestAttemptColumns as NearestAttemptColumns
+from graspdb.wire.support import ReachInfo as ReachInfo
+from graspdb.wire.support import Support as Support
+from graspdb.wire.support import SupportColumns as SupportColumns
 from graspdb.wire.sweeps import GridSpec as GridSpec
 from graspdb.wire.sweeps import Region as Region
 from graspdb.wire.sweeps import SampleSpec as SampleSpec

@@ -34,6 +34,7 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
+from graspdb.wire.support import EstimatorInfo, ReachInfo, Support, SupportColumns
 from graspdb.wire.trials import Finding
 
 WidthM = Annotated[float, Field(gt=0, le=1.0)]
@@ -49,6 +50,22 @@ NamedKernel = Annotated[
     Field(
         description="The density's kernel: ``isotropic``, ``anisotropic`` (the newest fitted for object and"
         " gripper) or a stored kernel's id; by default isotropic."
+    ),
+]
+EstimatorField = Annotated[EstimatorInfo | None, Field(description="Who estimated the answer.")]
+ReachField = Annotated[
+    ReachInfo | None,
+    Field(
+        description="How far from an attempt success probabilities are told; null before any attempt, and"
+        " where none was asked for."
+    ),
+]
+PriorProbability = Annotated[
+    float | None,
+    Field(
+        description="What geometry alone tells where no attempt is near enough: the share of successes among"
+        " attempts that held something by geometry, 0 where the open gripper collides or holds nothing; null"
+        " elsewhere, and where mesh or gripper are not known."
     ),
 ]
 
@@ -161,6 +178,7 @@ class DensityInfo(Response):
     warnings: Warnings = Field(default_factory=list)
     findings: list[Finding] = Field(default_factory=list)
     """What was doubtful about the selected trials when they came, over all batches."""
+    estimator: EstimatorField = None
 
 
 class PoseColumns(Request):
@@ -188,6 +206,8 @@ LikelihoodColumn = Literal[
     "interval",
     "effective_trials",
     "collision_free",
+    "support",
+    "prior_success_probability",
 ]
 
 
@@ -232,7 +252,10 @@ class Interval(Response):
 
 
 class Likelihoods(Response):
-    """Columns in the poses' order; one that was not asked for is null."""
+    """Columns in the poses' order; one that was not asked for is null.
+
+    Success probability and interval are null where ``support.enough`` is false.
+    """
 
     revision: Revision
     kernel: KernelInfo
@@ -252,6 +275,12 @@ class Likelihoods(Response):
     """How many attempts the success probability rests on, weighted by nearness; null if not asked for."""
     collision_free: list[bool | None] | None = None
     """Whether the open gripper clears the object; null until mesh and gripper are known."""
+    support: SupportColumns | None = Field(
+        default=None, description="How far every pose is from what was tried."
+    )
+    prior_success_probability: list[PriorProbability] | None = None
+    reach: ReachField = None
+    estimator: EstimatorField = None
 
 
 def _object_pose(value: Any) -> Any:
@@ -357,6 +386,22 @@ class GraspConstraints(Selection):
     max_width_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far the fingers may be apart once both touch the object, metres; by default as far as the jaw
     opens."""
+    min_success_probability: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            le=1,
+            description="Least success probability; a grasp too far from every attempt to have one fails it.",
+        ),
+    ] = None
+    min_effective_trials: Annotated[
+        float | None,
+        Field(
+            ge=0,
+            description="Fewest effective trials that the success probability rests on, with the nearest"
+            " attempt within the estimator's reach.",
+        ),
+    ] = None
     object_pose: ObjectPose | None = None
     """Pose of the object frame in the world frame: x,y,z in metres and a unit quaternion x,y,z,w; null if not
     known, then there is no world."""
@@ -416,6 +461,11 @@ class Grasp(Response):
     effective_trials: float | None = None
     """How many attempts the success probability rests on, weighted by nearness; null where it was not asked
     for."""
+    support: Support | None = Field(
+        default=None,
+        description="How far the grasp is from what was tried; null where no chance was asked for.",
+    )
+    prior_success_probability: PriorProbability = None
     collision_free: bool | None = None
     """Whether the open gripper clears the object; null until mesh and gripper are known."""
     prior: bool = False
@@ -462,6 +512,8 @@ class BestGrasps(Response):
     revision: Revision
     kernel: KernelInfo
     """The kernel of the density that answered."""
+    reach: ReachField = None
+    estimator: EstimatorField = None
 
 
 class SamplesRequest(Selection):
@@ -485,6 +537,12 @@ class Samples(Response):
     quaternion_xyzw: ToolRotations
     proposal_density: list[float]
     """Density that each pose was drawn with, 1/(m^3 rad^3); sent back with the trial, it weights it."""
+    support: SupportColumns | None = Field(
+        default=None,
+        description="How far every draw is from what was tried; null before any attempt, and where there are"
+        " too many attempts to read at once.",
+    )
+    prior: bool = Field(default=False, description="Whether geometry drew them, no trial.")
 
 
 Strategy = Literal["density", "uncertainty", "edges"]

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import math
 
-from .isotropic import BLOCK, empty_runs, place, runs_within
+from .isotropic import BLOCK, COUNT, OFFSET, TWIN, empty_runs, place, runs_within
 from .options import exact, inlined
 from .quaternions import relative, turned_back
 
-__all__ = ["held_out_sums", "near_pairs", "square_sums"]
+__all__ = ["displacements", "held_out_sums", "left_out_sums", "near_pairs", "nearest_anywhere", "square_sums"]
+
+#: Rows with a smaller exponent are at one pose, tried again.
+_SAME = 0.5 * 0.05**2
 
 
 @inlined
@@ -33,13 +36,14 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
 
     ``half`` (6,): 1 / (2 sigma^2), translations in units of the cells' scale, along each row's gripper's axes
     where ``turning`` and else along those positions are given in. A row's twin counts beside it.
-    Of a row's jaw and its turn the translation's x and y differ in sign only, which widths do not see.
+    Of a row's jaw and its turn the translation's x and y differ in sign only, which widths do not see. Where
+    ``out`` has four columns, the nearest row's exponent and its place follow, -1e30 and -1 without any.
     """
     runs, cut, data = empty_runs(cells, BLOCK), radius * radius, cells.data
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], 1.0)
         bx, by, bz, bw = at.qx, at.qy, at.qz, at.qw
-        total, squares = 0.0, 0.0
+        total, squares, least, nearest = 0.0, 0.0, 1e30, -1
         for r in range(runs_within(cells, at, radius, BLOCK, runs)):
             for i in range(runs[r, 0], runs[r, 1]):
                 x, y, z = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
@@ -54,15 +58,21 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
                 e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                 if e <= cut:
                     k = math.exp(-e)
+                    if e < least:
+                        least, nearest = e, i
                 if runs[r, 2] > 0:
                     # The row turned about its z: q times (0, 0, 1, 0).
                     u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
                     e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                     if e <= cut:
                         k += math.exp(-e)
+                        if e < least:
+                            least, nearest = e, i
                 total += k
                 squares += k * k
         out[j, 0], out[j, 1] = total, squares
+        if out.shape[1] > 2:
+            out[j, 2], out[j, 3] = -least, nearest
 
 
 @exact
@@ -127,3 +137,112 @@ def held_out_sums(first, won, squared, half, cut, out):
                 if won[i]:
                     success += k
         out[j, 0], out[j, 1], out[j, 2] = success, total, squares
+
+
+@inlined
+def _displaced(data, i, twin, at, half, turning):
+    """From row ``i``, or its nearer twin, to a pose: the translation (3) along the axes of the widths, the
+    rotation vector (3), and the exponents of either.
+    """
+    dx, dy, dz = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
+    ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
+    x, y, z = dx, dy, dz
+    if turning:
+        x, y, z = turned_back(ax, ay, az, aw, dx, dy, dz)
+    u, v, t = _rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
+    turned = half[3] * u * u + half[4] * v * v + half[5] * t * t
+    if twin:
+        b, c, d = _rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
+        other = half[3] * b * b + half[4] * c * c + half[5] * d * d
+        if other < turned:
+            u, v, t, turned = b, c, d, other
+    moved = half[0] * x * x + half[1] * y * y + half[2] * z * z
+    return x, y, z, u, v, t, moved, turned
+
+
+@exact
+def displacements(cells, places, positions, quaternions, half, turning, out):
+    """How far every pose is from the row at its place, into ``out`` (M, 4): metres, radians, and either in
+    widths. ``half`` and ``turning`` as in `square_sums`.
+    """
+    table = cells.table
+    for j in range(positions.shape[0]):
+        i, twin = places[j], False
+        for s in range(table.shape[0]):
+            if table[s, OFFSET] <= i < table[s, OFFSET] + table[s, COUNT]:
+                twin = table[s, TWIN] > 0.0
+        at = place(cells, positions[j], quaternions[j], 1.0)
+        x, y, z, u, v, t, moved, turned = _displaced(cells.data, i, twin, at, half, turning)
+        out[j, 0] = math.sqrt(x * x + y * y + z * z) / cells.scale
+        out[j, 1] = math.sqrt(u * u + v * v + t * t)
+        out[j, 2] = math.sqrt(2.0 * moved)
+        out[j, 3] = math.sqrt(2.0 * turned)
+
+
+@exact
+def nearest_anywhere(cells, positions, quaternions, half, turning, out):
+    """As `nearest.nearest_anywhere`, under widths for every axis: minus the least exponent, and its place."""
+    data, boxes, blocks = cells.data, cells.boxes, cells.blocks
+    least = min(half[0], min(half[1], half[2]))
+    for j in range(positions.shape[0]):
+        at = place(cells, positions[j], quaternions[j], 1.0)
+        best, chosen = -1e30, -1
+        for b in range(blocks.shape[0]):
+            gx = max(max(boxes[b, 0] - at.x, at.x - boxes[b, 3]), 0.0)
+            gy = max(max(boxes[b, 1] - at.y, at.y - boxes[b, 4]), 0.0)
+            gz = max(max(boxes[b, 2] - at.z, at.z - boxes[b, 5]), 0.0)
+            if -least * (gx * gx + gy * gy + gz * gz) <= best:
+                continue
+            for i in range(blocks[b, 0], blocks[b, 1]):
+                dx, dy, dz = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
+                if -least * (dx * dx + dy * dy + dz * dz) <= best:
+                    continue
+                displaced = _displaced(data, i, blocks[b, 2] > 0, at, half, turning)
+                exponent = -displaced[6] - displaced[7]
+                if exponent > best:
+                    best, chosen = exponent, i
+        out[j, 0], out[j, 1] = best, chosen
+
+
+@exact
+def left_out_sums(
+    cells, won, positions, quaternions, own, sides, half, turning, radius, step, width, sums, nearest
+):
+    """Kernel sums of rows by how far they are from every judged pose (J), as if the pose stood at the edge of
+    what was tried: of displacements only those that point to one side count.
+
+    Parameters
+    ----------
+    won : whether these rows succeeded
+    own : (J,) the row that is the pose itself, left out; -1 where it is not among these
+    sides : (J, 6) the directions away from the side that counts, of translation and of the rotation vector
+    step : every so many'th row is looked at
+    width : of a shell, in kernel widths
+    sums : (J, 2, K, 3)
+        To which k of successes, k, and k^2 are added: by the shell of the translation, and of the rotation.
+    nearest : (J, 3)
+        The least exponent so far of another pose, and that row's translation and rotation in widths; no side
+        is left out.
+    """
+    runs, cut, data, shells = empty_runs(cells, BLOCK), radius * radius, cells.data, sums.shape[2]
+    for j in range(positions.shape[0]):
+        at, side = place(cells, positions[j], quaternions[j], 1.0), sides[j]
+        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+            for i in range(runs[r, 0] + (-runs[r, 0]) % step, runs[r, 1], step):
+                if i == own[j]:
+                    continue
+                x, y, z, u, v, t, moved, turned = _displaced(data, i, runs[r, 2] > 0, at, half, turning)
+                if moved + turned > cut:
+                    continue
+                apart = math.sqrt(2.0 * moved), math.sqrt(2.0 * turned)
+                if _SAME < moved + turned < nearest[j, 0]:
+                    nearest[j, 0] = moved + turned
+                    nearest[j, 1], nearest[j, 2] = apart
+                k = math.exp(-moved - turned)
+                along = x * side[0] + y * side[1] + z * side[2], u * side[3] + v * side[4] + t * side[5]
+                for kind in range(2):
+                    if along[kind] <= 0.0:
+                        row = sums[j, kind, min(int(apart[kind] / width), shells - 1)]
+                        row[0] += k if won else 0.0
+                        row[1] += k
+                        row[2] += k * k

@@ -311,14 +311,17 @@ def square_sums(cells, positions, quaternions, kappa, radius, wide, out):
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over kernels with an exponent of at most radius^2.
 
     ``radius`` is the cut-off over sqrt 2: position and rotation share the allowance. The cut is exact,
-    because far from data it decides between an attempt and none.
+    because far from data it decides between an attempt and none. Where ``out`` has four columns, the largest
+    exponent and its place follow, -1e30 and -1 where none is above the cut.
     """
     runs, cut = empty_runs(cells, BLOCK), F32(radius * radius)
+    of_run = np.empty(runs.shape[0])
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
         out[j, :] = 0.0
-        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
+        count = runs_within(cells, at, radius, BLOCK, runs)
+        for r in range(count):
             begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
             # The constant lets LLVM make a loop of its own of either.
             if wide:
@@ -327,6 +330,28 @@ def square_sums(cells, positions, quaternions, kappa, radius, wide, out):
                 part = isotropic_runs.squares_run(cells.data, begin, end, near, twin, False, cut)
             out[j, 0] += part[0]
             out[j, 1] += part[1]
+            of_run[r] = part[0]
+        if out.shape[1] > 2:
+            out[j, 2], out[j, 3] = _nearest_by_sums(cells.data, near, runs, of_run[:count])
+
+
+@fast
+def _nearest_by_sums(data, near, runs, of_run):
+    """The largest exponent of some runs, and its place, by the sums of their kernels, which are used up.
+
+    No kernel is larger than its run's sum, so few runs are looked through. A row counts one half at least.
+    """
+    top, row = -1e30, -1
+    for _ in range(of_run.shape[0]):
+        r = int(np.argmax(of_run))
+        if of_run[r] <= 0.0 or of_run[r] < 0.499 * math.exp(top):
+            break
+        begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
+        here, place = isotropic_runs.nearest_of_run(data, begin, end, near, twin)
+        if here > top:
+            top, row = float(here), place
+        of_run[r] = 0.0
+    return top, float(row)
 
 
 @fast

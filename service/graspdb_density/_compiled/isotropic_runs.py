@@ -23,6 +23,8 @@ from .options import fast, inlined
 F32 = np.float32
 #: Rows in the vectors that a loop takes at once, with AVX-512; a multiple of what it takes elsewhere.
 LANES = 32
+#: Less than any exponent.
+LEAST = F32(-1e30)
 _ZERO = F32(0.0)
 
 
@@ -258,6 +260,23 @@ def squares_run(data, begin, end, at, twin, wide, cut):
         total += k
         squares += k * k
     return total, squares
+
+
+@inlined
+def _exponent(data, i, at, twin):
+    own, other = cosines(data, i, at)
+    return max(abs(own), abs(other * twin)) - at.kappa - squared(data, i, at)
+
+
+@fast
+def nearest_of_run(data, begin, end, at, twin):
+    """Largest exponent of a run, of the nearer twin's nearer end, and its row."""
+    top, row = LEAST, np.int64(begin)
+    for i in range(np.uint64(begin), np.uint64(end)):
+        here = _exponent(data, i, at, twin)
+        if here > top:
+            top, row = here, np.int64(i)
+    return top, row
 
 
 @fast

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from .isotropic import empty_runs, place, runs_within
-from .isotropic_runs import cosines, single, squared
+from .isotropic_runs import LEAST, cosines, nearest_of_run, single, squared
 from .options import fast
 
 F32 = np.float32
-__all__ = ["GATHERED", "exponents", "nearest_each", "nearest_rows"]
+__all__ = ["GATHERED", "exponents", "nearest_anywhere", "nearest_each", "nearest_rows"]
 
 #: Exponents taken at a time.
 GATHERED = 512
@@ -63,3 +63,32 @@ def nearest_each(cells, positions, quaternions, kappa, radius, best, rows):
     for j in range(positions.shape[0]):
         one = slice(j, j + 1)
         nearest_rows(cells, positions[j], quaternions[j], kappa, radius, best[one], rows[one])
+
+
+@fast
+def nearest_anywhere(cells, positions, quaternions, kappa, out):
+    """Of every pose, the largest exponent however far away, and its place, into ``out`` (M, 2).
+
+    Blocks whose bounding box proves every exponent to lie below the best one are left out.
+    """
+    boxes, blocks = cells.boxes, cells.blocks
+    bound = np.empty(blocks.shape[0], dtype=np.float32)
+    for j in range(positions.shape[0]):
+        near = single(place(cells, positions[j], quaternions[j], kappa))
+        for b in range(blocks.shape[0]):
+            gx = max(max(boxes[b, 0] - near.x, near.x - boxes[b, 3]), F32(0.0))
+            gy = max(max(boxes[b, 1] - near.y, near.y - boxes[b, 4]), F32(0.0))
+            gz = max(max(boxes[b, 2] - near.z, near.z - boxes[b, 5]), F32(0.0))
+            bound[b] = -(gx * gx + gy * gy + gz * gz)
+        # The block with the nearest box first, so that few others can hold a nearer kernel.
+        first = int(np.argmax(bound))
+        top, row = LEAST, -1
+        for k in range(-1, blocks.shape[0]):
+            b = first if k < 0 else k
+            if bound[b] <= top or k == first:
+                continue
+            begin, end, twin = blocks[b, 0], blocks[b, 1], F32(blocks[b, 2])
+            here, nearest = nearest_of_run(cells.data, begin, end, near, twin)
+            if here > top:
+                top, row = here, nearest
+        out[j, 0], out[j, 1] = top, row

@@ -117,6 +117,13 @@ class Cells:
             )
         ]
 
+    def poses(self, places: NDArray[np.integer]) -> Poses:
+        """Some of the sorted kernels' poses, as precise as they are held."""
+        arrays = self.arrays
+        positions = arrays.data[:3, places].T.astype(np.float64) / arrays.scale + arrays.centre
+        quaternions = arrays.data[3:7, places].T.astype(np.float64)
+        return Poses(np.ascontiguousarray(positions), np.ascontiguousarray(quaternions))
+
     def visiting_order(self, positions: Floats) -> NDArray[np.intp]:
         """An order in which neighbours follow each other, so that kernels stay in the processor's cache."""
         edge = self.arrays.table[0, c.EDGE] / self.arrays.scale

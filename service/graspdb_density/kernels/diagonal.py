@@ -53,3 +53,10 @@ class DiagonalKernel:
             return poses
         turned = np.ascontiguousarray(poses.positions @ np.reshape(self.axes, (3, 3)))
         return Poses(turned, poses.quaternions_xyzw)
+
+    def back(self, along: Poses) -> Poses:
+        """What `along` made of poses (N), in the object frame again."""
+        if self.axes is None:
+            return along
+        positions = np.ascontiguousarray(along.positions @ np.reshape(self.axes, (3, 3)).T)
+        return Poses(positions, along.quaternions_xyzw)

@@ -12,13 +12,16 @@ by it, not the truth at a point.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
-from .._compiled import diagonal, isotropic
+from .._compiled import diagonal, isotropic, nearest
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
@@ -27,16 +30,48 @@ from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
 
-__all__ = ["PRIOR_TRIALS", "SUCCESS_CUTOFF", "SuccessEstimate", "SuccessKernel", "SuccessModel"]
+__all__ = [
+    "PRIOR_TRIALS",
+    "SUCCESS_CUTOFF",
+    "NearestAttempts",
+    "SuccessEstimate",
+    "SuccessKernel",
+    "SuccessModel",
+]
 
 SuccessKernel = IsotropicKernel | DiagonalKernel
+Sums = tuple[Floats, Floats]
+"""Sums of kernels at M poses over the successes and over the failures."""
 
 #: Trials the prior share is worth.
 PRIOR_TRIALS = 1.0
 #: An attempt is within reach when position and rotation together are within this many standard deviations.
 SUCCESS_CUTOFF = 5.0
 #: Poses a thread takes at once.
-_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK = 256, 128
+_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _FAR_BLOCK = 256, 128, 16
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NearestAttempts:
+    """How far M poses are from the attempt nearest to each in the kernel's own measure.
+
+    Attributes
+    ----------
+    position_m, rotation : (M,)
+        Metres, and radians from it or from its jaw's twin, whichever is nearer.
+    position_widths, rotation_widths : (M,)
+        The same in standard deviations of the kernel.
+    """
+
+    position_m: Floats
+    rotation: Floats
+    position_widths: Floats
+    rotation_widths: Floats
+
+    @property
+    def widths(self) -> Floats:
+        """(M,) position and rotation together."""
+        return np.hypot(self.position_widths, self.rotation_widths)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,8 +100,8 @@ class SuccessModel:
 
     def __init__(self, kernel: SuccessKernel, succeeded: Cells | None, failed: Cells | None) -> None:
         self.kernel = kernel
-        self._succeeded = succeeded
-        self._failed = failed
+        #: The attempts that succeeded and those that failed, sorted.
+        self.parts = succeeded, failed
 
     @classmethod
     def build(
@@ -98,19 +133,15 @@ class SuccessModel:
     def extend(self, poses: Poses, success: ArrayLike, symmetric: ArrayLike | bool = True) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
         won = checked_outcomes(success, len(poses))
-        if isinstance(self.kernel, IsotropicKernel):
-            widest = self.kernel.sigma_position_m
-        else:
-            # No width is larger than the one the cells are made for, so their runs reach far enough.
-            poses, widest = self.kernel.along(poses), max(self.kernel.sigmas[:3])
-        attempts = Rows.of(poses, symmetric=symmetric)
+        attempts = Rows.of(self._along(poses), symmetric=symmetric)
         parts: list[Cells | None] = []
-        for present, chosen in ((self._succeeded, won), (self._failed, ~won)):
+        for present, chosen in zip(self.parts, (won, ~won), strict=True):
             rows = attempts[chosen]
             if not len(rows):
                 parts.append(present)
             elif present is None:
-                parts.append(Cells.build(rows, widest))
+                # No width is larger than the one the cells are made for, so their runs reach far enough.
+                parts.append(Cells.build(rows, self.widest_m))
             else:
                 parts.append(present.extend(rows))
         return SuccessModel(self.kernel, parts[0], parts[1])
@@ -118,11 +149,11 @@ class SuccessModel:
     @property
     def size(self) -> int:
         """Attempts."""
-        return self.successes + (0 if self._failed is None else len(self._failed.rows))
+        return sum(len(part.rows) for part in self.parts if part is not None)
 
     @property
     def successes(self) -> int:
-        return 0 if self._succeeded is None else len(self._succeeded.rows)
+        return 0 if self.parts[0] is None else len(self.parts[0].rows)
 
     @property
     def prior_share(self) -> float:
@@ -132,7 +163,20 @@ class SuccessModel:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held."""
-        return sum(part.nbytes for part in (self._succeeded, self._failed) if part is not None)
+        return sum(part.nbytes for part in self.parts if part is not None)
+
+    def drawn(self, count: int, rng: np.random.Generator) -> list[tuple[int, Poses]]:
+        """Of the successes and of the failures how many there are, and at most ``count`` drawn at random."""
+        found = []
+        for part in self.parts:
+            size = 0 if part is None else len(part.rows)
+            poses = Poses(np.empty((0, 3)), np.empty((0, 4)))
+            if part is not None:
+                poses = part.poses(rng.permutation(size)[:count])
+            if isinstance(self.kernel, DiagonalKernel):
+                poses = self.kernel.back(poses)
+            found.append((size, poses))
+        return found
 
     def evaluate(self, poses: Poses, *, level: float = 0.9, threads: int = 1) -> SuccessEstimate:
         """Success probability with its interval at M poses.
@@ -142,9 +186,19 @@ class SuccessModel:
         ValueError
             Without any attempt, or for a level outside (0, 1).
         """
+        return self._estimate(self._sums(poses, threads), level, threads)
+
+    def evaluate_near(
+        self, poses: Poses, *, level: float = 0.9, threads: int = 1
+    ) -> tuple[SuccessEstimate, NearestAttempts]:
+        """As `evaluate`, and how far the nearest attempts are, however far: for little more."""
+        sums = self._sums(poses, threads, nearest=True)
+        return self._estimate(sums, level, threads), self._nearest(poses, sums, threads, everywhere=True)
+
+    def _estimate(self, sums: Sums, level: float, threads: int) -> SuccessEstimate:
         if not 0.0 < level < 1.0:
             raise ValueError(f"level must be between 0 and 1, not {level!r}")
-        probability, trials, alpha, beta = self._beta(poses, threads)
+        probability, trials, alpha, beta = self._beta(sums)
         tail = 0.5 * (1.0 - level)
         low = _quantiles(alpha, beta, tail, threads)
         high = _quantiles(alpha, beta, 1.0 - tail, threads)
@@ -152,21 +206,47 @@ class SuccessModel:
 
     def probability(self, poses: Poses, *, threads: int = 1) -> Floats:
         """The probability of `evaluate` alone, (M,): much faster, for the interval's ends take longest."""
-        return self._beta(poses, threads)[0]
+        return self._beta(self._sums(poses, threads))[0]
 
-    def lower_end(self, poses: Poses, *, level: float = 0.9, threads: int = 1) -> Floats:
-        """The lower end of `evaluate` alone, (M,)."""
-        _, _, alpha, beta = self._beta(poses, threads)
-        return _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
+    def without_interval(
+        self, poses: Poses, *, everywhere: bool = False, threads: int = 1
+    ) -> tuple[Floats, Floats, NearestAttempts]:
+        """The probability and effective trials of `evaluate`, (M,), and how far the nearest attempts are.
 
-    def _beta(self, poses: Poses, threads: int) -> tuple[Floats, Floats, Floats, Floats]:
+        Those beyond the cut-off are only looked for ``everywhere``: else their distance is infinite.
+        """
+        sums = self._sums(poses, threads, nearest=True)
+        probability, trials, _, _ = self._beta(sums)
+        return probability, trials, self._nearest(poses, sums, threads, everywhere=everywhere)
+
+    def lower_end(
+        self,
+        poses: Poses,
+        *,
+        level: float = 0.9,
+        near: Callable[[NearestAttempts], NDArray[np.bool_]] | None = None,
+        threads: int = 1,
+    ) -> Floats:
+        """The lower end of `evaluate` alone, (M,); where the nearest attempt is not ``near``, no higher than
+        if nothing had been tried.
+        """
+        sums = self._sums(poses, threads, nearest=near is not None)
+        _, _, alpha, beta = self._beta(sums)
+        low = _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
+        if near is None:
+            return low
+        _, _, alpha, beta = self._beta((np.zeros((1, 2)), np.zeros((1, 2))))
+        untried = _quantiles(alpha, beta, 0.5 * (1.0 - level), 1)
+        told = near(self._nearest(poses, sums, threads, everywhere=False))
+        return np.where(told, low, np.minimum(low, untried))
+
+    def _beta(self, sums: Sums) -> tuple[Floats, Floats, Floats, Floats]:
         """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
         if not self.size:
             raise ValueError("a success probability needs at least one attempt")
-        won = self._sums(self._succeeded, poses, threads)
-        lost = self._sums(self._failed, poses, threads)
+        won, lost = sums
         prior = self.prior_share
-        total, squares = (won + lost).T
+        total, squares = (won[:, :2] + lost[:, :2]).T
         probability, trials, share = shrunk_share(won[:, 0], total, squares, prior)
         alpha = PRIOR_TRIALS * prior + trials * share
         beta = PRIOR_TRIALS * (1.0 - prior) + trials * (1.0 - share)
@@ -177,17 +257,19 @@ class SuccessModel:
             alpha, beta = alpha + (softened - prior), beta - (softened - prior)
         return probability, trials, alpha, beta
 
-    def _sums(self, cells: Cells | None, poses: Poses, threads: int) -> Floats:
-        """Sums of k and k^2 (M, 2)."""
+    def _sums(self, poses: Poses, threads: int, *, nearest: bool = False) -> Sums:
+        """Sums of k and k^2 (M, 2) by outcome; (M, 4) with the nearest attempt's exponent and place."""
+        columns = 4 if nearest else 2
+        won, lost = (self._sums_of(part, poses, columns, threads) for part in self.parts)
+        return won, lost
+
+    def _sums_of(self, cells: Cells | None, poses: Poses, columns: int, threads: int) -> Floats:
         radius, kernel = scaled_radius(SUCCESS_CUTOFF), self.kernel
         if cells is None:
-            return np.zeros((len(poses), 2))
+            return np.tile([0.0, 0.0, -1e30, -1.0][:columns], (len(poses), 1))
         arrays = cells.arrays
         if isinstance(kernel, DiagonalKernel):
-            poses = kernel.along(poses)
-            half = 0.5 / np.array(kernel.sigmas) ** 2
-            half[:3] /= arrays.scale**2
-            turning, block = kernel.axes is None, _DIAGONAL_BLOCK
+            half, turning, block = self.half(cells), self.turning, _DIAGONAL_BLOCK
 
             def loop(p: Floats, q: Floats, out: Floats) -> None:
                 diagonal.square_sums(arrays, p, q, half, turning, radius, out)
@@ -197,17 +279,86 @@ class SuccessModel:
             def loop(p: Floats, q: Floats, out: Floats) -> None:
                 isotropic.square_sums(arrays, p, q, kappa, radius, wide, out)
 
-        return cells.at_poses(loop, poses, columns=(2,), block=block, threads=threads)
+        return cells.at_poses(loop, self._along(poses), columns=(columns,), block=block, threads=threads)
+
+    def _nearest(self, poses: Poses, sums: Sums, threads: int, *, everywhere: bool) -> NearestAttempts:
+        """How far the nearest attempts are; those that no sum reached are looked for ``everywhere``."""
+        along = self._along(poses)
+        best, places = np.stack([part[:, 2:].T for part in sums], axis=1)
+        far = np.flatnonzero(np.maximum(*places) < 0.0)
+        if everywhere and far.size:
+            best[:, far], places[:, far] = self._search(along[far], threads)
+        distances = np.full((len(poses), 4), np.inf)
+        nearer = np.argmax(best, axis=0)
+        for number, cells in enumerate(self.parts):
+            rows = np.flatnonzero((nearer == number) & (places[number] >= 0.0))
+            if cells is not None and rows.size:
+                at, out = places[number, rows].astype(np.int64), np.empty((len(rows), 4))
+                diagonal.displacements(cells.arrays, at, *along[rows], self.half(cells), self.turning, out)
+                distances[rows] = out
+        return NearestAttempts(*np.ascontiguousarray(distances.T))
+
+    def _search(self, along: Poses, threads: int) -> Floats:
+        """Largest exponents and their places in either part, however far, (2, 2, M)."""
+        found = np.tile([[[-1e30]], [[-1.0]]], (1, 2, len(along)))
+        kernel = self.kernel
+        for number, cells in enumerate(self.parts):
+            if cells is None:
+                continue
+            arrays = cells.arrays
+            if isinstance(kernel, DiagonalKernel):
+                loop = partial(_nearest_diagonal, arrays, self.half(cells), self.turning)
+            else:
+                loop = partial(_nearest_anywhere, arrays, kernel.kappa)
+            best = cells.at_poses(loop, along, columns=(2,), block=_FAR_BLOCK, threads=threads)
+            found[:, number] = best.T
+        return found
+
+    @property
+    def widest_m(self) -> float:
+        """The kernel's largest width in position."""
+        kernel = self.kernel
+        return kernel.sigma_position_m if isinstance(kernel, IsotropicKernel) else max(kernel.sigmas[:3])
+
+    @property
+    def turning(self) -> bool:
+        """Whether translations are along each attempt's gripper's axes."""
+        return isinstance(self.kernel, DiagonalKernel) and self.kernel.axes is None
+
+    def half(self, cells: Cells) -> Floats:
+        """1 / (2 sigma^2) of every axis (6,), translations in units of the cells' scale."""
+        kernel = self.kernel
+        if isinstance(kernel, IsotropicKernel):
+            return np.repeat([1.0, 0.5 / kernel.sigma_rotation**2], 3)
+        half = 0.5 / np.array(kernel.sigmas) ** 2
+        half[:3] /= cells.arrays.scale**2
+        return np.asarray(half, dtype=np.float64)
+
+    def _along(self, poses: Poses) -> Poses:
+        """Poses with their positions along the kernel's fixed axes, where it has such."""
+        if isinstance(self.kernel, IsotropicKernel):
+            return poses
+        return self.kernel.along(poses)
 
 
-def shrunk_share(won: Floats, total: Floats, squares: Floats, prior: float) -> tuple[Floats, Floats, Floats]:
+def _nearest_anywhere(arrays: Any, kappa: float, p: Floats, q: Floats, out: Floats) -> None:
+    nearest.nearest_anywhere(arrays, p, q, kappa, out)
+
+
+def _nearest_diagonal(arrays: Any, half: Floats, turning: bool, p: Floats, q: Floats, out: Floats) -> None:
+    diagonal.nearest_anywhere(arrays, p, q, half, turning, out)
+
+
+def shrunk_share(
+    won: Floats, total: Floats, squares: Floats, prior: float | Floats
+) -> tuple[Floats, Floats, Floats]:
     """Success probability, effective trials and the share it is shrunk from, each (M,).
 
     Parameters
     ----------
     won, total, squares : (M,)
         Sums of k over successes, and of k and k^2 over all attempts.
-    prior : float
+    prior : float or (M,)
         The share of successes among all attempts.
     """
     reached = total > 0.0

@@ -14,11 +14,13 @@ from graspdb.wire import (
     BestGraspRequest,
     BestGrasps,
     DensityInfo,
+    EstimatorInfo,
     KernelInfo,
     LikelihoodRequest,
     Likelihoods,
     Proposals,
     ProposalsRequest,
+    ReachInfo,
     Samples,
     SamplesRequest,
     Selection,
@@ -70,9 +72,9 @@ def get_likelihood(
     pose = Poses(np.array([query.position]), np.array([query.quaternion_xyzw]))
 
     def answer(query: LikelihoodQuery) -> Response:
-        built, columns = likelihood.likelihood(ctx, id, query, pose, query.include)
+        built, reach, columns = likelihood.likelihood(ctx, id, query, pose, query.include)
         tag = _tag(built.object_row.id, built.revision, query)
-        return columns_json(_head(built.revision, built.kernel), columns, {"ETag": tag})
+        return columns_json(_head(built.revision, built.kernel, reach), columns, {"ETag": tag})
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -99,9 +101,9 @@ def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> 
         given = content.pop("poses", None)
         options = validated(content, LikelihoodOptions)
         poses = read_poses(given)
-    built, columns = likelihood.likelihood(ctx, id, options, poses, options.include)
+    built, reach, columns = likelihood.likelihood(ctx, id, options, poses, options.include)
     form = columns_arrow if kind == ARROW else columns_json
-    return form(_head(built.revision, built.kernel), columns, {"Vary": "Accept"})
+    return form(_head(built.revision, built.kernel, reach), columns, {"Vary": "Accept"})
 
 
 @router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
@@ -152,17 +154,14 @@ def post_proposals(ctx: Ctx, id: ObjectId, query: ProposalsRequest) -> Response:
 
 def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
     return columns_json(
-        {**_head(drawn.revision, drawn.kernel), "seed": drawn.seed, **more},
-        {
-            "position": drawn.position,
-            "quaternion_xyzw": drawn.quaternion_xyzw,
-            "proposal_density": drawn.proposal_density,
-        },
+        {**_head(drawn.revision, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more},
+        drawn.columns(),
     )
 
 
-def _head(revision: int, kernel: KernelInfo) -> dict[str, Any]:
-    return {"revision": revision, "kernel": kernel.model_dump()}
+def _head(revision: int, kernel: KernelInfo, reach: ReachInfo | None = None) -> dict[str, Any]:
+    head = {"revision": revision, "kernel": kernel.model_dump(), "estimator": EstimatorInfo().model_dump()}
+    return head if reach is None else {**head, "reach": reach.model_dump()}
 
 
 def _json(answer: BaseModel, tag: str | None = None) -> Response:

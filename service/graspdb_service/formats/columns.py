@@ -6,7 +6,7 @@ text in pieces.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,15 @@ def _value(value: Any) -> bytes:
     return b"[" + b",".join(pieces) + b"]"
 
 
+def _flat(columns: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Columns, those of mappings within mappings by all their names."""
+    for name, value in columns.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name}_{part}", column) for part, column in _flat(value))
+        else:
+            yield name, value
+
+
 def columns_arrow(
     head: Mapping[str, Any], columns: Mapping[str, Any], headers: Mapping[str, str] | None = None
 ) -> Response:
@@ -56,14 +65,11 @@ def columns_arrow(
     arrays join the head.
     """
     arrays, told = {}, dict(head)
-    for name, value in columns.items():
-        parts = value.items() if isinstance(value, Mapping) else [(None, value)]
-        for part, column in parts:
-            full = name if part is None else f"{name}_{part}"
-            if not isinstance(column, np.ndarray):
-                told[full] = column
-            else:
-                arrays[full] = column if column.dtype == np.bool_ else arrow.numbers(column)
+    for name, column in _flat(columns):
+        if not isinstance(column, np.ndarray):
+            told[name] = column
+        else:
+            arrays[name] = column if column.dtype == np.bool_ else arrow.numbers(column)
     batch = arrow.record_batch(arrays, told)
     content = b"".join(arrow.stream(batch.schema, [batch]))
     return Response(content, media_type=ARROW, headers=dict(headers or {}))

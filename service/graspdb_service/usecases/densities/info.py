@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from graspdb.wire import DensityInfo, Selection
+from graspdb.wire import DensityInfo, EstimatorInfo, Selection
 from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.storage.trials import findings
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -39,5 +39,6 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
         bytes=built.nbytes,
         warnings=warnings,
         findings=of_selection(doubtful),
+        estimator=EstimatorInfo(),
     )
     return info, built.object_row.id

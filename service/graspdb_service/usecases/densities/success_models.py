@@ -3,6 +3,9 @@
 Every attempt counts, packed ones of sweeps included; ``simulation_error`` is none, and every other outcome
 but ``success`` is a failure. Where the geometry is known, a pose at which the open gripper collides has the
 probability 0 and attempts that collided tell nothing of the others; where it is not, they are failures.
+
+A probability is told only as far from the attempts as the model's own validated reach
+(:mod:`graspdb_density.success.reach`); it is validated with the model, and held with it.
 """
 
 from __future__ import annotations
@@ -15,12 +18,21 @@ from functools import partial
 import numpy as np
 
 from graspdb.wire.queries import TrialSelection
-from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessEstimate, SuccessModel
+from graspdb_density import (
+    DiagonalKernel,
+    IsotropicKernel,
+    NearestAttempts,
+    Reach,
+    SuccessEstimate,
+    SuccessModel,
+    validate_reach,
+)
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.trial_columns import Bools
+from graspdb_service.trial_columns import Bools, Floats
 from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials import attempts
@@ -30,6 +42,60 @@ from graspdb_service.usecases.trials.selection import Selected, as_of
 LEVEL = 0.9
 #: Attempts of the random sample that searches feel their way by where a model has far more of them.
 _SAMPLE, _LARGE = 100_000, 400_000
+#: Attempts of either outcome by which geometry is judged.
+_HELD = 256
+#: A reach is validated anew once there are this many times as many attempts; of few ones, every time.
+_GROWN, _FEW = 1.1, 2_000
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Columns (n,); NaN where nothing is known.
+
+    ``enough``: the nearest attempt is within the reach of the predictions, or the open gripper collides,
+    which needs no attempt. Elsewhere the probability and its interval are NaN; ``prior`` is what geometry
+    alone tells there, where it was asked.
+    """
+
+    probability: Floats
+    low: Floats
+    high: Floats
+    effective_trials: Floats
+    nearest: NearestAttempts
+    enough: Bools
+    prior: Floats
+
+    @classmethod
+    def unknown(cls, count: int) -> Estimates:
+        """Before any attempt."""
+        probability, low, high, prior, *distances = (np.full(count, np.nan) for _ in range(8))
+        nearest = NearestAttempts(*distances)
+        enough = np.zeros(count, dtype=np.bool_)
+        return cls(probability, low, high, np.zeros(count), nearest, enough, prior)
+
+    def put_support(self, part: slice, trials: Floats, nearest: NearestAttempts, reach: Reach) -> None:
+        """Fill in how far some of the poses are from the attempts of a model."""
+        self.effective_trials[part] = trials
+        self.enough[part] = reach.covers(nearest)
+        for name in ("position_m", "rotation", "position_widths", "rotation_widths"):
+            getattr(self.nearest, name)[part] = getattr(nearest, name)
+
+    def put(self, part: slice, answer: SuccessEstimate, nearest: NearestAttempts, reach: Reach) -> None:
+        """Fill in what a model answers for some of the poses."""
+        self.put_support(part, answer.effective_trials, nearest, reach)
+        enough = self.enough[part]
+        for column, values in zip(self._chances, (answer.probability, answer.low, answer.high), strict=True):
+            column[part] = np.where(enough, values, np.nan)
+
+    def without_collisions(self, free: Bools) -> None:
+        """No chance where the open gripper collides."""
+        for column in self._chances:
+            column[~free] = 0.0
+        self.enough[~free] = True
+
+    @property
+    def _chances(self) -> tuple[Floats, Floats, Floats]:
+        return self.probability, self.low, self.high
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,21 +109,25 @@ class _Attempts:
     sweeps: Mapping[str, str]
     model: SuccessModel | None
     sample: SuccessModel | None
+    reach: Reach | None
 
     @property
     def nbytes(self) -> int:
         return 4_096 + sum(part.nbytes for part in (self.model, self.sample) if part is not None)
 
 
-_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None)
+_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None, None)
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """All attempts, and the ones to search by: a random sample where all would take too long."""
+    """All attempts, and the ones to search by: a random sample where all would take too long; how far from
+    them they tell.
+    """
 
     whole: SuccessModel
     quick: SuccessModel
+    reach: Reach
 
 
 @dataclass(frozen=True)
@@ -96,32 +166,49 @@ class Successes:
             lambda a: a.revision >= built.revision,
             lambda before: self._refresh(key, built.selected, before),
         )
-        if found.model is None or not found.model.size:
+        if found.model is None or found.reach is None:
             return None
-        return Model(found.model, found.sample or found.model)
+        return Model(found.model, found.sample or found.model, found.reach)
 
-    def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> SuccessEstimate:
-        """Success probability of poses (n,) under a model from :meth:`model`, NaN where nothing is known.
+    def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> Estimates:
+        """Success probability of poses (n,) under a model from :meth:`model`.
 
         ``free`` (n,) tells whether the open gripper is free of the object there; None where geometry or
         gripper is unknown.
         """
-        nothing = np.full((3, len(poses)), np.nan)
-        found = SuccessEstimate(nothing[0], nothing[1], nothing[2], np.zeros(len(poses)), LEVEL)
+        estimates = Estimates.unknown(len(poses))
         if model is not None:
-            work = partial(model.whole.evaluate, level=LEVEL, threads=self._compute.threads)
-            parts = self._compute.blocks(poses, work)
-            found = SuccessEstimate(
-                np.concatenate([part.probability for part in parts]),
-                np.concatenate([part.low for part in parts]),
-                np.concatenate([part.high for part in parts]),
-                np.concatenate([part.effective_trials for part in parts]),
-                LEVEL,
-            )
+            work = partial(model.whole.evaluate_near, level=LEVEL, threads=self._compute.threads)
+            start = 0
+            for answer, nearest in self._compute.blocks(poses, work):
+                stop = start + len(answer.probability)
+                estimates.put(slice(start, stop), answer, nearest, model.reach)
+                start = stop
         if free is not None:
-            for column in (found.probability, found.low, found.high):
-                column[~free] = 0.0
-        return found
+            estimates.without_collisions(free)
+        return estimates
+
+    def support(self, model: Model, poses: Poses) -> Estimates:
+        """As :meth:`estimate`, how far poses are from the attempts alone."""
+        estimates = Estimates.unknown(len(poses))
+        work = partial(model.whole.without_interval, everywhere=True, threads=self._compute.threads)
+        start = 0
+        for _, trials, nearest in self._compute.blocks(poses, work):
+            estimates.put_support(slice(start, start + len(trials)), trials, nearest, model.reach)
+            start += len(trials)
+        return estimates
+
+    def add_prior(
+        self, estimates: Estimates, model: Model | None, poses: Poses, test: CollisionTest | None
+    ) -> None:
+        """What geometry tells of poses too far from every attempt, where it can be known."""
+        far = np.flatnonzero(~estimates.enough)
+        if test is None or not far.size:
+            return
+        threads = self._compute.threads
+        share = self._compute.run(lambda: _share_of_held(model, test, threads))
+        held = np.concatenate(self._compute.blocks(poses[far], partial(test.holds, threads=threads)))
+        estimates.prior[far] = np.where(held, share, 0.0)
 
     def _refresh(self, key: _Key, selected: Selected, before: _Attempts | None) -> _Attempts:
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]
@@ -151,7 +238,32 @@ class Successes:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
             chosen = np.random.default_rng(row.revision).random(len(new)) < share
             sample = self._compute.run(lambda: _extended(sample, new, chosen, kernel))
-        return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample)
+        reach = self._reach(model, before.reach)
+        return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample, reach)
+
+    def _reach(self, model: SuccessModel | None, before: Reach | None) -> Reach | None:
+        """How far a model tells: validated anew where it has grown enough since."""
+        if model is None:
+            return None
+        if before is not None:
+            due = _GROWN * before.attempts if model.size > _FEW else before.attempts + 1
+            if model.size < due:
+                return before
+        return self._compute.run(lambda: validate_reach(model, threads=self._compute.threads))
+
+
+def _share_of_held(model: Model | None, test: CollisionTest, threads: int) -> float:
+    """The share of successes among attempts that hold something by geometry, with half a success in one more.
+
+    Of a few hundred of either outcome, drawn at random, each weighing what it stands for.
+    """
+    if model is None:
+        return 0.5
+    held = [
+        size * float(test.holds(poses, threads).mean()) if len(poses) else 0.0
+        for size, poses in model.whole.drawn(_HELD, np.random.default_rng(0))
+    ]
+    return (held[0] + 0.5) / (sum(held) + 1.0)
 
 
 def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts) -> Stored:

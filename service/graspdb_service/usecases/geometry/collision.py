@@ -31,6 +31,8 @@ Solid = Scene | Surface
 _MAX_BYTES = 256 * 2**20
 #: Hulls, planes, edges and trees take about this many times the bytes of the file.
 _GROWTH = 10
+#: What reaches less far between the fingers is grazed: no gripper is placed more exactly.
+_GRAZED_M = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,12 @@ class CollisionTest:
         return self.solid.holds(poses, self.shape, threads=threads)
 
     def widths(self, poses: Poses, threads: int = 1) -> Floats:
-        """The jaw's opening (n,) once both fingers touch the object; NaN where it collides or misses."""
-        return self.solid.widths(poses, self.shape, threads=threads)
+        """The jaw's opening (n,) once both fingers touch the object; NaN where it collides or misses, or only
+        grazes the object with the rim of its pads.
+        """
+        widths = np.array(self.solid.widths(poses, self.shape, threads=threads))
+        widths[~self.solid.holds(poses, self.shape.slimmer(_GRAZED_M), threads=threads)] = np.nan
+        return widths
 
 
 class Scenes:

@@ -12,6 +12,7 @@ from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Admissible
 from graspdb_geometry.grippers import GripperShape
 from graspdb_service.trial_columns import Bools
+from graspdb_service.usecases.densities.success_models import Model
 from graspdb_service.usecases.grasps.constraints import Constraints
 
 #: A chance is told within so many standard deviations of a success, position and rotation together. Farther
@@ -46,6 +47,19 @@ def clear_of(limits: Constraints, shape: GripperShape, distance: float, threads:
         return ~hit
 
     return clear
+
+
+def likely_enough(model: Model, probability: float, trials: float, threads: int) -> Admissible:
+    """Whether poses have a success probability, at least so high and from at least so many effective trials.
+
+    Of those that collide nothing is asked: what may collide has failed another check, or is wanted.
+    """
+
+    def likely(poses: Poses) -> Bools:
+        chances, worth, nearest = model.whole.without_interval(poses, threads=threads)
+        return np.asarray((chances >= probability) & (worth >= trials) & model.reach.covers(nearest))
+
+    return likely
 
 
 @dataclass(frozen=True, eq=False)

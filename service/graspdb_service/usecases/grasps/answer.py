@@ -10,11 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.wire import BestGrasps, Grasp, GraspConstraints, Interval, WorldPose
+from graspdb.wire import (
+    BestGrasps,
+    EstimatorInfo,
+    Grasp,
+    GraspConstraints,
+    Interval,
+    ReachInfo,
+    WorldPose,
+)
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.densities.success_models import LEVEL
+from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
+from graspdb_service.usecases.densities.support import reach_info, support_of
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, question_of
 from graspdb_service.usecases.grasps.search import closest
@@ -36,8 +45,14 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         question = question_of(ctx, request, built, limits)
         answer: dict[str, Any] = {"status": "no_successes", "grasps": [], "kernel": built.kernel}
         if question is not None:
-            answer = {"kernel": question.kernel, "ranking": question.ranking, **_answer(ctx, question)}
-    return BestGrasps.model_validate({"revision": built.revision, **answer}), built.object_row.id
+            answer = {
+                "kernel": question.kernel,
+                "ranking": question.ranking,
+                "reach": reach_info(question.model),
+                **_answer(ctx, question),
+            }
+    told = {"revision": built.revision, "estimator": EstimatorInfo()}
+    return BestGrasps.model_validate({**told, **answer}), built.object_row.id
 
 
 def _answer(ctx: Estimators, question: Question) -> dict[str, Any]:
@@ -81,15 +96,10 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     estimates = None
     if question.chances:
         estimates = ctx.successes.estimate(question.model, poses, free)
+        ctx.successes.add_prior(estimates, question.model, poses, test)
+    reach = reach_info(question.model)
     grasps = []
     for i, item in enumerate(found):
-        chances: dict[str, object] = {}
-        if estimates is not None:
-            chances["effective_trials"] = float(estimates.effective_trials[i])
-        if estimates is not None and math.isfinite(estimates.probability[i]):
-            low, high = float(estimates.low[i]), float(estimates.high[i])
-            chances["success_probability"] = float(estimates.probability[i])
-            chances["interval"] = Interval(level=LEVEL, low=low, high=high)
         density = math.exp(item.log_density)
         grasps.append(
             Grasp.model_validate(
@@ -101,7 +111,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
                     "density": density,
                     "log_density": item.log_density,
                     "relative": float(relative[i]),
-                    **chances,
+                    **({} if estimates is None else _chances(estimates, i, reach)),
                     "collision_free": None if free is None else bool(free[i]),
                     "prior": question.prior,
                     "candidate": _place(limits, item),
@@ -112,6 +122,19 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
             )
         )
     return grasps
+
+
+def _chances(estimates: Estimates, row: int, reach: ReachInfo | None) -> dict[str, Any]:
+    """How likely one of the grasps succeeds, and what that rests on."""
+    support = support_of(estimates, row, reach)
+    chances: dict[str, Any] = {"effective_trials": support.effective_trials, "support": support}
+    if math.isfinite(estimates.probability[row]):
+        low, high = float(estimates.low[row]), float(estimates.high[row])
+        chances["success_probability"] = float(estimates.probability[row])
+        chances["interval"] = Interval(level=LEVEL, low=low, high=high)
+    if math.isfinite(estimates.prior[row]):
+        chances["prior_success_probability"] = float(estimates.prior[row])
+    return chances
 
 
 def _world(limits: Constraints, item: Maximum) -> WorldPose | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.wire import Selection
+from graspdb.wire import ReachInfo, Selection
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
@@ -17,6 +17,17 @@ from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.success_models import LEVEL
+from graspdb_service.usecases.densities.support import reach_info, support_columns
+
+#: Columns that take a model of the attempts.
+CHANCES = (
+    "success_probability",
+    "interval",
+    "effective_trials",
+    "support",
+    "prior_success_probability",
+)
 
 
 def likelihood(
@@ -25,8 +36,9 @@ def likelihood(
     request: Selection,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> tuple[Built, dict[str, Any]]:
-    """How likely poses (n,) in the object frame are under the density of the successes, and that density.
+) -> tuple[Built, ReachInfo | None, dict[str, Any]]:
+    """How likely poses (n,) in the object frame are under the density of the successes, and that density;
+    how far from an attempt success probabilities are told.
 
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
     is minus infinity where the density is exactly zero; NaN stands for not known.
@@ -47,7 +59,8 @@ def likelihood(
     with ctx.compute.admitted():
         built = ctx.densities.requested(slug, request)
         columns: dict[str, Any] = {}
-        free, threads = None, ctx.compute.threads
+        free = test = reach = None
+        threads = ctx.compute.threads
         if asked("density", "log_density", "relative"):
             search, relative = built.search, np.zeros(count)
             logs = np.full(count, -np.inf)
@@ -57,19 +70,25 @@ def likelihood(
                     relative = ctx.compute.run(partial(search.relative, logs, threads))
             density = np.exp(logs) if asked("density") else None
             columns |= {"density": density, "log_density": logs, "relative": relative}
-        chances = asked("success_probability", "interval", "effective_trials")
+        chances = asked(*CHANCES)
         if chances or asked("collision_free"):
             test = ctx.scenes.test(built.selected)
             if test is not None:
                 free = np.concatenate(ctx.compute.blocks(poses, partial(test.free, threads=threads)))
         if chances:
             model = ctx.successes.model(built, collisions_known=free is not None)
-            estimate = ctx.successes.estimate(model, poses, free)
-            columns["success_probability"] = estimate.probability
-            columns["interval"] = {"level": estimate.level, "low": estimate.low, "high": estimate.high}
-            columns["effective_trials"] = estimate.effective_trials
+            reach = reach_info(model)
+            estimates = ctx.successes.estimate(model, poses, free)
+            columns["success_probability"] = estimates.probability
+            columns["interval"] = {"level": LEVEL, "low": estimates.low, "high": estimates.high}
+            columns["effective_trials"] = estimates.effective_trials
+            columns["support"] = support_columns(estimates)
+            if test is not None and asked("prior_success_probability"):
+                ctx.successes.add_prior(estimates, model, poses, test)
+                columns["prior_success_probability"] = estimates.prior
         columns["collision_free"] = free
-    return built, {name: column for name, column in columns.items() if column is not None and asked(name)}
+    known = {name: column for name, column in columns.items() if column is not None and asked(name)}
+    return built, reach, known
 
 
 def log_density(ctx: Estimators, density: SearchedDensity, poses: Poses, cutoff: float | None) -> Floats:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
 from graspdb.wire import GraspConstraints, Ranking
-from graspdb_density import GraspDensity, ModeSearch, PoseNoise, SuccessModel, expected
+from graspdb_density import GraspDensity, ModeSearch, PoseNoise, Reach, SuccessModel, expected
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_service.storage.objects import ObjectRow
@@ -33,8 +32,9 @@ def by_success(
     search: ModeSearch, model: Model, test: CollisionTest | None, pull: Pull, threads: int
 ) -> tuple[ScoreSearch, Ranking]:
     """The lower end of the success probability's interval."""
-    score = success_score(model.whole, "low", test, threads)
-    rough = score if model.quick is model.whole else success_score(model.quick, "low", test, threads)
+    score = lower_end_score(model.whole, model.reach, test, threads)
+    # What is within reach of a sample is within reach of all.
+    rough = score if model.quick is model.whole else lower_end_score(model.quick, model.reach, test, threads)
     told = f"lower end of the success probability's {LEVEL:.0%} interval"
     ranking = Ranking(objective="success_probability", score=told)
     return ScoreSearch(search, threads, score, rough, pull, _RESOLUTION), ranking
@@ -81,22 +81,29 @@ def by_mean(
     return ScoreSearch(search, threads, score, rough, pull, resolution), ranking
 
 
-def success_score(
-    model: SuccessModel, column: Literal["low", "probability"], test: CollisionTest | None, threads: int
-) -> Score:
-    """A column of the success probability as a score: 0 where the open gripper collides."""
+def success_score(model: SuccessModel, test: CollisionTest | None, threads: int) -> Score:
+    """The success probability as a score: 0 where the open gripper collides."""
+    return _where_free(lambda poses: model.probability(poses, threads=threads), test, threads)
 
+
+def lower_end_score(model: SuccessModel, reach: Reach, test: CollisionTest | None, threads: int) -> Score:
+    """The lower end of its interval: 0 where the open gripper collides; no higher than if nothing had been
+    tried where the nearest attempt is out of reach.
+    """
+
+    def low(poses: Poses) -> Floats:
+        return model.lower_end(poses, level=LEVEL, near=reach.covers, threads=threads)
+
+    return _where_free(low, test, threads)
+
+
+def _where_free(value: Score, test: CollisionTest | None, threads: int) -> Score:
     def score(poses: Poses) -> Floats:
-        values = np.zeros(len(poses))
-        index = np.arange(len(poses))
-        if test is not None:
-            index = np.flatnonzero(test.free(poses, threads=threads))
-        if not len(index):
-            return values
-        if column == "low":
-            values[index] = model.lower_end(poses[index], level=LEVEL, threads=threads)
-        else:
-            values[index] = model.probability(poses[index], threads=threads)
+        if test is None:
+            return value(poses)
+        values, free = np.zeros(len(poses)), test.free(poses, threads=threads)
+        if free.any():
+            values[free] = value(poses[free])
         return values
 
     return score

@@ -16,6 +16,7 @@ from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import PRIOR_TRIALS
 from graspdb_service.problems import conflict, invalid
+from graspdb_service.usecases.densities.build import KernelChoice
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
@@ -80,7 +81,7 @@ def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
                 "nothing-uncertain",
                 "Every pose near the successes collides or is known: use strategy=density, or sweep a grid",
             )
-        return samples.drawn_from(ctx, proposal, built.object_row, built.kernel, request.count, request.seed)
+        return samples.drawn_from(ctx, proposal, built, built.kernel, request.count, request.seed)
 
 
 def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
@@ -91,7 +92,10 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     with ctx.compute.admitted():
         selected = ctx.densities.selections.resolve(slug, request)
         prior = ctx.priors.get(selected, choice)
-        return samples.drawn_from(ctx, prior.density, selected.row, prior.kernel, request.count, request.seed)
+        built = ctx.densities.get(selected, KernelChoice())
+        return samples.drawn_from(
+            ctx, prior.density, built, prior.kernel, request.count, request.seed, prior=True
+        )
 
 
 def uncertain(

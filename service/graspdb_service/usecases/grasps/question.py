@@ -17,14 +17,14 @@ from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import Model
 from graspdb_service.usecases.geometry.collision import CollisionTest, shape_of
 from graspdb_service.usecases.grasps import objectives
-from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of
+from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of, likely_enough
 from graspdb_service.usecases.grasps.constraints import Constraints
+from graspdb_service.usecases.grasps.likelihood import CHANCES
 from graspdb_service.usecases.grasps.objectives import success_score
 from graspdb_service.usecases.grasps.search import Bounds, CandidateRanking, Engine, ScoreSearch
 
 #: Up to so many attempts a model of success probability is built at once; above, it must be asked for.
 FEW_ATTEMPTS = 500_000
-_CHANCES = frozenset({"success_probability", "interval", "effective_trials"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def question_of(
     chances = _wants_chances(request, built)
     model = ctx.successes.model(built, collisions_known=test is not None) if chances else None
     by_success = _by_success(request, model)
-    if by_success and model is None:
+    if (by_success or _least_chance(request)) and model is None:
         if built.search is None:
             # Nothing was tried: no chance ranks what no trial tells of.
             return None
@@ -82,7 +82,7 @@ def question_of(
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if request.objective == "robust":
-            value = None if chance is None else success_score(chance.quick, "probability", test, threads)
+            value = None if chance is None else success_score(chance.quick, test, threads)
             pull = None if chance is None else near.pull
             return objectives.by_mean(request, row, search, value, pull, threads)
         if chance is not None:
@@ -95,7 +95,7 @@ def question_of(
         if limits.candidates is not None:
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
-        bounds = _bounds(request, built, limits, search, test, near if by_success else None, threads)
+        bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
         return Question(built, search, kernel, limits, test, chances, model, bounds, engine, ranking)
 
     return ctx.compute.run(complete)
@@ -112,13 +112,18 @@ def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:
     """Whether grasps come with a success probability; the same for the same request and revision."""
-    if request.objective == "success_probability":
+    if request.objective == "success_probability" or _least_chance(request):
         return True
     if request.objective == "robust" and request.robust_of != "density":
         return True
     if request.include is not None:
-        return not _CHANCES.isdisjoint(request.include)
+        return not set(CHANCES).isdisjoint(request.include)
     return sum(built.selected.outcomes.values()) <= FEW_ATTEMPTS
+
+
+def _least_chance(request: GraspConstraints) -> bool:
+    """Whether a grasp must have a success probability, so likely or from so many trials."""
+    return request.min_success_probability is not None or request.min_effective_trials is not None
 
 
 def _by_success(request: GraspConstraints, model: Model | None) -> bool:
@@ -135,6 +140,7 @@ def _bounds(
     search: ModeSearch,
     test: CollisionTest | None,
     near: NearSuccesses | None,
+    model: Model | None,
     threads: int,
 ) -> Bounds:
     """Region, separation, and every constraint that a region can't express, the cheap ones first."""
@@ -161,4 +167,7 @@ def _bounds(
     wide = request.max_width_m
     if wide is not None and test is not None:
         checks.append(lambda poses: test.widths(poses, threads) <= wide)
+    if model is not None and _least_chance(request):
+        probability, trials = request.min_success_probability, request.min_effective_trials
+        checks.append(likely_enough(model, probability or 0.0, trials or 0.0, threads))
     return Bounds(limits.region, all_of(checks), request.count, separation)

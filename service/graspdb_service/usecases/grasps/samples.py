@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +12,12 @@ from graspdb.wire import KernelInfo, Selection
 from graspdb_density import se3
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_service.problems import ProblemError, conflict
-from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.support import support_columns
 from graspdb_service.usecases.grasps.likelihood import log_density
+from graspdb_service.usecases.grasps.question import FEW_ATTEMPTS
 
 #: Draws see more of the kernels' tails than a plain question.
 _CUTOFF = 5.0
@@ -22,7 +25,11 @@ _CUTOFF = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with."""
+    """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with.
+
+    ``support``: columns of how far they are from what was tried, where attempts tell and it was asked;
+    ``prior``: geometry drew them, no trial.
+    """
 
     revision: int
     kernel: KernelInfo
@@ -30,10 +37,27 @@ class Draw:
     position: Floats
     quaternion_xyzw: Floats
     proposal_density: Floats
+    support: dict[str, Any] | None = None
+    prior: bool = False
+
+    def columns(self) -> dict[str, Any]:
+        """Those of an answer, by name."""
+        names = ("position", "quaternion_xyzw", "proposal_density", "support")
+        return {name: getattr(self, name) for name in names}
 
 
-def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int | None) -> Draw:
+def draw(
+    ctx: Estimators,
+    slug: str,
+    selection: Selection,
+    count: int,
+    seed: int | None,
+    *,
+    support: bool = True,
+) -> Draw:
     """Draw grasps; the same revision, selection, kernel, count and seed (None: made up) give the same ones.
+
+    ``support``: whether it is told how far they are from what was tried.
 
     413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
     """
@@ -42,28 +66,42 @@ def draw(ctx: Estimators, slug: str, selection: Selection, count: int, seed: int
         built = ctx.densities.requested(slug, selection)
         if built.asked is None:
             raise no_successes(slug)
-        return drawn_from(ctx, built.asked, built.object_row, built.kernel, count, seed)
+        return drawn_from(ctx, built.asked, built, built.kernel, count, seed, support=support)
 
 
 def drawn_from(
     ctx: Estimators,
     density: SearchedDensity,
-    row: ObjectRow,
+    built: Built,
     kernel: KernelInfo,
     count: int,
     seed: int | None,
+    *,
+    prior: bool = False,
+    support: bool = True,
 ) -> Draw:
-    """Draws from a density of an object as it was at a revision."""
+    """Draws from a density of an object as it was at a revision; ``built`` are its trials."""
     chosen = secrets.randbits(63) if seed is None else seed
     poses = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
     return Draw(
-        revision=row.revision,
+        revision=built.revision,
         kernel=kernel,
         seed=chosen,
         position=poses.positions,
         quaternion_xyzw=se3.canonical(poses.quaternions_xyzw),
         proposal_density=np.exp(log_density(ctx, density, poses, _CUTOFF)),
+        support=_support(ctx, built, poses) if support else None,
+        prior=prior,
     )
+
+
+def _support(ctx: Estimators, built: Built, poses: se3.Poses) -> dict[str, Any] | None:
+    """How far draws are from what was tried; None without attempts, and with too many to read at once."""
+    if sum(built.selected.outcomes.values()) > FEW_ATTEMPTS:
+        return None
+    known = ctx.scenes.test(built.selected) is not None
+    model = ctx.successes.model(built, collisions_known=known)
+    return None if model is None else support_columns(ctx.successes.support(model, poses))
 
 
 def check_count(ctx: Estimators, count: int) -> None:

@@ -15,6 +15,7 @@ from graspdb_density import (
     SuccessModel,
     choose_widths,
     se3,
+    validate_reach,
 )
 from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
@@ -52,6 +53,8 @@ def _exercise() -> None:
     success = rng.random(300) < 0.5
     model = SuccessModel.build(poses, success, kernel=kernel)
     model.extend(poses, success).evaluate(poses[:5])
+    model.evaluate_near(Poses(poses.positions[:3] + 1.0, poses.quaternions_xyzw[:3]))
+    validate_reach(model)
     density = GraspDensity.build(poses, kernel=kernel)
     density = density.extend(density.sample(10, rng))
     density.log_density(poses)

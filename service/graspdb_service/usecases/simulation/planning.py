@@ -234,7 +234,7 @@ def _drawn(ctx: Estimators, slug: str, spec: SweepCreate, sample: SampleSpec) ->
     if sample.count > limit:
         raise invalid("sample.count", f"at most {limit}")
     selection = Selection(gripper=spec.gripper, protocol=sample.protocol, kernel=sample.kernel)
-    drawn = samples.draw(ctx, slug, selection, sample.count, sample.seed)
+    drawn = samples.draw(ctx, slug, selection, sample.count, sample.seed, support=False)
     table = np.column_stack([drawn.position, drawn.quaternion_xyzw, drawn.proposal_density])
     return _Plan("sample", len(table), poses=table, kernel=drawn.kernel)
 
