@@ -159,17 +159,18 @@ def _sum_at(cells, at, radius, wide, runs):
     for r in range(runs_within(cells, at, radius, BLOCK, runs)):
         begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
         visited += end - begin
-        full = end
-        if wide == 0 and twin > _ZERO:
-            full -= (end - begin) % isotropic_runs.LANES
-            if full + isotropic_runs.LANES > data.shape[1]:
-                full = end
-        if full > begin:
-            part = isotropic_runs.run(data, begin, full, near, twin, wide)
-            total += part[0]
-            spread += part[1]
-        if end > full:
-            part = isotropic_runs.rest_narrow(data, full, end, near)
+        full = end - (end - begin) % isotropic_runs.LANES
+        if wide == 0 and twin > _ZERO and full + isotropic_runs.LANES <= data.shape[1]:
+            if full > begin:
+                part = isotropic_runs.run_narrow(data, begin, full, near)
+                total += part[0]
+                spread += part[1]
+            if end > full:
+                part = isotropic_runs.rest_narrow(data, full, end, near)
+                total += part[0]
+                spread += part[1]
+        else:
+            part = isotropic_runs.run(data, begin, end, near, twin, wide)
             total += part[0]
             spread += part[1]
     return total, spread, visited
