@@ -16,7 +16,6 @@ import numpy as np
 from graspdb.examples import EXAMPLES, example
 from graspdb.wire import Finger, GridPlan, GripperProfile, SimulatePayload
 from graspdb_geometry import collision
-from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.process.local import LocalRunner
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.force_test import weakest_force
@@ -69,7 +68,7 @@ def measure(name: str) -> None:
         chunk = payload(name, k * CHUNK, (k + 1) * CHUNK)
         _, positions, quaternions = chunks.poses_of(chunk)
         started = time.process_time()
-        codes, _ = workpiece.scene.classify(ToolPoses(positions, quaternions), workpiece.shape)
+        codes, _ = workpiece.classify(positions, quaternions)
         filtered = time.process_time() - started
         started = time.process_time()
         chunks.simulate_chunk(chunk, workpiece)
