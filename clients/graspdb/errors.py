@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from graspdb.wire import FieldError, Problem
 from graspdb.wire.reports import CheckCall
 from graspdb.wire.sweeps import FailedChunk
@@ -85,12 +87,22 @@ class ServiceError(GraspDBError):
 class Infeasible(GraspDBError):
     """No admissible grasp lies within any kernel's reach, or the object has no success yet.
 
-    ``nearest`` is the closest grasp outside the constraints, where there is one.
+    ``nearest`` is the closest grasp outside the constraints, where there is one; ``conflict`` names the
+    fewest constraints found that exclude each other, and ``relax`` a value of each that would do.
     """
 
-    def __init__(self, message: str, *, nearest: object | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        nearest: object | None = None,
+        conflict: Sequence[str] = (),
+        relax: Mapping[str, bool | float | list[float]] | None = None,
+    ) -> None:
         super().__init__(message)
         self.nearest = nearest
+        self.conflict = tuple(conflict)
+        self.relax = dict(relax or {})
 
 
 class SweepFailed(GraspDBError):

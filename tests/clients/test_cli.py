@@ -263,9 +263,11 @@ def test_no_grasp_is_one_message_and_exit_code_1(run: Run, fresh_id: str, trials
     code, out, err = run("best-grasp", fresh_id, *far)
     assert (code, out) == (1, "")
     assert "nearest" in err
+    assert "--box-min excludes all that was tried; --box-min " in err
     code, out, _ = run("--json", "best-grasp", fresh_id, *far)
     assert code == 1
     assert json.loads(out)["nearest"]["position"]
+    assert json.loads(out)["conflict"] == ["box_min"]
 
 
 @pytest.mark.parametrize(

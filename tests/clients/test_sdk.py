@@ -336,6 +336,10 @@ def test_no_grasp_raises_and_names_the_nearest(db: Client, grasped: GraspObject,
     with pytest.raises(Infeasible) as caught:
         grasped.best_grasp(box=([1, 1, 1], [2, 2, 2]))
     assert caught.value.nearest is not None
+    assert caught.value.conflict == ("box_min",)
+    corner = caught.value.relax["box_min"]
+    assert grasped.best_grasp(box=(corner, [2, 2, 2])).density > 0
+    assert "box_min excludes all that was tried" in str(caught.value)
     empty = db.objects.create(f"{fresh_id}-empty")
     with pytest.raises(Infeasible, match="no successful trial"):
         empty.best_grasp()

@@ -83,7 +83,8 @@ def best_grasp(
         found = state.db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
     except Infeasible as error:
         if state.json:
-            out({"status": "infeasible", "grasps": [], "nearest": error.nearest, "message": str(error)})
+            told = {"conflict": error.conflict, "relax": error.relax, "message": str(error)}
+            out({"status": "infeasible", "grasps": [], "nearest": error.nearest, **told})
             raise typer.Exit(1) from None
         raise
     if state.json:

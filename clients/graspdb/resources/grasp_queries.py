@@ -125,10 +125,12 @@ class GraspQueries(Resource):
                 f"{self.id} has no successful trial yet, so there is no grasp to choose from"
                 f"{'' if given.get('prior') is False else way_out}"
             )
-        where = "" if grasps.nearest is None else f"; the nearest grasp outside is {grasps.nearest!r}"
         raise Infeasible(
-            f"no grasp of {self.id} fulfils the constraints within reach of what was tried{where}",
+            f"no grasp of {self.id} fulfils the constraints within reach of what was tried"
+            f"{grasps.why_none()}",
             nearest=grasps.nearest,
+            conflict=grasps.conflict,
+            relax=grasps.relax,
         )
 
     def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:

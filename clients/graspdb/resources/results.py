@@ -194,7 +194,9 @@ class Grasps(Sequence[Grasp]):
     """Distinct grasps, best first.
 
     ``status`` is ``ok``, or ``fewer`` if less than the asked number exist, or ``infeasible`` or
-    ``no_successes`` if there is none; ``nearest`` is then the closest grasp outside the constraints.
+    ``no_successes`` if there is none; ``nearest`` is then the closest grasp outside the constraints,
+    ``conflict`` names the fewest constraints found that exclude each other, ``relax`` a value of each that
+    would do.
     ``ranking`` says what they are ranked by, ``reach`` how far from an attempt success probabilities are
     told. Where they were simulated before they were answered (``verify=True``), those that held come first.
     """
@@ -207,6 +209,8 @@ class Grasps(Sequence[Grasp]):
         self.reach = answer.reach
         self.estimator = answer.estimator
         self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest)
+        self.conflict = tuple(answer.conflict)
+        self.relax = dict(answer.relax)
         self._grasps = tuple(Grasp.from_wire(grasp) for grasp in answer.grasps)
 
     @overload
@@ -221,6 +225,29 @@ class Grasps(Sequence[Grasp]):
 
     def __iter__(self) -> Iterator[Grasp]:
         return iter(self._grasps)
+
+    def why_none(self) -> str:
+        """Why there is no grasp, in words: what excludes what, what would do, and the nearest outside."""
+        told = ""
+        if self.conflict:
+            what = "all that was tried" if len(self.conflict) == 1 else "each other"
+            exclude = "excludes" if len(self.conflict) == 1 else "exclude"
+            told += f": {' and '.join(self.conflict)} {exclude} {what}"
+        if self.relax:
+            values = [
+                f"{name}={','.join(f'{number:g}' for number in np.atleast_1d(value))}"
+                if not isinstance(value, bool)
+                else f"{name}={str(value).lower()}"
+                for name, value in self.relax.items()
+            ]
+            told += f"; {' or '.join(values)} would do"
+        if self.nearest is not None:
+            at, along = (
+                " ".join(f"{number:+.3f}" for number in vector)
+                for vector in (self.nearest.position, self.nearest.matrix[:3, 2])
+            )
+            told += f"; the nearest grasp outside is at {at} m and approaches along {along} (object's frame)"
+        return told
 
     def simulated(self, outcomes: Sequence[str]) -> Grasps:
         """The same grasps with what became of each in simulation; those that held come first."""

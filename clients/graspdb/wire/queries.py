@@ -52,7 +52,9 @@ NamedKernel = Annotated[
         " gripper) or a stored kernel's id; by default isotropic."
     ),
 ]
-EstimatorField = Annotated[EstimatorInfo | None, Field(description="Who estimated the answer.")]
+EstimatorField = Annotated[
+    EstimatorInfo | None, Field(description="Who estimated the answer; null from services that do not say.")
+]
 ReachField = Annotated[
     ReachInfo | None,
     Field(
@@ -275,10 +277,10 @@ class Likelihoods(Response):
     """How many attempts the success probability rests on, weighted by nearness; null if not asked for."""
     collision_free: list[bool | None] | None = None
     """Whether the open gripper clears the object; null until mesh and gripper are known."""
-    support: SupportColumns | None = Field(
-        default=None, description="How far every pose is from what was tried."
-    )
-    prior_success_probability: list[PriorProbability] | None = None
+    support: SupportColumns | None = None
+    """How far every pose is from what was tried; null if not asked for."""
+    prior_success_probability: list[float | None] | None = None
+    """What geometry alone tells where no attempt is near enough, as a grasp's; null if not asked for."""
     reach: ReachField = None
     estimator: EstimatorField = None
 
@@ -386,22 +388,11 @@ class GraspConstraints(Selection):
     max_width_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far the fingers may be apart once both touch the object, metres; by default as far as the jaw
     opens."""
-    min_success_probability: Annotated[
-        float | None,
-        Field(
-            ge=0,
-            le=1,
-            description="Least success probability; a grasp too far from every attempt to have one fails it.",
-        ),
-    ] = None
-    min_effective_trials: Annotated[
-        float | None,
-        Field(
-            ge=0,
-            description="Fewest effective trials that the success probability rests on, with the nearest"
-            " attempt within the estimator's reach.",
-        ),
-    ] = None
+    min_success_probability: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Least success probability; a grasp too far from every attempt to have one fails it; by default none."""
+    min_effective_trials: Annotated[float, Field(ge=0)] | None = None
+    """Fewest effective trials that the success probability rests on, with the nearest attempt within the
+    estimator's reach; by default none."""
     object_pose: ObjectPose | None = None
     """Pose of the object frame in the world frame: x,y,z in metres and a unit quaternion x,y,z,w; null if not
     known, then there is no world."""
@@ -461,10 +452,8 @@ class Grasp(Response):
     effective_trials: float | None = None
     """How many attempts the success probability rests on, weighted by nearness; null where it was not asked
     for."""
-    support: Support | None = Field(
-        default=None,
-        description="How far the grasp is from what was tried; null where no chance was asked for.",
-    )
+    support: Support | None = None
+    """How far the grasp is from what was tried; null where no chance was asked for."""
     prior_success_probability: PriorProbability = None
     collision_free: bool | None = None
     """Whether the open gripper clears the object; null until mesh and gripper are known."""
@@ -507,6 +496,12 @@ class BestGrasps(Response):
     nearest: Grasp | None = None
     """Where infeasible, the best grasp in the object frame that ignores the constraints' region but lies
     closest to it; else null."""
+    conflict: list[str] = Field(default_factory=list)
+    """Where infeasible, the fewest constraints found that exclude each other within reach of what was tried,
+    by their fields; one alone excludes all that was tried."""
+    relax: dict[str, bool | float | list[float]] = Field(default_factory=dict)
+    """Where infeasible, a value for each of these that would do, all other constraints as they are; without
+    those that no such value was found for."""
     ranking: Ranking | None = None
     """What the grasps were ranked by; null where there was nothing to rank."""
     revision: Revision
@@ -537,12 +532,11 @@ class Samples(Response):
     quaternion_xyzw: ToolRotations
     proposal_density: list[float]
     """Density that each pose was drawn with, 1/(m^3 rad^3); sent back with the trial, it weights it."""
-    support: SupportColumns | None = Field(
-        default=None,
-        description="How far every draw is from what was tried; null before any attempt, and where there are"
-        " too many attempts to read at once.",
-    )
-    prior: bool = Field(default=False, description="Whether geometry drew them, no trial.")
+    support: SupportColumns | None = None
+    """How far every draw is from what was tried; null before any attempt, and where there are too many
+    attempts to read at once."""
+    prior: bool = False
+    """Whether geometry drew them, no trial."""
 
 
 Strategy = Literal["density", "uncertainty", "edges"]

@@ -2,81 +2,60 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
-
-from pydantic import Field
+from typing import Literal
 
 from graspdb.wire.base import Response
-
-Metres = Annotated[
-    float,
-    Field(
-        description="Distance of the tool's origin from that of the nearest attempt, metres, object frame."
-    ),
-]
-Degrees = Annotated[
-    float,
-    Field(
-        description="Angle of the rotation from the nearest attempt, or from its twin of a symmetric jaw,"
-        " degrees."
-    ),
-]
-Widths = Annotated[
-    float,
-    Field(
-        description="Position and rotation together, in standard deviations of the kernel that estimates"
-        " success probabilities."
-    ),
-]
-Trials = Annotated[
-    float,
-    Field(
-        description="Trials that the estimate is worth, (sum k)^2 / sum k^2 over the attempts' kernels k: how"
-        " many tell, not how far they are."
-    ),
-]
-Enough = Annotated[
-    bool,
-    Field(
-        description="Whether the nearest attempt is within the reach of the estimator; true, too, where the"
-        " open gripper collides, which geometry tells alone. Where false, the success probability is null."
-    ),
-]
 
 
 class NearestAttempt(Response):
     """How far the nearest attempt is: the one whose kernel is highest at the pose."""
 
-    position_m: Metres
-    rotation_deg: Degrees
-    kernel_widths: Widths
+    position_m: float
+    """Distance of the tool's origin from that of the attempt, metres."""
+    rotation_deg: float
+    """Angle of the rotation from the attempt's, or from its twin's of a symmetric jaw, degrees."""
+    kernel_widths: float
+    """Position and rotation together, in standard deviations of the kernel that estimates success
+    probabilities."""
 
 
 class Support(Response):
-    """What an answer rests on; ``nearest_attempt`` is null before any attempt."""
+    """What an answer rests on."""
 
     nearest_attempt: NearestAttempt | None = None
-    effective_trials: Trials
-    enough: Enough
-    reason: Annotated[str | None, Field(description="Why it is not enough, in words; null where it is.")] = (
-        None
-    )
+    """How far the nearest attempt is; null before any."""
+    effective_trials: float
+    """Trials that the estimate is worth, (sum k)^2 / sum k^2 over the attempts' kernels k: how many tell, not
+    how far they are."""
+    enough: bool
+    """Whether the nearest attempt is within the reach of the estimator; true, too, where the open gripper
+    collides, which geometry tells alone. Where false, the success probability is null."""
+    reason: str | None = None
+    """Why it is not enough, in words; null where it is."""
 
 
 class NearestAttemptColumns(Response):
-    """:class:`NearestAttempt` of every pose; null before any attempt."""
+    """How far the nearest attempt of every pose is, in columns."""
 
-    position_m: list[Metres | None]
-    rotation_deg: list[Degrees | None]
-    kernel_widths: list[Widths | None]
+    position_m: list[float | None]
+    """Distance of each tool's origin from that of its attempt, metres; null before any attempt."""
+    rotation_deg: list[float | None]
+    """Angle of each rotation from its attempt's, or from its twin's of a symmetric jaw, degrees; null before
+    any attempt."""
+    kernel_widths: list[float | None]
+    """Position and rotation together, in standard deviations of the kernel that estimates success
+    probabilities; null before any attempt."""
 
 
 class SupportColumns(Response):
-    """:class:`Support` of every pose; why it may not be enough is the answer's ``reach``."""
+    """What the answer to every pose rests on, in columns; why it may not be enough is ``reach``."""
 
     nearest_attempt: NearestAttemptColumns
-    effective_trials: list[Trials]
-    enough: list[Enough]
+    """How far the nearest attempt of every pose is."""
+    effective_trials: list[float]
+    """Trials that each estimate is worth, (sum k)^2 / sum k^2 over the attempts' kernels k."""
+    enough: list[bool]
+    """Whether each nearest attempt is within reach, or the open gripper collides there."""
 
 
 class ReachInfo(Response):
@@ -87,32 +66,26 @@ class ReachInfo(Response):
     19 of 20 attempts lie to another one.
     """
 
-    position_widths: Annotated[
-        float, Field(description="Limit of the translation, in standard deviations of the kernel.")
-    ]
-    rotation_widths: Annotated[
-        float, Field(description="Limit of the rotation, in standard deviations of the kernel.")
-    ]
-    position_m: Annotated[
-        float | None,
-        Field(description="The same, metres; null where the kernel has a width for every axis."),
-    ] = None
-    rotation_deg: Annotated[
-        float | None,
-        Field(description="The same, degrees; null where the kernel has a width for every axis."),
-    ] = None
-    validated: Annotated[
-        bool, Field(description="Whether left-out attempts are predicted better than by the share at all.")
-    ]
-    attempts: Annotated[int, Field(description="Attempts that there were when it was validated.")]
-    rule: Annotated[str, Field(description="How the limits came about, in words.")]
+    position_widths: float
+    """Limit of the translation, in standard deviations of the kernel."""
+    rotation_widths: float
+    """Limit of the rotation, in standard deviations of the kernel."""
+    position_m: float | None = None
+    """Limit of the translation, metres; null where the kernel has a width for every axis."""
+    rotation_deg: float | None = None
+    """Limit of the rotation, degrees; null where the kernel has a width for every axis."""
+    validated: bool
+    """Whether left-out attempts are predicted better than by the share at all."""
+    attempts: int
+    """How many attempts there were when it was validated."""
+    rule: str
+    """How the limits came about, in words."""
 
 
 class EstimatorInfo(Response):
     """Who answered: ``kernel``, density and regression by kernels."""
 
-    name: Annotated[str, Field(description="Name of the estimator.")] = "kernel"
-    state: Annotated[
-        Literal["fitting", "ready"],
-        Field(description="While an estimator is fitted, the kernel estimate answers."),
-    ] = "ready"
+    name: str = "kernel"
+    """Name of the estimator."""
+    state: Literal["fitting", "ready"] = "ready"
+    """``ready``; or ``fitting``, while the kernel estimate answers in its place."""

@@ -24,8 +24,9 @@ from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
 from graspdb_service.usecases.densities.support import reach_info, support_of
+from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
-from graspdb_service.usecases.grasps.question import Question, question_of
+from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
 from graspdb_service.usecases.grasps.search import closest
 
 _NEAREST_TRIALS = 5
@@ -49,13 +50,13 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "kernel": question.kernel,
                 "ranking": question.ranking,
                 "reach": reach_info(question.model),
-                **_answer(ctx, question),
+                **_answer(ctx, request, question),
             }
     told = {"revision": built.revision, "estimator": EstimatorInfo()}
     return BestGrasps.model_validate({**told, **answer}), built.object_row.id
 
 
-def _answer(ctx: Estimators, question: Question) -> dict[str, Any]:
+def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> dict[str, Any]:
     engine, bounds = question.engine, question.bounds
     found = ctx.compute.run(lambda: engine.best(bounds))
     if found:
@@ -67,7 +68,33 @@ def _answer(ctx: Estimators, question: Question) -> dict[str, Any]:
         poses = centres.poses
     widths = Separation(centres.kernel.sigma_position_m, centres.kernel.sigma_rotation)
     nearest = _described(ctx, question, ctx.compute.run(lambda: closest(engine, bounds, poses, widths)))
-    return {"status": "infeasible", "grasps": [], "nearest": nearest[0] if nearest else None}
+    found_conflict = _conflict(ctx, request, question)
+    return {
+        "status": "infeasible",
+        "grasps": [],
+        "nearest": nearest[0] if nearest else None,
+        "conflict": found_conflict.constraints,
+        "relax": found_conflict.relax,
+    }
+
+
+def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) -> Conflict:
+    """Which constraints exclude each other, as grasps are ranked by what noise averages."""
+    averaged = question.ranking.robust_of or question.ranking.objective
+    plain = dict.fromkeys(("robust_of", "pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg"))
+    chances = ("success_probability", "effective_trials") if asks_chance(request) else ("density",)
+    asked = request.model_copy(update={**plain, "count": 1, "objective": averaged, "include": list(chances)})
+    built = question.built
+
+    def ask(request: GraspConstraints) -> Grasp | None:
+        limits = constraints(request, jaw_symmetric=built.selected.jaw_symmetric)
+        other = question_of(ctx, request, built, limits)
+        if other is None:
+            return None
+        found = ctx.compute.run(lambda: other.engine.best(other.bounds))
+        return next(iter(_described(ctx, other, found)), None)
+
+    return conflict_of(asked, ask, collisions_known=question.test is not None)
 
 
 def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> list[Grasp]:

@@ -68,7 +68,7 @@ def question_of(
     chances = _wants_chances(request, built)
     model = ctx.successes.model(built, collisions_known=test is not None) if chances else None
     by_success = _by_success(request, model)
-    if (by_success or _least_chance(request)) and model is None:
+    if (by_success or asks_chance(request)) and model is None:
         if built.search is None:
             # Nothing was tried: no chance ranks what no trial tells of.
             return None
@@ -112,7 +112,7 @@ def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:
     """Whether grasps come with a success probability; the same for the same request and revision."""
-    if request.objective == "success_probability" or _least_chance(request):
+    if request.objective == "success_probability" or asks_chance(request):
         return True
     if request.objective == "robust" and request.robust_of != "density":
         return True
@@ -121,7 +121,7 @@ def _wants_chances(request: GraspConstraints, built: Built) -> bool:
     return sum(built.selected.outcomes.values()) <= FEW_ATTEMPTS
 
 
-def _least_chance(request: GraspConstraints) -> bool:
+def asks_chance(request: GraspConstraints) -> bool:
     """Whether a grasp must have a success probability, so likely or from so many trials."""
     return request.min_success_probability is not None or request.min_effective_trials is not None
 
@@ -167,7 +167,7 @@ def _bounds(
     wide = request.max_width_m
     if wide is not None and test is not None:
         checks.append(lambda poses: test.widths(poses, threads) <= wide)
-    if model is not None and _least_chance(request):
+    if model is not None and asks_chance(request):
         probability, trials = request.min_success_probability, request.min_effective_trials
         checks.append(likely_enough(model, probability or 0.0, trials or 0.0, threads))
     return Bounds(limits.region, all_of(checks), request.count, separation)
