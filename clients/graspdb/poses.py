@@ -14,9 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 
-__all__ = ["Poses", "as_poses", "as_vector7", "matrices", "quaternions_of", "vector"]
+__all__ = [
+    "POSE_COLUMNS",
+    "Poses",
+    "as_poses",
+    "as_vector7",
+    "first_masked",
+    "matrices",
+    "quaternions_of",
+    "vector",
+]
 
 Floats = NDArray[np.float64]
+
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""A pose's columns in tables: metres, and a unit quaternion."""
 
 
 class Poses(NamedTuple):
@@ -47,14 +59,18 @@ def as_poses(poses: ArrayLike | Any) -> Poses:
     """One or many poses, checked, their quaternions normalised.
 
     (N, 4, 4) or (4, 4) homogeneous matrices, or (N, 7) or (7,) rows ``x y z qx qy qz qw``; anything with
-    ``position`` and ``quaternion_xyzw`` (a grasp, samples) is taken too, and a list of such. A ValueError
-    names the first pose that is not finite, beyond 1 km, or whose rotation is farther than 1e-3 from exact.
+    ``position`` and ``quaternion_xyzw`` (a grasp, samples) is taken too, and a list of such; a DataFrame by
+    the names of these columns; a SciPy RigidTransform. A ValueError names the first pose that is not finite,
+    masked, beyond 1 km, or whose rotation is farther than 1e-3 from exact.
     """
     if hasattr(poses, "position") and hasattr(poses, "quaternion_xyzw"):
         given = Poses(*(np.atleast_2d(np.asarray(x, float)) for x in (poses.position, poses.quaternion_xyzw)))
         return as_poses(given.rows)
     if isinstance(poses, (list, tuple)) and len(poses) and all(hasattr(p, "quaternion_xyzw") for p in poses):
         return Poses(*(np.concatenate(columns) for columns in zip(*map(as_poses, poses), strict=True)))
+    if (row := first_masked(poses)) is not None:
+        raise ValueError(f"pose {row} is masked: leave it out")
+    poses = _numbers_of(poses)
     try:
         array = np.asarray(poses, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -88,6 +104,25 @@ def as_poses(poses: ArrayLike | Any) -> Poses:
         "lies more than 1 km from the origin: coordinates are metres",
     )
     return Poses(position, quaternion)
+
+
+def _numbers_of(poses: Any) -> Any:
+    """What a table's named columns or a rigid transform hold; anything else as it is."""
+    if hasattr(poses, "as_matrix"):
+        return poses.as_matrix()
+    names = getattr(poses, "columns", None)
+    if names is None or callable(names):
+        return poses
+    if missing := [name for name in POSE_COLUMNS if name not in names]:
+        raise ValueError(f"poses of a table have the columns {', '.join(POSE_COLUMNS)}; it lacks {missing}")
+    return np.column_stack([poses[name] for name in POSE_COLUMNS])
+
+
+def first_masked(values: Any) -> int | None:
+    """The first entry of a masked array that has anything masked; None without."""
+    if not np.ma.is_masked(values):
+        return None
+    return int(np.ma.getmaskarray(values).reshape(len(values), -1).any(axis=1).argmax())
 
 
 def _refuse(bad: ArrayLike, what: str) -> None:

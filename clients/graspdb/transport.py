@@ -13,9 +13,12 @@ import random
 import time
 import uuid
 from collections.abc import Callable, Mapping
+from datetime import date
+from functools import partial
 from typing import Any, TypeVar
 
 import httpx
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from graspdb.errors import Unreachable, error_for
@@ -29,7 +32,9 @@ _RETRIED = frozenset({429, 502, 503, 504})
 
 
 class Transport:
-    """One connection pool to one service; safe to share between threads. See :class:`graspdb.Client`."""
+    """One connection pool to one service; safe to share between threads, and after fork: a child connects
+    anew. See :class:`graspdb.Client`.
+    """
 
     def __init__(
         self,
@@ -48,9 +53,22 @@ class Transport:
             headers["Authorization"] = f"Bearer {key}"
         self._retries = retries
         self._sleep = sleep
-        self._http = httpx.Client(
-            base_url=self.url, headers=headers, timeout=httpx.Timeout(timeout_s, connect=10.0)
+        self._make = partial(
+            httpx.Client,
+            base_url=self.url,
+            headers=headers,
+            timeout=httpx.Timeout(timeout_s, connect=10.0),
         )
+        self._process, self._made = os.getpid(), self._make()
+        self._inherited: httpx.Client | None = None
+
+    @property
+    def _http(self) -> httpx.Client:
+        """This process's pool: on a connection inherited by fork, one would read the answers of others."""
+        if self._process != os.getpid():
+            # The inherited pool is left as it is: closing it would end connections of the parent's.
+            self._inherited, self._process, self._made = self._made, os.getpid(), self._make()
+        return self._made
 
     def close(self) -> None:
         self._http.close()
@@ -84,7 +102,7 @@ class Transport:
             if isinstance(body, BaseModel):
                 content = body.model_dump_json(exclude_unset=True).encode()
             else:
-                content = json.dumps(body, allow_nan=False).encode()
+                content = json.dumps(body, allow_nan=False, default=_plain).encode()
             send.setdefault("Content-Type", "application/json")
         if idempotency_key or idempotent:
             send["Idempotency-Key"] = idempotency_key or str(uuid.uuid4())
@@ -117,6 +135,15 @@ class Transport:
     def model(self, model: type[Model], method: str, path: str, **options: Any) -> Model:
         """:meth:`request`, and the answer as this model."""
         return model.model_validate_json(self.request(method, path, **options).content)
+
+
+def _plain(value: object) -> Any:
+    """What NumPy and the calendar hand over, as JSON has it; TypeError for anything else."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, date):
+        return value.isoformat()
+    raise TypeError(f"{value!r} of type {type(value).__name__} can't be sent as JSON")
 
 
 def _retry_after(response: httpx.Response) -> float:

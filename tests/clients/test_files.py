@@ -123,3 +123,24 @@ def test_wrong_poses_are_named(tmp_path: Path) -> None:
         read_poses(_file(tmp_path, "p.json", [POSE, {**POSE, "quaternion_xyzw": [0, 0, 0, 2]}]))
     with pytest.raises(ValueError, match="has no 'position'"):
         read_poses(_file(tmp_path, "p.json", [{"quaternion_xyzw": [0, 0, 0, 1]}]))
+
+
+def test_what_other_programs_write(tmp_path: Path) -> None:
+    """A byte order mark before JSON; 1.0 and 0.0 where a column of booleans had gaps."""
+    marked = tmp_path / "marked.json"
+    marked.write_text(json.dumps({"trials": [{"outcome": True}]}), encoding="utf-8-sig")
+    assert read_trials(str(marked)) == ([{"outcome": True}], {})
+    gaps = tmp_path / "gaps.csv"
+    gaps.write_text("x,y,z,qx,qy,qz,qw,outcome\n0,0,0.1,1,0,0,0,1.0\n0,0,0.1,1,0,0,0,0.0\n")
+    assert [record["outcome"] for record in read_trials(str(gaps))[0]] == [True, False]
+
+
+def test_what_is_no_number_or_no_text_is_named(tmp_path: Path) -> None:
+    lines = tmp_path / "lines.ndjson"
+    lines.write_text('{"outcome": true, "quality": 1}\n{"outcome": true, "quality": NaN}\n')
+    with pytest.raises(ValueError, match=r"lines\.ndjson: NaN is no JSON number.*line 2"):
+        read_trials(str(lines))
+    wide = tmp_path / "wide.csv"
+    wide.write_text("x,y,z,qx,qy,qz,qw,outcome\n", encoding="utf-16")
+    with pytest.raises(ValueError, match=r"wide\.csv is not UTF-8"):
+        read_trials(str(wide))

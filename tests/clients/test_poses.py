@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from graspdb.poses import as_poses, as_vector7, matrices
 from graspdb.wire.base import rotation_to_quaternion
@@ -76,3 +80,25 @@ def test_one_pose_in_every_form() -> None:
 def test_what_is_no_pose_is_refused(poses: object, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         as_poses(poses)
+
+
+def test_tables_and_rigid_transforms_are_taken() -> None:
+    rows = np.array([[0.1, 0.2, 0.3, 0, 0, 0.6, 0.8], [0, 0, 0.1, 1, 0, 0, 0]])
+    table = pd.DataFrame(rows[:, ::-1], columns=["qw", "qz", "qy", "qx", "z", "y", "x"]).assign(outcome=True)
+    np.testing.assert_allclose(as_poses(table).rows, rows)
+    with pytest.raises(ValueError, match="lacks \\['qw'\\]"):
+        as_poses(table.drop(columns="qw"))
+    # SciPy's RigidTransform (since 1.16) and what looks like it.
+    as_matrix = SimpleNamespace(as_matrix=lambda: matrices(rows[:, :3], rows[:, 3:]))
+    np.testing.assert_allclose(as_poses(as_matrix).rows, rows)
+    with pytest.raises(ValueError, match="shape"):
+        as_poses(Rotation.from_quat(rows[:, 3:]))
+
+
+def test_masked_poses_are_refused() -> None:
+    rows = np.tile([0.1, 0.2, 0.3, 0, 0, 0, 1], (3, 1))
+    mask = np.zeros(rows.shape, dtype=bool)
+    np.testing.assert_allclose(as_poses(np.ma.masked_array(rows, mask)).rows, rows)
+    mask[1, 2] = True
+    with pytest.raises(ValueError, match="pose 1 is masked"):
+        as_poses(np.ma.masked_array(rows, mask))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import multiprocessing
 import struct
 import warnings
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
@@ -16,12 +19,14 @@ from graspdb import Client, Infeasible, wire
 from graspdb.errors import (
     AmbiguousSelection,
     Conflict,
+    GraspDBError,
     InvalidInput,
     LeaseLost,
     NotFound,
     Unreachable,
     error_for,
 )
+from graspdb.files.meshes import read_mesh
 from graspdb.poses import as_poses, matrices
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.trials import DoubtfulTrials
@@ -472,3 +477,60 @@ def test_errors_have_the_class_that_their_problem_names(db: Client) -> None:
         thing.density()
     problem = wire.Problem(type="urn:graspdb:problem:lease-lost", title="Another's", status=409)
     assert isinstance(error_for(problem), LeaseLost)
+
+
+def test_what_numpy_and_pandas_hand_over_is_taken(db: Client, fresh_id: str) -> None:
+    item = db.objects.create(fresh_id)
+    poses = np.tile([0, 0, 0.1, 1.0, 0, 0, 0], (3, 1))
+    item.trials.add(
+        poses,
+        [True, False, True],
+        quality=np.ma.masked_array([0.1, 0.2, 0.3], mask=[False, True, False]),
+        measured_at=np.array(["2024-01-01", "NaT", "2024-01-02T03:04:05"], "M8[s]"),
+        metadata={"run": np.int64(3), "day": datetime(2024, 1, 1, tzinfo=UTC), "joints": np.arange(2.0)},
+    )
+    first, second, third = item.trials.list()
+    assert (first.quality, second.quality, third.quality) == (0.1, None, 0.3)
+    assert second.measured_at is None
+    assert third.measured_at == datetime(2024, 1, 2, 3, 4, 5, tzinfo=UTC)
+    assert first.metadata == {"run": 3, "day": "2024-01-01T00:00:00+00:00", "joints": [0.0, 1.0]}
+    stamps = pd.Series(pd.to_datetime(["2024-01-01T01:00+01:00", None, "2024-01-02T00:00+00:00"], utc=True))
+    item.trials.add(poses, True, measured_at=stamps)
+    assert [trial.measured_at for trial in item.trials.list()][3:] == [
+        datetime(2024, 1, 1, tzinfo=UTC), None, datetime(2024, 1, 2, tzinfo=UTC)
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="outcome 1 is masked"):
+        item.trials.add(poses, np.ma.masked_array([True, False, True], mask=[False, True, False]))
+
+
+@pytest.mark.parametrize("content", [b"solid\nfacet", b"SOLID x\n", b"\xef\xbb\xbfsolid x\n"])
+def test_bytes_of_an_ascii_stl_are_known(content: bytes) -> None:
+    assert read_mesh(content, None) == (content, "model/stl")
+
+
+def test_a_client_made_before_a_fork_gets_its_own_answers(db: Client, fresh_id: str) -> None:
+    """Four children ask at once with the client of their parent, which has a connection open."""
+    ids = [f"{fresh_id}-{number}" for number in range(4)]
+    for name in ids:
+        db.objects.create(name)
+    fork = multiprocessing.get_context("fork")
+    barrier, wrong = fork.Barrier(len(ids)), fork.SimpleQueue()
+
+    def ask(name: str) -> None:
+        barrier.wait(60)
+        for _ in range(50):
+            try:
+                found = db.objects.get(name).info.id
+            except (GraspDBError, ValueError) as error:
+                found = repr(error)
+            if found != name:
+                wrong.put((name, found))
+
+    children = [fork.Process(target=ask, args=(name,)) for name in ids]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join(120)
+    assert [child.exitcode for child in children] == [0] * len(ids)
+    assert wrong.empty()
+    assert db.objects.get(ids[0]).info.id == ids[0]

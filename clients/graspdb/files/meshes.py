@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -46,10 +47,12 @@ def read_mesh(mesh: MeshLike, media_type: str | None, *, prefer: str = "ply") ->
 def _sniffed(content: bytes) -> str | None:
     if content[:4] == b"glTF":
         return GLB
-    if content[:4] in {b"ply\n", b"ply\r"}:
+    text = content.removeprefix(codecs.BOM_UTF8)
+    if text[:4] in {b"ply\n", b"ply\r"}:
         return "model/ply"
     triangles = int.from_bytes(content[80:84], "little")
-    if content.lstrip()[:6] == b"solid " or (len(content) >= 84 and len(content) == 84 + 50 * triangles):
+    solid = text.lstrip()[:6].lower()
+    if solid.split() == [b"solid"] or (len(content) >= 84 and len(content) == 84 + 50 * triangles):
         return "model/stl"
     return None
 

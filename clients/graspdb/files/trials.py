@@ -9,6 +9,7 @@ an empty cell is a value not given. JSON is what the HTTP interface takes: one t
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import sys
@@ -19,9 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.poses import as_poses
+from graspdb.poses import POSE_COLUMNS, as_poses
 
-POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at"})
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
 
@@ -120,9 +120,15 @@ def read_poses(path: str) -> NDArray[np.float64]:
 
 
 def _json_or_ndjson(path: str) -> Any:
-    text = sys.stdin.read() if path == "-" else Path(path).read_text(encoding="utf-8")
+    text = sys.stdin.read().removeprefix("\ufeff") if path == "-" else _text(path)
+
+    def refuse(name: str) -> Any:
+        raise FileProblem(f"{path}: {name} is no JSON number; leave the field out where it is not known")
+
     try:
-        return json.loads(text)
+        return json.loads(text, parse_constant=refuse)
+    except FileProblem:
+        raise
     except ValueError as error:
         whole = error
     records = []
@@ -130,12 +136,24 @@ def _json_or_ndjson(path: str) -> Any:
         if not line.strip():
             continue
         try:
-            records.append(json.loads(line))
+            records.append(json.loads(line, parse_constant=refuse))
+        except FileProblem as error:
+            raise FileProblem(f"{error} (line {number})") from error
         except ValueError as error:
             if number == 1:
                 raise FileProblem(f"{path} is neither JSON nor NDJSON: {whole}") from error
             raise FileProblem(f"{path}, line {number}: {error}") from error
     return records
+
+
+def _text(path: str) -> str:
+    """A file's text, with or without a byte order mark; FileProblem where it is not UTF-8."""
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileProblem(
+            f"{path} is not UTF-8 ({error.reason} at byte {error.start}): save it as that"
+        ) from None
 
 
 def _rows(path: str, columns: Any) -> list[dict[str, Any]]:
@@ -154,7 +172,7 @@ def _rows(path: str, columns: Any) -> list[dict[str, Any]]:
 
 
 def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
-    with Path(path).open(newline="", encoding="utf-8-sig") as file:
+    with io.StringIO(_text(path), newline="") as file:
         reader = csv.DictReader(file, skipinitialspace=True)
         names = set(reader.fieldnames or ())
         wanted = {*POSE_COLUMNS, "outcome"} if trials else set(POSE_COLUMNS)
@@ -182,8 +200,9 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
 
 
 def _outcome(text: Any) -> Any:
-    """CSV has no booleans; the service names what is left wrong."""
-    return {"true": True, "1": True, "false": False, "0": False}.get(str(text).lower(), text)
+    """CSV has no booleans, and tables with gaps have 1.0 and 0.0; the service names what is left wrong."""
+    known = {"true": True, "1": True, "1.0": True, "false": False, "0": False, "0.0": False}
+    return known.get(str(text).lower(), text)
 
 
 def _number(where: str, name: str, text: str) -> float:

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.options import Option, known_keywords
-from graspdb.poses import as_poses
+from graspdb.poses import as_poses, first_masked
 from graspdb.resources.pages import Listing, Resource, segment
 from graspdb.resources.results import TrialArrays
 from graspdb.resources.selection import TrialSelection
@@ -117,7 +117,7 @@ class Trials(Resource):
         quality: ArrayLike | None = None,
         width_m: ArrayLike | None = None,
         pose_covariance: ArrayLike | None = None,
-        measured_at: datetime | Sequence[datetime | None] | None = None,
+        measured_at: datetime | Sequence[datetime | None] | ArrayLike | None = None,
         metadata: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
         **upload: Unpack[Upload],
     ) -> Receipt:
@@ -133,7 +133,7 @@ class Trials(Resource):
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
         - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
         - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, tool frame.
-        - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial.
+        - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial; NumPy's times are UTC.
         """
         given = as_poses(poses)
         count = len(given.position)
@@ -144,8 +144,7 @@ class Trials(Resource):
             covariances = np.asarray(pose_covariance, dtype=np.float64)
             columns["pose_covariance"] = _listed("pose_covariance", covariances, count, (6, 6))
         if measured_at is not None:
-            times = _each("measured_at", measured_at, datetime, count)
-            columns["measured_at"] = [None if time is None else time.isoformat() for time in times]
+            columns["measured_at"] = _times(measured_at, count)
         shared: dict[str, Any] = {"gripper": gripper, "source": source, "protocol": protocol}
         if isinstance(metadata, Mapping):
             shared["metadata"] = dict(metadata)
@@ -301,7 +300,19 @@ def _from_row(finding: wire.Finding, start: int) -> wire.Finding:
     return finding.model_copy(update={"first_indices": [start + index for index in finding.first_indices]})
 
 
+def _times(times: Any, count: int) -> list[str | None]:
+    """Times as text, a value a trial; NumPy's and pandas' too, whose missing ones are None."""
+    if getattr(getattr(times, "dtype", None), "kind", None) == "M":
+        utc = _listed("measured_at", np.asarray(times, dtype="datetime64[us]"), count)
+        return [None if time is None else time.replace(tzinfo=UTC).isoformat() for time in utc]
+    listed = _each("measured_at", times, datetime, count)
+    # A missing time of pandas is one that differs from itself.
+    return [None if time is None or time != time else time.isoformat() for time in listed]
+
+
 def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
+    if (row := first_masked(outcomes)) is not None:
+        raise ValueError(f"outcome {row} is masked: leave it out")
     values = _listed("outcomes", np.asarray(outcomes), count)
     for index, value in enumerate(values):
         if not isinstance(value, bool) and value not in wire.OUTCOME_CODES:
@@ -312,6 +323,8 @@ def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> list[float | None]:
+    if np.ma.is_masked(values):
+        values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     listed = _listed(name, np.asarray(values, dtype=np.float64), count)
     return [None if np.isnan(value) else value for value in listed]
 
