@@ -178,5 +178,10 @@ def test_a_taught_pose_is_the_best_of_its_equals(
     body = {"objective": "success_probability", "candidates": away, "count": 5}
     found = http.post("/objects/thing/best-grasp", json=body).json()["grasps"]
     assert [item["candidate"] for item in found] == [3, 2, 4, 1, 0]
-    for item in found:
+    near = [item for item in found if item["support"]["enough"]]
+    assert [item["candidate"] for item in near] == [3, 2]
+    for item in near:
         assert item["score"] == pytest.approx(item["interval"]["low"], abs=1e-7)
+    for item in found[len(near) :]:
+        assert item["interval"] is None
+        assert item["score"] < near[-1]["score"]
