@@ -259,6 +259,7 @@ class AsyncGrippers(Mirror[Grippers]):
 
     create = _awaited(Grippers.create)
     get = _awaited(Grippers.get)
+    delete = _awaited(Grippers.delete)
     list = _iterated(Grippers.list, _same)
     __aiter__ = list
 

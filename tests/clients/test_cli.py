@@ -313,6 +313,8 @@ def test_grippers(run: Run, fresh_id: str, tmp_path: Path) -> None:
     file.write_text(json.dumps({k: v for k, v in profile.items() if v is not None} | {"force_n": 5}))
     assert run("grippers", "create", fresh_id, str(file), "--name", "Weak")[0] == 0
     assert "Weak" in run("grippers", "show", fresh_id)[1]
+    assert run("grippers", "delete", fresh_id)[0] == 0
+    assert "no gripper" in run("grippers", "show", fresh_id)[2]
 
 
 @pytest.mark.parametrize("as_json", [(), ("--json",)])

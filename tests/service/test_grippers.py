@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -102,3 +103,23 @@ def test_replicas_that_start_at_once_seed_once(database_url: str) -> None:
         assert [row.id for row in grippers.page(tx, after="", limit=10)] == ["panda", "pg70"]
     for database in replicas:
         database.dispose()
+
+
+def test_a_wrong_profile_is_deleted_while_nothing_uses_it(
+    http: httpx.Client, make_object: Callable[..., str]
+) -> None:
+    assert http.post("/grippers", json=MINE).status_code == 201
+    place = f"/grippers/{MINE['id']}"
+    thing = make_object(http)
+    trial = {"position": [0, 0, 0.1], "quaternion_xyzw": [1, 0, 0, 0], "outcome": True, "gripper": MINE["id"]}
+    batch = http.post(f"/objects/{thing}/trials", json=trial).json()["batch"]
+    refused = http.delete(place)
+    assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (409, "gripper-in-use")
+    assert http.delete(f"/objects/{thing}/batches/{batch}").status_code == 204
+    assert http.delete(place).status_code == 204
+    assert http.get(place).status_code == 404
+    assert http.delete(place).status_code == 404
+    assert http.post("/grippers", json={**MINE, "force_n": 12}).status_code == 201
+    assert http.post(f"/objects/{thing}/trials", json=trial).status_code == 201
+    assert http.get(f"/objects/{thing}/density").json()["outcomes"] == {"success": 1}
+    assert http.delete("/grippers/pg70").status_code == 409

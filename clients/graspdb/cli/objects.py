@@ -15,7 +15,7 @@ from graspdb.examples import EXAMPLES
 from graspdb.resources.objects import GraspObject, ObjectProperties
 
 objects = Commands(no_args_is_help=True, help="Create, list, show and delete objects.")
-grippers = Commands(no_args_is_help=True, help="Create, list and show gripper profiles.")
+grippers = Commands(no_args_is_help=True, help="Create, list, show and delete gripper profiles.")
 
 GripperId = Annotated[str, typer.Argument(metavar="GRIPPER", show_default=False)]
 Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
@@ -172,3 +172,10 @@ def create_gripper(
     fields = {**profile, **({"name": name} if name else {}), "id": id}
     created = state.db.grippers.create(**fields)
     state.show(created, f"Gripper {created.id} is created.")
+
+
+@grippers.command("delete")
+def delete_gripper(state: State, id: GripperId) -> None:
+    """Delete a gripper profile that no trial, sweep or kernel uses: its id is free then."""
+    state.db.grippers.delete(id)
+    state.show({"deleted": id}, f"{id} is deleted.")

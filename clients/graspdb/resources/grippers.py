@@ -21,6 +21,10 @@ class Grippers(Resource):
         """The gripper with this id."""
         return self._transport.model(wire.GripperInfo, "GET", f"{self._path}/{segment(id)}")
 
+    def delete(self, id: str) -> None:
+        """Delete a gripper; Conflict while trials, sweeps or kernels use it, and for a built-in one."""
+        self._transport.request("DELETE", f"{self._path}/{segment(id)}")
+
     def list(self) -> Iterator[wire.GripperInfo]:
         """All grippers."""
         return iter(Listing(self._transport, self._path, wire.GripperInfo))

@@ -31,3 +31,9 @@ def list_grippers(ctx: Ctx, limit: Limit = 100, cursor: Cursor = None) -> Page[G
 def get_gripper(ctx: Ctx, gripper: GripperId, request: Request) -> Response:
     """One gripper's profile."""
     return tagged_json(request, grippers.get(ctx.database, gripper))
+
+
+@router.delete("/grippers/{gripper}", status_code=204, **scope("admin"))
+def delete_gripper(ctx: Ctx, gripper: GripperId) -> None:
+    """Delete a gripper that nothing uses, so that its id is free; 409 while trials, sweeps or kernels do."""
+    grippers.remove(ctx.database, gripper)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import and_, delete, exists, or_, select
 
 from graspdb_service.storage.database import Tx, all_as, first_as, insert_new
-from graspdb_service.storage.tables import grippers
+from graspdb_service.storage.tables import grippers, kernels, provenances, sweeps, trials
 
 
 @dataclass(frozen=True)
@@ -48,3 +48,22 @@ def create(tx: Tx, gripper: str, name: str | None, profile: dict[str, Any], *, b
     """Insert a gripper; False where the id is taken."""
     now = datetime.now(UTC)
     return insert_new(tx, grippers, id=gripper, name=name, profile=profile, builtin=builtin, created_at=now)
+
+
+def is_used(tx: Tx, gripper: str) -> bool:
+    """Whether trials, sweeps or kernels name the gripper."""
+    own = and_(trials.c.object_id == provenances.c.object_id, trials.c.provenance_id == provenances.c.id)
+    query = select(
+        or_(
+            exists().where(sweeps.c.gripper == gripper),
+            exists().where(kernels.c.gripper == gripper),
+            exists().where(provenances.c.gripper == gripper, own),
+        )
+    )
+    return bool(tx.scalar(query))
+
+
+def remove(tx: Tx, gripper: str) -> None:
+    """Delete a gripper that is not used, and what is left of those that used it."""
+    tx.execute(delete(provenances).where(provenances.c.gripper == gripper))
+    tx.execute(delete(grippers).where(grippers.c.id == gripper))

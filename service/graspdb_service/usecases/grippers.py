@@ -51,6 +51,20 @@ def page(database: Database, *, after: str, limit: int) -> tuple[list[GripperInf
     return [_info(row) for row in rows[:limit]], rows[limit - 1].id if len(rows) > limit else None
 
 
+def remove(database: Database, gripper: str) -> None:
+    """Delete a gripper; 409 while trials, sweeps or kernels use it, and for a built-in one."""
+    with database.write() as tx:
+        if require(tx, gripper).builtin:
+            raise conflict("gripper-built-in", f"Gripper {gripper!r} is built in: it can't be deleted")
+        if grippers.is_used(tx, gripper):
+            raise conflict(
+                "gripper-in-use",
+                f"Trials, sweeps or kernels use gripper {gripper!r}: delete those first, or make another"
+                " gripper (POST /grippers)",
+            )
+        grippers.remove(tx, gripper)
+
+
 def require(tx: Tx, gripper: str) -> GripperRow:
     """The gripper, or a 404."""
     row = grippers.find(tx, gripper) if is_slug(gripper) else None
