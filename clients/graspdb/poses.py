@@ -125,6 +125,24 @@ def first_masked(values: Any) -> int | None:
     return int(np.ma.getmaskarray(values).reshape(len(values), -1).any(axis=1).argmax())
 
 
+def numbers(name: str, values: ArrayLike, count: int) -> list[float | None]:
+    """A number a pose as JSON, None for NaN and what is masked; one goes for all."""
+    if np.ma.is_masked(values):
+        values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
+    found = listed(name, np.asarray(values, dtype=np.float64), count)
+    return [None if np.isnan(value) else value for value in found]
+
+
+def listed(name: str, array: NDArray[Any], count: int, one: tuple[int, ...] = ()) -> list[Any]:
+    """A value of shape ``one`` a trial; one goes for all."""
+    if array.shape not in {one, (count, *one)}:
+        raise ValueError(
+            f"{name}: shape {array.shape}; expected {(count, *one)}, one a pose, or {one} for all"
+        )
+    found: list[Any] = np.broadcast_to(array, (count, *one)).tolist()
+    return found
+
+
 def _refuse(bad: ArrayLike, what: str) -> None:
     if np.any(bad):
         raise ValueError(f"pose {int(np.argmax(bad))} {what}")

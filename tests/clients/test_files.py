@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graspdb.files.trials import as_stated, read_poses, read_trials
+from graspdb.files.trials import as_stated, read_drawn_poses, read_poses, read_trials
 
 HEADER = "x,y,z,qx,qy,qz,qw"
 POSE = {"position": [0.1, 0.2, 0.3], "quaternion_xyzw": [0, 0, 0, 1]}
@@ -144,3 +144,16 @@ def test_what_is_no_number_or_no_text_is_named(tmp_path: Path) -> None:
     wide.write_text("x,y,z,qx,qy,qz,qw,outcome\n", encoding="utf-16")
     with pytest.raises(ValueError, match=r"wide\.csv is not UTF-8"):
         read_trials(str(wide))
+
+
+def test_poses_come_with_the_density_they_were_drawn_with(tmp_path: Path) -> None:
+    """As `proposals --csv` and the HTTP interface write them."""
+    table = tmp_path / "drawn.csv"
+    table.write_text("x,y,z,qx,qy,qz,qw,proposal_density\n0,0,0.1,1,0,0,0,2.5\n0,0,0.2,1,0,0,0,\n")
+    columns = tmp_path / "drawn.json"
+    rows = {"position": [[0, 0, 0.1], [0, 0, 0.2]], "quaternion_xyzw": [[1, 0, 0, 0]] * 2}
+    columns.write_text(json.dumps({**rows, "proposal_density": [2.5, None]}))
+    for path in (table, columns):
+        drawn = read_drawn_poses(str(path))
+        np.testing.assert_array_equal(drawn.position[:, 2], [0.1, 0.2])
+        np.testing.assert_array_equal(drawn.proposal_density, [2.5, np.nan])

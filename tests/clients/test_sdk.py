@@ -407,6 +407,10 @@ def test_a_sweep_simulates_every_pose_it_was_given(db: Client, fresh_id: str) ->
     assert item.refresh().info.trials == 0  # a check enters nothing
     assert sweep.id in [s.id for s in db.sweeps.list(object=item.id)]
     assert db.workers()
+    drawn = item.sweep(poses=poses, proposal_density=[4, 1, np.nan, np.nan]).wait(timeout=120)
+    # Only what met physics has a row.
+    assert {trial.pose_index: trial.proposal_density for trial in item.trials.list()} == {0: 4.0}
+    item.batches.delete(drawn.info.batch)
     collected = item.sweep(max_poses=2_000, seed=1, chunk_poses=500).wait(timeout=120)
     assert collected.info.poses_done == 2_000
     outcomes = collected.outcomes()

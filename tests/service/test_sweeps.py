@@ -257,6 +257,8 @@ def test_an_object_lighter_than_a_gram_is_refused(sqlite_http: httpx.Client, giv
     start(http, "box", grid=GRID)
 
 
+GIVEN = {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}
+
 BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({"gripper": "none-such"}, "gripper"),
     ({"grid": {"region": {"lower": [1, 1, 1], "upper": [2, 2, 2]}}}, "grid.region"),
@@ -274,6 +276,9 @@ BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({"poses": []}, "poses"),
     ({"poses": [{"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 0]}]}, "poses"),
     ({"poses": {"position": [[0, 0, 0]], "quaternion_xyzw": []}}, "poses"),
+    ({"poses": [GIVEN], "proposal_density": [1.0, 2.0]}, "proposal_density"),
+    ({"poses": [GIVEN], "proposal_density": 0}, "proposal_density"),
+    ({"proposal_density": 1.0}, "body"),
     ({"grid": GRID, "chunk_poses": 0}, "chunk_poses"),
     ({"grid": {"position_step_m": 0.005}, "chunk_poses": 1}, "chunk_poses"),
     ({"protocol": "shake"}, "protocol"),
@@ -388,6 +393,20 @@ def test_given_poses_are_simulated_in_their_order(http: httpx.Client) -> None:
     np.testing.assert_array_equal([trial["position"] for trial in stored], position[kept])
     # Nobody drew them, so they have no density to be weighted by.
     assert {trial["proposal_density"] for trial in stored} == {None}
+
+
+@pytest.mark.parametrize("each", [True, False])
+def test_given_poses_keep_the_density_they_were_drawn_with(sqlite_http: httpx.Client, each: bool) -> None:
+    add_box(sqlite_http)
+    position = np.linspace([-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], 30)
+    columns = {"position": position.tolist(), "quaternion_xyzw": [[0, 0, 0, 1]] * 30}
+    densities = [None, *np.linspace(1.0, 2.0, 29).tolist()] if each else [3.0] * 30
+    start(sqlite_http, poses=columns, proposal_density=densities if each else 3.0)
+    work(sqlite_http)
+    stored = trials(sqlite_http)
+    assert stored
+    for trial in stored:
+        assert trial["proposal_density"] == densities[trial["pose_index"]]
 
 
 def test_a_list_of_poses_may_hold_matrices(sqlite_http: httpx.Client) -> None:

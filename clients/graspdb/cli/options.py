@@ -24,7 +24,7 @@ import numpy as np
 import typer
 
 from graspdb.cli.common import State
-from graspdb.files.trials import read_poses
+from graspdb.files.trials import read_drawn_poses
 from graspdb.options import Corners, Option, PoseFile, Vector
 
 __all__ = ["Commands", "Numbers", "option_names", "vector_option"]
@@ -139,7 +139,7 @@ class _Field:
                 raise typer.BadParameter(f"{_flag(option.lower)} and {_flag(option.upper)} go together")
             return None if lower is None else (lower, upper)
         given = values[self.name]
-        return read_poses(given) if isinstance(option, PoseFile) and given is not None else given
+        return read_drawn_poses(given) if isinstance(option, PoseFile) and given is not None else given
 
 
 def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:

@@ -15,7 +15,7 @@ import math
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,10 +85,26 @@ def as_stated(
     return converted
 
 
+class DrawnPoses(NamedTuple):
+    """N poses of a file, (N, 3) metres and (N, 4), and the density (N,) that each was drawn with,
+    1/(m^3 rad^3), NaN where it says none.
+    """
+
+    position: NDArray[np.float64]
+    quaternion_xyzw: NDArray[np.float64]
+    proposal_density: NDArray[np.float64]
+
+
 def read_poses(path: str) -> NDArray[np.float64]:
     """Poses as rows x y z qx qy qz qw (N, 7), from .csv, .npy, .json or NDJSON; FileProblem says where."""
+    return np.concatenate(read_drawn_poses(path)[:2], axis=1)
+
+
+def read_drawn_poses(path: str) -> DrawnPoses:
+    """Poses as :func:`read_poses` reads them, with their ``proposal_density`` where the file has it."""
     if path.lower().endswith(".npy"):
-        return as_poses(np.load(path, allow_pickle=False)).rows
+        position, quaternion = as_poses(np.load(path, allow_pickle=False))
+        return DrawnPoses(position, quaternion, np.full(len(position), np.nan))
     if path.lower().endswith(".csv"):
         records = _csv(path, trials=False)
     else:
@@ -99,12 +115,12 @@ def read_poses(path: str) -> NDArray[np.float64]:
             data = data["columns"]
         if isinstance(data, dict) and isinstance(data.get("quaternion_xyzw"), list):
             nested = data["quaternion_xyzw"] and isinstance(data["quaternion_xyzw"][0], list)
-            columns = {key: data.get(key) for key in ("position", "quaternion_xyzw")}
+            columns = {key: data.get(key) for key in ("position", "quaternion_xyzw", "proposal_density")}
             data = _rows(path, columns) if nested else [data]
         records = data if isinstance(data, list) else [data]
     if not records:
         raise FileProblem(f"{path} has no poses")
-    rows = []
+    rows, densities = [], []
     for number, record in enumerate(records):
         try:
             pose: Any = record
@@ -113,10 +129,13 @@ def read_poses(path: str) -> NDArray[np.float64]:
             elif isinstance(record, dict):
                 pose = [*record["position"], *record["quaternion_xyzw"]]
             rows.append(as_poses(pose).rows[0])
+            drawn = record.get("proposal_density") if isinstance(record, dict) else None
+            densities.append(math.nan if drawn is None else float(drawn))
         except (KeyError, TypeError, ValueError) as error:
             reason = f"has no {error}" if isinstance(error, KeyError) else str(error)
             raise FileProblem(f"{path}, pose {number}: {reason}") from error
-    return np.array(rows)
+    table = np.array(rows)
+    return DrawnPoses(table[:, :3], table[:, 3:], np.array(densities))
 
 
 def _json_or_ndjson(path: str) -> Any:
@@ -193,6 +212,8 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
                     if text:
                         record[name] = _number(where, name, text) if name in _NUMBER_COLUMNS else text
                 record["outcome"] = _outcome(record.get("outcome"))
+            elif (row.get("proposal_density") or "").strip():
+                record["proposal_density"] = _number(where, "proposal_density", row["proposal_density"])
             records.append(record)
     if not records:
         raise FileProblem(f"{path} has a header but no rows")

@@ -23,7 +23,7 @@ from rich.progress import (
 from graspdb import wire
 from graspdb.errors import SweepFailed
 from graspdb.options import Corners, Option, PoseFile
-from graspdb.poses import as_poses, vector
+from graspdb.poses import as_poses, numbers, vector
 from graspdb.resources.pages import Listing, Resource, answers, segment, validate
 from graspdb.resources.results import TriedPoses, pose_columns, table_html
 from graspdb.transport import Transport
@@ -55,6 +55,8 @@ class SweepOptions(TypedDict, total=False):
 
     The grid has ``position_step_m``, ``rotation_step_deg``, a ``margin_m`` about the bounding box, and a
     ``region``, the box (lower, upper) it is cut to; ``max_poses`` takes a random part of it, by ``seed``.
+    Poses are stored with their ``proposal_density``, (N,) or one number, 1/(m^3 rad^3), NaN where unknown; by
+    default that of the samples or proposals that ``poses`` are.
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
     counter gravity in every direction) or ``lift``; ``fidelity`` ``standard`` or ``fine`` (smaller time
     step); ``purpose`` ``collect``, or ``check``: outcomes are stored but enter no density.
@@ -71,6 +73,7 @@ class SweepOptions(TypedDict, total=False):
     poses: Annotated[
         ArrayLike | Any | None, PoseFile("Simulate exactly the poses of this file (.csv, .npy, .json).")
     ]
+    proposal_density: ArrayLike | None
     sample: Annotated[int | None, Option("Simulate so many draws from the density.", min=1)]
     seed: Annotated[int | None, Option("Of --max-poses or --sample.", min=0)]
     gripper: Annotated[str | None, Option("Gripper profile [pg70].")]
@@ -259,7 +262,11 @@ def create_sweep(transport: Transport, path: str, options: SweepOptions) -> Swee
     if poses is not None:
         if seed:
             raise ValueError("seed is for a grid or for sample: given poses are simulated as they are")
-        fields["poses"] = as_poses(poses).columns()
+        given = as_poses(poses)
+        drawn = fields.pop("proposal_density", getattr(poses, "proposal_density", None))
+        if drawn is not None:
+            fields["proposal_density"] = numbers("proposal_density", drawn, len(given.position))
+        fields["poses"] = given.columns()
     elif sample is not None:
         fields["sample"] = {"count": sample, **seed}
     else:

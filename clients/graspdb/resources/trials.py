@@ -11,14 +11,14 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.options import Option, known_keywords
-from graspdb.poses import as_poses, first_masked
+from graspdb.poses import as_poses, first_masked, listed, numbers
 from graspdb.resources.pages import Listing, Resource, segment
 from graspdb.resources.results import TrialArrays
 from graspdb.resources.selection import TrialSelection
@@ -138,11 +138,11 @@ class Trials(Resource):
         given = as_poses(poses)
         count = len(given.position)
         columns = {**given.columns(), "outcome": _outcomes(outcomes, count)}
-        numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
-        columns |= {name: _numbers(name, x, count) for name, x in numbers.items() if x is not None}
+        given_numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
+        columns |= {name: numbers(name, x, count) for name, x in given_numbers.items() if x is not None}
         if pose_covariance is not None:
             covariances = np.asarray(pose_covariance, dtype=np.float64)
-            columns["pose_covariance"] = _listed("pose_covariance", covariances, count, (6, 6))
+            columns["pose_covariance"] = listed("pose_covariance", covariances, count, (6, 6))
         if measured_at is not None:
             columns["measured_at"] = _times(measured_at, count)
         shared: dict[str, Any] = {"gripper": gripper, "source": source, "protocol": protocol}
@@ -303,17 +303,17 @@ def _from_row(finding: wire.Finding, start: int) -> wire.Finding:
 def _times(times: Any, count: int) -> list[str | None]:
     """Times as text, a value a trial; NumPy's and pandas' too, whose missing ones are None."""
     if getattr(getattr(times, "dtype", None), "kind", None) == "M":
-        utc = _listed("measured_at", np.asarray(times, dtype="datetime64[us]"), count)
+        utc = listed("measured_at", np.asarray(times, dtype="datetime64[us]"), count)
         return [None if time is None else time.replace(tzinfo=UTC).isoformat() for time in utc]
-    listed = _each("measured_at", times, datetime, count)
+    each = _each("measured_at", times, datetime, count)
     # A missing time of pandas is one that differs from itself.
-    return [None if time is None or time != time else time.isoformat() for time in listed]
+    return [None if time is None or time != time else time.isoformat() for time in each]
 
 
 def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
     if (row := first_masked(outcomes)) is not None:
         raise ValueError(f"outcome {row} is masked: leave it out")
-    values = _listed("outcomes", np.asarray(outcomes), count)
+    values = listed("outcomes", np.asarray(outcomes), count)
     for index, value in enumerate(values):
         if not isinstance(value, bool) and value not in wire.OUTCOME_CODES:
             raise ValueError(
@@ -322,29 +322,12 @@ def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
     return values
 
 
-def _numbers(name: str, values: ArrayLike, count: int) -> list[float | None]:
-    if np.ma.is_masked(values):
-        values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
-    listed = _listed(name, np.asarray(values, dtype=np.float64), count)
-    return [None if np.isnan(value) else value for value in listed]
-
-
-def _listed(name: str, array: NDArray[Any], count: int, one: tuple[int, ...] = ()) -> list[Any]:
-    """A value of shape ``one`` a trial; one goes for all."""
-    if array.shape not in {one, (count, *one)}:
-        raise ValueError(
-            f"{name}: shape {array.shape}; expected {(count, *one)}, one a pose, or {one} for all"
-        )
-    listed: list[Any] = np.broadcast_to(array, (count, *one)).tolist()
-    return listed
-
-
 def _each(name: str, values: Any, kind: type[Any], count: int) -> list[Any]:
     """A value a trial; one goes for all."""
-    listed = [values] * count if isinstance(values, kind) else list(values)
-    if len(listed) != count:
-        raise ValueError(f"{name} has {len(listed)} entries for {count} poses")
-    return listed
+    each = [values] * count if isinstance(values, kind) else list(values)
+    if len(each) != count:
+        raise ValueError(f"{name} has {len(each)} entries for {count} poses")
+    return each
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from graspdb.wire.base import (
 )
 from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
+from graspdb.wire.trials import ProposalDensity
 
 Protocol = Literal["wrench", "lift"]
 Fidelity = Literal["standard", "fine"]
@@ -79,6 +80,9 @@ class SweepCreate(Request):
     """Simulate a grid about the object; null for another plan."""
     poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns | None = None
     """Simulate exactly these poses of the tool frame in the object frame; null for another plan."""
+    proposal_density: list[ProposalDensity | None] | ProposalDensity | None = None
+    """Density that each of ``poses`` was drawn with, or all of them, 1/(m^3 rad^3), as proposals have it: it
+    weighs their trials; null where it is not known."""
     sample: SampleSpec | None = None
     """Simulate draws from the density; null for another plan."""
     gripper: Slug = "pg70"
@@ -97,6 +101,8 @@ class SweepCreate(Request):
     def _one_plan(self) -> SweepCreate:
         if sum(plan is not None for plan in (self.grid, self.poses, self.sample)) > 1:
             raise ValueError("give one of grid, poses and sample")
+        if self.proposal_density is not None and self.poses is None:
+            raise ValueError("proposal_density is of given poses: grids and samples have their own")
         return self
 
 

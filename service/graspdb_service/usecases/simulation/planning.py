@@ -127,7 +127,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created
 
 def _request(spec: SweepCreate, plan: _Plan) -> dict[str, Any]:
     """What was asked for, defaults filled in; given poses are stored as the plan's."""
-    asked = spec.model_dump(mode="json", exclude={"poses"}, exclude_none=True)
+    asked = spec.model_dump(mode="json", exclude={"poses", "proposal_density"}, exclude_none=True)
     if plan.grid is not None:
         asked["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
     return asked
@@ -195,7 +195,7 @@ def _mass(row: ObjectRow) -> float | None:
 
 def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan:
     if spec.poses is not None:
-        return _given(ctx, spec.poses)
+        return _given(ctx, spec.poses, spec.proposal_density)
     if spec.sample is not None:
         return _drawn(ctx, slug, spec, spec.sample)
     wish = spec.grid or GridSpec()
@@ -220,12 +220,19 @@ def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan
     return _Plan("grid", count, grid=plan, full_count=full)
 
 
-def _given(ctx: Estimators, given: Sequence[Pose] | PoseColumns) -> _Plan:
+def _given(
+    ctx: Estimators,
+    given: Sequence[Pose] | PoseColumns,
+    drawn: Sequence[float | None] | float | None,
+) -> _Plan:
     poses = poses_of(given)
     limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
     if len(poses) > limit:
         raise invalid("poses", f"{len(poses)} are more than {limit}: make several sweeps of them")
-    table = np.column_stack([*poses, np.full(len(poses), np.nan)])
+    densities = np.array(drawn, dtype=np.float64)
+    if densities.shape not in ((), (len(poses),)):
+        raise invalid("proposal_density", f"{len(densities)} values for {len(poses)} poses")
+    table = np.column_stack([*poses, np.broadcast_to(densities, len(poses))])
     return _Plan("poses", len(table), poses=table)
 
 
