@@ -199,16 +199,26 @@ class Successes:
         return estimates
 
     def add_prior(
-        self, estimates: Estimates, model: Model | None, poses: Poses, test: CollisionTest | None
+        self,
+        estimates: Estimates,
+        model: Model | None,
+        poses: Poses,
+        test: CollisionTest | None,
+        free: Bools | None,
     ) -> None:
         """What geometry tells of poses too far from every attempt, where it can be known."""
-        far = np.flatnonzero(~estimates.enough)
-        if test is None or not far.size:
+        far = ~estimates.enough
+        if test is None or free is None or not far.any():
+            return
+        estimates.prior[far] = 0.0
+        # What collides holds nothing: only the others are worth closing the jaw on.
+        rows = np.flatnonzero(far & free)
+        if not rows.size:
             return
         threads = self._compute.threads
         share = self._compute.run(lambda: _share_of_held(model, test, threads))
-        held = np.concatenate(self._compute.blocks(poses[far], partial(test.holds, threads=threads)))
-        estimates.prior[far] = np.where(held, share, 0.0)
+        held = np.concatenate(self._compute.blocks(poses[rows], partial(test.holds, threads=threads)))
+        estimates.prior[rows[held]] = share
 
     def _refresh(self, key: _Key, selected: Selected, before: _Attempts | None) -> _Attempts:
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]

@@ -123,7 +123,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     estimates = None
     if question.chances:
         estimates = ctx.successes.estimate(question.model, poses, free)
-        ctx.successes.add_prior(estimates, question.model, poses, test)
+        ctx.successes.add_prior(estimates, question.model, poses, test, free)
     reach = reach_info(question.model)
     grasps = []
     for i, item in enumerate(found):

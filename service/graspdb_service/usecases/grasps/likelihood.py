@@ -84,7 +84,7 @@ def likelihood(
             columns["effective_trials"] = estimates.effective_trials
             columns["support"] = support_columns(estimates)
             if test is not None and asked("prior_success_probability"):
-                ctx.successes.add_prior(estimates, model, poses, test)
+                ctx.successes.add_prior(estimates, model, poses, test, free)
                 columns["prior_success_probability"] = estimates.prior
         columns["collision_free"] = free
     known = {name: column for name, column in columns.items() if column is not None and asked(name)}
