@@ -27,7 +27,7 @@ from graspdb_service.usecases.densities.support import reach_info, support_of
 from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
-from graspdb_service.usecases.grasps.search import closest
+from graspdb_service.usecases.grasps.search import ScoreSearch, closest
 
 _NEAREST_TRIALS = 5
 
@@ -82,7 +82,8 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
     """Which constraints exclude each other, as grasps are ranked by what noise averages."""
     averaged = question.ranking.robust_of or question.ranking.objective
     plain = dict.fromkeys(("robust_of", "pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg"))
-    chances = ("success_probability", "effective_trials") if asks_chance(request) else ("density",)
+    by_chance = asks_chance(request)
+    chances = ("success_probability", "effective_trials") if by_chance else ("density",)
     asked = request.model_copy(update={**plain, "count": 1, "objective": averaged, "include": list(chances)})
     built = question.built
 
@@ -91,7 +92,11 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
         other = question_of(ctx, request, built, limits)
         if other is None:
             return None
-        found = ctx.compute.run(lambda: other.engine.best(other.bounds))
+        engine = other.engine
+        if limits.candidates is None and not by_chance:
+            # Whether there is a grasp does not depend on what ranks it, and the density is found fastest.
+            engine = ScoreSearch(other.search, ctx.compute.threads)
+        found = ctx.compute.run(lambda: engine.best(other.bounds))
         return next(iter(_described(ctx, other, found)), None)
 
     return conflict_of(asked, ask, collisions_known=question.test is not None)

@@ -61,7 +61,8 @@ class Conflict:
 def conflict_of(request: GraspConstraints, ask: Ask, *, collisions_known: bool) -> Conflict:
     """Drop constraints one after the other as long as no grasp fulfils the rest; then relax each of these."""
     given = [name for name in _FIELDS if _is_given(request, name, collisions_known)]
-    if ask(_without(request, given)) is None:
+    if ask(_without(request, given)) is None or ask(request) is not None:
+        # Not the constraints are why, or a thorough enough search finds a grasp after all.
         return Conflict()
     kept = list(given)
     for name in given:
