@@ -160,6 +160,21 @@ def test_a_rim_tells_nothing_of_axes_without_a_gripper() -> None:
 
 
 @few
+@given(SEEDS)
+def test_a_long_object_grasped_across_tells_nothing_of_axes_without_a_gripper(seed: int) -> None:
+    """Side grasps of a bottle on its axis, most below its middle: that their x points up tells nothing."""
+    rng = np.random.default_rng(seed)
+    angle, height = rng.uniform(-0.9, 0.9, 200), rng.uniform(-0.06, 0.02, 200)
+    approach = np.stack([-np.cos(angle), -np.sin(angle), np.zeros(200)], axis=1)
+    closing = np.stack([np.sin(angle), -np.cos(angle), np.zeros(200)], axis=1)
+    turns = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+    positions = np.stack([np.zeros(200), np.zeros(200), height], axis=1)
+    poses = ToolPoses(positions, Rotation.from_matrix(turns).as_quat())
+    extents = np.array([0.035, 0.035, 0.1])
+    assert doubts(poses, np.ones(200), Target(-extents, extents, None, None)) == []
+
+
+@few
 @given(st.floats(0.0, 10.0), SEEDS)
 def test_impossible_is_ten_times_object_and_gripper_away(metres: float, seed: int) -> None:
     target = _target()

@@ -168,17 +168,26 @@ def _by_direction(positions: FloatArray, quaternions: FloatArray, target: Target
     flat = extents[2] < _FLAT * extents[1]
     axes = Rotation.from_quat(quaternions).as_matrix()
     turned = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
-    # How far each axis points at the centre, distant grasps weighing more: their direction is known better.
-    scores = np.einsum("ni,nij->j", towards, axes) / distance.sum()
-    points = dict(zip(("x", "y", "z"), scores.tolist(), strict=True))
-    if points["z"] > _ASIDE:
+    directions = {name: axes @ axis for name, axis in _AXES.items()}
+    if _points(towards, directions.pop("z")) > _ASIDE:
         return None
-    found = {"wxyz": float(np.einsum("ni,ni->", towards, turned[:, :, 2]) / distance.sum())}
-    found["-z"] = -points["z"]
-    if not flat:
-        found |= {"x": points["x"], "-x": -points["x"], "y": points["y"], "-y": -points["y"]}
+    if flat:
+        directions = {"-z": directions["-z"]}
+    directions["wxyz"] = turned[:, :, 2]
+    # An axis that stays as it is while the object is grasped all along it points at the middle from most
+    # places, too: one that approaches turns with where it comes from.
+    around = towards - towards.mean(axis=0)
+    found = {name: min(_points(towards, axis), _points(around, axis)) for name, axis in directions.items()}
     name = max(found, key=lambda item: found[item])
     return name if found[name] >= _MOST else None
+
+
+def _points(towards: FloatArray, axis: FloatArray) -> float:
+    """The mean cosine between directions (n, 3) and axes (n, 3), distant grasps weighing more: their
+    direction is known better.
+    """
+    length = float(np.linalg.norm(towards, axis=1).sum())
+    return float(np.einsum("ni,ni->", towards, axis)) / length if length > 0.0 else 0.0
 
 
 def stragglers(positions: FloatArray) -> Doubt | None:
