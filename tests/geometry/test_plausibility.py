@@ -135,6 +135,16 @@ def test_another_approach_axis_is_named(seed: int, axis: str) -> None:
 
 @few
 @given(SEEDS)
+def test_closing_along_x_is_named(seed: int) -> None:
+    poses = _rim_grasps(seed)
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    turned = (Rotation.from_quat(np.asarray(poses.quaternions_xyzw)) * quarter).as_quat()
+    found = doubts(ToolPoses(poses.positions, turned), _all(poses), PLATE)
+    assert (found[0].code, found[0].likeness) == ("another-closing-axis", "x")
+
+
+@few
+@given(SEEDS)
 def test_a_cloud_alone_tells_reversed_approaches_wherever_it_lies(seed: int) -> None:
     rng = np.random.default_rng(seed)
     outward = rng.normal(size=(60, 3))

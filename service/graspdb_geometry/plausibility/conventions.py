@@ -40,6 +40,8 @@ _WORLD_M, _AROUND = 10.0, 0.2
 #: In whatever unit they are, grasps of one object are spread by more than this.
 _CLOSEST_M = 0.0005
 
+_CLOSING_X = "z, closing along x"
+
 #: Directions to the object that agree more than this with one another tell nothing of an axis: in a single
 #: cluster any axis may point there.
 _ALIKE = 0.9
@@ -109,6 +111,8 @@ def rotations(poses: ToolPoses, held: IntArray, target: Target | None) -> Doubt 
     rows = np.arange(count)
     if name == "wxyz":
         return Doubt("looks-like-wxyz", rows, len(asked))
+    if name == _CLOSING_X:
+        return Doubt("another-closing-axis", rows, len(asked), "x")
     return Doubt("another-approach-axis", rows, len(asked), name)
 
 
@@ -121,7 +125,7 @@ def _conventions(quaternions: FloatArray) -> Iterator[tuple[str, FloatArray]]:
         for closing in _AXES.values():
             if abs(axis @ closing) < 0.5 and closing.sum() > 0 and not (name == "z" and closing[1]):
                 turn = Rotation.from_matrix(np.stack([np.cross(closing, axis), closing, axis], axis=1))
-                label = name if name != "z" else "z, closing along x"
+                label = name if name != "z" else _CLOSING_X
                 yield label, (Rotation.from_quat(quaternions) * turn).as_quat()
 
 

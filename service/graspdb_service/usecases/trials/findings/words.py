@@ -49,6 +49,11 @@ _WORDS = {
         f"{_FRAME}. Turn the poses about their own origin so that z approaches and post them again in"
         " place of these",
     ),
+    "another-closing-axis": _Words(
+        "the fingers look as if they close along the tool's {detail} axis: along y few of the grasps hold the"
+        " object without colliding, along {detail} most do",
+        f"{_FRAME}. Turn the poses by 90 degrees about their own z and post them again in place of these",
+    ),
     "out-of-reach": _Words(
         "{of} lie farther from the object than the gripper reaches ({detail} from the tool's origin)",
         f"{_FRAME}. A pose of the flange or of the gripper's base needs the way to the tool (base_to_tool)",
