@@ -32,7 +32,8 @@ def doubts(poses: PoseArrays, held: npt.ArrayLike, target: Target | None) -> lis
         A unit or convention that they look like instead first, then single poses. Codes:
         ``looks-like-millimetres``, ``looks-like-centimetres``, ``looks-like-wxyz``,
         ``another-approach-axis``, ``another-closing-axis``, ``implausible-poses`` (beyond
-        `Target.limit_m`), ``out-of-reach``, ``approaches-away``, ``collides``, ``closes-on-nothing``; without a target ``far-from-the-rest``.
+        `Target.limit_m`), ``out-of-reach``, ``approaches-away``, ``collides``,
+        ``closes-on-nothing``; without a target ``far-from-the-rest``.
 
     Raises
     ------
