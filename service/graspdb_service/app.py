@@ -40,6 +40,8 @@ from graspdb_service.api import (
 )
 from graspdb_service.api.context import Context
 from graspdb_service.api.routing.document import document
+from graspdb_service.api.routing.encodings import Decoding
+from graspdb_service.api.routing.methods import METHODS, Methods, allowed
 from graspdb_service.api.routing.scopes import declared_parameters, refuse_unknown_parameters
 from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid_fields
@@ -112,6 +114,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.parameters = declared_parameters(openapi_document())
     _add_docs(app)
     _add_problems(app)
+    app.add_middleware(Methods)
+    app.add_middleware(Decoding, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(RequestTrace, max_body_bytes=settings.max_body_bytes)
     return app
 
@@ -184,8 +188,9 @@ class RequestTrace:
             await problem_response(problem, request_id)(scope, receive, traced)
         finally:
             route = getattr(scope.get("route"), "path", "unmatched")
-            REQUESTS.labels(scope["method"], route, status).inc()
-            LATENCY.labels(scope["method"], route).observe(time.perf_counter() - started)
+            method = scope["method"] if scope["method"] in METHODS else "other"
+            REQUESTS.labels(method, route, status).inc()
+            LATENCY.labels(method, route).observe(time.perf_counter() - started)
 
 
 def _add_docs(app: FastAPI) -> None:
@@ -246,7 +251,8 @@ def _add_problems(app: FastAPI) -> None:
             404: f"There is nothing at {request.url.path}",
             405: f"{request.method} is not for {request.url.path}",
         }.get(error.status_code, str(error.detail))
-        return answer(request, ProblemError(error.status_code, kind, title, headers=error.headers))
+        headers = {"Allow": allowed(request.scope)} if error.status_code == 405 else error.headers
+        return answer(request, ProblemError(error.status_code, kind, title, headers=headers))
 
 
 def body_too_large() -> ProblemError:
