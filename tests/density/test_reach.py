@@ -187,6 +187,36 @@ def test_what_was_tried_in_one_orientation_tells_of_no_other() -> None:
     assert not found.covers(near).any()
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("kernel", [ISOTROPIC, DIAGONAL, ALONG], ids=["isotropic", "diagonal", "along axes"])
+def test_turns_about_one_axis_tell_nothing_of_the_others(kernel: SuccessKernel, axis: int) -> None:
+    """A jaw that went round a bottle, at many heights, and was never tilted."""
+    rng = np.random.default_rng(7)
+    unit = np.eye(3)[axis]
+    angle, height = rng.uniform(-1.2, 1.2, 2_000), rng.uniform(-0.3, 0.3, 2_000)
+    rows = Poses(height[:, None] * unit, se3.from_rotation_vector(angle[:, None] * unit))
+    won = np.sin(height / 0.06) > 0.0
+    model = SuccessModel.build(rows, won, kernel=kernel, symmetric=False)
+    found = validate_reach(model)
+
+    def told(turn: list[float], shift: float = 0.0) -> bool:
+        at = Poses(0.1 * unit[None] + shift * np.roll(unit, 1), se3.from_rotation_vector(np.array([turn])))
+        return bool(found.covers(model.evaluate_near(at)[1])[0])
+
+    width = math.radians(15.0) if kernel is ISOTROPIC else kernel.sigmas[3 + axis]
+    assert told((1.2 * unit).tolist())
+    assert told(((1.2 + 1.5 * width) * unit).tolist())
+    assert not told((0.6 * np.roll(unit, 1)).tolist())
+    assert not told((0.6 * np.roll(unit, 2)).tolist())
+    assert not told([0.0, 0.0, 0.0], shift=0.04)
+
+
+def test_where_all_was_tried_no_axis_stands_out() -> None:
+    found = reach_of(wave(0.04), 4_000, 0, turn=1.5)
+    assert min(found.along[:3]) >= found.position * ISOTROPIC.sigma_position_m
+    assert min(found.along[3:]) >= 0.6 * found.rotation * ISOTROPIC.sigma_rotation
+
+
 def test_all_alike_or_nothing() -> None:
     rng = np.random.default_rng(2)
     rows = scattered(500, rng)

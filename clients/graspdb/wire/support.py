@@ -59,11 +59,12 @@ class SupportColumns(Response):
 
 
 class ReachInfo(Response):
-    """How far from an attempt success probabilities are told; both limits hold of the nearest attempt.
+    """How far from an attempt success probabilities are told; all limits hold of the nearest attempt.
 
     Validated on attempts that were predicted again with everything nearer left out: up to there they are
     predicted better than by the share of successes alone. Where too few attempts tell, up to how near
-    19 of 20 attempts lie to another one.
+    19 of 20 attempts lie to another one. Along and about each axis no farther than attempts near one another
+    lie apart: a tool that only ever turned about one axis tells nothing of the others.
     """
 
     position_widths: float
@@ -74,6 +75,12 @@ class ReachInfo(Response):
     """Limit of the translation, metres; null where the kernel has a width for every axis."""
     rotation_deg: float | None = None
     """Limit of the rotation, degrees; null where the kernel has a width for every axis."""
+    along_m: list[float] | None = None
+    """Limits of the translation along x, y and z of the attempt's gripper, or along the kernel's axes where
+    it has its own, metres, (3,); null in answers of earlier versions."""
+    about_deg: list[float] | None = None
+    """Limits of the rotation about x, y and z of the attempt's gripper, degrees, (3,); null in answers of
+    earlier versions."""
     validated: bool
     """Whether left-out attempts are predicted better than by the share at all."""
     attempts: int

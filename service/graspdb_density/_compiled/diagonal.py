@@ -161,9 +161,11 @@ def _displaced(data, i, twin, at, half, turning):
 
 
 @exact
-def displacements(cells, places, positions, quaternions, half, turning, out):
-    """How far every pose is from the row at its place, into ``out`` (M, 4): metres, radians, and either in
-    widths. ``half`` and ``turning`` as in `square_sums`.
+def displacements(cells, places, positions, quaternions, half, turning, gripper, out):
+    """How far every pose is from the row at its place, into ``out`` (M, 10): metres, radians, either in
+    widths, and the translation (3) and rotation vector (3) themselves, metres and radians. ``half`` and
+    ``turning`` as in `square_sums`; where ``gripper``, the translation is along the row's gripper's axes
+    whatever the widths are along.
     """
     table = cells.table
     for j in range(positions.shape[0]):
@@ -177,6 +179,11 @@ def displacements(cells, places, positions, quaternions, half, turning, out):
         out[j, 1] = math.sqrt(u * u + v * v + t * t)
         out[j, 2] = math.sqrt(2.0 * moved)
         out[j, 3] = math.sqrt(2.0 * turned)
+        if gripper and not turning:
+            data = cells.data
+            x, y, z = turned_back(data[3, i], data[4, i], data[5, i], data[6, i], x, y, z)
+        out[j, 4], out[j, 5], out[j, 6] = x / cells.scale, y / cells.scale, z / cells.scale
+        out[j, 7], out[j, 8], out[j, 9] = u, v, t
 
 
 @exact

@@ -61,12 +61,16 @@ class NearestAttempts:
         Metres, and radians from it or from its jaw's twin, whichever is nearer.
     position_widths, rotation_widths : (M,)
         The same in standard deviations of the kernel.
+    displacement : (M, 6) or None
+        The translation, metres, along the attempt's gripper's axes, or along the kernel's where it has its
+        own; and the rotation vector, radians, in the gripper's axes. None where it was not kept.
     """
 
     position_m: Floats
     rotation: Floats
     position_widths: Floats
     rotation_widths: Floats
+    displacement: Floats | None = None
 
     @property
     def widths(self) -> Floats:
@@ -288,15 +292,21 @@ class SuccessModel:
         far = np.flatnonzero(np.maximum(*places) < 0.0)
         if everywhere and far.size:
             best[:, far], places[:, far] = self._search(along[far], threads)
-        distances = np.full((len(poses), 4), np.inf)
+        distances = np.full((len(poses), 10), np.inf)
         nearer = np.argmax(best, axis=0)
         for number, cells in enumerate(self.parts):
             rows = np.flatnonzero((nearer == number) & (places[number] >= 0.0))
             if cells is not None and rows.size:
-                at, out = places[number, rows].astype(np.int64), np.empty((len(rows), 4))
-                diagonal.displacements(cells.arrays, at, *along[rows], self.half(cells), self.turning, out)
-                distances[rows] = out
-        return NearestAttempts(*np.ascontiguousarray(distances.T))
+                distances[rows] = self.displacements(cells, places[number, rows], along[rows])
+        metres, radians, along, about = np.ascontiguousarray(distances[:, :4].T)
+        return NearestAttempts(metres, radians, along, about, distances[:, 4:])
+
+    def displacements(self, cells: Cells, places: Floats, along: Poses) -> Floats:
+        """From sorted attempts to poses along the kernel's axes, (M, 10), as `diagonal.displacements`."""
+        at, out = places.astype(np.int64), np.empty((len(along), 10))
+        gripper = self.turning or isinstance(self.kernel, IsotropicKernel)
+        diagonal.displacements(cells.arrays, at, *along, self.half(cells), self.turning, gripper, out)
+        return out
 
     def _search(self, along: Poses, threads: int) -> Floats:
         """Largest exponents and their places in either part, however far, (2, 2, M)."""
@@ -319,6 +329,14 @@ class SuccessModel:
         """The kernel's largest width in position."""
         kernel = self.kernel
         return kernel.sigma_position_m if isinstance(kernel, IsotropicKernel) else max(kernel.sigmas[:3])
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """The kernel's width along and about every axis, metres and radians, (6,)."""
+        kernel = self.kernel
+        if isinstance(kernel, IsotropicKernel):
+            return (kernel.sigma_position_m,) * 3 + (kernel.sigma_rotation,) * 3
+        return tuple(kernel.sigmas)
 
     @property
     def turning(self) -> bool:

@@ -7,6 +7,10 @@ at the edge of what was tried. Predictions reach as far as that distance may gro
 by Brier's score, than the share of successes alone. Distances of position and of rotation are judged apart,
 for an object may forgive one and not the other, in standard deviations of the kernel.
 
+Neither distance is asked in one direction alone, and attempts may lie along a line of directions: a tool
+that only ever turned about one axis tells nothing of the others. So no component of a displacement, along or
+about an axis of the gripper, reaches farther than those between attempts near one another.
+
 Attempts of one block of space fare alike: means over attempts are compared by how they differ between blocks.
 
 Where too few attempts tell, or predictions beat nothing, no distance is validated. What lies as near to an
@@ -45,6 +49,8 @@ _JUDGED, _PAIRS = 800, 2_000_000
 _LEAST_JUDGED, _LEAST_BLOCKS, _BLOCK_WIDTHS = 20, 5, 3.0
 #: Chance that a distance is validated at which predictions are no better than the share.
 _CHANCE = 0.05
+#: Pairs whose displacements are looked at, and the fewest within the cut-off that tell of an axis.
+_DISPLACED, _LEAST_PAIRS = 200_000, 20
 #: Within the distance that this share of attempts keep from the nearest other one a pose counts as tried
 #: itself; the distance is bounded, in widths.
 _NEARLY_ALL, _NEAREST, _FARTHEST = 0.95, 0.2, 1.0
@@ -64,6 +70,9 @@ class Reach:
         tell, 0 where they are predicted no better.
     attempts
         How many there were when it was validated.
+    along : (6,)
+        Up to where a displacement from the nearest attempt is told along each axis, metres, and about it,
+        radians; axes as in `NearestAttempts.displacement`.
     """
 
     position: float
@@ -71,11 +80,14 @@ class Reach:
     validated_position: float | None
     validated_rotation: float | None
     attempts: int
+    along: tuple[float, ...] = (math.inf,) * 6
 
     def covers(self, nearest: NearestAttempts) -> Bools:
         """Whether poses (M,) are within reach of the attempt nearest to each."""
-        near = nearest.position_widths <= self.position
-        return np.asarray(near & (nearest.rotation_widths <= self.rotation))
+        near = (nearest.position_widths <= self.position) & (nearest.rotation_widths <= self.rotation)
+        if nearest.displacement is not None:
+            near &= (np.abs(nearest.displacement) <= np.array(self.along)).all(axis=1)
+        return np.asarray(near)
 
 
 def validate_reach(model: SuccessModel, *, threads: int = 1) -> Reach:
@@ -92,6 +104,8 @@ def validate_reach(model: SuccessModel, *, threads: int = 1) -> Reach:
     if known.any():
         spacing = np.quantile(nearest[known, 1:], _NEARLY_ALL, axis=0)
     tried = np.clip(spacing, _NEAREST, _FARTHEST)
+    sigmas = np.array(model.sigmas)
+    along = np.maximum(judged.ranges(), sigmas * np.repeat(tried, 3))
     position, rotation = (_validated(judged, sums[:, kind]) for kind in range(2))
     return Reach(
         position=max(float(tried[0]), position or 0.0),
@@ -99,6 +113,7 @@ def validate_reach(model: SuccessModel, *, threads: int = 1) -> Reach:
         validated_position=position,
         validated_rotation=rotation,
         attempts=model.size,
+        along=tuple(along.tolist()),
     )
 
 
@@ -107,7 +122,8 @@ class _Judged:
     """Attempts (J) that are predicted again, their positions along the kernel's axes.
 
     ``own`` (2, J) is each one's place among the sorted successes or failures, -1 in the other; ``weight``
-    (J,) what each stands for; ``sides`` (J, 6) directions of translation and rotation.
+    (J,) what each stands for; ``sides`` (J, 6) directions of translation and rotation; ``pairs`` (K, 2) of
+    them, drawn at random.
     """
 
     model: SuccessModel
@@ -116,6 +132,7 @@ class _Judged:
     won: Bools
     weight: Floats
     sides: Floats
+    pairs: NDArray[np.int64]
 
     @classmethod
     def of(cls, model: SuccessModel, rng: np.random.Generator) -> _Judged:
@@ -134,7 +151,23 @@ class _Judged:
             weights.append(np.full(len(places), size / len(places)))
         rows = np.concatenate(own, axis=1)
         sides = rng.standard_normal((rows.shape[1], 6))
-        return cls(model, Poses.concatenate(poses), rows, rows[0] >= 0, np.concatenate(weights), sides)
+        pairs = rng.integers(0, rows.shape[1], (_DISPLACED, 2))
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        return cls(model, Poses.concatenate(poses), rows, rows[0] >= 0, np.concatenate(weights), sides, pairs)
+
+    def ranges(self) -> Floats:
+        """How far apart attempts near one another lie along and about each axis, metres and radians, (6,)."""
+        found = []
+        for number, cells in enumerate(self.model.parts):
+            if cells is not None:
+                pairs = self.pairs[self.own[number, self.pairs[:, 0]] >= 0]
+                places = self.own[number, pairs[:, 0]].astype(np.float64)
+                found.append(self.model.displacements(cells, places, self.poses[pairs[:, 1]]))
+        apart = np.concatenate(found)
+        near = apart[np.hypot(apart[:, 2], apart[:, 3]) <= SUCCESS_CUTOFF, 4:]
+        if len(near) < _LEAST_PAIRS:
+            return np.zeros(6)
+        return np.asarray(np.quantile(np.abs(near), _NEARLY_ALL, axis=0))
 
     def left_out(self, threads: int) -> tuple[Floats, Floats]:
         """Kernel sums (J, 2, K, 3) by the shells of `diagonal.left_out_sums`, and nearest attempts (J, 3)."""

@@ -50,7 +50,7 @@ def _reason(nearest: NearestAttempt | None, reach: ReachInfo | None) -> str:
         return "no attempt tells how likely a success is: post trials that failed, too"
     return (
         f"the nearest attempt is {1e3 * nearest.position_m:.1f} mm and {nearest.rotation_deg:.0f} degrees"
-        f" away; success probabilities are told up to {_limits(reach)}"
+        f" away; success probabilities are told up to {_limits(reach)}{_by_axis(reach)}"
     )
 
 
@@ -59,6 +59,17 @@ def _limits(reach: ReachInfo) -> str:
         widths = f"{reach.position_widths:.2g} kernel widths of position and {reach.rotation_widths:.2g}"
         return f"{widths} of rotation"
     return f"{1e3 * reach.position_m:.1f} mm and {reach.rotation_deg:.0f} degrees"
+
+
+def _by_axis(reach: ReachInfo) -> str:
+    """The limits of single axes, where they say more than those of all."""
+    told = []
+    along, about = reach.along_m, reach.about_deg
+    if along is not None and (reach.position_m is None or min(along) < reach.position_m):
+        told.append(f"{', '.join(f'{1e3 * limit:.0f}' for limit in along)} mm along x, y, z")
+    if about is not None and (reach.rotation_deg is None or min(about) < reach.rotation_deg):
+        told.append(f"{', '.join(f'{limit:.0f}' for limit in about)} degrees about x, y, z")
+    return f", no more than {' and '.join(told)} of the gripper" if told else ""
 
 
 def reach_info(model: Model | None) -> ReachInfo | None:
@@ -71,6 +82,8 @@ def reach_info(model: Model | None) -> ReachInfo | None:
         rotation_widths=reach.rotation,
         validated=bool(reach.validated_position or reach.validated_rotation),
         attempts=reach.attempts,
+        along_m=list(reach.along[:3]),
+        about_deg=np.degrees(reach.along[3:]).tolist(),
         rule="",
     )
     if isinstance(kernel, IsotropicKernel):
@@ -91,5 +104,8 @@ def reach_info(model: Model | None) -> ReachInfo | None:
         if validated is not None:
             why = "left-out attempts are predicted no better than by the share of successes any farther"
         told.append(f"{name}: {why}, so as near as 19 of 20 attempts lie to another one, at most one width")
-    info.rule = f"up to {_limits(info)} from the nearest attempt ({'; '.join(told)})"
+    by_axis = _by_axis(info)
+    if by_axis:
+        told.append("along and about single axes: as far as attempts near one another lie apart")
+    info.rule = f"up to {_limits(info)} from the nearest attempt{by_axis} ({'; '.join(told)})"
     return info
