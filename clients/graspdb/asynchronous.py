@@ -258,6 +258,8 @@ class AsyncGrippers(Mirror[Grippers]):
     """:class:`graspdb.resources.grippers.Grippers`."""
 
     create = _awaited(Grippers.create)
+    update = _awaited(Grippers.update)
+    versions = _iterated(Grippers.versions, _same)
     get = _awaited(Grippers.get)
     delete = _awaited(Grippers.delete)
     list = _iterated(Grippers.list, _same)

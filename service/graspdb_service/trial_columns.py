@@ -76,11 +76,25 @@ class TrialColumns:
 
 
 class Provenance(NamedTuple):
-    """What some of an object's trials have in common."""
+    """What some of an object's trials have in common.
+
+    ``gripper`` is one version, as in ``panda@1``; of a request perhaps an id alone, which means the newest.
+    """
 
     gripper: str | None
     source: str | None
     protocol: str | None
+
+
+def gripper_parts(name: str) -> tuple[str, int | None]:
+    """A gripper's id and its version, None where the name tells none: ``panda@1`` or ``panda``."""
+    gripper, _, version = name.partition("@")
+    return gripper, int(version) if version else None
+
+
+def is_gripper(name: str, asked: str) -> bool:
+    """Whether the gripper of a trial is the one asked for: of any version, where that tells none."""
+    return name == asked or ("@" not in asked and gripper_parts(name)[0] == asked)
 
 
 class BatchOrigin(NamedTuple):

@@ -313,6 +313,11 @@ def test_grippers(run: Run, fresh_id: str, tmp_path: Path) -> None:
     file.write_text(json.dumps({k: v for k, v in profile.items() if v is not None} | {"force_n": 5}))
     assert run("grippers", "create", fresh_id, str(file), "--name", "Weak")[0] == 0
     assert "Weak" in run("grippers", "show", fresh_id)[1]
+    file.write_text(json.dumps(profile | {"force_n": 11}))
+    assert f"{fresh_id}@2 now: force_n changed" in run("grippers", "update", fresh_id, str(file))[1]
+    assert json.loads(run("grippers", "show", f"{fresh_id}@1")[1])["force_n"] != 11
+    assert json.loads(run("grippers", "show", fresh_id)[1])["force_n"] == 11
+    assert f"{fresh_id}@2" in run("grippers", "versions", fresh_id)[1]
     assert run("grippers", "delete", fresh_id)[0] == 0
     assert "no gripper" in run("grippers", "show", fresh_id)[2]
 

@@ -129,6 +129,10 @@ def test_grippers(db: Client, fresh_id: str) -> None:
     profile = db.grippers.get("pg70").profile.model_dump(exclude_none=True)
     made = db.grippers.create(fresh_id, **profile | {"force_n": 10.0})
     assert db.grippers.get(fresh_id).profile == made.profile
+    corrected = db.grippers.update(fresh_id, **profile | {"force_n": 12.0})
+    assert (corrected.version, corrected.changed) == (2, ["force_n"])
+    assert [found.version for found in db.grippers.versions(fresh_id)] == [1, 2]
+    assert db.grippers.get(f"{fresh_id}@1").profile == made.profile
     assert made.profile.force_n == 10.0
     with pytest.raises(InvalidInput, match="finger"):
         db.grippers.create("incomplete", max_opening_m=0.1, palm_size_m=(0.1, 0.1, 0.1))

@@ -15,7 +15,7 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
 
-from graspdb_service.storage import schema
+from graspdb_service.storage import grippers, schema
 from graspdb_service.storage.database import Database, UnsupportedDatabase
 from graspdb_service.storage.tables import metadata
 from graspdb_service.storage.trials import findings
@@ -77,16 +77,18 @@ def test_downgrade_leaves_nothing_and_upgrade_comes_back(empty_url: str) -> None
     database.dispose()
 
 
-@pytest.mark.parametrize("version", ["0001", "0002"])
+@pytest.mark.parametrize("version", ["0001", "0002", "0004"])
 def test_data_of_every_earlier_version_is_read_on(empty_url: str, version: str) -> None:
-    """Batches from before findings have none, and go as before."""
+    """Batches from before findings have none, and go as before; what was tried was with a first version."""
     database = Database(empty_url)
     schema.upgrade(database, version)
     now = "'2026-01-01 00:00:00'"
     statements = (
         f"INSERT INTO objects (id, slug, revision, epoch, last_seq, created_at, updated_at)"
         f" VALUES (1, 'mug', 1, 0, 2, {now}, {now})",
-        "INSERT INTO provenances (id, object_id, source) VALUES (1, 1, 'robot')",
+        "INSERT INTO grippers (id, profile, builtin, created_at)"
+        f""" VALUES ('mine', '{{"max_opening_m": 0.07}}', false, {now})""",
+        "INSERT INTO provenances (id, object_id, gripper, source) VALUES (1, 1, 'mine', 'robot')",
         "INSERT INTO tallies (provenance_id, outcome, row_count, packed_count) VALUES (1, 1, 2, 0)",
         "INSERT INTO batches"
         " (id, key, object_id, revision, first_seq, last_seq, inserted, packed, created_at)"
@@ -104,8 +106,12 @@ def test_data_of_every_earlier_version_is_read_on(empty_url: str, version: str) 
     schema.check(database)
     found = batches.get(database, "mug", KEY)
     assert (found.outcomes, found.sources, found.findings) == ({"success": 2}, ["robot"], [])
+    assert (found.grippers, found.gripper_versions) == (["mine"], ["mine@1"])
     with database.read() as tx:
         assert findings.totals(tx, 1, [1]) == []
+        gripper = grippers.find(tx, "mine")
+    assert gripper is not None
+    assert (gripper.profile, gripper.versioned, gripper.changed) == ({"max_opening_m": 0.07}, "mine@1", None)
     batches.remove(database, "mug", KEY)
     database.dispose()
 

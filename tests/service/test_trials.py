@@ -175,7 +175,9 @@ def test_what_is_posted_is_read_back(mug: httpx.Client, trials: list[dict[str, A
     assert len(stored) == len(trials)
     for sent, found in zip(trials, stored, strict=True):
         assert found["quaternion_xyzw"] == pytest.approx(sent["quaternion_xyzw"], abs=1e-15)
-        for name in set(found) - {"quaternion_xyzw", "seq", "revision", "batch", "withdrawn"}:
+        assert found["gripper_version"] == (None if sent.get("gripper") is None else 1)
+        own = {"quaternion_xyzw", "seq", "revision", "batch", "withdrawn", "gripper_version"}
+        for name in set(found) - own:
             assert found[name] == sent.get(name), name
 
 

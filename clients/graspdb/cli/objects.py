@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +18,9 @@ objects = Commands(no_args_is_help=True, help="Create, list, show and delete obj
 grippers = Commands(no_args_is_help=True, help="Create, list, show and delete gripper profiles.")
 
 GripperId = Annotated[str, typer.Argument(metavar="GRIPPER", show_default=False)]
+ProfileFile = Annotated[
+    Path, typer.Argument(help="JSON file with the profile, as `grippers show` prints it.", show_default=False)
+]
 Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
 
 
@@ -146,32 +149,61 @@ def list_grippers(state: State) -> None:
 
 @grippers.command("show")
 def show_gripper(state: State, id: GripperId) -> None:
-    """Show one gripper profile, as the JSON file that `grippers create` takes."""
+    """Show one gripper profile, or a version as in panda@1: the JSON file that `grippers create` takes."""
     found = state.db.grippers.get(id)
     name = {"name": found.name} if found.name else {}
     profile = found.profile.model_dump(mode="json", exclude_none=True)
     state.show(found, json.dumps({**name, **profile}, indent=2, ensure_ascii=False))
 
 
-@grippers.command("create")
-def create_gripper(
-    state: State,
-    id: GripperId,
-    file: Annotated[
-        Path,
-        typer.Argument(help="JSON file with the profile, as `grippers show` prints it.", show_default=False),
-    ],
-    name: Annotated[str | None, typer.Option(help="A name for people.")] = None,
-) -> None:
-    """Create a gripper profile from a JSON file."""
+def _profile(file: Path) -> dict[str, Any]:
+    """A profile and its name, as `grippers show` prints them."""
     given = json.loads(file.read_text(encoding="utf-8"))
     if not isinstance(given, dict):
         raise ValueError(f"{file} holds no JSON object")
     # With --json `grippers show` prints the service's answer, which has the profile in it.
-    profile = {"name": given.get("name"), **given["profile"]} if "profile" in given else given
-    fields = {**profile, **({"name": name} if name else {}), "id": id}
+    return {"name": given.get("name"), **given["profile"]} if "profile" in given else given
+
+
+@grippers.command("create")
+def create_gripper(
+    state: State,
+    id: GripperId,
+    file: ProfileFile,
+    name: Annotated[str | None, typer.Option(help="A name for people.")] = None,
+) -> None:
+    """Create a gripper profile from a JSON file."""
+    fields = {**_profile(file), **({"name": name} if name else {}), "id": id}
     created = state.db.grippers.create(**fields)
     state.show(created, f"Gripper {created.id} is created.")
+
+
+@grippers.command("update")
+def update_gripper(
+    state: State,
+    id: GripperId,
+    file: ProfileFile,
+    name: Annotated[str | None, typer.Option(help="Another name for people.")] = None,
+) -> None:
+    """Make a new version of a gripper profile from a JSON file; what was tried keeps its version."""
+    fields = {**_profile(file), "id": id, **({"name": name} if name else {})}
+    updated = state.db.grippers.update(fields.pop("id"), **fields)
+    changed = f": {', '.join(updated.changed)} changed" if updated.changed else ""
+    state.show(updated, f"{updated.id} stands for {updated.id}@{updated.version} now{changed}.")
+
+
+@grippers.command("versions")
+def list_versions(state: State, id: GripperId) -> None:
+    """List the versions of a gripper profile."""
+    state.show_list(
+        list(state.db.grippers.versions(id)),
+        {
+            "version": lambda g: f"{g.id}@{g.version}",
+            "made": lambda g: f"{g.version_created_at:%Y-%m-%d %H:%M}" if g.version_created_at else "",
+            "changed": lambda g: ", ".join(g.changed),
+        },
+        empty="No versions.",
+    )
 
 
 @grippers.command("delete")

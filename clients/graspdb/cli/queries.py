@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from rich.markup import escape
 
 from graspdb.cli.common import (
     ERRORS,
@@ -88,7 +89,7 @@ def best_grasp(
             raise typer.Exit(1) from None
         raise
     if state.json:
-        names = ("status", "ranking", "revision", "kernel")
+        names = ("status", "ranking", "revision", "kernel", "warnings")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())
@@ -96,6 +97,14 @@ def best_grasp(
         show_rows({**found[0].summary(), **_ranked_by(found)})
     else:
         _show_grasps(found, in_world=found[0].world is not None and constraints.get("frame") != "object")
+    if not state.json:
+        _mind(found.warnings)
+
+
+def _mind(warnings: Sequence[str]) -> None:
+    """What a person should know before relying on an answer."""
+    for warning in warnings:
+        ERRORS.print(f"Mind: {escape(in_commands(warning))}", highlight=False, soft_wrap=True)
 
 
 def _ranked_by(found: Grasps) -> dict[str, str]:
@@ -177,6 +186,7 @@ def likelihood(
     if state.json:
         out(found)
         return
+    _mind(found.warnings)
     if csv:
         out_csv(pose_columns(as_poses(poses)) | found.columns())
         return

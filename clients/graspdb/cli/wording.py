@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, str] = {
     "POST /objects/OBJECT/sweeps": "sweep OBJECT",
     "GET /grippers": "grippers list",
     "POST /grippers": "grippers create",
+    "PUT /grippers/GRIPPER": "grippers update GRIPPER FILE",
     "GET /kernels": "kernels list",
     "POST /kernels": "kernels fit OBJECT",
     "GET /sweeps": "sweeps list",

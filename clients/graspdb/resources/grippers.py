@@ -18,8 +18,22 @@ class Grippers(Resource):
         return self._transport.model(wire.GripperInfo, "POST", self._path, body=request, idempotent=True)
 
     def get(self, id: str) -> wire.GripperInfo:
-        """The gripper with this id."""
+        """The gripper with this id, or one version of it, as in ``panda@1``."""
         return self._transport.model(wire.GripperInfo, "GET", f"{self._path}/{segment(id)}")
+
+    def update(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
+        """Make a new version of a gripper: all its fields, as for :meth:`create`, built-in ones too.
+
+        The id stands for it from now on; what was tried keeps its version, ``panda@1``. The same profile
+        again makes none. ``name`` None leaves the name as it is.
+        """
+        request = validate(wire.GripperUpdate, {"name": name, **profile})
+        path = f"{self._path}/{segment(id)}"
+        return self._transport.model(wire.GripperInfo, "PUT", path, body=request)
+
+    def versions(self, id: str) -> Iterator[wire.GripperInfo]:
+        """All versions of a gripper, the first one first."""
+        return iter(Listing(self._transport, f"{self._path}/{segment(id)}/versions", wire.GripperInfo))
 
     def delete(self, id: str) -> None:
         """Delete a gripper; Conflict while trials, sweeps or kernels use it, and for a built-in one."""

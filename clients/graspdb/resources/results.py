@@ -208,6 +208,7 @@ class Grasps(Sequence[Grasp]):
         self.ranking = answer.ranking
         self.reach = answer.reach
         self.estimator = answer.estimator
+        self.warnings = list(answer.warnings)
         self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest)
         self.conflict = tuple(answer.conflict)
         self.relax = dict(answer.relax)
@@ -402,6 +403,7 @@ class LikelihoodArrays(Columns):
     prior_success_probability: Floats | None = None
     reach: wire.ReachInfo | None = None
     estimator: wire.EstimatorInfo | None = None
+    warnings: Sequence[str] = ()
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -424,6 +426,7 @@ class LikelihoodArrays(Columns):
             support=SupportArrays.from_wire(support) if len(support) == len(answers) else None,
             reach=answers[-1].reach,
             estimator=answers[-1].estimator,
+            warnings=answers[-1].warnings,
             interval=interval,
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
             **columns,

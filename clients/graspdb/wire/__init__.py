@@ -11,6 +11,7 @@ from graspdb.wire.base import OUTCOME_CODES as OUTCOME_CODES
 from graspdb.wire.base import OUTCOMES as OUTCOMES
 from graspdb.wire.base import SOURCES as SOURCES
 from graspdb.wire.base import FieldError as FieldError
+from graspdb.wire.base import GripperRef as GripperRef
 from graspdb.wire.base import Outcome as Outcome
 from graspdb.wire.base import Page as Page
 from graspdb.wire.base import Pose as Pose
@@ -23,6 +24,7 @@ from graspdb.wire.grippers import Finger as Finger
 from graspdb.wire.grippers import GripperCreate as GripperCreate
 from graspdb.wire.grippers import GripperInfo as GripperInfo
 from graspdb.wire.grippers import GripperProfile as GripperProfile
+from graspdb.wire.grippers import GripperUpdate as GripperUpdate
 from graspdb.wire.jobs import ClaimedJob as ClaimedJob
 from graspdb.wire.jobs import ClaimRequest as ClaimRequest
 from graspdb.wire.jobs import ClaimResponse as ClaimResponse

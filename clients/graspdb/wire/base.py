@@ -103,6 +103,8 @@ Vector4 = Annotated[Quadruple, BeforeValidator(_split_commas)]
 Vector7 = Annotated[tuple[float, float, float, float, float, float, float], BeforeValidator(_split_commas)]
 Slug = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """An identifier that stands in a URL: letters, digits, ``.``, ``_``, ``-``; at most 64 characters."""
+GripperRef = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}(@[1-9][0-9]{0,8})?$")]
+"""A gripper's id, or one version of it, as in ``panda@1``."""
 Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: _no_nul(s))]
 Metadata = Annotated[dict[str, Any], AfterValidator(lambda value: _storable(value))]
 """Any JSON object of the user's: finite numbers only, at most 64 KiB as text."""
@@ -116,6 +118,13 @@ Revision = Annotated[int, Field(description="Revision of the object that the ans
 StoredRevision = Annotated[int, Field(description="Revision of the object that stored it.")]
 ChosenGripper = Annotated[
     str | None, Field(description="Gripper whose trials count; null where the trials name none.")
+]
+OneGripperVersion = Annotated[
+    int | None, Field(description="Version of the gripper, counted from 1; null where no gripper is named.")
+]
+GripperVersions = Annotated[
+    list[int],
+    Field(description="Versions of the gripper that the selected trials were made with; none without one."),
 ]
 ChosenProtocol = Annotated[
     str | None, Field(description="Protocol whose trials count; null where the trials name none.")

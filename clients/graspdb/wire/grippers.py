@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from datetime import datetime
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from graspdb.wire.base import Pose, Request, Response, Slug, Text
+
+SHAPE_FIELDS = ("max_opening_m", "finger.", "tip_offset_m", "palm_size_m")
+"""What the fields of a profile that make the gripper's shape begin with."""
 
 Length = Annotated[float, Field(ge=1e-4, le=2.0)]
 
@@ -49,6 +54,26 @@ class GripperProfile(Request):
     base_to_tool: Pose | None = None
     """Pose of the tool frame in the gripper's base frame, metres and a unit quaternion; null if unknown."""
 
+    def differences(self, other: GripperProfile) -> list[str]:
+        """Fields in which two profiles differ by more than rounding, as in ``finger.length_m``."""
+        fields = ((name, value) for name, value in self if name != "finger")
+        own = [("finger." + name, value) for name, value in self.finger] + list(fields)
+        return sorted(name for name, value in own if not _alike(value, other.value_of(name)))
+
+    def value_of(self, field: str) -> Any:
+        """The value of a field, as in ``finger.length_m``."""
+        return operator.attrgetter(field)(self)
+
+
+def _alike(one: Any, other: Any) -> bool:
+    if isinstance(one, Pose) and isinstance(other, Pose):
+        one, other = (pose.position + pose.quaternion_xyzw for pose in (one, other))
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return all(map(_alike, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
+    return bool(one == other)
+
 
 class GripperCreate(GripperProfile):
     """A gripper to store: its profile under an id."""
@@ -59,8 +84,17 @@ class GripperCreate(GripperProfile):
     """A name for people; null for none."""
 
 
+class GripperUpdate(GripperProfile):
+    """A gripper's profile from now on: all of it, where a field left out takes its default."""
+
+    id: Slug | None = None
+    """Id of the gripper once more, as in the path; null to leave it out."""
+    name: Text | None = None
+    """A name for people; by default the one it has."""
+
+
 class GripperInfo(Response):
-    """A stored gripper."""
+    """A stored gripper, its profile that of one version."""
 
     id: str
     """Id of the gripper, by which trials and sweeps name it."""
@@ -71,4 +105,12 @@ class GripperInfo(Response):
     builtin: bool
     """Whether GraspDB brought it along."""
     created_at: datetime
-    """When it was stored, UTC."""
+    """When the gripper was first stored, UTC."""
+    version: int = 1
+    """Which version this profile is, counted from 1: ``panda@1`` names the first of ``panda``."""
+    newest_version: int = 1
+    """The version that the id alone stands for."""
+    version_created_at: datetime | None = None
+    """When this version was stored, UTC; null from services that keep none."""
+    changed: list[str] = Field(default_factory=list)
+    """Fields of the profile in which this version differs from the one before, as in ``finger.length_m``."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from graspdb.wire.base import Request, Response, Slug, Source
+from graspdb.wire.base import GripperRef, Request, Response, Slug, Source
 
 Alignment = Literal["gripper", "object", "edge", "surface-pair"]
 """Axes that translations are measured along; rotations are always in the gripper's frame."""
@@ -70,7 +70,7 @@ class KernelCreate(Request):
 
     object: Slug | None = None
     """Object whose successes it is fitted on; null for a kernel given by its components."""
-    gripper: Slug | None = None
+    gripper: GripperRef | None = None
     """Gripper whose trials it is fitted on, by default the one they all name; or that a given kernel is
     for."""
     protocol: Slug | None = None
@@ -174,7 +174,8 @@ class StoredKernel(Response):
     alignment: str
     """Whose axes translations are measured along: ``gripper``, ``object``, ``edge`` or ``surface-pair``."""
     gripper: str | None
-    """Gripper that it is for; null where it is for any."""
+    """Gripper that it is for, one version of it as in ``panda@1`` where it is of that alone; null where it is
+    for any."""
     sigma_position_m: float
     """Standard deviation per axis in position of the isotropic kernel with equal determinant, metres."""
     sigma_rotation_deg: float

@@ -11,6 +11,8 @@ from graspdb.wire.base import (
     ChosenProtocol,
     ChosenSource,
     Direction,
+    GripperRef,
+    GripperVersions,
     IntervalLevel,
     ObjectId,
     OutcomeCounts,
@@ -89,8 +91,9 @@ class KernelSpec(Request):
 class TrialSelection(Request):
     """Which trials a question is about."""
 
-    gripper: Slug | None = None
-    """Only trials with this gripper, and those that name none; by default the one gripper they name."""
+    gripper: GripperRef | None = None
+    """Only trials with this gripper, of any of its versions or one (``panda@1``), and those that name none;
+    by default the one gripper they name. The profile is that of the version, by default the newest."""
     protocol: Slug | None = None
     """Only trials judged by this protocol, and those that name none; by default the one they name."""
     source: Source | None = None
@@ -162,6 +165,7 @@ class DensityInfo(Response):
     epoch: int
     """Revision of the object's last change that was not an append of trials."""
     gripper: ChosenGripper
+    gripper_versions: GripperVersions = Field(default_factory=list)
     protocol: ChosenProtocol
     source: ChosenSource
     kernel: KernelInfo
@@ -283,6 +287,7 @@ class Likelihoods(Response):
     """What geometry alone tells where no attempt is near enough, as a grasp's; null if not asked for."""
     reach: ReachField = None
     estimator: EstimatorField = None
+    warnings: Warnings = Field(default_factory=list)
 
 
 def _object_pose(value: Any) -> Any:
@@ -509,6 +514,7 @@ class BestGrasps(Response):
     """The kernel of the density that answered."""
     reach: ReachField = None
     estimator: EstimatorField = None
+    warnings: Warnings = Field(default_factory=list)
 
 
 class SamplesRequest(Selection):
@@ -537,6 +543,7 @@ class Samples(Response):
     attempts to read at once."""
     prior: bool = False
     """Whether geometry drew them, no trial."""
+    warnings: Warnings = Field(default_factory=list)
 
 
 Strategy = Literal["density", "uncertainty", "edges"]

@@ -18,8 +18,11 @@ from graspdb.wire.base import (
     ChosenProtocol,
     ChosenSource,
     Direction,
+    GripperRef,
+    GripperVersions,
     IntervalLevel,
     ObjectId,
+    OneGripperVersion,
     OutcomeCounts,
     Request,
     Response,
@@ -59,6 +62,7 @@ class Report(Response):
     object: ObjectId
     revision: Revision
     gripper: ChosenGripper = None
+    gripper_versions: GripperVersions = Field(default_factory=list)
     protocol: ChosenProtocol = None
     source: ChosenSource = None
     text: str
@@ -719,7 +723,7 @@ class SourcesOptions(Request):
     """The simulated trials that predict, and the widths of their kernel."""
 
     source: ClassVar[Literal["simulation"]] = "simulation"
-    gripper: Slug | None = None
+    gripper: GripperRef | None = None
     """Only trials with this gripper; by default the one that they name."""
     protocol: Slug | None = None
     """Only simulated trials judged by this protocol; by default the one that they name."""
@@ -772,6 +776,7 @@ class SummaryRow(Response):
     object: ObjectId
     revision: Revision
     gripper: ChosenGripper
+    gripper_version: OneGripperVersion = None
     protocol: ChosenProtocol
     source: ChosenSource
     outcomes: OutcomeCounts

@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from graspdb.wire.base import (
+    GripperRef,
     ObjectId,
+    OneGripperVersion,
     OutcomeCounts,
     Pose,
     Position,
@@ -85,8 +87,8 @@ class SweepCreate(Request):
     weighs their trials; null where it is not known."""
     sample: SampleSpec | None = None
     """Simulate draws from the density; null for another plan."""
-    gripper: Slug = "pg70"
-    """Id of the gripper that grasps."""
+    gripper: GripperRef = "pg70"
+    """Id of the gripper that grasps, in its newest version, or one version of it, as in ``panda@1``."""
     protocol: Protocol = "wrench"
     """``wrench``: the contact forces can counter gravity in every direction; ``lift``: still held after a
     lift and a shake."""
@@ -146,6 +148,7 @@ class SweepInfo(Response):
     """Id of the batch that its outcomes are stored in."""
     gripper: str
     """Id of the gripper that grasps."""
+    gripper_version: OneGripperVersion = None
     protocol: str
     """How an outcome is judged: ``wrench`` or ``lift``."""
     fidelity: str

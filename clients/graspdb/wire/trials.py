@@ -8,8 +8,10 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from graspdb.wire.base import (
+    GripperRef,
     Metadata,
     ObjectId,
+    OneGripperVersion,
     Outcome,
     OutcomeCounts,
     Pose,
@@ -44,8 +46,9 @@ Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
 class TrialDefaults(Request):
     """What may stand once beside ``trials`` or ``columns`` for every trial that does not say it itself."""
 
-    gripper: Slug | None = None
-    """Id of the gripper that grasped; null if unknown: the trial then fits every gripper."""
+    gripper: GripperRef | None = None
+    """Id of the gripper that grasped, in its newest version, or one version, as in ``panda@1``; null if
+    unknown: the trial then fits every gripper."""
     source: Source | None = None
     """Who tried: ``simulation``, ``robot``, ``human`` or ``import``; null if unknown."""
     protocol: Slug | None = None
@@ -88,8 +91,8 @@ class TrialColumns(Request):
     """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a trial."""
     outcome: list[OutcomeIn]
     """What became of each, by name; true and false mean success and failure."""
-    gripper: list[Slug | None] | None = None
-    """Id of the gripper of each; null if unknown."""
+    gripper: list[GripperRef | None] | None = None
+    """Id of the gripper of each, or one version of it; null if unknown."""
     source: list[Source | None] | None = None
     """Who tried each; null if unknown."""
     protocol: list[Slug | None] | None = None
@@ -130,6 +133,7 @@ class TrialOut(Response):
     """What became of it, by name."""
     gripper: str | None = None
     """Id of the gripper that grasped; null if unknown."""
+    gripper_version: OneGripperVersion = None
     source: str | None = None
     """Who tried: ``simulation``, ``robot``, ``human`` or ``import``; null if unknown."""
     protocol: str | None = None
@@ -239,6 +243,8 @@ class BatchInfo(Response):
     outcomes: OutcomeCounts = Field(default_factory=dict)
     grippers: list[str] = Field(default_factory=list)
     """Ids of the grippers that its trials name."""
+    gripper_versions: list[str] = Field(default_factory=list)
+    """The same with their versions, as in ``panda@1``."""
     sources: list[str] = Field(default_factory=list)
     """Sources that its trials name."""
     protocols: list[str] = Field(default_factory=list)

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from graspdb.wire import Page, Slug
+from graspdb.wire import GripperRef, Page, Slug
 from graspdb.wire.kernels import KernelCreate, StoredKernel
 from graspdb.wire.reports import ReportRun
 from graspdb_service.api.routing.caching import tagged_json
@@ -44,7 +44,9 @@ def list_kernels(
     limit: Limit = 100,
     cursor: Cursor = None,
     object: Annotated[Slug | None, Query(description="Only those fitted on this object.")] = None,
-    gripper: Annotated[Slug | None, Query(description="Only those for this gripper.")] = None,
+    gripper: Annotated[
+        GripperRef | None, Query(description="Only those for this gripper, or for this version alone.")
+    ] = None,
 ) -> Page[StoredKernel]:
     """The kernels, oldest first."""
     items, after = stored.page(ctx, after=number_cursor(cursor), limit=limit, object=object, gripper=gripper)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -33,15 +32,15 @@ from graspdb.wire.queries import (
     SelectionQuery,
 )
 from graspdb_density.se3 import Poses
-from graspdb_service import __version__
 from graspdb_service.api.context import Context
-from graspdb_service.api.routing.caching import etag, not_modified
+from graspdb_service.api.routing.caching import answer_tag, not_modified
 from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.columns import columns_arrow, columns_json
 from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted, media_type
 from graspdb_service.formats.poses import read_arrow_poses, read_poses
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.info import density_info
 from graspdb_service.usecases.grasps import likelihood, proposals, samples
 from graspdb_service.usecases.grasps.answer import best_grasps
@@ -58,8 +57,8 @@ def get_density(
     """The density of a selection of trials: kernel, widths and their rule, counts, effective sample size."""
 
     def answer(query: SelectionQuery) -> Response:
-        info, object_id = density_info(ctx, id, query)
-        return _json(info, _tag(object_id, info.revision, query))
+        info, selected = density_info(ctx, id, query)
+        return _json(info, answer_tag(selected, info.revision, query))
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -73,8 +72,8 @@ def get_likelihood(
 
     def answer(query: LikelihoodQuery) -> Response:
         built, reach, columns = likelihood.likelihood(ctx, id, query, pose, query.include)
-        tag = _tag(built.object_row.id, built.revision, query)
-        return columns_json(_head(built.revision, built.kernel, reach), columns, {"ETag": tag})
+        tag = answer_tag(built.selected, built.revision, query)
+        return columns_json(_likelihood_head(built, reach), columns, {"ETag": tag})
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -103,7 +102,7 @@ def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> 
         poses = read_poses(given)
     built, reach, columns = likelihood.likelihood(ctx, id, options, poses, options.include)
     form = columns_arrow if kind == ARROW else columns_json
-    return form(_head(built.revision, built.kernel, reach), columns, {"Vary": "Accept"})
+    return form(_likelihood_head(built, reach), columns, {"Vary": "Accept"})
 
 
 @router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
@@ -113,8 +112,8 @@ def get_best_grasp(
     """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
 
     def answer(query: BestGraspQuery) -> Response:
-        best, object_id = best_grasps(ctx, id, query)
-        return _json(best, _tag(object_id, best.revision, query))
+        best, selected = best_grasps(ctx, id, query)
+        return _json(best, answer_tag(selected, best.revision, query))
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -154,14 +153,24 @@ def post_proposals(ctx: Ctx, id: ObjectId, query: ProposalsRequest) -> Response:
 
 def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
     return columns_json(
-        {**_head(drawn.revision, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more},
+        {
+            **_head(drawn.revision, drawn.kernel, drawn.warnings),
+            "seed": drawn.seed,
+            "prior": drawn.prior,
+            **more,
+        },
         drawn.columns(),
     )
 
 
-def _head(revision: int, kernel: KernelInfo, reach: ReachInfo | None = None) -> dict[str, Any]:
-    head = {"revision": revision, "kernel": kernel.model_dump(), "estimator": EstimatorInfo().model_dump()}
+def _likelihood_head(built: Built, reach: ReachInfo | None) -> dict[str, Any]:
+    head = _head(built.revision, built.kernel, built.selected.warnings)
     return head if reach is None else {**head, "reach": reach.model_dump()}
+
+
+def _head(revision: int, kernel: KernelInfo, warnings: Sequence[str]) -> dict[str, Any]:
+    head = {"revision": revision, "kernel": kernel.model_dump(), "estimator": EstimatorInfo().model_dump()}
+    return {**head, "warnings": list(warnings)}
 
 
 def _json(answer: BaseModel, tag: str | None = None) -> Response:
@@ -181,12 +190,6 @@ def _unless_known(
         query = query.model_copy(update={"kernel": newest.id})
     seen = None
     if "if-none-match" in request.headers:
-        row = selections.resolve(slug, query).row
-        seen = not_modified(request, _tag(row.id, row.revision, query))
+        selected = selections.resolve(slug, query)
+        seen = not_modified(request, answer_tag(selected, selected.row.revision, query))
     return answer(query) if seen is None else seen
-
-
-def _tag(object_id: int, revision: int, query: Selection) -> str:
-    """What an answer depends on: the object, its revision, the question, and who answers."""
-    question = hashlib.sha256(f"{type(query).__name__} {query.model_dump_json()}".encode()).hexdigest()[:24]
-    return etag(object_id, revision, question, __version__)

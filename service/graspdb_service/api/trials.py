@@ -9,6 +9,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from graspdb.wire import (
     BatchInfo,
     BatchReceipt,
+    GripperRef,
     Outcome,
     Page,
     Slug,
@@ -82,7 +83,8 @@ def list_trials(
         Source | None, Query(description="Only trials from this source; by default all.")
     ] = None,
     gripper: Annotated[
-        Slug | None, Query(description="Only trials with this gripper; by default all.")
+        GripperRef | None,
+        Query(description="Only trials with this gripper, or this version of it; by default all."),
     ] = None,
     protocol: Annotated[Slug | None, Query(description="Only trials judged so; by default all.")] = None,
     batch: Annotated[

@@ -29,7 +29,14 @@ SCALARS = ("proposal_density", "quality", "width_m")
 _OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at")
 NAMES = frozenset(REQUIRED) | frozenset(_OPTIONAL) | DEFAULTS
 _SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_GRIPPER = re.compile(_SLUG.pattern + r"(@[1-9][0-9]{0,8})?")
+_GRIPPER_RULE = "a gripper's id, or one version of it, as in panda@1"
 _SLUG_RULE = "letters, digits, '.', '_', '-'; at most 64 characters, the first a letter or digit"
+_NAME_RULES = {
+    "gripper": (_GRIPPER, _GRIPPER_RULE),
+    "source": (re.compile("|".join(SOURCES)), f"one of {', '.join(SOURCES)}"),
+    "protocol": (_SLUG, _SLUG_RULE),
+}
 _METADATA: TypeAdapter[Any] = TypeAdapter(Metadata)
 _TIME: TypeAdapter[datetime] = TypeAdapter(datetime)
 _MOST_ERRORS = 20
@@ -200,15 +207,13 @@ def _names(fields: Fields, name: str, default: str | None) -> list[str | None] |
     values = fields.lists.get(name)
     if values is None:
         return None
-    known = SOURCES if name == "source" else None
+    allowed, rule = _NAME_RULES[name]
 
     def good(value: Any) -> bool:
-        if value is None or not isinstance(value, str):
-            return value is None
-        return _SLUG.fullmatch(value) is not None if known is None else value in known
+        return value is None or (isinstance(value, str) and allowed.fullmatch(value) is not None)
 
     if not set(map(type, values)) <= {str, type(None)} or not all(map(good, set(values))):
-        fields.refuse(name, good, _SLUG_RULE if known is None else f"one of {', '.join(known)}")
+        fields.refuse(name, good, rule)
         return None
     return [default if value is None else value for value in values]
 

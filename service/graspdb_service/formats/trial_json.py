@@ -24,7 +24,7 @@ from graspdb_service.formats.trial_fields import (
     refuse_too_many,
 )
 from graspdb_service.problems import invalid
-from graspdb_service.trial_columns import Provenance, TrialBatch, TrialPage
+from graspdb_service.trial_columns import TrialBatch, TrialPage, gripper_parts
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
@@ -170,6 +170,7 @@ def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
     columns = page.columns
     batches = [page.batches[number] for number in columns.batch.tolist()]
     provenances = [page.provenances[number] for number in columns.provenance.tolist()]
+    named = [None if item.gripper is None else gripper_parts(item.gripper) for item in provenances]
     own = zip(columns.metadata, batches, strict=True)
     return {
         "seq": columns.seq,
@@ -178,7 +179,10 @@ def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
         "position": columns.position,
         "quaternion_xyzw": columns.quaternion_xyzw,
         "outcome": columns.outcome,
-        **{name: [getattr(item, name) for item in provenances] for name in Provenance._fields},
+        "gripper": [None if name is None else name[0] for name in named],
+        "gripper_version": [None if name is None else name[1] for name in named],
+        "source": [item.source for item in provenances],
+        "protocol": [item.protocol for item in provenances],
         "proposal_density": columns.proposal_density,
         "quality": columns.quality,
         "width_m": columns.width_m,

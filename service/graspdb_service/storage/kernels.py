@@ -10,11 +10,15 @@ from sqlalchemy import delete, insert, select
 
 from graspdb_service.storage.database import Tx, all_as, first_as
 from graspdb_service.storage.tables import kernels
+from graspdb_service.trial_columns import gripper_parts
 
 
 @dataclass(frozen=True, kw_only=True)
 class NewKernel:
-    """A kernel to store: components and provenance as :mod:`graspdb.wire.kernels` has them."""
+    """A kernel to store: components and provenance as :mod:`graspdb.wire.kernels` has them.
+
+    ``gripper`` is its id, or one version of it, as in ``panda@1``.
+    """
 
     kind: str
     alignment: str
@@ -35,13 +39,14 @@ class KernelRow(NewKernel):
 
 def create(tx: Tx, id: str, kernel: NewKernel) -> KernelRow:
     """Insert a kernel."""
-    statement = insert(kernels).values(id=id, **vars(kernel), created_at=datetime.now(UTC))
-    return KernelRow(**tx.execute(statement.returning(*kernels.c)).one()._mapping)
+    values = {**vars(kernel), **_gripper_columns(kernel.gripper)}
+    statement = insert(kernels).values(id=id, **values, created_at=datetime.now(UTC))
+    return _row(**tx.execute(statement.returning(*kernels.c)).one()._mapping)
 
 
 def find(tx: Tx, id: str) -> KernelRow | None:
     """The kernel with this id."""
-    return first_as(tx, select(kernels).where(kernels.c.id == id), KernelRow)
+    return first_as(tx, select(kernels).where(kernels.c.id == id), _row)
 
 
 def newest(tx: Tx, object_id: int, gripper: str | None) -> KernelRow | None:
@@ -50,13 +55,16 @@ def newest(tx: Tx, object_id: int, gripper: str | None) -> KernelRow | None:
         select(kernels)
         .where(
             kernels.c.object_id == object_id,
-            kernels.c.gripper.is_not_distinct_from(gripper),
+            *(
+                kernels.c[column].is_not_distinct_from(value)
+                for column, value in _gripper_columns(gripper).items()
+            ),
             kernels.c.kind == "anisotropic",
         )
         .order_by(kernels.c.number.desc())
         .limit(1)
     )
-    return first_as(tx, query, KernelRow)
+    return first_as(tx, query, _row)
 
 
 def page(tx: Tx, *, after: int, limit: int, object_id: int | None, gripper: str | None) -> list[KernelRow]:
@@ -65,8 +73,21 @@ def page(tx: Tx, *, after: int, limit: int, object_id: int | None, gripper: str 
     if object_id is not None:
         query = query.where(kernels.c.object_id == object_id)
     if gripper is not None:
+        gripper, version = gripper_parts(gripper)
         query = query.where(kernels.c.gripper == gripper)
-    return all_as(tx, query, KernelRow)
+        if version is not None:
+            query = query.where(kernels.c.gripper_version == version)
+    return all_as(tx, query, _row)
+
+
+def _gripper_columns(name: str | None) -> dict[str, str | int | None]:
+    gripper, version = (None, None) if name is None else gripper_parts(name)
+    return {"gripper": gripper, "gripper_version": version}
+
+
+def _row(*, gripper: str | None, gripper_version: int | None, **columns: Any) -> KernelRow:
+    name = gripper if gripper_version is None else f"{gripper}@{gripper_version}"
+    return KernelRow(gripper=name, **columns)
 
 
 def remove(tx: Tx, id: str) -> bool:

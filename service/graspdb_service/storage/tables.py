@@ -72,9 +72,24 @@ grippers = Table(
     metadata,
     Column("id", String(64), primary_key=True),
     Column("name", Text),
-    Column("profile", JSON, nullable=False),
     Column("builtin", Boolean, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
+)
+
+# What a gripper was and is: the newest version is what its id alone stands for. Never changed once stored.
+gripper_versions = Table(
+    "gripper_versions",
+    metadata,
+    # AUTOINCREMENT: what was computed with one profile is never taken for another's.
+    Column("id", BigId, primary_key=True, autoincrement=True),
+    Column("gripper", ForeignKey("grippers.id", ondelete="CASCADE"), nullable=False),
+    Column("version", Integer, nullable=False),
+    Column("profile", JSON, nullable=False),
+    # Fields in which it differs from the version before; null in the first.
+    Column("changed", JSON(none_as_null=True)),
+    Column("created_at", UtcDateTime, nullable=False),
+    UniqueConstraint("gripper", "version"),
+    sqlite_autoincrement=True,
 )
 
 # Content-addressed: meshes and convex parts, stored once whoever uses them.
@@ -119,6 +134,7 @@ provenances = Table(
     Column("gripper", ForeignKey("grippers.id")),
     Column("source", String(16)),
     Column("protocol", String(64)),
+    Column("gripper_version", Integer),
 )
 
 # Trials by provenance and outcome, kept in the transactions that change them: counting reads no trial.
@@ -329,6 +345,8 @@ kernels = Table(
     Column("components", JSON, nullable=False),
     Column("provenance", JSON, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
+    # Null: for all versions of the gripper.
+    Column("gripper_version", Integer),
     sqlite_autoincrement=True,
 )
 

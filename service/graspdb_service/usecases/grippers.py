@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from graspdb.wire import GripperCreate, GripperInfo, GripperProfile
+from graspdb.wire import GripperCreate, GripperInfo, GripperProfile, GripperUpdate
 from graspdb_geometry.grippers import PANDA, PG70, GripperShape
 from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
+from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.geometry.collision import shape_of
-from graspdb_service.usecases.identifiers import is_slug
+from graspdb_service.usecases.identifiers import is_gripper_name
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 
 
 def seed(database: Database) -> None:
     """Store the built-in grippers where they are missing; several replicas may do so at once."""
     with database.read() as tx:
-        if not grippers.missing(tx, BUILTIN):
+        if grippers.builtin_ids(tx) >= BUILTIN.keys():
             return
     with database.write() as tx:
         for gripper, (name, profile) in sorted(BUILTIN.items()):
@@ -38,8 +39,38 @@ def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
     return replay_or(database, "POST /grippers", sent, make)
 
 
+def update(database: Database, gripper: str, request: GripperUpdate) -> GripperInfo:
+    """Store a profile as the gripper's newest version; the profile that it has already makes none."""
+    _refuse_version(gripper, "PUT")
+    if request.id not in (None, gripper):
+        raise invalid("id", f"this is of gripper {gripper!r}: leave it out, or give the same one")
+    profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
+    _check_shape(profile)
+    with database.write() as tx:
+        require(tx, gripper)
+        grippers.lock(tx, gripper)
+        # Once more, for what was committed while the lock was another's.
+        row = require(tx, gripper)
+        changed = profile.differences(GripperProfile.model_validate(row.profile))
+        if changed:
+            grippers.add_version(tx, gripper, row.version + 1, profile.model_dump(mode="json"), changed)
+        if request.name is not None:
+            grippers.rename(tx, gripper, request.name)
+        return _info(require(tx, gripper))
+
+
+def versions(
+    database: Database, gripper: str, *, after: int, limit: int
+) -> tuple[list[GripperInfo], int | None]:
+    """A page of a gripper's versions, the first one first, and where the next page starts."""
+    with database.read() as tx:
+        require(tx, gripper)
+        rows = grippers.versions(tx, gripper, after=after, limit=limit + 1)
+    return [_info(row) for row in rows[:limit]], rows[limit - 1].version if len(rows) > limit else None
+
+
 def get(database: Database, gripper: str) -> GripperInfo:
-    """One gripper."""
+    """One gripper, or one version of it, as in ``panda@1``."""
     with database.read() as tx:
         return _info(require(tx, gripper))
 
@@ -53,7 +84,9 @@ def page(database: Database, *, after: str, limit: int) -> tuple[list[GripperInf
 
 def remove(database: Database, gripper: str) -> None:
     """Delete a gripper; 409 while trials, sweeps or kernels use it, and for a built-in one."""
+    _refuse_version(gripper, "DELETE")
     with database.write() as tx:
+        grippers.lock(tx, gripper, deleting=True)
         if require(tx, gripper).builtin:
             raise conflict("gripper-built-in", f"Gripper {gripper!r} is built in: it can't be deleted")
         if grippers.is_used(tx, gripper):
@@ -66,8 +99,8 @@ def remove(database: Database, gripper: str) -> None:
 
 
 def require(tx: Tx, gripper: str) -> GripperRow:
-    """The gripper, or a 404."""
-    row = grippers.find(tx, gripper) if is_slug(gripper) else None
+    """The gripper, or the version of it, or a 404."""
+    row = grippers.find(tx, gripper) if is_gripper_name(gripper) else None
     return found(row, "gripper", gripper, "GET /grippers lists them, POST /grippers makes one")
 
 
@@ -80,6 +113,25 @@ def named(tx: Tx, gripper: str) -> GripperRow:
     return row
 
 
+def hold(tx: Tx, gripper: str) -> None:
+    """Keep the gripper that a request's field names from being deleted before the transaction ends; 422 where
+    it has been.
+    """
+    if not grippers.held(tx, [gripper]):
+        named(tx, gripper)
+
+
+def _refuse_version(gripper: str, method: str) -> None:
+    """422 for one version where a gripper is meant: what trials were made with stays as it was."""
+    name, version = gripper_parts(gripper) if is_gripper_name(gripper) else (gripper, None)
+    if version is not None:
+        told = "a version stays as it was: "
+        told += (
+            f"PUT /grippers/{name} makes a new one" if method == "PUT" else "a gripper is deleted with all"
+        )
+        raise invalid("gripper", told)
+
+
 def _check_shape(profile: GripperProfile) -> None:
     try:
         shape_of(profile)
@@ -90,7 +142,7 @@ def _check_shape(profile: GripperProfile) -> None:
 
 
 def _info(row: GripperRow) -> GripperInfo:
-    return GripperInfo.model_validate(vars(row))
+    return GripperInfo.model_validate({**vars(row), "changed": row.changed or []})
 
 
 def _profile(shape: GripperShape, base_offset_m: float, **facts: float) -> GripperProfile:

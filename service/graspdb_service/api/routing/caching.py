@@ -9,10 +9,20 @@ import orjson
 from fastapi import Request, Response
 from pydantic import BaseModel
 
+from graspdb.wire import Selection
+from graspdb_service import __version__
+from graspdb_service.usecases.trials.selection import Selected
+
 
 def etag(*parts: object) -> str:
     """A weak ETag of what an answer depends on."""
     return 'W/"' + ".".join(str(part) for part in parts) + '"'
+
+
+def answer_tag(selected: Selected, revision: int, query: Selection) -> str:
+    """What an answer depends on: object, revision, the gripper's profile, the question, and who answers."""
+    question = hashlib.sha256(f"{type(query).__name__} {query.model_dump_json()}".encode()).hexdigest()[:24]
+    return etag(selected.row.id, revision, selected.stamp, question, __version__)
 
 
 def not_modified(request: Request, tag: str) -> Response | None:

@@ -23,7 +23,12 @@ Ctx = Annotated[Context, Depends(context)]
 
 
 ObjectId = Annotated[str, Path(description="Id of the object, as it was registered.")]
-GripperId = Annotated[str, Path(description="Id of the gripper, as `GET /grippers` lists it.")]
+GripperId = Annotated[
+    str,
+    Path(
+        description="Id of the gripper, as `GET /grippers` lists it; read, too, one version, as in `panda@1`."
+    ),
+]
 BatchId = Annotated[str, Path(description="Id of the batch, as posting its trials answered it.")]
 KernelId = Annotated[str, Path(description="Id of the kernel, as fitting or storing it answered it.")]
 RunId = Annotated[str, Path(description="Id of the run, as the 202 that started it answered it.")]

@@ -16,7 +16,8 @@ from sqlalchemy import Select, func, insert, select, update
 
 from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, all_as
-from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
+from graspdb_service.storage.tables import batches, jobs, packed_outcomes, provenances, sweeps
+from graspdb_service.trial_columns import gripper_parts
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,11 @@ def checked(tx: Tx, object_id: int, *, gripper: str | None, protocol: str | None
     """Finished chunks of an object's checks with a gripper and protocol (None: any), in the plans' order."""
     query = _of_object(object_id, "check")
     if gripper is not None:
+        gripper, version = gripper_parts(gripper)
         query = query.where(sweeps.c.gripper == gripper)
+        if version is not None:
+            query = query.join(provenances, provenances.c.id == sweeps.c.provenance_id)
+            query = query.where(provenances.c.gripper_version == version)
     if protocol is not None:
         query = query.where(sweeps.c.protocol == protocol)
     return all_as(tx, query.order_by(sweeps.c.id, packed_outcomes.c.number), PackedChunk)

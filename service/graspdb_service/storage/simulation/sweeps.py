@@ -15,7 +15,7 @@ from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import FailedChunk
 from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
 from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
-from graspdb_service.storage.tables import batches, jobs, objects, sweeps
+from graspdb_service.storage.tables import batches, jobs, objects, provenances, sweeps
 from graspdb_service.trial_columns import Floats
 
 #: float64 values of a stored pose: position, quaternion xyzw, proposal density (NaN where it has none).
@@ -34,6 +34,7 @@ class SweepRow:
     object_id: int
     provenance_id: int
     gripper: str
+    gripper_version: int
     protocol: str
     fidelity: str
     purpose: str
@@ -78,8 +79,10 @@ def _query() -> Select[Any]:
             objects.c.slug.label("object"),
             batches.c.id.label("batch_id"),
             batches.c.key.label("batch"),
+            provenances.c.gripper_version,
         )
         .join(objects, objects.c.id == sweeps.c.object_id)
+        .join(provenances, provenances.c.id == sweeps.c.provenance_id)
         .outerjoin(batches, batches.c.sweep_id == sweeps.c.id)
     )
 
@@ -102,9 +105,9 @@ def create(
 ) -> None:
     """Store a sweep and queue its jobs, one for every ``chunk_poses`` poses of the plan.
 
-    ``sweep`` is what :class:`SweepRow` has but for chunks, times, batch and the object's slug. ``poses`` of a
-    plan that is no grid are rows (pose_count, 8): position, quaternion xyzw and proposal density (NaN: none).
-    ``waiting`` for the object's convex parts, jobs can't be claimed.
+    ``sweep`` is what :class:`SweepRow` has but for chunks, times, batch, the gripper's version and the
+    object's slug. ``poses`` of a plan that is no grid are rows (pose_count, 8): position, quaternion xyzw and
+    proposal density (NaN: none). ``waiting`` for the object's convex parts, jobs can't be claimed.
     """
     chunk_poses, pose_count = sweep["chunk_poses"], sweep["pose_count"]
     values = {

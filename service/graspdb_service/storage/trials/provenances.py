@@ -9,12 +9,16 @@ from sqlalchemy import and_, func, insert, select
 from graspdb_service.storage.database import Tx, insert_or
 from graspdb_service.storage.tables import provenances
 from graspdb_service.storage.tables import tallies as tallied
-from graspdb_service.trial_columns import Provenance
+from graspdb_service.trial_columns import Provenance, gripper_parts
 
 
 def ensure(tx: Tx, object_id: int, provenance: Provenance) -> int:
-    """The id of this combination, made if it is new. Call it under the object's lock."""
-    names = provenance._asdict()
+    """The id of this combination, made if it is new. Call it under the object's lock, its gripper one version
+    that is held.
+    """
+    names: dict[str, str | int | None] = dict(provenance._asdict())
+    if provenance.gripper is not None:
+        names["gripper"], names["gripper_version"] = gripper_parts(provenance.gripper)
     same = [provenances.c[name].is_not_distinct_from(value) for name, value in names.items()]
     known = tx.execute(
         select(provenances.c.id).where(provenances.c.object_id == object_id, and_(*same)).limit(1)
@@ -27,9 +31,13 @@ def ensure(tx: Tx, object_id: int, provenance: Provenance) -> int:
 
 def of_object(tx: Tx, object_id: int) -> dict[int, Provenance]:
     """Every combination the object's trials (or planned sweeps) have, by id."""
-    columns = (provenances.c[name] for name in ("id", *Provenance._fields))
+    columns = (provenances.c[name] for name in ("id", "gripper_version", *Provenance._fields))
     query = select(*columns).where(provenances.c.object_id == object_id).order_by(provenances.c.id)
-    return {number: Provenance(*names) for number, *names in tx.execute(query)}
+    found = {}
+    for number, version, *names in tx.execute(query):
+        item = Provenance(*names)
+        found[number] = item if item.gripper is None else item._replace(gripper=f"{item.gripper}@{version}")
+    return found
 
 
 def add_tally(tx: Tx, provenance_id: int, outcome: int, *, rows: int = 0, packed: int = 0) -> None:

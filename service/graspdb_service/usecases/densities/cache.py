@@ -14,6 +14,7 @@ from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.trials import rows as trial_rows
+from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.densities import build, proposal_density, stored_kernel
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.geometry.features import Features
@@ -74,7 +75,7 @@ class Densities:
         self.selections = selections
         self._compute = compute
         self._features = features
-        self.kept: SingleFlightCache[tuple[int, TrialSelection, KernelChoice], Built]
+        self.kept: SingleFlightCache[tuple[tuple[int, TrialSelection, int | None], KernelChoice], Built]
         self.kept = SingleFlightCache(max_bytes, lambda built: built.nbytes)
 
     def get(self, selected: Selected, kernel: KernelChoice) -> Built:
@@ -86,7 +87,7 @@ class Densities:
             stored = self.stored(selected, kernel.stored)
             kernel = KernelChoice(stored=stored.id)
         return self.kept.get(
-            (selected.row.id, selected.filters, kernel),
+            (selected.key, kernel),
             lambda built: built.revision >= selected.row.revision,
             lambda before: self._refresh(selected, kernel, stored, before),
         )
@@ -114,7 +115,11 @@ class Densities:
             )
         if found is None:
             raise not_found("kernel", name, f"kernels there are: {', '.join(names)} (GET /kernels)")
-        if found.gripper not in (None, selected.gripper) and selected.gripper is not None:
+        if (
+            found.gripper
+            and selected.gripper
+            and gripper_parts(found.gripper)[0] != gripper_parts(selected.gripper)[0]
+        ):
             raise conflict(
                 "kernel-of-another-gripper",
                 f"Kernel {found.id} was fitted for the gripper {found.gripper!r}, these trials are of"

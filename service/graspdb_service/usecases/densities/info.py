@@ -7,16 +7,17 @@ from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.storage.trials import findings
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.trials.findings.words import of_selection
+from graspdb_service.usecases.trials.selection import Selected
 
 
-def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, int]:
-    """What is known of a density, and the object's internal id."""
+def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, Selected]:
+    """What is known of a density, and the selection of trials that it is made of."""
     with ctx.compute.admitted():
         built = ctx.densities.requested(slug, request)
     density, selected = built.density, built.selected
     size = 0 if density is None else density.size
     effective = 0.0 if density is None else density.effective_sample_size
-    warnings = []
+    warnings = list(selected.warnings)
     if size and effective < LOW_EFFECTIVE_SHARE * size:
         warnings.append(
             f"the weights are very uneven: {size} successes count like {effective:.0f};"
@@ -29,6 +30,7 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
         revision=built.revision,
         epoch=built.object_row.epoch,
         gripper=selected.gripper,
+        gripper_versions=list(selected.versions),
         protocol=selected.protocol,
         source=selected.source,
         kernel=built.kernel,
@@ -41,4 +43,4 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
         findings=of_selection(doubtful),
         estimator=EstimatorInfo(),
     )
-    return info, built.object_row.id
+    return info, selected

@@ -132,8 +132,7 @@ class Model:
 
 @dataclass(frozen=True)
 class _Key:
-    object_id: int
-    filters: TrialSelection
+    selection: tuple[int, TrialSelection, int | None]
     sigma_position_m: float
     sigma_rotation_deg: float
     collisions_known: bool
@@ -154,8 +153,7 @@ class Successes:
         With ``collisions_known``, by geometry and gripper, attempts that collided are left out.
         """
         key = _Key(
-            built.selected.row.id,
-            built.selected.filters,
+            built.selected.key,
             built.kernel.sigma_position_m,
             built.kernel.sigma_rotation_deg,
             collisions_known,

@@ -28,12 +28,13 @@ from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
 from graspdb_service.usecases.grasps.search import ScoreSearch, closest
+from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
 
 
-def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, int]:
-    """The best distinct grasps under the request's constraints, and the object's internal id.
+def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, Selected]:
+    """The best distinct grasps under the request's constraints, and the selection that they are of.
 
     422 names fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that are not
     there, and as the selection.
@@ -52,8 +53,12 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "reach": reach_info(question.model),
                 **_answer(ctx, request, question),
             }
-    told = {"revision": built.revision, "estimator": EstimatorInfo()}
-    return BestGrasps.model_validate({**told, **answer}), built.object_row.id
+    told = {
+        "revision": built.revision,
+        "estimator": EstimatorInfo(),
+        "warnings": list(built.selected.warnings),
+    }
+    return BestGrasps.model_validate({**told, **answer}), built.selected
 
 
 def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +40,7 @@ class Draw:
     proposal_density: Floats
     support: dict[str, Any] | None = None
     prior: bool = False
+    warnings: Sequence[str] = ()
 
     def columns(self) -> dict[str, Any]:
         """Those of an answer, by name."""
@@ -92,6 +94,7 @@ def drawn_from(
         proposal_density=np.exp(log_density(ctx, density, poses, _CUTOFF)),
         support=_support(ctx, built, poses) if support else None,
         prior=prior,
+        warnings=built.selected.warnings,
     )
 
 

@@ -63,6 +63,8 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Cr
     made = _given(ctx, request) if isinstance(request.components, list) else _fitted(ctx, request)
 
     def make(tx: Tx) -> Created:
+        if made.gripper is not None:
+            grippers.hold(tx, made.gripper)
         row = kernels.create(tx, str(uuid.uuid4()), made)
         return Created(fit.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 

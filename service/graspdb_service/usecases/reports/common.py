@@ -58,7 +58,7 @@ class KeptCurves:
 
     def __init__(self, max_bytes: int) -> None:
         self._curves: SingleFlightCache[
-            tuple[int, TrialSelection, str | None, float, float], IncrementalCurve
+            tuple[tuple[int, TrialSelection, int | None], str | None, float, float], IncrementalCurve
         ]
         self._curves = SingleFlightCache(max_bytes, lambda curve: curve.nbytes)
         self._matches: SingleFlightCache[tuple[bytes, str], Match]
@@ -80,7 +80,7 @@ class KeptCurves:
             if matched is None
             else (matched.kernel.sigma_position_m, matched.kernel.sigma_rotation)
         )
-        key = (built.object_row.id, built.selected.filters, kernel.id, *widths)
+        key = (built.selected.key, kernel.id, *widths)
         # A curve that nothing is to be added to comes back as it is.
         return self._curves.get(key, lambda _: False, lambda before: grow(before, progress))
 
@@ -99,6 +99,7 @@ def head(built: Built) -> dict[str, Any]:
         "object": built.object_row.slug,
         "revision": built.revision,
         "gripper": selected.gripper,
+        "gripper_versions": list(selected.versions),
         "protocol": selected.protocol,
         "source": selected.source,
         "level": LEVEL,

@@ -68,6 +68,8 @@ class Reports:
         parameters = {
             "report": report,
             "filters": selected.filters.model_dump(),
+            # Another profile changes no revision.
+            "gripper_stamp": selected.stamp,
             "kernel": vars(choice),
             "options": own,
         }
@@ -82,7 +84,8 @@ class Reports:
         asked, kernel = TrialSelection(**parameters["filters"]), KernelChoice(**parameters["kernel"])
         densities = self._inputs.densities
         built = densities.get(densities.selections.resolve(slug, asked), kernel)
-        return _COMPUTE[report](self._inputs, built, options, progress)
+        found = _COMPUTE[report](self._inputs, built, options, progress)
+        return found.model_copy(update={"warnings": [*built.selected.warnings, *found.warnings]})
 
     def run_kinds(self) -> dict[str, RunKind]:
         """Runs that compute reports."""

@@ -22,7 +22,7 @@ from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import calibrate
 from graspdb_service.problems import too_few_trials
 from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import Bools, Floats, Ints
+from graspdb_service.trial_columns import Bools, Floats, Ints, Provenance, is_gripper
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
@@ -131,7 +131,7 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
         own = {
             number: item
             for number, item in provenances.of_object(tx, built.object_row.id).items()
-            if number in counts and item.source == source and item.gripper in (None, chosen.gripper)
+            if number in counts and item.source == source and _of_the_gripper(item, chosen)
         }
     if any(item.protocol == chosen.protocol for item in own.values()):
         own = {number: item for number, item in own.items() if item.protocol in (None, chosen.protocol)}
@@ -140,6 +140,13 @@ def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | Non
     protocols = sorted({item.protocol for item in own.values() if item.protocol is not None})
     names = {"gripper": chosen.gripper, "protocol": ", ".join(protocols) or None, "source": source}
     return of_provenances(chosen.row, own, counts, profile=chosen.profile, **names)
+
+
+def _of_the_gripper(item: Provenance, chosen: Selected) -> bool:
+    """Whether trials are of the selection's gripper, or may be."""
+    if item.gripper is None or chosen.gripper is None:
+        return item.gripper is None
+    return is_gripper(item.gripper, chosen.gripper)
 
 
 def _all(inputs: ReportInputs, built: Built, selected: Selected) -> AllTrials:

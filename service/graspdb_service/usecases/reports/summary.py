@@ -7,6 +7,7 @@ from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
+from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.reports.common import LEVEL, share
 from graspdb_service.usecases.trials.selection import outcome_counts, total
 
@@ -65,7 +66,10 @@ def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
             SummaryRow(
                 object=item.slug,
                 revision=item.revision,
-                **origin._asdict(),
+                gripper=None if origin.gripper is None else gripper_parts(origin.gripper)[0],
+                gripper_version=None if origin.gripper is None else gripper_parts(origin.gripper)[1],
+                source=origin.source,
+                protocol=origin.protocol,
                 outcomes=outcomes,
                 trials=tried,
                 successes=won,

@@ -79,7 +79,8 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created
         return earlier
     with ctx.database.read() as tx:
         row = require(tx, slug)
-        profile = GripperProfile.model_validate(grippers.named(tx, spec.gripper).profile)
+        gripper = grippers.named(tx, spec.gripper)
+        profile = GripperProfile.model_validate(gripper.profile)
         if row.mesh_info is not None and row.parts_sha256 is None:
             decompositions.check(tx, row)
     world = _world(row, profile)
@@ -94,18 +95,20 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created
         locked = require(tx, slug, lock=True)
         if not world.still_holds(locked):
             raise conflict("object-changed", f"Object {slug!r} was changed at the same moment: send it again")
+        grippers.hold(tx, gripper.versioned)
         waiting = locked.parts_sha256 is None
         if waiting:
             decompositions.ask(tx, locked, created_ms)
         sweep_id = _new_id(created_ms)
         provenance_id = provenances.ensure(
-            tx, locked.id, Provenance(spec.gripper, "simulation", spec.protocol)
+            tx, locked.id, Provenance(gripper.versioned, "simulation", spec.protocol)
         )
         sweep = {
             "id": sweep_id,
             "object_id": locked.id,
             "provenance_id": provenance_id,
-            **spec.model_dump(include={"gripper", "protocol", "fidelity", "purpose"}),
+            "gripper": gripper.id,
+            **spec.model_dump(include={"protocol", "fidelity", "purpose"}),
             "plan": plan.kind,
             "request": _request(spec, plan),
             "snapshot": snapshot,

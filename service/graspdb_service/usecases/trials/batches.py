@@ -12,6 +12,7 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import batches, findings, provenances
 from graspdb_service.storage.trials.batches import BatchRow
+from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.trials import batch_removal
@@ -90,7 +91,8 @@ def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInf
             "sweep": batch.sweep_id,
             "withdrawn": batches.withdrawn_count(tx, batch),
             "outcomes": {OUTCOMES[code]: number for code, number in sorted(outcomes.items()) if number},
-            "grippers": distinct(item.gripper for item in items),
+            "grippers": distinct(item.gripper and gripper_parts(item.gripper)[0] for item in items),
+            "gripper_versions": distinct(item.gripper for item in items),
             "sources": distinct(item.source for item in items),
             "protocols": distinct(item.protocol for item in items),
             "findings": words.of_batch(stored.get(batch.id, []), batch.inserted, keys),

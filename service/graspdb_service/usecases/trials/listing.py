@@ -9,7 +9,7 @@ from graspdb.wire import OUTCOME_CODES
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import batches, provenances, rows
-from graspdb_service.trial_columns import TrialPage
+from graspdb_service.trial_columns import TrialPage, is_gripper
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 
@@ -67,7 +67,8 @@ def _read(
     passing = [
         number
         for number, name in names.items()
-        if all(want in (None, have) for want, have in zip(wanted, name, strict=True))
+        if chosen.gripper is None or (name.gripper is not None and is_gripper(name.gripper, chosen.gripper))
+        if chosen.source in (None, name.source) and chosen.protocol in (None, name.protocol)
     ]
     batch_id = None
     if chosen.batch is not None:

@@ -13,7 +13,7 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.trials import batches, findings, provenances, rows
-from graspdb_service.trial_columns import TrialBatch
+from graspdb_service.trial_columns import Provenance, TrialBatch
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runtime import Runtime
@@ -48,10 +48,10 @@ def add(
 
 def _store(tx: Tx, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) -> Created:
     row = require(tx, slug)
-    _refuse_unknown_grippers(tx, batch)
+    named = _held_grippers(tx, batch)
     count = len(batch.columns)
     revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
-    ids = np.array([provenances.ensure(tx, row.id, item) for item in batch.provenances])
+    ids = np.array([provenances.ensure(tx, row.id, item) for item in named])
     batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
     columns = replace(batch.columns, provenance=ids[batch.columns.provenance])
     rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first_seq)
@@ -95,8 +95,11 @@ def _refuse_implausible(batch: TrialBatch, concerns: Sequence[Concern]) -> None:
     )
 
 
-def _refuse_unknown_grippers(tx: Tx, batch: TrialBatch) -> None:
-    unknown = grippers.missing(tx, {item.gripper for item in batch.provenances if item.gripper is not None})
+def _held_grippers(tx: Tx, batch: TrialBatch) -> list[Provenance]:
+    """The batch's provenances, each gripper as the version that it stands for; 422 for one there is not."""
+    names = {item.gripper for item in batch.provenances if item.gripper is not None}
+    held = grippers.held(tx, names)
+    unknown = sorted(names - held.keys())
     if unknown:
         raise ProblemError(
             422,
@@ -105,3 +108,7 @@ def _refuse_unknown_grippers(tx: Tx, batch: TrialBatch) -> None:
             " GET /grippers lists them, POST /grippers makes one",
             errors=[(batch.field_of_gripper(name), f"there is no gripper {name!r}") for name in unknown],
         )
+    return [
+        item if item.gripper is None else item._replace(gripper=held[item.gripper])
+        for item in batch.provenances
+    ]

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from graspdb.wire import OUTCOMES, GripperProfile
+from graspdb.wire.grippers import SHAPE_FIELDS
 from graspdb.wire.queries import TrialSelection
 from graspdb_service.problems import conflict, found
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import Bools, Ints, Provenance
+from graspdb_service.trial_columns import Bools, Ints, Provenance, gripper_parts, is_gripper
 from graspdb_service.usecases.objects import require
 
 _KEPT = 4_096
+#: Versions that a warning tells of.
+_TOLD = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,9 @@ class Selected:
     ``row`` is the object; ``gripper`` and ``protocol`` are the one named, else the only one among the trials,
     else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw
     is mirror-symmetric; ``tried`` those of sources that post failures, too: only they tell how likely a
-    success is. ``outcomes`` counts selected trials by outcome, packed ones included.
+    success is. ``outcomes`` counts selected trials by outcome, packed ones included. ``gripper`` may be one
+    version, as in ``panda@1``; else ``profile`` is the newest's, whatever ``versions`` the trials are of, and
+    ``warnings`` say so. ``stamp`` is another one whenever the profile is.
     """
 
     row: ObjectRow
@@ -40,11 +46,19 @@ class Selected:
     provenances: Mapping[int, bool]
     outcomes: Mapping[str, int]
     tried: frozenset[int]
+    versions: Sequence[int]
+    stamp: int | None
+    warnings: Sequence[str]
 
     @property
     def filters(self) -> TrialSelection:
         """What selects the same trials whatever else is added to the object."""
         return TrialSelection(gripper=self.gripper, protocol=self.protocol, source=self.source)
+
+    @property
+    def key(self) -> tuple[int, TrialSelection, int | None]:
+        """What is kept of a selection goes by this, and by the object's revision."""
+        return self.row.id, self.filters, self.stamp
 
     def symmetric(self, provenance: Ints) -> Bools:
         """Whether the jaw was mirror-symmetric, of trials (n,) of the selection by their provenances."""
@@ -74,7 +88,7 @@ class Selections:
             key = row.id, asked.gripper, asked.protocol, asked.source
             with self._lock:
                 known = self._resolved.get(key)
-            if known is not None and known.row.revision == row.revision:
+            if known is not None and _still_holds(tx, known, row):
                 return known
             selected = resolve(tx, row, asked)
         with self._lock:
@@ -90,16 +104,24 @@ def as_of(tx: Tx, selected: Selected) -> Selected:
     :meth:`Selections.resolve`, 409 where the object was replaced.
     """
     row = require(tx, selected.row.slug, object_id=selected.row.id)
-    return selected if row.revision == selected.row.revision else resolve(tx, row, selected.filters)
+    return selected if _still_holds(tx, selected, row) else resolve(tx, row, selected.filters)
+
+
+def _still_holds(tx: Tx, selected: Selected, row: ObjectRow) -> bool:
+    """Whether neither the object has changed since nor what the gripper's name stands for."""
+    if selected.row.revision != row.revision:
+        return False
+    return selected.gripper is None or grippers.version_id(tx, selected.gripper) == selected.stamp
 
 
 def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
     """Find the provenances that a request is about.
 
-    A trial without gripper or protocol fits every selection and makes none ambiguous. 404 for an unknown
+    A trial without gripper or protocol fits every selection and makes none ambiguous, nor do several versions
+    of a gripper. 404 for an unknown
     gripper; 409 ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
-    profile = None if asked.gripper is None else _profile(tx, asked.gripper)
+    named_gripper = None if asked.gripper is None else _gripper(tx, asked.gripper)
     counts = outcome_counts(tx, row.id)
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = {
@@ -107,11 +129,14 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
         for number, item in provenances.of_object(tx, row.id).items()
         if number in counts
         and asked.source in (None, item.source)
-        and (asked.gripper is None or item.gripper in (None, asked.gripper))
+        and (asked.gripper is None or item.gripper is None or is_gripper(item.gripper, asked.gripper))
         and (asked.protocol is None or item.protocol in (None, asked.protocol))
     }
     items = candidates.values()
-    named = {name: distinct(getattr(item, name) for item in items) for name in ("gripper", "protocol")}
+    named = {
+        "gripper": distinct(item.gripper and gripper_parts(item.gripper)[0] for item in items),
+        "protocol": distinct(item.protocol for item in items),
+    }
     ambiguous = [name for name, values in named.items() if len(values) > 1 and getattr(asked, name) is None]
     if ambiguous:
         told = "; ".join(f"{name}: {', '.join(named[name])}" for name in ambiguous)
@@ -122,10 +147,15 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
             protocols=named["protocol"],
         )
     gripper, protocol = (getattr(asked, name) or next(iter(values), None) for name, values in named.items())
-    if gripper is not None and profile is None:
-        profile = _profile(tx, gripper)
+    if gripper is not None and named_gripper is None:
+        named_gripper = _gripper(tx, gripper)
+    profile = None if named_gripper is None else GripperProfile.model_validate(named_gripper.profile)
     names = {"gripper": gripper, "protocol": protocol, "source": asked.source}
-    return of_provenances(row, candidates, counts, profile=profile, **names)
+    selected = of_provenances(row, candidates, counts, profile=profile, **names)
+    if named_gripper is None or profile is None:
+        return selected
+    warnings = _of_other_versions(tx, named_gripper, profile, selected.versions)
+    return replace(selected, stamp=named_gripper.version_id, warnings=warnings)
 
 
 def of_provenances(
@@ -145,6 +175,7 @@ def of_provenances(
         if counts[number].keys() - {"success", "simulation_error"}
     }
     symmetric = profile is None or profile.symmetric
+    items = chosen.values()
     return Selected(
         row=row,
         gripper=gripper,
@@ -154,6 +185,9 @@ def of_provenances(
         provenances={number: item.gripper is None or symmetric for number, item in chosen.items()},
         outcomes=total([counts[number] for number in chosen]),
         tried=frozenset(number for number, item in chosen.items() if item.source in failing),
+        versions=sorted({gripper_parts(item.gripper)[1] or 0 for item in items if item.gripper is not None}),
+        stamp=None,
+        warnings=(),
     )
 
 
@@ -172,9 +206,33 @@ def total(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
     return {name: number for name, number in sums.items() if number}
 
 
-def _profile(tx: Tx, name: str) -> GripperProfile:
-    row = found(grippers.find(tx, name), "gripper", name, "GET /grippers lists those there are")
-    return GripperProfile.model_validate(row.profile)
+def _gripper(tx: Tx, name: str) -> GripperRow:
+    return found(grippers.find(tx, name), "gripper", name, "GET /grippers lists those there are")
+
+
+def _of_other_versions(
+    tx: Tx, gripper: GripperRow, profile: GripperProfile, versions: Collection[int]
+) -> list[str]:
+    """Warnings of trials that were made with other profiles of the gripper than the one that counts."""
+    others = grippers.profiles(tx, gripper.id, set(versions) - {gripper.version})
+    differing = {
+        number: fields
+        for number, other in sorted(others.items())
+        if (fields := profile.differences(GripperProfile.model_validate(other)))
+    }
+    if not differing:
+        return []
+    told = [f"{gripper.id}@{number} differs in {', '.join(fields)}" for number, fields in differing.items()]
+    if len(told) > _TOLD:
+        told[_TOLD:] = [f"{len(told) - _TOLD} more versions differ, too"]
+    kept = ""
+    if any(field.startswith(SHAPE_FIELDS) for fields in differing.values() for field in fields):
+        kept = "; their outcomes, collisions among them, are of the shapes that they were made with"
+    return [
+        f"trials of several versions of gripper {gripper.id!r} count, and the profile of {gripper.versioned}"
+        f" for all of them: {'; '.join(told)}{kept} (gripper={gripper.id}@{next(iter(differing))} selects one"
+        " version)"
+    ]
 
 
 def distinct(values: Iterable[str | None]) -> list[str]:

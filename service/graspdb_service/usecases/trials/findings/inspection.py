@@ -64,7 +64,7 @@ def profiles_of(tx: Tx, batch: TrialBatch) -> dict[str, GripperProfile]:
     for name in {item.gripper for item in batch.provenances[:_MOST_PROVENANCES]} - {None}:
         row = grippers.find(tx, str(name))
         if row is not None:
-            found[row.id] = GripperProfile.model_validate(row.profile)
+            found[str(name)] = GripperProfile.model_validate(row.profile)
     return found
 
 
