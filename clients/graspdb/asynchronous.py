@@ -19,6 +19,7 @@ import anyio.to_thread
 from graspdb import wire
 from graspdb.client import Client
 from graspdb.reports import AllReports, Reports
+from graspdb.resources.answers import Answers
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
 from graspdb.resources.objects import GraspObject, Objects
@@ -240,6 +241,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
     best_grasps = _awaited(GraspObject.best_grasps)
     samples = _awaited(GraspObject.samples)
     proposals = _awaited(GraspObject.proposals)
+    answers = _at_once(GraspObject.answers, AsyncListing[wire.AnswerInfo])
     sweep = _mirrored(GraspObject.sweep, AsyncSweep)
     sweeps = _iterated(GraspObject.sweeps, AsyncSweep)
 
@@ -264,6 +266,14 @@ class AsyncGrippers(Mirror[Grippers]):
     delete = _awaited(Grippers.delete)
     list = _iterated(Grippers.list, _same)
     __aiter__ = list
+
+
+class AsyncAnswers(Mirror[Answers]):
+    """:class:`graspdb.resources.answers.Answers`."""
+
+    get = _awaited(Answers.get)
+    delete = _awaited(Answers.delete)
+    list = _at_once(Answers.list, AsyncListing[wire.AnswerInfo])
 
 
 class AsyncKernels(Mirror[Kernels]):
@@ -293,6 +303,7 @@ class AsyncClient(Mirror[Client]):
         self.grippers = AsyncGrippers(self.sync.grippers)
         self.kernels = AsyncKernels(self.sync.kernels)
         self.sweeps = AsyncSweeps(self.sync.sweeps)
+        self.answers = AsyncAnswers(self.sync.answers)
         self.reports = AsyncAllReports(self.sync.reports)
 
     url = _Attribute[Client, str](lambda client: client.url)

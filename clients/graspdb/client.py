@@ -8,6 +8,7 @@ from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.examples import example
 from graspdb.reports import AllReports
+from graspdb.resources.answers import Answers
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
 from graspdb.resources.objects import GraspObject, Objects
@@ -39,6 +40,7 @@ class Client:
         self.objects = Objects(self._transport, "/objects")
         self.grippers = Grippers(self._transport, "/grippers")
         self.kernels = Kernels(self._transport, "/kernels")
+        self.answers = Answers(self._transport, "/answers")
         self.reports = AllReports(self._transport, "/reports")
         self.sweeps = Sweeps(self._transport, "/sweeps")
 

@@ -20,8 +20,6 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import Counter, Histogram
-from sqlalchemy.exc import OperationalError as DatabaseUnavailable
-from sqlalchemy.exc import TimeoutError as PoolExhausted
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -33,12 +31,12 @@ from graspdb_service.api import (
     meshes,
     objects,
     operations,
-    queries,
     reports,
     sweeps,
     trials,
 )
 from graspdb_service.api.context import Context
+from graspdb_service.api.questions import answers, queries
 from graspdb_service.api.routing.document import document
 from graspdb_service.api.routing.encodings import Decoding
 from graspdb_service.api.routing.methods import METHODS, Methods, allowed
@@ -47,7 +45,7 @@ from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
-from graspdb_service.storage.database import Database
+from graspdb_service.storage.database import UNAVAILABLE, Database
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.usecases.grippers import seed
 
@@ -70,6 +68,7 @@ ROUTERS = [
     grippers.router,
     trials.router,
     queries.router,
+    answers.router,
     kernels.router,
     reports.router,
     sweeps.router,
@@ -230,8 +229,6 @@ def _add_problems(app: FastAPI) -> None:
     def on_gone(request: Request, _: ObjectGone) -> Response:
         return answer(request, ProblemError(404, "not-found", "The object has just been deleted"))
 
-    @app.exception_handler(DatabaseUnavailable)
-    @app.exception_handler(PoolExhausted)
     def on_database(request: Request, error: Exception) -> Response:
         log.error("request %s: %s", getattr(request.state, "request_id", ""), error)
         problem = ProblemError(
@@ -241,6 +238,9 @@ def _add_problems(app: FastAPI) -> None:
             headers={"Retry-After": "2"},
         )
         return answer(request, problem)
+
+    for unavailable in UNAVAILABLE:
+        app.exception_handler(unavailable)(on_database)
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:

@@ -33,6 +33,9 @@ class Settings(BaseSettings):
     max_samples: Annotated[int, Field(ge=1)] = 1_000_000
     max_sweep_poses: Annotated[int, Field(ge=1)] = 100_000_000
     max_density_cache_bytes: Annotated[int, Field(ge=2**20)] = 2**30
+    max_answers: Annotated[int, Field(ge=1)] = 5_000
+    """So many answers of each object and kind of question are kept, those given last, beside those that a
+    name or a trial keeps; none is deleted within ten minutes."""
 
     lease_s: Annotated[float, Field(gt=0)] = 60.0
     """How long a worker keeps a job without renewing."""

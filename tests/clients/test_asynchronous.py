@@ -14,6 +14,7 @@ import trimesh
 
 from graspdb import AsyncClient, Client, GraspDBError, Infeasible, asynchronous
 from graspdb.reports import AllReports, Reports
+from graspdb.resources.answers import Answers
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
 from graspdb.resources.objects import GraspObject, Objects
@@ -34,6 +35,7 @@ MIRRORS = {
     Sweeps: asynchronous.AsyncSweeps,
     Sweep: asynchronous.AsyncSweep,
     Grippers: asynchronous.AsyncGrippers,
+    Answers: asynchronous.AsyncAnswers,
     Kernels: asynchronous.AsyncKernels,
 }
 #: How the synchronous client waits and pages: nothing that a program calls.

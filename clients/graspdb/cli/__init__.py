@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 
 from graspdb import __version__
-from graspdb.cli import kernels, objects, queries, reports, sweeps, trials
+from graspdb.cli import answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
 from graspdb.cli.options import Commands
 from graspdb.cli.wording import in_commands
@@ -70,6 +70,7 @@ app.command("best-grasp")(queries.best_grasp)
 app.command("likelihood")(queries.likelihood)
 app.command("samples")(queries.samples)
 app.command("proposals")(queries.proposals)
+app.add_typer(answers.answers, name="answers")
 app.command("report")(reports.report)
 app.add_typer(kernels.kernels, name="kernels")
 app.command("sweep")(sweeps.sweep)

@@ -89,12 +89,13 @@ def best_grasp(
             raise typer.Exit(1) from None
         raise
     if state.json:
-        names = ("status", "ranking", "revision", "kernel", "warnings")
+        names = ("status", "ranking", "revision", "kernel", "warnings", "answer", "newer_revision")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())
     elif count == 1:
         show_rows({**found[0].summary(), **_ranked_by(found)})
+        _tell_kept(found)
     else:
         _show_grasps(found, in_world=found[0].world is not None and constraints.get("frame") != "object")
     if not state.json:
@@ -105,6 +106,16 @@ def _mind(warnings: Sequence[str]) -> None:
     """What a person should know before relying on an answer."""
     for warning in warnings:
         ERRORS.print(f"Mind: {escape(in_commands(warning))}", highlight=False, soft_wrap=True)
+
+
+def _tell_kept(found: Grasps) -> None:
+    """That a name's answer is older than the object is now."""
+    if found.newer_revision is not None:
+        ERRORS.print(
+            f"The name keeps this answer of revision {found.revision}; the object is at"
+            f" {found.newer_revision}: leave --name out for today's.",
+            soft_wrap=True,
+        )
 
 
 def _ranked_by(found: Grasps) -> dict[str, str]:
@@ -142,6 +153,7 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
     if all(g.prior_success_probability is None for g in found):
         del columns["by geometry"]
     show_table(found, columns, empty="No grasp.")
+    _tell_kept(found)
     if found.ranking is not None and ranked_by:
         ERRORS.print(f"The score that they are ranked by is the {found.ranking.score}.", soft_wrap=True)
     if found.reach is not None and any(g.support is not None and not g.support.enough for g in found):

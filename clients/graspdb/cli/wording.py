@@ -36,6 +36,8 @@ COMMANDS: Mapping[str, str] = {
     "DELETE /objects/OBJECT/batches/BATCH": "batches delete OBJECT BATCH",
     "POST /objects/OBJECT/best-grasp": "best-grasp OBJECT",
     "POST /objects/OBJECT/sweeps": "sweep OBJECT",
+    "GET /answers/ANSWER": "answers get ANSWER",
+    "DELETE /answers/ANSWER": "answers delete ANSWER",
     "GET /grippers": "grippers list",
     "POST /grippers": "grippers create",
     "PUT /grippers/GRIPPER": "grippers update GRIPPER FILE",

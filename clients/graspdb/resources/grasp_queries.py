@@ -54,6 +54,7 @@ class GraspQueries(Resource):
         *,
         include: Sequence[str] | None = None,
         chunk: int = QUERY_POSES,
+        name: str | None = None,
         **selection: Unpack[Selection],
     ) -> LikelihoodArrays:
         """How likely these grasps are, as NumPy arrays in the poses' order.
@@ -61,11 +62,12 @@ class GraspQueries(Resource):
         ``poses`` are (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples, sent ``chunk`` a
         request. ``include`` are the columns to compute: ``density``, ``log_density``, ``relative``,
         ``success_probability``, ``interval``, ``effective_trials``, ``collision_free``, ``support``,
-        ``prior_success_probability``; by default all.
+        ``prior_success_probability``; by default all. ``name`` keeps the answer of at most 1,000 poses, as in
+        :class:`Constraints`.
         """
         options = known_keywords(Selection, selection, "likelihood")
         given = as_poses(poses)
-        options["include"] = None if include is None else names(include)
+        options |= {"include": None if include is None else names(include), "name": name}
         # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
         probe = validate(wire.LikelihoodRequest, {**options, "poses": given.columns(slice(1))})
         request = probe.model_dump(mode="json", exclude_unset=True)
@@ -149,10 +151,19 @@ class GraspQueries(Resource):
         return grasps.simulated(outcomes.outcome[np.argsort(outcomes.pose_index)].tolist())
 
     def samples(
-        self, count: int = 100, *, seed: int | None = None, **selection: Unpack[Selection]
+        self,
+        count: int = 100,
+        *,
+        seed: int | None = None,
+        name: str | None = None,
+        **selection: Unpack[Selection],
     ) -> SampledPoses:
-        """Poses drawn from the density; the same seed and revision give the same poses."""
-        fields = {**known_keywords(Selection, selection, "samples"), "count": count, "seed": seed}
+        """Poses drawn from the density; the same seed and revision give the same poses.
+
+        ``name`` keeps the answer, as in :class:`Constraints`; of at most 1,000 poses.
+        """
+        fields = known_keywords(Selection, selection, "samples")
+        fields |= {"count": count, "seed": seed, "name": name}
         request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
         return SampledPoses.from_wire(answer)
@@ -163,16 +174,17 @@ class GraspQueries(Resource):
         *,
         strategy: str = "density",
         seed: int | None = None,
+        name: str | None = None,
         **selection: Unpack[Selection],
     ) -> SampledPoses:
         """Grasps to try next; send ``proposal_density`` back with their trials.
 
         ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges``
         needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on opposed surfaces,
-        edges or points; some of what it draws collides.
+        edges or points; some of what it draws collides. ``name`` keeps the answer, as for :meth:`samples`.
         """
         fields = known_keywords(Selection, selection, "proposals")
-        fields |= {"count": count, "seed": seed, "strategy": strategy}
+        fields |= {"count": count, "seed": seed, "strategy": strategy, "name": name}
         request = validate(wire.ProposalsRequest, fields)
         answer = self._transport.model(wire.Proposals, "POST", f"{self._path}/proposals", body=request)
         return SampledPoses.from_wire(answer)

@@ -12,6 +12,7 @@ from graspdb.errors import GraspDBError
 from graspdb.files.meshes import GLB, MeshLike, read_mesh, scene_of
 from graspdb.options import Option, known_keywords
 from graspdb.reports import Reports
+from graspdb.resources.answers import Answers
 from graspdb.resources.grasp_queries import GraspQueries
 from graspdb.resources.pages import Listing, Resource, segment, validate
 from graspdb.resources.results import table_html
@@ -107,6 +108,10 @@ class GraspObject(GraspQueries):
     def sweeps(self) -> Iterator[Sweep]:
         """The sweeps of this object."""
         return Sweeps(self._transport, "/sweeps").list(object=self.id)
+
+    def answers(self, *, name: str | None = None, kind: str | None = None) -> Listing[wire.AnswerInfo]:
+        """The answers about this object that are kept, the newest first: see :meth:`Answers.list`."""
+        return Answers(self._transport, "/answers").list(self.id, name=name, kind=kind)
 
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""

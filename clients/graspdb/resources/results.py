@@ -82,6 +82,7 @@ class Grasp:
     - ``width_m``: opening of the jaw once both fingers touch the object, metres.
     - ``nearest_trials``: ``seq`` of the trials nearest to it.
     - ``active_constraints``: those that hold it where it is.
+    - ``answer``: id of the answer that it is of, for the trial that tries it; None where it is not kept.
     """
 
     position: Floats
@@ -103,11 +104,12 @@ class Grasp:
     candidate: int | None = None
     simulated: str | None = None
     prior: bool = False
+    answer: str | None = None
     raw: wire.Grasp | None = field(default=None)
 
     @classmethod
-    def from_wire(cls, grasp: wire.Grasp) -> Grasp:
-        """From the service's answer."""
+    def from_wire(cls, grasp: wire.Grasp, answer: str | None = None) -> Grasp:
+        """From the service's answer, by the id that this has."""
         fields = {name: getattr(grasp, name) for name in wire.Grasp.model_fields}
         world = grasp.world
         fields |= {
@@ -117,7 +119,7 @@ class Grasp:
             "nearest_trials": tuple(grasp.nearest_trials),
             "active_constraints": tuple(grasp.active_constraints),
         }
-        return cls(**fields, raw=grasp)
+        return cls(**fields, answer=answer, raw=grasp)
 
     @property
     def matrix(self) -> Floats:
@@ -178,6 +180,8 @@ class Grasp:
             rows["width [m]"] = f"{self.width_m:.4f}"
         if self.active_constraints:
             rows["held by"] = ", ".join(self.active_constraints)
+        if self.answer is not None:
+            rows["answer"] = self.answer
         return rows
 
     def __repr__(self) -> str:
@@ -198,7 +202,9 @@ class Grasps(Sequence[Grasp]):
     ``conflict`` names the fewest constraints found that exclude each other, ``relax`` a value of each that
     would do.
     ``ranking`` says what they are ranked by, ``reach`` how far from an attempt success probabilities are
-    told. Where they were simulated before they were answered (``verify=True``), those that held come first.
+    told. ``answer`` is the id that the service keeps them under, None where it does not; ``newer_revision``
+    the object's revision now, where a name keeps them of an older one. Where they were simulated before they
+    were answered (``verify=True``), those that held come first.
     """
 
     def __init__(self, answer: wire.BestGrasps) -> None:
@@ -209,10 +215,12 @@ class Grasps(Sequence[Grasp]):
         self.reach = answer.reach
         self.estimator = answer.estimator
         self.warnings = list(answer.warnings)
-        self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest)
+        self.answer = answer.answer
+        self.newer_revision = answer.newer_revision
+        self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest, answer.answer)
         self.conflict = tuple(answer.conflict)
         self.relax = dict(answer.relax)
-        self._grasps = tuple(Grasp.from_wire(grasp) for grasp in answer.grasps)
+        self._grasps = tuple(Grasp.from_wire(grasp, answer.answer) for grasp in answer.grasps)
 
     @overload
     def __getitem__(self, index: int) -> Grasp: ...
@@ -388,6 +396,8 @@ class LikelihoodArrays(Columns):
     ``density`` in 1/(m^3 rad^3); ``log_density`` natural, minus infinity where the density is exactly
     zero; ``relative`` to the density's global maximum. ``success_probability`` and ``interval`` are NaN where
     ``support.enough`` is False; ``reach`` says how far from an attempt they are told, and why no farther.
+    ``answer`` is the id that the service keeps them under, None where it does not; ``newer_revision`` the
+    object's revision now, where a name keeps them of an older one.
     """
 
     revision: int
@@ -404,6 +414,8 @@ class LikelihoodArrays(Columns):
     reach: wire.ReachInfo | None = None
     estimator: wire.EstimatorInfo | None = None
     warnings: Sequence[str] = ()
+    answer: str | None = None
+    newer_revision: int | None = None
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -428,6 +440,8 @@ class LikelihoodArrays(Columns):
             estimator=answers[-1].estimator,
             warnings=answers[-1].warnings,
             interval=interval,
+            answer=answers[0].answer if len(answers) == 1 else None,
+            newer_revision=answers[-1].newer_revision,
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
             **columns,
         )
@@ -500,7 +514,9 @@ class SampledPoses(PoseArrays):
     """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials.
 
     ``criterion`` says how proposals were drawn; None for plain samples. ``support`` says how far each is from
-    what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial.
+    what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial. ``answer`` is
+    the id that the service keeps them under, None where it does not; ``newer_revision`` the object's revision
+    now, where a name keeps them of an older one.
     """
 
     proposal_density: Floats
@@ -510,6 +526,8 @@ class SampledPoses(PoseArrays):
     criterion: str | None = None
     support: SupportArrays | None = None
     prior: bool = False
+    answer: str | None = None
+    newer_revision: int | None = None
 
     @classmethod
     def from_wire(cls, answer: wire.Samples) -> SampledPoses:
@@ -524,6 +542,8 @@ class SampledPoses(PoseArrays):
             criterion=answer.criterion if isinstance(answer, wire.Proposals) else None,
             support=None if answer.support is None else SupportArrays.from_wire([answer.support]),
             prior=answer.prior,
+            answer=answer.answer,
+            newer_revision=answer.newer_revision,
         )
 
     def _columns(self) -> dict[str, Any]:

@@ -69,6 +69,8 @@ class Constraints(Selection, total=False):
     - ``min_separation_m``, ``min_separation_deg``: how far apart, in either, two grasps count as distinct.
     - ``include``: scores to compute, as in `GraspObject.likelihood`. By default the success probability comes
       along where the objective needs it or there are at most 500,000 attempts.
+    - ``name``: keeps the answer under this name: the same question is answered exactly so again, until it is
+      deleted (``db.answers``).
     - ``prior``: whether an object with geometry and no success yet may answer from its edges; such grasps
       have ``grasp.prior``. By default it does where a gripper is known; True says what is missing where it
       can't.
@@ -110,6 +112,7 @@ class Constraints(Selection, total=False):
     include: Sequence[str] | None
     min_separation_m: Annotated[float | None, Option("Distinct from this distance on.")]
     min_separation_deg: Annotated[float | None, Option("Distinct from this angle on.")]
+    name: Annotated[str | None, Option("Keep the answer under this name.")]
     prior: Annotated[bool | None, Option("Before any success: whether to choose by the edges.")]
 
 

@@ -50,6 +50,8 @@ from graspdb.wire.objects import ObjectCreate as ObjectCreate
 from graspdb.wire.objects import ObjectInfo as ObjectInfo
 from graspdb.wire.objects import ObjectPatch as ObjectPatch
 from graspdb.wire.objects import PartsInfo as PartsInfo
+from graspdb.wire.queries import Answer as Answer
+from graspdb.wire.queries import AnswerInfo as AnswerInfo
 from graspdb.wire.queries import BestGraspRequest as BestGraspRequest
 from graspdb.wire.queries import BestGrasps as BestGrasps
 from graspdb.wire.queries import DensityInfo as DensityInfo

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from graspdb.wire.base import (
     ChosenGripper,
@@ -70,6 +72,39 @@ PriorProbability = Annotated[
         description="What geometry alone tells where no attempt is near enough: the share of successes among"
         " attempts that held something by geometry, 0 where the open gripper collides or holds nothing; null"
         " elsewhere, and where mesh or gripper are not known."
+    ),
+]
+
+
+def _no_answer_id(name: str) -> str:
+    if re.fullmatch(ANSWER_ID, name):
+        raise ValueError("a name of 20 hexadecimal digits would look like an answer's id: choose another")
+    return name
+
+
+ANSWER_ID = r"[0-9a-f]{20}"
+"""What ids of answers look like; no name of a user's does."""
+AnswerName = Annotated[
+    Slug | None,
+    AfterValidator(lambda name: None if name is None else _no_answer_id(name)),
+    Field(
+        description="Keeps the answer under this name until it is deleted: the same question under the same"
+        " name is answered exactly so again. By default it has no name."
+    ),
+]
+AnswerId = Annotated[
+    str | None,
+    Field(
+        description="Id of this answer: `GET /answers/{id}` gives it again exactly, and a trial may name it."
+        " Null where it is not kept: of more than 1,000 poses or 4 MiB, and while the database can't be"
+        " written."
+    ),
+]
+NewerRevision = Annotated[
+    int | None,
+    Field(
+        description="Revision of the object now, where it is newer than the one that this answer was kept of"
+        " under a name: today's trials may answer otherwise. Null elsewhere."
     ),
 ]
 
@@ -235,6 +270,7 @@ class LikelihoodRequest(Selection):
     poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns
     """Poses of the tool frame in the object frame, in a list or in columns; 1 to 1,000,000."""
     include: IncludedColumns = None
+    name: AnswerName = None
 
 
 class Intervals(Response):
@@ -288,6 +324,8 @@ class Likelihoods(Response):
     reach: ReachField = None
     estimator: EstimatorField = None
     warnings: Warnings = Field(default_factory=list)
+    answer: AnswerId = None
+    newer_revision: NewerRevision = None
 
 
 def _object_pose(value: Any) -> Any:
@@ -407,6 +445,7 @@ class GraspConstraints(Selection):
     """Grasps are distinct from this distance of their origins on, metres; by default 0.01."""
     min_separation_deg: Angle | None = None
     """Grasps are distinct from this angle between them on, degrees; by default 20."""
+    name: AnswerName = None
 
 
 class BestGraspRequest(GraspConstraints):
@@ -515,6 +554,8 @@ class BestGrasps(Response):
     reach: ReachField = None
     estimator: EstimatorField = None
     warnings: Warnings = Field(default_factory=list)
+    answer: AnswerId = None
+    newer_revision: NewerRevision = None
 
 
 class SamplesRequest(Selection):
@@ -524,6 +565,7 @@ class SamplesRequest(Selection):
     """How many poses to draw."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
     """The same seed and revision give the same poses; by default a new one."""
+    name: AnswerName = None
 
 
 class Samples(Response):
@@ -544,6 +586,8 @@ class Samples(Response):
     prior: bool = False
     """Whether geometry drew them, no trial."""
     warnings: Warnings = Field(default_factory=list)
+    answer: AnswerId = None
+    newer_revision: NewerRevision = None
 
 
 Strategy = Literal["density", "uncertainty", "edges"]
@@ -586,6 +630,7 @@ class LikelihoodQuery(SelectionQuery):
     quaternion_xyzw: Quaternion
     """Rotation of the tool frame in the object frame: a unit quaternion x,y,z,w."""
     include: Annotated[IncludedColumns, BeforeValidator(_listed)] = None
+    name: AnswerName = None
 
 
 class BestGraspQuery(GraspConstraints):
@@ -599,3 +644,47 @@ class LikelihoodOptions(Selection):
     """A likelihood request without its poses, which are read as arrays."""
 
     include: IncludedColumns = None
+    name: AnswerName = None
+
+
+# -- answers that are kept
+
+AnswerKind = Literal["best-grasp", "likelihood", "samples", "proposals"]
+
+
+class AnswerInfo(Response):
+    """An answer that is kept: what it was about."""
+
+    answer: str
+    """Id of the answer."""
+    names: list[str] = Field(default_factory=list)
+    """Names that it was given, by which it is found, too."""
+    object: ObjectId
+    kind: AnswerKind
+    """What was asked: the last part of the request's path."""
+    revision: Revision
+    object_revision: int
+    """Revision of the object now: where it is newer, the same question may be answered otherwise."""
+    gripper: ChosenGripper = None
+    protocol: ChosenProtocol = None
+    source: ChosenSource = None
+    version: str
+    """Version of the service that answered."""
+    trials: int
+    """How many trials name it as the answer that they tried; it can't be deleted then."""
+    created_at: datetime
+    """When it was first given, UTC."""
+    asked_at: datetime
+    """When it was last given, UTC, to the minute."""
+
+
+class Answer(AnswerInfo):
+    """An answer that is kept: the question, and the answer exactly as it was given."""
+
+    question: dict[str, Any]
+    """The question, as `POST /objects/{id}/{kind}` takes it, the seed that was drawn included."""
+    kernel: KernelInfo
+    """The kernel of the density that answered."""
+    estimator: EstimatorField = None
+    result: dict[str, Any]
+    """The answer as it was given, whatever became of the object's trials since."""

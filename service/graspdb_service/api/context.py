@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
+from graspdb_service.usecases.answers.asking import Asking
+from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
-from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -20,7 +21,7 @@ from graspdb_service.usecases.trials.selection import Selections
 
 
 @dataclass(kw_only=True)
-class Context(Estimators):
+class Context(Asking):
     """The parts of one service process."""
 
     reports: Reports
@@ -44,11 +45,13 @@ class Context(Estimators):
             scenes=scenes,
             priors=Priors(compute, scenes),
             successes=Successes(database, compute, settings.max_density_cache_bytes),
+            answers=AnswerKeeper(database, most=settings.max_answers),
             reports=reports,
             runs=Runs(database, wait_s=settings.report_wait_s, kinds={fit.RUN: fits, **reports.run_kinds()}),
         )
 
     def close(self) -> None:
+        self.answers.close()
         self.runs.close()
         self.compute.close()
         self.database.dispose()

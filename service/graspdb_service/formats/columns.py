@@ -27,8 +27,12 @@ def columns_json(
     A column is an array (n,) or (n, k), in which what is not finite becomes null, None, or a mapping of
     further members.
     """
-    body = b"".join((b"{", _members({**head, **columns}), b"}"))
-    return Response(body, media_type=JSON, headers=dict(headers or {}))
+    return Response(json_of_columns(head, columns), media_type=JSON, headers=dict(headers or {}))
+
+
+def json_of_columns(head: Mapping[str, Any], columns: Mapping[str, Any]) -> bytes:
+    """The body of :func:`columns_json`."""
+    return b"".join((b"{", _members({**head, **columns}), b"}"))
 
 
 def _members(values: Mapping[str, Any]) -> bytes:

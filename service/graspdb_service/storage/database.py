@@ -9,7 +9,8 @@ from typing import Any, TypeAlias, TypeVar
 from sqlalchemy import Connection, Double, Engine, Executable, Table, create_engine, event, make_url, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolExhausted
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
 
@@ -18,6 +19,8 @@ Tx: TypeAlias = Connection
 """An open transaction, as the use cases pass it on."""
 
 SQLITE_BUSY_MS = 30_000
+UNAVAILABLE = (OperationalError, PoolExhausted)
+"""What a database raises that does not answer, is full, or has no connection free."""
 
 
 class unix_now(GenericFunction[float]):

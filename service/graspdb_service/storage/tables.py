@@ -377,6 +377,41 @@ report_runs = Table(
     CheckConstraint("state IN ('running', 'done', 'failed', 'cancelled')", name="state"),
 )
 
+# Answers as they were given, each once: what was asked, of which revision, and what was answered.
+answers = Table(
+    "answers",
+    metadata,
+    # AUTOINCREMENT: trials name an answer by its number, which is never another's.
+    Column("number", BigId, primary_key=True, autoincrement=True),
+    Column("id", String(20), nullable=False, unique=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False),
+    Column("kind", String(16), nullable=False),
+    Column("revision", BigInteger, nullable=False),
+    # Which trials it was about, as its selection was resolved.
+    Column("gripper", String(80)),
+    Column("protocol", String(64)),
+    Column("source", String(16)),
+    Column("version", String(40), nullable=False),
+    # JSON, deflated.
+    Column("question", LargeBinary, nullable=False),
+    Column("result", LargeBinary, nullable=False),
+    # How many trials name it: such an answer stays.
+    Column("trial_count", BigInteger, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    # When it was given last, to the minute.
+    Column("asked_at", UtcDateTime, nullable=False),
+    Index("ix_answers_recent", "object_id", "kind", "asked_at"),
+    sqlite_autoincrement=True,
+)
+
+# Names that users gave answers; an answer may have several.
+answer_names = Table(
+    "answer_names",
+    metadata,
+    Column("name", String(64), primary_key=True),
+    Column("answer_number", ForeignKey("answers.number", ondelete="CASCADE"), nullable=False, index=True),
+)
+
 idempotency_keys = Table(
     "idempotency_keys",
     metadata,

@@ -19,10 +19,13 @@ def etag(*parts: object) -> str:
     return 'W/"' + ".".join(str(part) for part in parts) + '"'
 
 
-def answer_tag(selected: Selected, revision: int, query: Selection) -> str:
-    """What an answer depends on: object, revision, the gripper's profile, the question, and who answers."""
+def answer_tag(selected: Selected, revision: int, query: Selection, kept: str | None = None) -> str:
+    """What an answer depends on: object, revision, the gripper's profile, the question, and who answers;
+    beside that the id that it is ``kept`` under.
+    """
     question = hashlib.sha256(f"{type(query).__name__} {query.model_dump_json()}".encode()).hexdigest()[:24]
-    return etag(selected.row.id, revision, selected.stamp, question, __version__)
+    parts = (selected.row.id, revision, selected.stamp, question, __version__)
+    return etag(*parts) if kept is None else etag(*parts, kept)
 
 
 def not_modified(request: Request, tag: str) -> Response | None:
@@ -34,6 +37,13 @@ def not_modified(request: Request, tag: str) -> Response | None:
     if "*" in tags or tag.removeprefix("W/") in tags:
         return Response(status_code=304, headers={"ETag": tag})
     return None
+
+
+def seen_after(request: Request, tag: str) -> list[str]:
+    """What tags that the client has add to this one."""
+    start = tag.removeprefix("W/").removesuffix('"') + "."
+    seen = (item.strip().removeprefix("W/") for item in request.headers.get("if-none-match", "").split(","))
+    return [item.removeprefix(start).removesuffix('"') for item in seen if item.startswith(start)]
 
 
 def tagged_json(request: Request, content: Any, *, tag: str | None = None) -> Response:

@@ -31,6 +31,7 @@ GripperId = Annotated[
 ]
 BatchId = Annotated[str, Path(description="Id of the batch, as posting its trials answered it.")]
 KernelId = Annotated[str, Path(description="Id of the kernel, as fitting or storing it answered it.")]
+AnswerRef = Annotated[str, Path(description="Id of the answer, or a name that it was given.")]
 RunId = Annotated[str, Path(description="Id of the run, as the 202 that started it answered it.")]
 SweepId = Annotated[str, Path(description="Id of the sweep, as planning it answered it.")]
 JobId = Annotated[str, Path(description="Id of the job, as the claim answered it.")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +18,7 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.support import support_columns
 from graspdb_service.usecases.grasps.likelihood import log_density
 from graspdb_service.usecases.grasps.question import FEW_ATTEMPTS
+from graspdb_service.usecases.trials.selection import Selected
 
 #: Draws see more of the kernels' tails than a plain question.
 _CUTOFF = 5.0
@@ -28,11 +28,11 @@ _CUTOFF = 5.0
 class Draw:
     """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with.
 
-    ``support``: columns of how far they are from what was tried, where attempts tell and it was asked;
-    ``prior``: geometry drew them, no trial.
+    ``selected`` are the trials that it is about; ``support``: columns of how far the draws are from what was
+    tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial.
     """
 
-    revision: int
+    selected: Selected
     kernel: KernelInfo
     seed: int
     position: Floats
@@ -40,7 +40,10 @@ class Draw:
     proposal_density: Floats
     support: dict[str, Any] | None = None
     prior: bool = False
-    warnings: Sequence[str] = ()
+
+    @property
+    def revision(self) -> int:
+        return self.selected.row.revision
 
     def columns(self) -> dict[str, Any]:
         """Those of an answer, by name."""
@@ -86,7 +89,7 @@ def drawn_from(
     chosen = secrets.randbits(63) if seed is None else seed
     poses = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
     return Draw(
-        revision=built.revision,
+        selected=built.selected,
         kernel=kernel,
         seed=chosen,
         position=poses.positions,
@@ -94,7 +97,6 @@ def drawn_from(
         proposal_density=np.exp(log_density(ctx, density, poses, _CUTOFF)),
         support=_support(ctx, built, poses) if support else None,
         prior=prior,
-        warnings=built.selected.warnings,
     )
 
 

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable
+from typing import Annotated, TypeVar
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel
 
 from graspdb.wire import (
     BestGraspRequest,
     BestGrasps,
     DensityInfo,
-    EstimatorInfo,
-    KernelInfo,
     LikelihoodRequest,
     Likelihoods,
     Proposals,
     ProposalsRequest,
-    ReachInfo,
     Samples,
     SamplesRequest,
     Selection,
@@ -33,17 +29,17 @@ from graspdb.wire.queries import (
 )
 from graspdb_density.se3 import Poses
 from graspdb_service.api.context import Context
-from graspdb_service.api.routing.caching import answer_tag, not_modified
+from graspdb_service.api.routing.caching import answer_tag, not_modified, seen_after
 from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
-from graspdb_service.formats.columns import columns_arrow, columns_json
+from graspdb_service.formats.columns import columns_arrow
 from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted, media_type
 from graspdb_service.formats.poses import read_arrow_poses, read_poses
-from graspdb_service.usecases.densities.build import Built
+from graspdb_service.problems import invalid
+from graspdb_service.usecases.answers import asking
+from graspdb_service.usecases.answers.asking import Told
 from graspdb_service.usecases.densities.info import density_info
-from graspdb_service.usecases.grasps import likelihood, proposals, samples
-from graspdb_service.usecases.grasps.answer import best_grasps
 
 router = APIRouter(tags=["queries"])
 
@@ -58,7 +54,8 @@ def get_density(
 
     def answer(query: SelectionQuery) -> Response:
         info, selected = density_info(ctx, id, query)
-        return _json(info, answer_tag(selected, info.revision, query))
+        tag = answer_tag(selected, info.revision, query)
+        return Response(info.model_dump_json(), media_type=JSON, headers={"ETag": tag})
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -71,9 +68,7 @@ def get_likelihood(
     pose = Poses(np.array([query.position]), np.array([query.quaternion_xyzw]))
 
     def answer(query: LikelihoodQuery) -> Response:
-        built, reach, columns = likelihood.likelihood(ctx, id, query, pose, query.include)
-        tag = answer_tag(built.selected, built.revision, query)
-        return columns_json(_likelihood_head(built, reach), columns, {"ETag": tag})
+        return _told(asking.likelihood(ctx, id, query, pose), query)
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -100,9 +95,12 @@ def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> 
         given = content.pop("poses", None)
         options = validated(content, LikelihoodOptions)
         poses = read_poses(given)
-    built, reach, columns = likelihood.likelihood(ctx, id, options, poses, options.include)
-    form = columns_arrow if kind == ARROW else columns_json
-    return form(_likelihood_head(built, reach), columns, {"Vary": "Accept"})
+    if kind == ARROW and options.name is not None:
+        raise invalid("name", "an answer under a name comes as JSON: say so by Accept")
+    told = asking.likelihood(ctx, id, options, poses)
+    if kind == ARROW:
+        return columns_arrow(told.head, told.columns, {"Vary": "Accept"})
+    return Response(told.json, media_type=JSON, headers={"Vary": "Accept"})
 
 
 @router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
@@ -112,8 +110,7 @@ def get_best_grasp(
     """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
 
     def answer(query: BestGraspQuery) -> Response:
-        best, selected = best_grasps(ctx, id, query)
-        return _json(best, answer_tag(selected, best.revision, query))
+        return _told(asking.best_grasps(ctx, id, query), query)
 
     return _unless_known(ctx, id, request, query, answer)
 
@@ -126,15 +123,13 @@ def get_best_grasp(
 def post_best_grasp(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> Response:
     """As GET, the constraints as JSON; also half spaces, obstacles, candidates and poses to exclude."""
     query = validated(read_object(request, body), BestGraspRequest, most=MAX_OBSTACLE_POINTS)
-    answer, _ = best_grasps(ctx, id, query)
-    return _json(answer)
+    return _told(asking.best_grasps(ctx, id, query))
 
 
 @router.post("/objects/{id}/samples", response_model=Samples, **scope("read"))
 def post_samples(ctx: Ctx, id: ObjectId, query: SamplesRequest) -> Response:
     """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
-    drawn = samples.draw(ctx, id, query, query.count, query.seed)
-    return _drawn(drawn, {})
+    return _told(asking.draws(ctx, id, query))
 
 
 @router.post("/objects/{id}/proposals", response_model=Proposals, **scope("read"))
@@ -147,49 +142,34 @@ def post_proposals(ctx: Ctx, id: ObjectId, query: ProposalsRequest) -> Response:
     degrees. Grasps at which the open gripper collides are left out before; what is drawn about the others is
     not tested, for then the density would not be the one it was drawn with.
     """
-    drawn, criterion = proposals.propose(ctx, id, query)
-    return _drawn(drawn, {"strategy": query.strategy, "criterion": criterion})
+    return _told(asking.draws(ctx, id, query))
 
 
-def _drawn(drawn: samples.Draw, more: dict[str, Any]) -> Response:
-    return columns_json(
-        {
-            **_head(drawn.revision, drawn.kernel, drawn.warnings),
-            "seed": drawn.seed,
-            "prior": drawn.prior,
-            **more,
-        },
-        drawn.columns(),
-    )
-
-
-def _likelihood_head(built: Built, reach: ReachInfo | None) -> dict[str, Any]:
-    head = _head(built.revision, built.kernel, built.selected.warnings)
-    return head if reach is None else {**head, "reach": reach.model_dump()}
-
-
-def _head(revision: int, kernel: KernelInfo, warnings: Sequence[str]) -> dict[str, Any]:
-    head = {"revision": revision, "kernel": kernel.model_dump(), "estimator": EstimatorInfo().model_dump()}
-    return {**head, "warnings": list(warnings)}
-
-
-def _json(answer: BaseModel, tag: str | None = None) -> Response:
-    return Response(
-        answer.model_dump_json(), media_type="application/json", headers={} if tag is None else {"ETag": tag}
-    )
+def _told(told: Told, query: Selection | None = None) -> Response:
+    """An answer; tagged where it is one to a query, and kept."""
+    tag = None
+    if query is not None and told.selected is not None and told.id is not None:
+        tag = answer_tag(told.selected, told.revision, query, told.id)
+    return Response(told.json, media_type=JSON, headers={} if tag is None else {"ETag": tag})
 
 
 def _unless_known(
     ctx: Context, slug: str, request: Request, query: Q, answer: Callable[[Q], Response]
 ) -> Response:
-    """The answer to a query, or 304 where the client has that of this revision already."""
+    """The answer to a query, or 304 where the client has that of this revision already.
+
+    An answer with an id must still be kept under it, and one with a name is looked up by that.
+    """
     selections = ctx.densities.selections
     if query.kernel == "anisotropic":
         # Pinned to the newest kernel, by its id: another kernel makes another answer and another ETag.
         newest = ctx.densities.stored(selections.resolve(slug, query), "anisotropic")
         query = query.model_copy(update={"kernel": newest.id})
-    seen = None
-    if "if-none-match" in request.headers:
-        selected = selections.resolve(slug, query)
-        seen = not_modified(request, answer_tag(selected, selected.row.revision, query))
-    return answer(query) if seen is None else seen
+    if "if-none-match" not in request.headers or getattr(query, "name", None) is not None:
+        return answer(query)
+    selected = selections.resolve(slug, query)
+    tag = answer_tag(selected, selected.row.revision, query)
+    kept = next((answer for answer in seen_after(request, tag) if ctx.answers.keeps(answer)), None)
+    if kept is not None:
+        tag = answer_tag(selected, selected.row.revision, query, kept)
+    return not_modified(request, tag) or answer(query)

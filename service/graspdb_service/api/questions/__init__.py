@@ -1,0 +1,1 @@
+"""Questions about grasps, and their answers that are kept."""
