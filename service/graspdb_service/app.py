@@ -45,7 +45,7 @@ from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
-from graspdb_service.storage.database import UNAVAILABLE, Database
+from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.usecases.grippers import seed
 
@@ -241,6 +241,18 @@ def _add_problems(app: FastAPI) -> None:
 
     for unavailable in UNAVAILABLE:
         app.exception_handler(unavailable)(on_database)
+
+    @app.exception_handler(CommitUnknown)
+    def on_unknown(request: Request, error: CommitUnknown) -> Response:
+        log.error("request %s: lost while it was committed: %s", request.state.request_id, error)
+        problem = ProblemError(
+            503,
+            "commit-unknown",
+            "The database broke off while it stored this: nobody knows whether it is stored. Look for it, or"
+            " send the same again under the same Idempotency-Key, which stores nothing twice",
+            headers={"Retry-After": "2"},
+        )
+        return answer(request, problem)
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, TypeVar
 from sqlalchemy import Connection, Double, Engine, Executable, Table, create_engine, event, make_url, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
-from sqlalchemy.exc import ArgumentError, OperationalError
+from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolExhausted
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
@@ -69,6 +69,21 @@ class UnsupportedDatabase(ValueError):
     """The database URL names neither a SQLite file nor PostgreSQL."""
 
 
+class CommitUnknown(Exception):
+    """The database was told to commit, and the connection broke before it said that it had."""
+
+
+@contextmanager
+def _drivers_errors(tx: Tx) -> Iterator[None]:
+    """Have what the driver's own cursors raise, which many rows go through, raised as SQLAlchemy's."""
+    driver = tx.dialect.dbapi
+    assert driver is not None
+    try:
+        yield
+    except driver.Error as error:
+        raise DBAPIError.instance(None, None, error, driver.Error, dialect=tx.dialect) from error
+
+
 class Database:
     """Connections to one database, ``sqlite:///file`` or ``postgresql://...``; else UnsupportedDatabase.
 
@@ -92,14 +107,25 @@ class Database:
     @contextmanager
     def read(self) -> Iterator[Tx]:
         """A read-only transaction: one snapshot of everything."""
-        with self._reader.begin() as tx:
+        with self._reader.begin() as tx, _drivers_errors(tx):
             yield tx
 
     @contextmanager
     def write(self) -> Iterator[Tx]:
-        """A writing transaction, committed when the block ends and rolled back if it raises."""
-        with self._writer.begin() as tx:
-            yield tx
+        """A writing transaction, committed when the block ends and rolled back if it raises.
+
+        CommitUnknown where the connection broke while it was committed.
+        """
+        with self._writer.connect() as tx:
+            transaction = tx.begin()
+            with _drivers_errors(tx):
+                yield tx
+            try:
+                transaction.commit()
+            except DBAPIError as error:
+                if not error.connection_invalidated:
+                    raise
+                raise CommitUnknown(str(error.orig)) from error
 
     def ping(self) -> None:
         """Raise if the database can't be reached."""
