@@ -1,4 +1,4 @@
-"""``graspdb-server``: serve and migrate."""
+"""``graspdb-server``: serve, migrate, and what keeps a database in order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 import threading
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 NEEDS = "graspdb-server needs {}: pip install 'graspdb[service]'"
 
@@ -18,6 +18,8 @@ try:
     import uvicorn
 
     from graspdb.processes import LIFELINE_HELP, end_with_parent
+    from graspdb_service.commands import upkeep
+    from graspdb_service.commands.options import DatabaseUrl, fail, settings_from
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
     from graspdb_service.storage.database import Database, UnsupportedDatabase
@@ -29,10 +31,6 @@ if TYPE_CHECKING:
 
 cli = typer.Typer(add_completion=False, no_args_is_help=True, help="The GraspDB service.")
 
-DatabaseUrl = Annotated[
-    str | None, typer.Option("--database-url", help="sqlite:///FILE or postgresql://USER@HOST/NAME")
-]
-
 
 @cli.command(epilog=LIFELINE_HELP)
 def serve(
@@ -43,9 +41,9 @@ def serve(
     log_level: Annotated[str, typer.Option(help="critical, error, warning, info or debug.")] = "info",
 ) -> None:
     """Serve the HTTP API. A SQLite database is created and migrated; PostgreSQL must be current."""
-    settings = _settings(host=host, port=port, database_url=database_url, auth=auth)
+    settings = settings_from(host=host, port=port, database_url=database_url, auth=auth)
     if settings.auth != "off" and not _is_loopback(settings.host):
-        _fail(
+        fail(
             f"Serving on {settings.host} without keys would open the database to the network."
             " Listen on 127.0.0.1, or say so explicitly: --auth off (GRASPDB_AUTH=off)."
         )
@@ -55,7 +53,7 @@ def serve(
     try:
         app = _application(settings)
     except (schema.StaleSchema, UnsupportedDatabase) as error:
-        _fail(str(error))
+        fail(str(error))
     _warm_up(app)
     uvicorn.run(
         app,
@@ -79,10 +77,10 @@ def _warm_up(app: Any) -> None:
 def migrate(database_url: DatabaseUrl = None) -> None:
     """Bring the database's schema to this version; safe to run from several places at once."""
     try:
-        database = Database(_settings(database_url=database_url).database_url)
+        database = Database(settings_from(database_url=database_url).database_url)
         typer.echo(f"The schema is at {schema.upgrade(database)}.")
     except (schema.StaleSchema, UnsupportedDatabase) as error:
-        _fail(str(error))
+        fail(str(error))
 
 
 @cli.command()
@@ -94,20 +92,17 @@ def openapi() -> None:
         app.state.context.close()
 
 
+for command in (upkeep.backup, upkeep.restore):
+    cli.command()(command)
+
+
 def _application(settings: Settings) -> FastAPI:
     # Imported here: migrating needs none of the numerics, which take a second to load.
     try:
         from graspdb_service.app import create_app  # extra: service
     except ModuleNotFoundError as error:
-        _fail(NEEDS.format(error.name))
+        fail(NEEDS.format(error.name))
     return create_app(settings)
-
-
-def _settings(**given: Any) -> Settings:
-    try:
-        return Settings(**{name: value for name, value in given.items() if value is not None})
-    except ValueError as error:
-        _fail(str(error))
 
 
 def _is_loopback(host: str) -> bool:
@@ -117,11 +112,6 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def _fail(message: str) -> NoReturn:
-    typer.echo(message, err=True)
-    raise SystemExit(1)
 
 
 def main() -> None:

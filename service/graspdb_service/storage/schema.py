@@ -35,22 +35,33 @@ def migrations_directory() -> Path:
 def upgrade(database: Database, revision: str = "head") -> str:
     """Bring the schema to ``revision`` and return what it then is; safe when several processes do it."""
     with database.write() as tx:
-        if not database.is_sqlite:
-            tx.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": ADVISORY_LOCK})
-        history = _refuse_newer(tx)
-        if revision == "head" and _current(tx) == history.get_current_head():
-            return str(_current(tx))
-        command.upgrade(alembic_config(tx), revision)
-        return _current(tx) or "base"
+        lock(tx)
+        return apply(tx, revision)
+
+
+def apply(tx: Tx, revision: str = "head") -> str:
+    """As :func:`upgrade`, in an open transaction that holds the lock."""
+    refuse_newer(tx)
+    stored = current(tx)
+    if revision == "head" and stored == history()[-1]:
+        return stored
+    command.upgrade(alembic_config(tx), revision)
+    return current(tx) or "base"
+
+
+def lock(tx: Tx) -> None:
+    """Keep others from changing the schema until the transaction ends; SQLite's writer is alone anyway."""
+    if tx.dialect.name == "postgresql":
+        tx.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": ADVISORY_LOCK})
 
 
 def check(database: Database) -> None:
     """Raise :class:`StaleSchema` unless the schema is exactly the one this version was written for."""
     with database.read() as tx:
-        head = _refuse_newer(tx).get_current_head()
-        current = _current(tx)
-    if current != head:
-        found = "has no schema yet" if current is None else f"is at schema {current}"
+        refuse_newer(tx)
+        stored, head = current(tx), history()[-1]
+    if stored != head:
+        found = "has no schema yet" if stored is None else f"is at schema {stored}"
         raise StaleSchema(
             f"The database {found}, this version of graspdb needs {head}."
             " Stop the other replicas' writes if you can, then run: graspdb-server migrate"
@@ -65,17 +76,22 @@ def alembic_config(tx: Tx) -> Config:
     return config
 
 
-def _current(tx: Tx) -> str | None:
+def current(tx: Tx) -> str | None:
+    """The version that the database's schema has; None without one."""
     return MigrationContext.configure(tx).get_current_revision()
 
 
-def _refuse_newer(tx: Tx) -> ScriptDirectory:
-    """The history of migrations, unless the database is at one that it does not have."""
-    current = _current(tx)
+def history() -> list[str]:
+    """Every version that this installation knows, the oldest first."""
     script = ScriptDirectory(str(migrations_directory()))
-    if current is not None and current not in {item.revision for item in script.walk_revisions()}:
+    return [item.revision for item in script.walk_revisions()][::-1]
+
+
+def refuse_newer(tx: Tx) -> None:
+    """StaleSchema if the database's schema is a version that this installation does not know."""
+    stored = current(tx)
+    if stored is not None and stored not in history():
         raise StaleSchema(
-            f"The database is at schema {current}, which this version of graspdb does not know:"
+            f"The database is at schema {stored}, which this version of graspdb does not know:"
             " it was written by a newer one. Install that version or newer."
         )
-    return script

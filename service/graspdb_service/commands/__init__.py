@@ -1,0 +1,1 @@
+"""Commands of ``graspdb-server`` beside serving."""

@@ -1,0 +1,27 @@
+"""What the commands share: the settings that they are given, and how they end when they can't go on."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from graspdb_service.settings import Settings
+
+DatabaseUrl = Annotated[
+    str | None, typer.Option("--database-url", help="sqlite:///FILE or postgresql://USER@HOST/NAME")
+]
+
+
+def settings_from(**given: Any) -> Settings:
+    """The settings of the environment, and above them the options that were given."""
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValueError as error:
+        fail(str(error))
+
+
+def fail(message: str, code: int = 1) -> NoReturn:
+    """End the command with a line on standard error."""
+    typer.echo(message, err=True)
+    raise SystemExit(code)
