@@ -5,40 +5,24 @@ from __future__ import annotations
 import base64
 import json
 import threading
-import time
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, settings
-from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, rule
-from hypothesis.stateful import run_state_machine_as_test as run_machine
 from sqlalchemy import text
 
 from graspdb.wire import (
     OUTCOME_CODES,
-    ClaimRequest,
-    FailureReport,
     GridPlan,
     MeshInfo,
     PartsInfo,
-    SimulateResult,
-    SweepCreate,
 )
 from graspdb_geometry.grids import PoseGrid
-from graspdb_service.api.context import Context
-from graspdb_service.problems import ProblemError
-from graspdb_service.settings import Settings
-from graspdb_service.storage import assets, objects, schema
+from graspdb_service.storage import assets, objects
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import jobs as job_rows
-from graspdb_service.usecases import grippers
-from graspdb_service.usecases.runtime.idempotency import Sent
-from graspdb_service.usecases.simulation import leases, planning, results, sweeps
 
 BOX = {"lower": [-0.02, -0.02, -0.05], "upper": [0.02, 0.02, 0.05]}
 GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "margin_m": 0.0}
@@ -476,193 +460,6 @@ def test_a_lift_sweep_waits_for_a_worker_that_can(sqlite_http: httpx.Client, sql
 
 
 # --- against a model ------------------------------------------------------------------------------------
-
-
-class LeaseProtocol(RuleBasedStateMachine):
-    """Workers claim, stall, come back late, give up and repeat themselves; the model says what holds."""
-
-    leases: Bundle[Any] = Bundle("leases")
-    context: Context
-    number = 0
-
-    @initialize()
-    def sweep(self) -> None:
-        LeaseProtocol.number += 1
-        slug = f"box-{LeaseProtocol.number}-{time.time_ns()}"
-        add_box(self.context.database, slug)
-        spec = SweepCreate.model_validate({"grid": GRID, "chunk_poses": 500})
-        made = planning.create(self.context, slug, spec, Sent(None, b""))
-        self.slug, self.sweep_id = slug, made.body["id"]
-        self.state = dict.fromkeys(range(4), "queued")
-        self.attempts: Counter[int] = Counter()
-        self.holder: dict[int, str | None] = dict.fromkeys(range(4))
-        self.expired: dict[int, bool] = dict.fromkeys(range(4), False)
-        self.reported: dict[int, str | None] = dict.fromkeys(range(4))
-
-    @rule(target=leases, limit=st.integers(1, 3))
-    def claim(self, limit: int) -> Any:
-        most = self.context.settings.max_attempts
-        for chunk, state in self.state.items():
-            if state == "leased" and self.expired[chunk] and self.attempts[chunk] >= most:
-                self.state[chunk] = "failed"
-        free = [
-            chunk
-            for chunk, state in self.state.items()
-            if state == "queued" or (state == "leased" and self.expired[chunk])
-        ]
-        request = ClaimRequest(worker="w", limit=limit)
-        answer = leases.claim(self.context, request)
-        claimed = [(job.payload.start // 500, job) for job in answer.jobs]  # type: ignore[union-attr]
-        assert [chunk for chunk, _ in claimed] == free[:limit]
-        for chunk, job in claimed:
-            assert job.lease_id != self.holder[chunk]
-            self.state[chunk] = "leased"
-            self.attempts[chunk] += 1
-            self.holder[chunk], self.expired[chunk], self.reported[chunk] = job.lease_id, False, None
-        return multiple(*claimed)
-
-    @rule(lease=leases)
-    def run_out(self, lease: Any) -> None:
-        chunk, job = lease
-        with self.context.database.write() as tx:
-            tx.execute(
-                text("UPDATE jobs SET lease_expires_at = 0 WHERE lease_id = :lease AND state = 'leased'"),
-                {"lease": job.lease_id},
-            )
-        if self._holds(chunk, job):
-            self.expired[chunk] = True
-
-    @rule(lease=leases)
-    def renew(self, lease: Any) -> None:
-        chunk, job = lease
-        if self._holds(chunk, job):
-            assert not leases.renew(self.context, job.id, job.lease_id).cancel
-            self.expired[chunk] = False
-        elif self.state[chunk] == "cancelled" and self.holder[chunk] == job.lease_id:
-            assert leases.renew(self.context, job.id, job.lease_id).cancel
-        else:
-            self._refused(leases.renew, job.id, job.lease_id)
-
-    @rule(lease=leases)
-    def give_back(self, lease: Any) -> None:
-        chunk, job = lease
-        if not self._holds(chunk, job):
-            self._refused(leases.release, job.id, job.lease_id)
-            return
-        leases.release(self.context, job.id, job.lease_id)
-        self.state[chunk], self.holder[chunk] = "queued", None
-        self.attempts[chunk] -= 1
-
-    @rule(lease=leases)
-    def report_failure(self, lease: Any) -> None:
-        chunk, job = lease
-        report = FailureReport(error="boom")
-        if self._holds(chunk, job):
-            last = self.attempts[chunk] >= self.context.settings.max_attempts
-            noted = leases.fail(self.context, job.id, job.lease_id, report)
-            self.state[chunk] = "failed" if last else "queued"
-            assert noted.state == self.state[chunk]
-        elif self.holder[chunk] == job.lease_id and self.state[chunk] in ("queued", "failed"):
-            assert leases.fail(self.context, job.id, job.lease_id, report).state == self.state[chunk]
-        else:
-            self._refused(leases.fail, job.id, job.lease_id, report)
-
-    @rule(lease=leases)
-    def hand_in(self, lease: Any) -> None:
-        chunk, job = lease
-        result = simulate(job.payload.model_dump(mode="json"))
-        model = SimulateResult.model_validate(result)
-        arguments = (job.id, job.lease_id, b"the same bytes", model)
-        if self._holds(chunk, job):
-            answer = results.complete(self.context, *arguments)
-            assert answer.inserted == len(result["rows"]["pose_index"])
-            self.state[chunk] = "done"
-            self.reported[chunk] = answer.model_dump_json()
-        elif self.state[chunk] == "done" and self.holder[chunk] == job.lease_id:
-            assert results.complete(self.context, *arguments).model_dump_json() == self.reported[chunk]
-        else:
-            self._refused(results.complete, *arguments)
-
-    @rule()
-    def cancel(self) -> None:
-        sweeps.cancel(self.context.database, self.sweep_id)
-        for chunk, state in self.state.items():
-            if state in ("queued", "leased"):
-                self.state[chunk] = "cancelled"
-
-    @rule()
-    def retry(self) -> None:
-        sweeps.retry(self.context.database, self.sweep_id)
-        for chunk, state in self.state.items():
-            if state in ("failed", "cancelled"):
-                self.state[chunk], self.holder[chunk], self.attempts[chunk] = "queued", None, 0
-
-    @invariant()
-    def done_chunks_are_stored_once(self) -> None:
-        if not hasattr(self, "sweep_id"):
-            return
-        info = sweeps.get(self.context.database, self.sweep_id)
-        states = Counter(self.state.values())
-        assert (info.chunks_done, info.chunks_failed) == (states["done"], states["failed"])
-        if states["cancelled"]:
-            assert info.state == "cancelled"
-        elif states["queued"] or states["leased"]:
-            assert info.state in ("queued", "running")
-        else:
-            assert info.state == ("failed" if states["failed"] else "done")
-        grid = PoseGrid(**BOX, **GRID)
-        index = [
-            grid.pose_indices(chunk * 500, min(chunk * 500 + 500, GRID_POSES))
-            for chunk, state in self.state.items()
-            if state == "done"
-        ]
-        expected = np.concatenate([np.empty(0, dtype=np.int64), *index])
-        codes = outcome_of(expected)
-        with self.context.database.read() as tx:
-            row = objects.find(tx, self.slug)
-            assert row is not None
-            found = tx.execute(
-                text("SELECT pose_index, outcome FROM trials WHERE object_id = :id ORDER BY pose_index"),
-                {"id": row.id},
-            ).all()
-        physics = codes != OUTCOME_CODES["collision"]
-        assert [(int(a), int(b)) for a, b in found] == list(
-            zip(expected[physics].tolist(), codes[physics].tolist(), strict=True)
-        )
-        assert sum(info.outcomes.values()) == len(expected)
-
-    def teardown(self) -> None:
-        if hasattr(self, "sweep_id"):
-            sweeps.cancel(self.context.database, self.sweep_id)
-
-    def _holds(self, chunk: int, job: Any) -> bool:
-        return self.state[chunk] == "leased" and self.holder[chunk] == job.lease_id
-
-    def _refused(self, call: Any, *arguments: Any) -> None:
-        with pytest.raises(ProblemError) as caught:
-            call(self.context, *arguments)
-        assert (caught.value.status, caught.value.kind) == (409, "lease-lost")
-
-
-def test_the_lease_protocol_against_a_model(database_url: str) -> None:
-    database = Database(database_url)
-    if database.is_sqlite:
-        schema.upgrade(database)
-    grippers.seed(database)
-    context = Context.create(Settings(database_url=database_url, max_attempts=2), database)
-    machine = type("Machine", (LeaseProtocol,), {"context": context})
-    try:
-        run_machine(
-            machine,
-            settings=settings(
-                max_examples=25,
-                stateful_step_count=20,
-                deadline=None,
-                suppress_health_check=list(HealthCheck),
-            ),
-        )
-    finally:
-        context.close()
 
 
 def test_a_grid_plan_on_the_wire_is_the_grid_of_the_service() -> None:
