@@ -13,6 +13,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
+import anyio.to_thread
 import swagger_ui_bundle
 from fastapi import Depends, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -21,6 +22,7 @@ from fastapi.responses import HTMLResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import Counter, Histogram
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspdb_service import __version__
@@ -37,6 +39,7 @@ from graspdb_service.api import (
 )
 from graspdb_service.api.context import Context
 from graspdb_service.api.questions import answers, queries
+from graspdb_service.api.routing.admission import Admission
 from graspdb_service.api.routing.document import document
 from graspdb_service.api.routing.encodings import Decoding
 from graspdb_service.api.routing.methods import METHODS, Methods, allowed
@@ -50,6 +53,9 @@ from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.usecases.grippers import seed
 
 log = logging.getLogger("graspdb")
+
+#: What is counted for an answer that nobody waited for.
+CLIENT_GONE = 499
 
 REQUESTS = Counter("graspdb_http_requests_total", "Requests answered.", ["method", "route", "status"])
 LATENCY = Histogram(
@@ -94,8 +100,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         raise
     ctx = Context.create(settings, database)
 
+    admission = Admission(settings)
+
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        admission.open()
+        await anyio.to_thread.run_sync(ctx.health.start)
         yield
         ctx.close()
 
@@ -107,6 +117,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         dependencies=[Depends(refuse_unknown_parameters)],
     )
     app.state.context = ctx
+    app.state.admission = admission
     for router in ROUTERS:
         app.include_router(router)
     app.openapi = openapi_document  # type: ignore[method-assign]
@@ -115,7 +126,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     _add_problems(app)
     app.add_middleware(Methods)
     app.add_middleware(Decoding, max_body_bytes=settings.max_body_bytes)
-    app.add_middleware(RequestTrace, max_body_bytes=settings.max_body_bytes)
+    app.add_middleware(RequestTrace)
     return app
 
 
@@ -137,13 +148,11 @@ def problem_response(problem: ProblemError, request_id: str) -> Response:
 class RequestTrace:
     """Gives every request an id, answers it as ``X-Request-ID``, and counts and times the request.
 
-    What no handler caught ends here as a problem, with its traceback in the log under that id. A body over
-    the limit is refused before any of it is read where its length is told, else as soon as it grows past it.
+    What no handler caught ends here as a problem, with its traceback in the log under that id.
     """
 
-    def __init__(self, app: ASGIApp, max_body_bytes: int) -> None:
+    def __init__(self, app: ASGIApp) -> None:
         self.app = app
-        self.max_body_bytes = max_body_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -161,22 +170,10 @@ class RequestTrace:
                 message.setdefault("headers", []).append((b"x-request-id", request_id.encode()))
             await send(message)
 
-        size = 0
-
-        async def limited() -> Message:
-            nonlocal size
-            message = await receive()
-            size += len(message.get("body", b""))
-            if size > self.max_body_bytes:
-                raise HTTPException(413)
-            return message
-
         try:
-            length = dict(scope["headers"]).get(b"content-length", b"0")
-            if length.isdigit() and int(length) > self.max_body_bytes:
-                await problem_response(body_too_large(), request_id)(scope, receive, traced)
-            else:
-                await self.app(scope, limited, traced)
+            await self.app(scope, receive, traced)
+        except ClientDisconnect:
+            status = CLIENT_GONE
         except Exception:
             log.exception("request %s failed", request_id)
             if begun:
@@ -212,7 +209,7 @@ def _add_problems(app: FastAPI) -> None:
         return problem_response(problem, getattr(request.state, "request_id", ""))
 
     @app.exception_handler(ProblemError)
-    def on_problem(request: Request, error: ProblemError) -> Response:
+    async def on_problem(request: Request, error: ProblemError) -> Response:
         return answer(request, error)
 
     @app.exception_handler(RequestValidationError)
@@ -255,9 +252,9 @@ def _add_problems(app: FastAPI) -> None:
         return answer(request, problem)
 
     @app.exception_handler(HTTPException)
-    def on_http(request: Request, error: HTTPException) -> Response:
+    async def on_http(request: Request, error: HTTPException) -> Response:
         if error.status_code == 413:
-            return answer(request, body_too_large())
+            return answer(request, ProblemError(413, "body-too-large", str(error.detail)))
         kind = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
         title = {
             404: f"There is nothing at {request.url.path}",
@@ -265,13 +262,6 @@ def _add_problems(app: FastAPI) -> None:
         }.get(error.status_code, str(error.detail))
         headers = {"Allow": allowed(request.scope)} if error.status_code == 405 else error.headers
         return answer(request, ProblemError(error.status_code, kind, title, headers=headers))
-
-
-def body_too_large() -> ProblemError:
-    """413, before or while a body is read."""
-    return ProblemError(
-        413, "body-too-large", "The body is over the limit (see /info): send it in several requests"
-    )
 
 
 def problem_of_validation(errors: Any) -> ProblemError:

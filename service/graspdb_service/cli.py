@@ -68,9 +68,15 @@ def serve(
 
 def _warm_up(app: Any) -> None:
     """Load what queries need while the server already answers."""
-    from graspdb_service.usecases.runtime.warmup import warm_up  # extra: service
+    from graspdb_service.usecases.runtime.warmup import keep_tidy, settle, warm_up  # extra: service
 
-    threading.Thread(target=warm_up, args=(app.state.context.compute,), daemon=True).start()
+    settle()
+
+    def behind() -> None:
+        warm_up(app.state.context.compute)
+        keep_tidy(lambda: app.state.admission.is_quiet)
+
+    threading.Thread(target=behind, name="graspdb-behind", daemon=True).start()
 
 
 @cli.command()

@@ -25,6 +25,29 @@ class Settings(BaseSettings):
     """Threads of the compute pool; BLAS threads stay at 1."""
 
     max_body_bytes: Annotated[int, Field(ge=1_000)] = 256 * 2**20
+    """A body of trials, poses, obstacles or a mesh; any other has at most ``max_small_body_bytes``."""
+    max_small_body_bytes: Annotated[int, Field(ge=1_000)] = 2**20
+    max_bytes_in_flight: Annotated[int, Field(ge=1_000)] = 512 * 2**20
+    """Bodies that the service holds at a time, all together; one client has at most half, or one body."""
+    max_body_seconds: Annotated[float, Field(gt=0)] = 300.0
+    """A body arrives within this, and after 10 s at ``min_body_bytes_per_second`` or faster."""
+    min_body_bytes_per_second: Annotated[int, Field(ge=0)] = 16 * 2**10
+    max_json_values: Annotated[int, Field(ge=1_000)] = 50_000_000
+    max_json_depth: Annotated[int, Field(ge=8, le=200)] = 32
+
+    max_queries_at_once: Annotated[int, Field(ge=2)] = 24
+    """Questions that are computed or wait for a processor; of one client three quarters, as of all below."""
+    max_reports_at_once: Annotated[int, Field(ge=2)] = 10
+    max_uploads_at_once: Annotated[int, Field(ge=2)] = 6
+    max_meshes_at_once: Annotated[int, Field(ge=2)] = 4
+    max_writes_at_once: Annotated[int, Field(ge=2)] = 10
+    max_reads_at_once: Annotated[int, Field(ge=2)] = 24
+    max_question_seconds: Annotated[float, Field(gt=0)] = 120.0
+    """An answer to a question comes within this, or within its own ``timeout_s``."""
+    max_waiting: Annotated[int, Field(ge=0)] = 100
+    """Requests that wait for a place of a kind, clients in turn; the next is told 429."""
+    max_waiting_seconds: Annotated[float, Field(gt=0)] = 20.0
+    """How long a request waits for a place, or a body for room, before it is told 503."""
     max_mesh_bytes: Annotated[int, Field(ge=1_000)] = 64 * 2**20
     max_mesh_seconds: Annotated[float, Field(gt=0)] = 20.0
     max_mesh_memory_bytes: Annotated[int, Field(ge=2**28)] = 2 * 2**30
@@ -36,6 +59,11 @@ class Settings(BaseSettings):
     max_answers: Annotated[int, Field(ge=1)] = 5_000
     """So many answers of each object and kind of question are kept, those given last, beside those that a
     name or a trial keeps; none is deleted within ten minutes."""
+
+    min_free_disk_bytes: Annotated[int, Field(ge=0)] = 4 * 2**20
+    """With less free under a SQLite database the service says that it is not ready."""
+    probe_seconds: Annotated[float, Field(gt=0)] = 3.0
+    """How often the service looks whether its database can be used."""
 
     lease_s: Annotated[float, Field(gt=0)] = 60.0
     """How long a worker keeps a job without renewing."""

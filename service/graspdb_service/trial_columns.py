@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -15,6 +16,15 @@ from graspdb_density.se3 import Poses
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+
+def json_text(value: Any) -> str:
+    """A document (or the text that it is already) as both databases keep it."""
+    return (
+        value
+        if isinstance(value, str)
+        else json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    )
 
 
 def _floats() -> Floats:
@@ -41,7 +51,8 @@ class TrialColumns:
     codes as :data:`graspdb.wire.OUTCOME_CODES`. ``provenance`` is which :class:`Provenance`: its place in a
     list that comes with the columns, once stored its id. ``proposal_density`` 1/(m^3 rad^3), ``quality`` and
     ``width_m`` are NaN where a trial has none, ``pose_index`` -1 where it is of no sweep. ``measured_at``
-    (aware), ``pose_covariance`` (6x6 nested lists) and ``metadata`` are a value or None a trial. ``seq`` is
+    (aware), ``pose_covariance`` (6x6 nested lists) and ``metadata`` are a value or None a trial, the latter
+    two as JSON text where they came in a request: many objects of Python's take long to free. ``seq`` is
     ascending, ``batch`` internal, ``withdrawn`` (n,) whether it counts no more.
     """
 
@@ -54,8 +65,8 @@ class TrialColumns:
     width_m: Floats = field(default_factory=_floats)
     pose_index: Ints = field(default_factory=_ints)
     measured_at: Sequence[datetime | None] = ()
-    pose_covariance: Sequence[list[list[float]] | None] = ()
-    metadata: Sequence[dict[str, Any] | None] = ()
+    pose_covariance: Sequence[list[list[float]] | str | None] = ()
+    metadata: Sequence[dict[str, Any] | str | None] = ()
     seq: Ints = field(default_factory=_ints)
     revision: Ints = field(default_factory=_ints)
     batch: Ints = field(default_factory=_ints)
@@ -63,6 +74,26 @@ class TrialColumns:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    @classmethod
+    def joined(cls, parts: Sequence[TrialColumns]) -> TrialColumns:
+        """Trials of several parts in order; a column that only some have is NaN or None in others."""
+        if len(parts) == 1:
+            return parts[0]
+        columns: dict[str, Any] = {}
+        for name, blank in vars(parts[0]).items():
+            pieces = [getattr(part, name) for part in parts]
+            if not any(len(piece) for piece in pieces):
+                columns[name] = blank
+            elif isinstance(blank, np.ndarray):
+                lengths = zip(parts, pieces, strict=True)
+                columns[name] = np.concatenate(
+                    [piece if len(piece) else np.full(len(part), np.nan) for part, piece in lengths]
+                )
+            else:
+                lengths = zip(parts, pieces, strict=True)
+                columns[name] = [x for part, piece in lengths for x in piece or [None] * len(part)]
+        return cls(**columns)
 
     @property
     def poses(self) -> Poses:

@@ -23,7 +23,6 @@ from graspdb_service.settings import Settings
 from graspdb_service.usecases.densities import cache as densities_module
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
-from graspdb_service.usecases.runtime.compute import MAX_QUERIES, Compute
 
 Floats = NDArray[np.float64]
 Poses = tuple[Floats, Floats]
@@ -108,22 +107,6 @@ def test_least_recently_used_goes_first() -> None:
     get("huge", 500)
     assert made[-1] == "huge"
     assert cache.nbytes <= 100
-
-
-def test_more_queries_than_places_are_refused() -> None:
-    compute = Compute(1)
-    places = [compute.admitted() for _ in range(MAX_QUERIES)]
-    for place in places:
-        place.__enter__()
-    with pytest.raises(ProblemError) as caught, compute.admitted():
-        pass
-    assert caught.value.status == 429
-    assert "Retry-After" in caught.value.headers
-    for place in places:
-        place.__exit__(None, None, None)
-    with compute.admitted():
-        pass
-    compute.close()
 
 
 # -- densities over a database -------------------------------------------------------------------------------

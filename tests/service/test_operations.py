@@ -7,7 +7,10 @@ import httpx
 
 def test_health_answers(http: httpx.Client) -> None:
     assert http.get("/livez").json() == {"status": "alive"}
-    assert http.get("/readyz").json() == {"status": "ready"}
+    ready = http.get("/readyz").json()
+    assert ready["status"] == "ready"
+    assert ready["age_s"] >= 0
+    assert {"schema", "write"} <= set(ready["checks"])
 
 
 def test_info_states_limits(sqlite_http: httpx.Client) -> None:

@@ -141,7 +141,7 @@ def test_body_over_the_limit_is_413(sqlite_url: str, serve: Serve, chunked: bool
 
 def test_every_limit_is_told(sqlite_http: httpx.Client) -> None:
     limits = sqlite_http.get("/info").json()["limits"]
-    assert set(limits) == {name for name in Settings.model_fields if name.startswith("max_")}
+    assert set(limits) == {name for name in Settings.model_fields if name.startswith(("max_", "min_"))}
 
 
 def test_huge_header_is_refused(sqlite_http: httpx.Client) -> None:

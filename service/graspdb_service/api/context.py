@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
+from graspdb_service.storage.probe import Probe
 from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
@@ -16,6 +17,7 @@ from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.kernels import fit
 from graspdb_service.usecases.reports.registry import Reports
 from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.runtime.health import Health
 from graspdb_service.usecases.runtime.runs import Runs
 from graspdb_service.usecases.trials.selection import Selections
 
@@ -26,10 +28,11 @@ class Context(Asking):
 
     reports: Reports
     runs: Runs
+    health: Health
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
-        compute = Compute(settings.threads)
+        compute = Compute(settings.threads, settings.max_question_seconds)
         features = Features(database, compute)
         densities = Densities(
             database, Selections(database), compute, features, settings.max_density_cache_bytes
@@ -47,11 +50,14 @@ class Context(Asking):
             successes=Successes(database, compute, settings.max_density_cache_bytes),
             answers=AnswerKeeper(database, most=settings.max_answers),
             reports=reports,
+            health=Health(
+                Probe(database, min_free_bytes=settings.min_free_disk_bytes).look, settings.probe_seconds
+            ),
             runs=Runs(database, wait_s=settings.report_wait_s, kinds={fit.RUN: fits, **reports.run_kinds()}),
         )
 
     def close(self) -> None:
         self.answers.close()
+        self.health.close()
         self.runs.close()
-        self.compute.close()
         self.database.dispose()

@@ -5,13 +5,14 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from graspdb.wire import GripperCreate, GripperInfo, GripperUpdate, Page
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor, number_cursor
 from graspdb_service.api.routing.parameters import Creating, Ctx, GripperId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import grippers
 
-router = APIRouter(tags=["grippers"])
+router = APIRouter(tags=["grippers"], route_class=AdmittedRoute)
 
 
 @router.post("/grippers", status_code=201, response_model=GripperInfo, **scope("admin"))

@@ -17,14 +17,15 @@ from graspdb.wire import (
     WorkerInfo,
 )
 from graspdb.wire.jobs import FailureNoted
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
 from graspdb_service.api.routing.parameters import Ctx, JobId, RawBody
 from graspdb_service.api.routing.scopes import scope
-from graspdb_service.formats.json_bodies import read_model
 from graspdb_service.formats.negotiation import BINARY, GLB, JSON, media_type, unsupported
+from graspdb_service.formats.sweep_outcomes import read_result
 from graspdb_service.usecases.simulation import leases, results
 
-router = APIRouter(tags=["jobs"])
+router = APIRouter(tags=["jobs"], route_class=AdmittedRoute)
 
 LeaseId = Annotated[
     str, Query(min_length=1, max_length=64, pattern=r"^[\x21-\x7e]+$", description="As the claim gave it.")
@@ -54,7 +55,7 @@ def release_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> None:
     leases.release(ctx, id, lease_id)
 
 
-@router.put("/jobs/{id}/result", **scope("jobs:work", body=_RESULTS))
+@router.put("/jobs/{id}/result", **scope("jobs:work", body=_RESULTS, work="uploads", large=True))
 def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: RawBody) -> ResultAccepted:
     """Store a chunk's outcomes, or an object's convex parts, and complete the job, in one transaction.
 
@@ -63,7 +64,7 @@ def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: R
     try:
         if media_type(request) == GLB:
             return results.complete_parts(ctx, id, lease_id, body)
-        return results.complete(ctx, id, lease_id, body, read_model(request, body, SimulateResult))
+        return results.complete(ctx, id, lease_id, body, read_result(request, body))
     except results.WrongResult as error:
         wanted = {"simulate": f"JSON, as {JSON}", "decompose": f"a GLB, as {GLB}"}[error.kind]
         raise unsupported(f"The result of a {error.kind} job is {wanted}") from None

@@ -10,13 +10,14 @@ from fastapi.responses import JSONResponse
 from graspdb.wire import GripperRef, Page, Slug
 from graspdb.wire.kernels import KernelCreate, StoredKernel
 from graspdb.wire.reports import ReportRun
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
 from graspdb_service.api.routing.parameters import Creating, Ctx, KernelId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases.kernels import stored
 
-router = APIRouter(tags=["kernels"])
+router = APIRouter(tags=["kernels"], route_class=AdmittedRoute)
 
 
 @router.post(
@@ -24,7 +25,7 @@ router = APIRouter(tags=["kernels"])
     status_code=201,
     response_model=StoredKernel,
     responses={202: {"model": ReportRun, "description": "Being fitted: Location says where it will be"}},
-    **scope("admin"),
+    **scope("admin", work="queries"),
 )
 def create_kernel(ctx: Ctx, request: KernelCreate, sent: Creating) -> object:
     """Fit a kernel on an object's successes, or store one given by its components.

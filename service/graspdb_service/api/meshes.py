@@ -7,13 +7,14 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import MeshInfo, PartsInfo
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import not_modified
 from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import BINARY, GLB, one_of
 from graspdb_service.usecases.geometry import meshes
 
-router = APIRouter(tags=["objects"])
+router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 
 MeshUnit = Annotated[
     Literal["m", "mm", "cm", "in"], Query(description="Unit of the mesh's coordinates; kept in metres.")
@@ -21,7 +22,7 @@ MeshUnit = Annotated[
 _MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, BINARY)
 
 
-@router.put("/objects/{id}/mesh", **scope("admin", body=_MESH_BODY))
+@router.put("/objects/{id}/mesh", **scope("admin", body=_MESH_BODY, work="meshes", large=True))
 def put_mesh(ctx: Ctx, id: ObjectId, request: Request, body: RawBody, unit: MeshUnit = "m") -> MeshInfo:
     """Store the mesh: STL, OBJ, PLY or GLB as the raw body, said by Content-Type."""
     return meshes.put_mesh(ctx, id, body, media=one_of(request, *meshes.MEDIA_TYPES), unit=unit)
@@ -38,7 +39,7 @@ def get_mesh(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     return _bytes(request, *meshes.get_mesh(ctx, id))
 
 
-@router.put("/objects/{id}/convex-parts", **scope("admin", body={GLB: BINARY}))
+@router.put("/objects/{id}/convex-parts", **scope("admin", body={GLB: BINARY}, work="meshes", large=True))
 def put_convex_parts(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> PartsInfo:
     """Store the convex parts: a GLB in metres with one geometry a part, object frame."""
     one_of(request, GLB)

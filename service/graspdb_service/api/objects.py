@@ -5,13 +5,14 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from graspdb.wire import ObjectCreate, ObjectInfo, ObjectPatch, Page
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import etag, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
 from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import objects
 
-router = APIRouter(tags=["objects"])
+router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 
 
 @router.post("/objects", status_code=201, response_model=ObjectInfo, **scope("admin"))

@@ -13,6 +13,7 @@ from graspdb.wire.reports import REPORTS, Report, ReportOptions, ReportRun, Summ
 from graspdb.wire.states import RunState
 from graspdb_service import __version__
 from graspdb_service.api.context import Context
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import etag, not_modified
 from graspdb_service.api.routing.parameters import Ctx, ObjectId, RunId
 from graspdb_service.api.routing.scopes import scope
@@ -21,7 +22,7 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.reports import summary
 from graspdb_service.usecases.runtime import runs
 
-router = APIRouter(tags=["reports"])
+router = APIRouter(tags=["reports"], route_class=AdmittedRoute)
 
 _FIGURES: dict[str, figures.Format] = {PNG: "png", SVG: "svg"}
 _RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -45,7 +46,7 @@ def _add_route(name: str, report: type[Report]) -> None:
         description=report.question,
         response_model=report,
         responses=_RESPONSES,
-        **scope("read"),
+        **scope("read", work="reports"),
     )
 
 
@@ -54,7 +55,10 @@ for _name, _report in REPORTS.items():
 
 
 @router.get(
-    "/reports/summary", response_model=SummaryReport, responses={200: _RESPONSES[200]}, **scope("read")
+    "/reports/summary",
+    response_model=SummaryReport,
+    responses={200: _RESPONSES[200]},
+    **scope("read", work="reports"),
 )
 def get_summary(ctx: Ctx, request: Request) -> Response:
     """What was tried on every object, by outcome, with the success rate by each way of counting (table I)."""

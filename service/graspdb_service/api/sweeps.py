@@ -8,15 +8,17 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.states import AnySweepState
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
 from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId, SweepId
 from graspdb_service.api.routing.scopes import scope
-from graspdb_service.formats.json_bodies import read_model
+from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
+from graspdb_service.formats.poses import read_densities, read_poses
 from graspdb_service.formats.sweep_outcomes import page_response, stream_response
 from graspdb_service.usecases.simulation import outcomes, planning, sweeps
 
-router = APIRouter(tags=["sweeps"])
+router = APIRouter(tags=["sweeps"], route_class=AdmittedRoute)
 
 PosesLimit = Annotated[
     int | None,
@@ -28,13 +30,22 @@ PosesLimit = Annotated[
     "/objects/{id}/sweeps",
     status_code=202,
     response_model=SweepInfo,
-    **scope("admin", body={"application/json": SweepCreate}),
+    **scope("admin", body={JSON: SweepCreate}, work="uploads", large=True),
 )
 def create_sweep(ctx: Ctx, id: ObjectId, request: Request, sent: Creating) -> object:
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
     draws from its density. Workers take its chunks."""
-    spec = read_model(request, sent.body or b"{}", SweepCreate)
-    return sent.answered(planning.create(ctx, id, spec, sent))
+    content = read_object(request, sent.body or b"{}")
+    given: planning.Given | None = None
+    poses = content.get("poses")
+    if poses is not None:
+        # Many poses are read as arrays, and the first stands for all of them in the model.
+        read = read_poses(poses)
+        given = planning.Given(read, read_densities(content.get("proposal_density"), "proposal_density"))
+        content |= {"poses": [{"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}]}
+        content.pop("proposal_density", None)
+    spec = validated(content, SweepCreate)
+    return sent.answered(planning.create(ctx, id, spec, sent, given))
 
 
 @router.get("/sweeps", **scope("read"))

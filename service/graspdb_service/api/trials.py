@@ -21,6 +21,7 @@ from graspdb.wire import (
     TrialsIn,
 )
 from graspdb.wire.trials import TrialColumnsIn
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
 from graspdb_service.api.routing.parameters import BatchId, Creating, Ctx, ObjectId
@@ -30,7 +31,7 @@ from graspdb_service.formats.trials import page_response, stream_response
 from graspdb_service.usecases import objects
 from graspdb_service.usecases.trials import batches, corrections, listing, posting
 
-router = APIRouter(tags=["trials"])
+router = APIRouter(tags=["trials"], route_class=AdmittedRoute)
 
 Seq = Annotated[int, Path(ge=1, lt=2**63, description="The trial's number in its object.")]
 
@@ -45,7 +46,7 @@ BODY = {
     "/objects/{id}/trials",
     status_code=201,
     response_model=BatchReceipt,
-    **scope("trials:write", body=BODY),
+    **scope("trials:write", body=BODY, work="uploads", large=True),
 )
 def add_trials(
     ctx: Ctx,

@@ -9,30 +9,21 @@ from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
-from graspdb_service.formats.json_pieces import LongArray, loads
+from graspdb_service.formats.json_pieces import Allowed, LongArray, loads
 from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def read_model(request: Request, body: bytes, model: type[Model]) -> Model:
-    """A body as its model, as FastAPI would read and refuse it; 415 for another media type than JSON."""
-    require_json(request)
-    try:
-        return model.model_validate_json(body)
-    except ValidationError as error:
-        raise RequestValidationError(error.errors(include_input=False, include_url=False)) from None
-
-
-def read_object(request: Request, body: bytes) -> dict[str, Any]:
+def read_object(request: Request, body: bytes, allowed: Allowed | None = None) -> dict[str, Any]:
     """A JSON object, its long arrays as :class:`LongArray`; NaN and Infinity are refused here.
 
     415 for another media type, 400 where the body is no JSON, 422 where it is no object.
     """
     require_json(request)
     try:
-        value = loads(body)
+        value = loads(body, allowed=allowed)
     except orjson.JSONDecodeError as error:
         raise no_json(error) from None
     if not isinstance(value, dict):

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import orjson
 from fastapi.exceptions import RequestValidationError
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from graspdb.wire import Pose
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
+from graspdb.wire.trials import ProposalDensity
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
 from graspdb_service.formats import arrow
@@ -27,6 +28,7 @@ Refuse = Callable[[str, int, str], None]
 _ROWS = 16_384
 _FIELDS = ("position", "quaternion_xyzw")
 _FINITE = "every number must be finite"
+_DENSITIES: TypeAdapter[list[float | None]] = TypeAdapter(list[ProposalDensity | None])
 
 
 # -- numbers, wherever they come from ------------------------------------------------------------------------
@@ -109,6 +111,24 @@ def read_poses(value: Any) -> Poses:
         raise invalid("poses", "at least one pose")
     position, quaternion = (np.concatenate(part) for part in zip(*rows, strict=True))
     return _checked(position, quaternion, "poses.{row}.{field}")
+
+
+def read_densities(value: Any, field: str) -> Floats:
+    """(n,) proposal densities of a list with NaN for null; a number alone (), null NaN."""
+    if not isinstance(value, list | LongArray):
+        return np.array(_densities([value], field, None)[0])
+    parts = [np.empty(0), *(_densities(items, field, first) for first, items in _pieces(value))]
+    return np.concatenate(parts)
+
+
+def _densities(items: list[Any], field: str, first: int | None) -> Floats:
+    try:
+        found = _DENSITIES.validate_python(items)
+    except ValidationError as error:
+        wrong = error.errors(include_input=False)[0]
+        place = field if first is None else f"{field}.{first + int(wrong['loc'][0])}"
+        raise invalid(place, wrong["msg"]) from None
+    return np.array(found, dtype=np.float64)
 
 
 def _pieces(value: list[Any] | LongArray) -> Iterator[tuple[int, list[Any]]]:

@@ -3,20 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
 import numpy as np
-from fastapi import Response
+from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 
-from graspdb.wire import OUTCOMES
+from graspdb.wire import OUTCOMES, SimulateResult
+from graspdb.wire.jobs import ResultRows
 from graspdb_service.formats import arrow
 from graspdb_service.formats.columns import columns_json
+from graspdb_service.formats.json_bodies import read_object, validated
+from graspdb_service.formats.json_pieces import LongArray
 from graspdb_service.formats.negotiation import ARROW
-from graspdb_service.trial_columns import TrialColumns
+from graspdb_service.problems import invalid
+from graspdb_service.trial_columns import Floats, Ints, TrialColumns
 
 _HEADERS = {"Vary": "Accept"}
+_COLUMNS: dict[str, TypeAdapter[Any]] = {
+    name: TypeAdapter(field.annotation or list) for name, field in ResultRows.model_fields.items()
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ChunkResult:
+    """What a worker measured: an outcome code (n,) a pose of the chunk, and columns of those with physics."""
+
+    outcomes: NDArray[np.uint8]
+    pose_index: Ints
+    width_m: Floats
+    quality: Floats
+
+
+def read_result(request: Request, body: bytes) -> ChunkResult:
+    """A body as a chunk's result; refused as :class:`graspdb.wire.SimulateResult` would refuse it."""
+    content = read_object(request, body)
+    rows = content.get("rows")
+    long: dict[str, list[NDArray[Any]]] = {}
+    if isinstance(rows, dict):
+        for name in [name for name, value in rows.items() if isinstance(value, LongArray)]:
+            long[name] = [_numbers(name, items) for items in rows[name]] if name in _COLUMNS else []
+            rows[name] = []
+    result = validated(content, SimulateResult)
+    short = {name: _array(name, getattr(result.rows, name)) for name in _COLUMNS}
+    columns = {name: np.concatenate([short[name], *long.get(name, [])]) for name in _COLUMNS}
+    return ChunkResult(np.frombuffer(result.outcomes, dtype=np.uint8), **columns)
+
+
+def _numbers(name: str, items: list[Any]) -> NDArray[Any]:
+    try:
+        return _array(name, _COLUMNS[name].validate_python(items))
+    except ValidationError as error:
+        raise invalid(f"rows.{name}", error.errors(include_input=False)[0]["msg"]) from None
+
+
+def _array(name: str, values: list[Any]) -> NDArray[Any]:
+    # None becomes NaN, which stands for "none" in the columns.
+    return np.array(values, dtype=np.int64 if name == "pose_index" else np.float64)
 
 
 def stream_response(sweep: str, pages: Iterator[TrialColumns]) -> Response:

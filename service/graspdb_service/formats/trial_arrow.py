@@ -15,10 +15,11 @@ from graspdb_service.formats.trial_fields import (
     NAMES,
     SCALARS,
     Faults,
-    Fields,
-    check,
+    blocks_of,
+    check_blocks,
     defaults_of,
     refuse_too_many,
+    sliced,
 )
 from graspdb_service.formats.trial_json import columns_of
 from graspdb_service.problems import invalid
@@ -58,7 +59,12 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
             lists[name] = items if convert is None else [None if x is None else convert(x) for x in items]
     faults = Faults()
     defaults = defaults_of(table.options, faults, "columns")
-    return check(Fields(lists, table.count, lambda i, name: f"columns.{name}.{i}", faults), defaults)
+    blocks = blocks_of({name: sliced(values) for name, values in lists.items()}, _place, faults)
+    return check_blocks(blocks, defaults, _place, limit)
+
+
+def _place(row: int, name: str) -> str:
+    return f"columns.{name}.{row}"
 
 
 def _outcomes(table: arrow.Table) -> NDArray[np.uint8]:

@@ -7,7 +7,7 @@ where that fails does a loop look for the places to name.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -21,7 +21,7 @@ from graspdb.wire.base import Metadata
 from graspdb.wire.trials import TrialDefaults
 from graspdb_service.formats.poses import near, no_vectors, unit, vectors
 from graspdb_service.problems import ProblemError, invalid_fields
-from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, TrialColumns
+from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, TrialColumns, json_text
 
 DEFAULTS = frozenset(TrialDefaults.model_fields)
 REQUIRED = ("position", "quaternion_xyzw", "outcome")
@@ -40,6 +40,11 @@ _NAME_RULES = {
 _METADATA: TypeAdapter[Any] = TypeAdapter(Metadata)
 _TIME: TypeAdapter[datetime] = TypeAdapter(datetime)
 _MOST_ERRORS = 20
+#: Trials that are looked at together.
+BLOCK = 16_384
+
+Place = Callable[[int, str], str]
+"""What a field of a trial is called in the request."""
 
 
 @dataclass
@@ -67,7 +72,7 @@ class Fields:
 
     lists: Mapping[str, Sequence[Any] | NDArray[Any]]
     count: int
-    place: Callable[[int, str], str]
+    place: Place
     faults: Faults
 
     def fault(self, name: str, row: int, message: str) -> None:
@@ -104,7 +109,53 @@ def defaults_of(beside: Mapping[str, Any], faults: Faults, form: str) -> TrialDe
     return TrialDefaults()
 
 
-def check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
+def check_blocks(blocks: Iterable[Fields], defaults: TrialDefaults, place: Place, limit: int) -> TrialBatch:
+    """Checked trials, block by block, so that no more of them than of one block are Python's at a time.
+
+    422 naming the fields that are wrong in the first block that has any; 413 for more trials than ``limit``.
+    """
+    parts: list[TrialBatch] = []
+    count = 0
+    for block in blocks:
+        count += block.count
+        refuse_too_many(count, limit)
+        parts.append(_check(block, defaults))
+    numbers: dict[Provenance, int] = {}
+    columns = []
+    for part in parts:
+        own = [numbers.setdefault(item, len(numbers)) for item in part.provenances]
+        columns.append(
+            replace(part.columns, provenance=np.array(own, dtype=np.int64)[part.columns.provenance])
+        )
+
+    def field_of_gripper(gripper: str) -> str:
+        named = (part.field_of_gripper(gripper) for part in parts)
+        return next((name for name in named if name != "gripper"), "gripper")
+
+    return TrialBatch(TrialColumns.joined(columns), list(numbers), defaults.metadata, field_of_gripper, place)
+
+
+def blocks_of(
+    lists: Mapping[str, Iterable[Sequence[Any] | NDArray[Any]]], place: Place, faults: Faults
+) -> Iterator[Fields]:
+    """Columns in consecutive blocks, as the fields of these; all have the same blocks."""
+    first = 0
+    for row in zip(*lists.values(), strict=True):
+        count = len(row[0])
+
+        def here(i: int, name: str, first: int = first) -> str:
+            return place(first + i, name)
+
+        yield Fields(dict(zip(lists, row, strict=True)), count, here, faults)
+        first += count
+
+
+def sliced(values: Sequence[Any] | NDArray[Any]) -> Iterator[Sequence[Any] | NDArray[Any]]:
+    """A column in blocks."""
+    return (values[start : start + BLOCK] for start in range(0, len(values), BLOCK))
+
+
+def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
     """Checked trials, or 422 naming the fields that are wrong, those found before included."""
     position, quaternion = _vectors(fields, "position", 3), _vectors(fields, "quaternion_xyzw", 4)
     refuse = fields.fault
@@ -117,7 +168,7 @@ def check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         width_m=_scalars(fields, "width_m", 0.0, 10.0),
         measured_at=_each(fields, "measured_at", _time),
         pose_covariance=_each(fields, "pose_covariance", _covariance),
-        metadata=_each(fields, "metadata", _METADATA.validate_python),
+        metadata=_each(fields, "metadata", _metadata),
     )
     provenances, provenance = _provenances(fields, defaults)
     fields.faults.raise_if_any()
@@ -129,7 +180,7 @@ def check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         replace(columns, provenance=provenance, proposal_density=proposal),
         provenances,
         defaults.metadata,
-        lambda gripper: _field_of_gripper(fields, gripper),
+        _fields_of_grippers(fields),
         fields.place,
     )
 
@@ -218,11 +269,13 @@ def _names(fields: Fields, name: str, default: str | None) -> list[str | None] |
     return [default if value is None else value for value in values]
 
 
-def _field_of_gripper(fields: Fields, gripper: str) -> str:
+def _fields_of_grippers(fields: Fields) -> Callable[[str], str]:
+    """The field that each gripper is named in first; nothing else of the request is kept for it."""
+    first: dict[Any, str] = {}
     for i, value in enumerate(fields.lists.get("gripper", ())):
-        if value == gripper:
-            return fields.place(i, "gripper")
-    return "gripper"
+        if value not in first:
+            first[value] = fields.place(i, "gripper")
+    return lambda gripper: first.get(gripper, "gripper")
 
 
 def _each(fields: Fields, name: str, check: Callable[[Any], Any]) -> list[Any]:
@@ -251,7 +304,11 @@ def _time(value: Any) -> datetime:
     return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
 
 
-def _covariance(value: Any) -> list[list[float]]:
+def _metadata(value: Any) -> str:
+    return json_text(_METADATA.validate_python(value))
+
+
+def _covariance(value: Any) -> str:
     if not isinstance(value, list) or len(value) != 6:
         raise ValueError("a 6x6 list of numbers, translation first")
     matrix = vectors(value, 6)
@@ -262,5 +319,4 @@ def _covariance(value: Any) -> list[list[float]]:
         raise ValueError("a covariance is symmetric")
     if np.linalg.eigvalsh((matrix + matrix.T) / (2 * scale)).min() < -1e-6:
         raise ValueError("a covariance has no negative eigenvalue")
-    listed: list[list[float]] = matrix.tolist()
-    return listed
+    return json_text(matrix.tolist())

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,17 @@ from numpy.typing import NDArray
 from graspdb.wire import OUTCOMES
 from graspdb.wire.base import expand_matrix
 from graspdb.wire.trials import TrialDefaults
+from graspdb_service.formats.json_pieces import WHOLE, Allowed, LongArray, lenient, loads
 from graspdb_service.formats.trial_fields import (
+    BLOCK,
     NAMES,
     REQUIRED,
     SCALARS,
     Faults,
     Fields,
-    check,
+    Place,
+    blocks_of,
+    check_blocks,
     defaults_of,
     refuse_too_many,
 )
@@ -27,75 +30,114 @@ from graspdb_service.problems import invalid
 from graspdb_service.trial_columns import TrialBatch, TrialPage, gripper_parts
 
 
-def parse(body: bytes, *, limit: int) -> TrialBatch:
+def parse(body: bytes, *, limit: int, allowed: Allowed) -> TrialBatch:
     """Check a JSON body of trials: 413 for more than ``limit``, 422 naming the fields that are wrong."""
-    document, flaw = _loads(body)
-    if not isinstance(document, dict):
-        raise invalid(
-            "body", flaw or "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}"
-        )
-    faults = Faults()
-    defaults = TrialDefaults()
-    if "columns" in document or "trials" in document:
-        form = "columns" if "columns" in document else "trials"
-        given = document.pop(form)
-        defaults = defaults_of(document, faults, form)
-        fields = (_from_columns if form == "columns" else _from_trials)(given, faults, limit)
-    else:
-        fields = _from_rows([document], faults, lambda _, name: name)
-    batch = check(fields, defaults)
-    if flaw:
-        raise invalid("body", flaw)
+    flaws: list[str] = []
+    try:
+        batch = _parsed(loads(body, allowed=allowed, flaws=flaws), flaws, limit)
+    except orjson.JSONDecodeError as error:
+        raise invalid("body", f"not valid JSON: {error}") from None
+    if flaws:
+        raise invalid("body", flaws[0])
     return batch
+
+
+def _parsed(document: Any, flaws: Sequence[str], limit: int) -> TrialBatch:
+    if not isinstance(document, dict):
+        told = "the body is a JSON object: a trial, {trials: [...]} or {columns: {...}}"
+        raise invalid("body", flaws[0] if flaws else told)
+    faults = Faults()
+    if "columns" not in document and "trials" not in document:
+        return check_blocks([_from_rows([document], faults, _of_one)], TrialDefaults(), _of_one, limit)
+    form = "columns" if "columns" in document else "trials"
+    given = document.pop(form)
+    defaults = defaults_of(document, faults, form)
+    if form == "columns":
+        return check_blocks(_from_columns(given, faults, limit), defaults, _of_columns, limit)
+    return check_blocks(_from_trials(given, faults, limit), defaults, _of_trials, limit)
+
+
+def _of_one(_: int, name: str) -> str:
+    return name
+
+
+def _of_columns(row: int, name: str) -> str:
+    return f"columns.{name}.{row}"
+
+
+def _of_trials(row: int, name: str) -> str:
+    return f"trials.{row}.{name}" if name else f"trials.{row}"
 
 
 def parse_lines(body: bytes, *, limit: int) -> TrialBatch:
     """As :func:`parse`, for one trial a line."""
-    lines = [line for line in body.split(b"\n") if line.strip()]
-    refuse_too_many(len(lines), limit)
-    rows, faults, flaws = [], Faults(), Faults()
-    for number, line in enumerate(lines):
-        row, flaw = _loads(line)
-        if flaw:
-            flaws.add(f"trials.{number}", flaw)
-        rows.append({} if flaw and row is None else row)
-    if not rows:
+    return check_blocks(_from_lines(body), TrialDefaults(), _of_trials, limit)
+
+
+def _from_lines(body: bytes) -> Iterator[Fields]:
+    """Blocks of lines; NaN and Infinity are let through until the fields that hold them can be named."""
+    later, first = Faults(), 0
+    for lines in _lines(body):
+        rows, flaws = [], Faults()
+        for number, line in enumerate(lines, first):
+            row, flaw = _line(line)
+            if flaw:
+                flaws.add(f"trials.{number}", flaw)
+                later.found += flaws.found[-1:]
+            rows.append({} if flaw and row is None else row)
+        if any(row == {} for row in rows):
+            flaws.raise_if_any()
+        yield from _blocks_of_rows([rows], Faults(), first)
+        later.raise_if_any()
+        first += len(lines)
+    if not first:
         raise invalid("body", "no trial in the body: one JSON object a line")
-    if any(row == {} for row in rows):
-        flaws.raise_if_any()
-    batch = check(_from_rows(rows, faults, lambda i, name: f"trials.{i}.{name}"), TrialDefaults())
-    flaws.raise_if_any()
-    return batch
 
 
-def _loads(text: bytes) -> tuple[Any, str | None]:
-    """JSON, and what is wrong with it.
+def _lines(body: bytes) -> Iterator[list[bytes]]:
+    """Lines that are not blank, a block at a time; 422 for one that is too long to be parsed at once."""
+    lines: list[bytes] = []
+    start = 0
+    while start < len(body):
+        stop = body.find(b"\n", start)
+        stop = len(body) if stop < 0 else stop
+        if stop - start > WHOLE:
+            raise invalid("body", f"a line of {stop - start:,} bytes: one trial a line, at most {WHOLE:,}")
+        line = body[start:stop]
+        if line.strip():
+            lines.append(line)
+            if len(lines) == BLOCK:
+                yield lines
+                lines = []
+        start = stop + 1
+    if lines:
+        yield lines
 
-    Python's own parser takes NaN, Infinity and 1e999, which are no JSON: they are let through with the flaw
-    so that the fields that hold them can be named.
-    """
+
+def _line(text: bytes) -> tuple[Any, str | None]:
+    """JSON, and what is wrong with it."""
     try:
         return orjson.loads(text), None
     except orjson.JSONDecodeError as error:
-        flaw = f"not valid JSON: {error}"
-    try:
-        return json.loads(text), flaw
-    except (ValueError, RecursionError):
-        return None, flaw
+        flaws: list[str] = []
+        try:
+            return lenient(text, error, flaws), flaws[0]
+        except orjson.JSONDecodeError:
+            return None, f"not valid JSON: {error}"
 
 
-# --- the three forms to one list a field ----------------------------------------------------------------
+# --- the three forms to blocks of one list a field ------------------------------------------------------
 
 
-def _from_columns(columns: Any, faults: Faults, limit: int) -> Fields:
+def _from_columns(columns: Any, faults: Faults, limit: int) -> Iterator[Fields]:
     if not isinstance(columns, dict):
         faults.add("columns", "an object of lists, one a field")
         faults.raise_if_any()
     for name in sorted(set(columns) - NAMES):
-        faults.add(f"columns.{name}", f"unknown column; there are {', '.join(sorted(NAMES))}")
-    lists: dict[str, Sequence[Any]] = {}
+        faults.add(f"columns.{name[:80]}", f"unknown column; there are {', '.join(sorted(NAMES))}")
+    lists: dict[str, list[Any] | LongArray] = {}
     for name in sorted(set(columns) & NAMES):
-        if isinstance(columns[name], list):
+        if isinstance(columns[name], list | LongArray):
             lists[name] = columns[name]
         elif columns[name] is not None or name in REQUIRED:
             faults.add(f"columns.{name}", "a list with one value a trial")
@@ -111,18 +153,44 @@ def _from_columns(columns: Any, faults: Faults, limit: int) -> Fields:
     if count == 0:
         faults.add("columns.position", "at least one trial")
     faults.raise_if_any()
-    return Fields(lists, count, lambda i, name: f"columns.{name}.{i}", faults)
+    return blocks_of({name: _in_blocks(values) for name, values in lists.items()}, _of_columns, faults)
 
 
-def _from_trials(trials: Any, faults: Faults, limit: int) -> Fields:
-    if not isinstance(trials, list) or not trials:
+def _in_blocks(values: list[Any] | LongArray) -> Iterator[list[Any]]:
+    """A list of a document, in lists of equal length but the last."""
+    if isinstance(values, list):
+        for start in range(0, len(values), BLOCK):
+            yield values[start : start + BLOCK]
+        return
+    held: list[Any] = []
+    for items in values:
+        held += items
+        while len(held) >= BLOCK:
+            yield held[:BLOCK]
+            held = held[BLOCK:]
+    if held:
+        yield held
+
+
+def _from_trials(trials: Any, faults: Faults, limit: int) -> Iterator[Fields]:
+    if not isinstance(trials, list | LongArray) or not len(trials):
         faults.add("trials", "a list of at least one trial")
         faults.raise_if_any()
     refuse_too_many(len(trials), limit)
-    return _from_rows(trials, faults, lambda i, name: f"trials.{i}.{name}" if name else f"trials.{i}")
+    return _blocks_of_rows(_in_blocks(trials), faults)
 
 
-def _from_rows(rows: list[Any], faults: Faults, place: Callable[[int, str], str]) -> Fields:
+def _blocks_of_rows(blocks: Iterable[list[Any]], faults: Faults, first: int = 0) -> Iterator[Fields]:
+    for rows in blocks:
+
+        def place(i: int, name: str, first: int = first) -> str:
+            return _of_trials(first + i, name)
+
+        yield _from_rows(rows, faults, place)
+        first += len(rows)
+
+
+def _from_rows(rows: list[Any], faults: Faults, place: Place) -> Fields:
     if set(map(type, rows)) != {dict}:
         for i, row in enumerate(rows):
             if not isinstance(row, dict):
@@ -146,9 +214,7 @@ def _from_rows(rows: list[Any], faults: Faults, place: Callable[[int, str], str]
     return Fields(lists, len(rows), place, faults)
 
 
-def _expanded(
-    row: dict[str, Any], i: int, faults: Faults, place: Callable[[int, str], str]
-) -> dict[str, Any]:
+def _expanded(row: dict[str, Any], i: int, faults: Faults, place: Place) -> dict[str, Any]:
     try:
         row = expand_matrix(row)
     except ValueError as error:

@@ -9,14 +9,15 @@ from fastapi import Response
 from fastapi.responses import StreamingResponse
 
 from graspdb_service.formats import trial_arrow, trial_json
+from graspdb_service.formats.json_pieces import Allowed
 from graspdb_service.formats.negotiation import ARROW, JSON, NDJSON, unsupported
 from graspdb_service.trial_columns import TrialBatch, TrialPage
 
 
-def parse(body: bytes, media: str, *, limit: int) -> TrialBatch:
+def parse(body: bytes, media: str, *, limit: int, allowed: Allowed) -> TrialBatch:
     """Check a body of trials: 415 for another media type, 413 for more than ``limit``, 422 naming fields."""
     if media in ("", JSON):
-        return trial_json.parse(body, limit=limit)
+        return trial_json.parse(body, limit=limit, allowed=allowed)
     if media in (NDJSON, "application/ndjson", "application/jsonl"):
         return trial_json.parse_lines(body, limit=limit)
     if media == ARROW:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias, TypeVar
 
-from sqlalchemy import Connection, Double, Engine, Executable, Table, create_engine, event, make_url, text
+from sqlalchemy import Connection, Double, Engine, Executable, Table, create_engine, event, make_url
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
@@ -95,6 +95,8 @@ class Database:
     def __init__(self, url: str, *, pool_size: int = 40) -> None:
         self.url = _normalised(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        self.path = self.url.database if self.is_sqlite else None
+        """The file of a SQLite database."""
         if self.is_sqlite:
             self._writer = _sqlite_engine(self.url, "BEGIN IMMEDIATE", pool_size=2, query_only=False)
             self._reader = _sqlite_engine(self.url, "BEGIN", pool_size=pool_size, query_only=True)
@@ -126,11 +128,6 @@ class Database:
                 if not error.connection_invalidated:
                     raise
                 raise CommitUnknown(str(error.orig)) from error
-
-    def ping(self) -> None:
-        """Raise if the database can't be reached."""
-        with self.read() as tx:
-            tx.execute(text("SELECT 1"))
 
     def dispose(self) -> None:
         """Close every pooled connection."""

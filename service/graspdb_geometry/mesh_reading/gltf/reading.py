@@ -27,6 +27,8 @@ from graspdb_geometry.mesh_reading.gltf.document import (
 from graspdb_geometry.mesh_reading.strips import triangles_of_fan, triangles_of_strip
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+#: Parsed at once, holding the interpreter's lock.
+MAX_JSON_BYTES = 4 * 2**20
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 #: Required extensions that change how a mesh looks, not where its triangles are.
@@ -81,6 +83,11 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         offset += 8 + size
     if not chunks or chunks[0][0] != JSON_CHUNK:
         raise FormatError("the first chunk of the GLB is not JSON")
+    if len(chunks[0][1]) > MAX_JSON_BYTES:
+        raise FormatError(
+            f"the GLB's description of its scene has {len(chunks[0][1]):,} bytes and at most"
+            f" {MAX_JSON_BYTES:,} are read: merge its nodes, or export it as STL"
+        )
     try:
         document = json.loads(chunks[0][1])
     except (ValueError, RecursionError):

@@ -8,16 +8,17 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import Answer, AnswerInfo, Page, Slug
 from graspdb.wire.queries import AnswerKind
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
 from graspdb_service.api.routing.parameters import AnswerRef, Ctx, ObjectId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases.answers import lookup
 
-router = APIRouter(tags=["answers"])
+router = APIRouter(tags=["answers"], route_class=AdmittedRoute)
 
 
-@router.get("/answers/{id}", response_model=Answer, **scope("read"))
+@router.get("/answers/{id}", response_model=Answer, **scope("read", work="queries"))
 def get_answer(
     ctx: Ctx,
     id: AnswerRef,

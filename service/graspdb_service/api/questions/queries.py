@@ -29,6 +29,7 @@ from graspdb.wire.queries import (
 )
 from graspdb_density.se3 import Poses
 from graspdb_service.api.context import Context
+from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import answer_tag, not_modified, seen_after
 from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
@@ -41,12 +42,12 @@ from graspdb_service.usecases.answers import asking
 from graspdb_service.usecases.answers.asking import Told
 from graspdb_service.usecases.densities.info import density_info
 
-router = APIRouter(tags=["queries"])
+router = APIRouter(tags=["queries"], route_class=AdmittedRoute)
 
 Q = TypeVar("Q", bound=Selection)
 
 
-@router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read"))
+@router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read", work="queries"))
 def get_density(
     ctx: Ctx, id: ObjectId, request: Request, query: Annotated[SelectionQuery, Query()]
 ) -> Response:
@@ -60,7 +61,7 @@ def get_density(
     return _unless_known(ctx, id, request, query, answer)
 
 
-@router.get("/objects/{id}/likelihood", response_model=Likelihoods, **scope("read"))
+@router.get("/objects/{id}/likelihood", response_model=Likelihoods, **scope("read", work="queries"))
 def get_likelihood(
     ctx: Ctx, id: ObjectId, request: Request, query: Annotated[LikelihoodQuery, Query()]
 ) -> Response:
@@ -77,7 +78,7 @@ def get_likelihood(
     "/objects/{id}/likelihood",
     response_model=Likelihoods,
     responses={200: {"content": {ARROW: {"schema": BINARY}}}},
-    **scope("read", body={"application/json": LikelihoodRequest, ARROW: BINARY}),
+    **scope("read", body={JSON: LikelihoodRequest, ARROW: BINARY}, work="queries", large=True),
 )
 def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> Response:
     """How likely each of many grasps is: columns in the poses' order.
@@ -103,7 +104,7 @@ def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> 
     return Response(told.json, media_type=JSON, headers={"Vary": "Accept"})
 
 
-@router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read"))
+@router.get("/objects/{id}/best-grasp", response_model=BestGrasps, **scope("read", work="queries"))
 def get_best_grasp(
     ctx: Ctx, id: ObjectId, request: Request, query: Annotated[BestGraspQuery, Query()]
 ) -> Response:
@@ -118,7 +119,7 @@ def get_best_grasp(
 @router.post(
     "/objects/{id}/best-grasp",
     response_model=BestGrasps,
-    **scope("read", body={"application/json": BestGraspRequest}),
+    **scope("read", body={JSON: BestGraspRequest}, work="queries", large=True),
 )
 def post_best_grasp(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> Response:
     """As GET, the constraints as JSON; also half spaces, obstacles, candidates and poses to exclude."""
@@ -126,13 +127,13 @@ def post_best_grasp(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> 
     return _told(asking.best_grasps(ctx, id, query))
 
 
-@router.post("/objects/{id}/samples", response_model=Samples, **scope("read"))
+@router.post("/objects/{id}/samples", response_model=Samples, **scope("read", work="queries"))
 def post_samples(ctx: Ctx, id: ObjectId, query: SamplesRequest) -> Response:
     """Draw grasps; sent back with the trial, ``proposal_density`` weights it. A seed makes it repeatable."""
     return _told(asking.draws(ctx, id, query))
 
 
-@router.post("/objects/{id}/proposals", response_model=Proposals, **scope("read"))
+@router.post("/objects/{id}/proposals", response_model=Proposals, **scope("read", work="queries"))
 def post_proposals(ctx: Ctx, id: ObjectId, query: ProposalsRequest) -> Response:
     """Grasps to try next; sent back with the trial, ``proposal_density`` weights it.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Header, Path, Request, Response
@@ -13,7 +13,7 @@ from graspdb_service.problems import invalid
 from graspdb_service.usecases.runtime.idempotency import Created, Sent
 
 
-def context(request: Request) -> Context:
+async def context(request: Request) -> Context:
     """The service's parts, as :func:`graspdb_service.app.create_app` put them together."""
     state: Context = request.app.state.context
     return state
@@ -45,13 +45,14 @@ _KeyHeader = Annotated[
 ]
 
 
-def _key(idempotency_key: _KeyHeader = None) -> str | None:
+async def _key(idempotency_key: _KeyHeader = None) -> str | None:
     if idempotency_key is not None and not re.fullmatch(r"[\x21-\x7e]{1,200}", idempotency_key):
         raise invalid("Idempotency-Key", "1 to 200 printable ASCII characters, best a UUID")
     return idempotency_key
 
 
 async def _raw_body(request: Request) -> bytes:
+    # A bytearray, if it is one: see Received.
     return await request.body()
 
 
@@ -63,15 +64,15 @@ RawBody = Annotated[bytes, Depends(_raw_body)]
 class Creation(Sent):
     """A creating request, and the response that tells where the new thing is."""
 
-    response: Response
+    response: Response = field(kw_only=True)
 
     def answered(self, made: Created) -> object:
         self.response.headers["Location"] = made.location
         return made.body
 
 
-def _creation(response: Response, body: RawBody, key: Annotated[str | None, Depends(_key)]) -> Creation:
-    return Creation(key, body, response)
+async def _creation(response: Response, body: RawBody, key: Annotated[str | None, Depends(_key)]) -> Creation:
+    return Creation(key, body, response=response)
 
 
 Creating = Annotated[Creation, Depends(_creation)]

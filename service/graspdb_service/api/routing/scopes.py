@@ -14,18 +14,31 @@ Scope = Literal["public", "read", "trials:write", "jobs:work", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 SCOPE_FIELD = "x-required-scope"
 
+Work = Literal["queries", "reports", "uploads", "meshes", "writes", "reads"]
+PLACE_FIELD = "x-place"
+BODY_FIELD = "x-body-limit"
+"""Both name a limit that ``GET /info`` tells; without the first the method says which, see :func:`scope`."""
+
 
 BODY_MODELS: dict[str, type[BaseModel]] = {}
 """Models of bodies that a route reads itself, for the OpenAPI document."""
 
 
-def scope(name: Scope, *, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``.
+def scope(
+    name: Scope, *, body: Mapping[str, Any] | None = None, work: Work | None = None, large: bool = False
+) -> dict[str, Any]:
+    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``, and what it may take.
 
     ``body`` documents a body that the route reads itself (:data:`RawBody`): by media type a model, a tuple
-    of models or a JSON schema.
+    of models or a JSON schema. ``large`` bodies may have ``max_body_bytes``, others ``max_small_body_bytes``.
+    ``work`` is the kind of place that a request takes: by default a read for GET, else a write; none for
+    what is public.
     """
     extra: dict[str, Any] = {SCOPE_FIELD: name}
+    if work is not None:
+        extra[PLACE_FIELD] = f"max_{work}_at_once"
+    if large:
+        extra[BODY_FIELD] = "max_body_bytes"
     if body is not None:
         content = {media: {"schema": _schema(given)} for media, given in body.items()}
         extra["requestBody"] = {"required": True, "content": content}
@@ -57,7 +70,7 @@ def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], fr
     return found
 
 
-def refuse_unknown_parameters(request: Request) -> None:
+async def refuse_unknown_parameters(request: Request) -> None:
     """422 for a query parameter that the route does not know: a typing error must not be ignored."""
     path = getattr(request.scope.get("route"), "path", None)
     known = request.app.state.parameters.get((request.method, path))

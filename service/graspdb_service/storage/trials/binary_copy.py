@@ -6,7 +6,6 @@ big-endian; null is the length -1 and no value.
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb_service.trial_columns import Bools
+from graspdb_service.trial_columns import Bools, json_text
 
 HEADER = b"PGCOPY\n\xff\r\n\x00" + struct.pack(">ii", 0, 0)
 END = struct.pack(">h", -1)
@@ -87,8 +86,3 @@ def microseconds(value: datetime | None) -> int:
         return 0
     since = value.astimezone(UTC) - _EPOCH
     return (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
-
-
-def json_text(value: Any) -> str:
-    """JSON as both databases keep it."""
-    return json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))

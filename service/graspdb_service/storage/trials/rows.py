@@ -19,8 +19,7 @@ from sqlalchemy import bindparam, update
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import trials
 from graspdb_service.storage.trials import binary_copy, provenances
-from graspdb_service.storage.trials.binary_copy import json_text
-from graspdb_service.trial_columns import Ints, TrialColumns
+from graspdb_service.trial_columns import Ints, TrialColumns, json_text
 
 SUCCESS = 1
 COPY_ROWS = 50_000
@@ -37,16 +36,13 @@ def insert(
     if len(columns) == 0:
         return
     shared = {"object_id": object_id, "revision": revision, "batch_id": batch_id}
-    if tx.dialect.name == "sqlite":
-        _insert_tuples(tx, shared, columns, first_seq)
-    else:
-        for start in range(0, len(columns), COPY_ROWS):
-            _copy_in(tx, shared, columns[start : start + COPY_ROWS], first_seq + start)
-    pairs, counts = np.unique(
-        np.stack([columns.provenance, columns.outcome.astype(np.int64)], axis=1), axis=0, return_counts=True
-    )
-    for (provenance_id, outcome), number in zip(pairs.tolist(), counts.tolist(), strict=True):
-        provenances.add_tally(tx, provenance_id, outcome, rows=number)
+    store = _insert_tuples if tx.dialect.name == "sqlite" else _copy_in
+    for start in range(0, len(columns), COPY_ROWS):
+        store(tx, shared, columns[start : start + COPY_ROWS], first_seq + start)
+    # As one number: rows of two would be sorted by Python's comparisons.
+    kinds, counts = np.unique(columns.provenance * 256 + columns.outcome, return_counts=True)
+    for kind, number in zip(kinds.tolist(), counts.tolist(), strict=True):
+        provenances.add_tally(tx, kind // 256, kind % 256, rows=number)
 
 
 def _numbers(columns: TrialColumns, first_seq: int) -> dict[str, NDArray[Any]]:

@@ -13,7 +13,7 @@ import os
 import resource
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -30,11 +30,12 @@ def inspect_in_child(
     media_type: str,
     unit: str = "m",
     *,
+    as_parts: bool = False,
     max_triangles: int = meshes.MAX_TRIANGLES,
     memory_bytes: int = 2 * 2**30,
     seconds: float = 30.0,
 ) -> Inspection:
-    """Load and measure a mesh.
+    """Load and measure a mesh; ``as_parts`` one whose geometries are to be convex parts, which are answered.
 
     ``memory_bytes`` is the child's address space, interpreter and libraries (about 0.4 GB) included;
     ``seconds`` are of processor time, and of waiting. Raises MeshError as `meshes.load`, and when the child
@@ -44,6 +45,7 @@ def inspect_in_child(
     if not meshes.readable(media_type, unit) or not data:
         meshes.load(data, media_type, unit, max_triangles=max_triangles)
     order = {
+        "as_parts": as_parts,
         "media_type": media_type,
         "unit": unit,
         "max_triangles": max_triangles,
@@ -85,9 +87,12 @@ def main() -> int:
         with contextlib.suppress(ValueError, OSError):  # an inherited limit may be tighter already
             resource.setrlimit(kind, (limit, limit))
     try:
+        data = sys.stdin.buffer.read()
         inspection = meshes.inspect(
-            sys.stdin.buffer.read(), order["media_type"], order["unit"], max_triangles=order["max_triangles"]
+            data, order["media_type"], order["unit"], max_triangles=order["max_triangles"]
         )
+        if order["as_parts"]:
+            inspection = replace(inspection, parts=meshes.parts_from_glb(data))
         answer = _serialise(inspection)
     except MeshError as error:
         answer = json.dumps({"error": {"field": error.field, "message": error.message}}).encode() + b"\n"

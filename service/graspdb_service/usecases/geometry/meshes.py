@@ -94,12 +94,7 @@ def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
 
 def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
     """Check convex parts, wherever they come from, and measure them against their object's mesh."""
-    # The child's limits first: what passed them is safe to read here.
-    _inspect(ctx, content, GLB, "m", field="parts")
-    try:
-        parts = meshes.parts_from_glb(content)
-    except MeshError as error:
-        raise _refused(error) from None
+    parts = _inspect(ctx, content, GLB, "m", field="parts").parts
     mesh = None if row.mesh_info is None else MeshInfo.model_validate(row.mesh_info)
     info = _parts_info(content, parts, mesh)
     if mesh is None:
@@ -166,6 +161,7 @@ def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str 
                 content,
                 media,
                 unit,
+                as_parts=field == "parts",
                 memory_bytes=ctx.settings.max_mesh_memory_bytes,
                 seconds=ctx.settings.max_mesh_seconds,
             )

@@ -14,6 +14,7 @@ from graspdb_geometry.grippers import GripperShape
 from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.densities.success_models import Model
 from graspdb_service.usecases.grasps.constraints import Constraints
+from graspdb_service.usecases.runtime.compute import breathing
 
 #: A chance is told within so many standard deviations of a success, position and rotation together. Farther
 #: out all kernels are tails, whose ratio is no smaller for it: a few far successes would promise anything.
@@ -34,7 +35,7 @@ def all_of(checks: Sequence[Admissible]) -> Admissible | None:
         allowed[left] = True
         return allowed
 
-    return admissible
+    return breathing(admissible, "testing poses")
 
 
 def clear_of(limits: Constraints, shape: GripperShape, distance: float, threads: int) -> Admissible:

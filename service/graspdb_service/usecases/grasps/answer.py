@@ -40,7 +40,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     there, and as the selection.
     """
     choice, _ = kernel_of(request)
-    with ctx.compute.admitted():
+    with ctx.compute.within():
         selected = ctx.densities.selections.resolve(slug, request)
         limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
         built = ctx.densities.get(selected, choice)

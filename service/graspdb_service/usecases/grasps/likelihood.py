@@ -56,7 +56,7 @@ def likelihood(
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
 
-    with ctx.compute.admitted():
+    with ctx.compute.within():
         built = ctx.densities.requested(slug, request)
         columns: dict[str, Any] = {}
         free = test = reach = None

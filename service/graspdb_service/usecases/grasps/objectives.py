@@ -16,6 +16,7 @@ from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.success_models import LEVEL, Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.search import ScoreSearch
+from graspdb_service.usecases.runtime.compute import breathing
 
 #: Draws of the noise that a mean is taken over, and while searching.
 _NOISE_DRAWS, _FEW_DRAWS = 256, 16
@@ -62,6 +63,7 @@ def by_mean(
     averaged = "density" if value is None else "success_probability"
     if value is None:
         value, noises = _widened(search, noises)
+    value = breathing(value, "scoring poses")
     score = rough = value
     if any(noise.sigma_position_m or noise.sigma_rotation for noise in noises.values()):
         score, rough = (

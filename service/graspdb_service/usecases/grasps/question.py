@@ -91,6 +91,7 @@ def question_of(
 
     def complete() -> Question:
         by, ranking = ranked()
+        by = by.with_breath()
         engine: Engine = by
         if limits.candidates is not None:
             separated = request.min_separation_m is not None or request.min_separation_deg is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +18,7 @@ from graspdb_density.search.scored_poses import (
     ranked_by_density_where_flat,
 )
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.runtime.compute import breathing
 
 #: Poses shown to the collision test at a time while looking for the nearest admissible one.
 _BLOCK = 1_024
@@ -64,6 +65,18 @@ class ScoreSearch:
     rough: Score | None = None
     pull: Pull | None = None
     resolution: float = 0.0
+
+    def with_breath(self) -> ScoreSearch:
+        """The same, which lets other questions between its steps."""
+        if self.score is None:
+            return self
+        score = breathing(self.score, "scoring poses")
+        rough = (
+            score
+            if self.rough is self.score or self.rough is None
+            else breathing(self.rough, "scoring poses")
+        )
+        return replace(self, score=score, rough=rough)
 
     def best(self, bounds: Bounds) -> list[Maximum]:
         return self.search.maxima(

@@ -28,7 +28,7 @@ def fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
     409 for too few successes or failures, or attempts all in one place.
     """
     assert request.object is not None
-    with ctx.compute.admitted():
+    with ctx.compute.within():
         selected = ctx.densities.selections.resolve(request.object, fit.trials_of(request))
         # Said first: without axes no number of trials helps.
         axes = stored_kernel.axes(request.alignment, selected, ctx.scenes.features)

@@ -192,7 +192,7 @@ def _isotropic_widths(covariance: Floats) -> KernelWidths | None:
 def _fitted(ctx: Estimators, request: KernelCreate) -> NewKernel:
     if request.kind == "probability":
         return axis_bandwidth_fit.fitted(ctx, request)
-    with ctx.compute.admitted():
+    with ctx.compute.within():
         return fit.fitted(
             ctx.densities,
             ctx.scenes.features,

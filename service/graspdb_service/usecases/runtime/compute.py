@@ -1,54 +1,137 @@
-"""The service's compute pool: a few threads for numbers, so that the rest of the service stays quick."""
+"""The service's processors: computations in turns of clients, so that the rest of the service stays quick."""
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import busy
+from graspdb_service.usecases.runtime.asked import Asked, asked
+from graspdb_service.usecases.runtime.fair_share import Claim, FairShare, NoRoom
 
 T = TypeVar("T")
+A = TypeVar("A", bound=np.generic)
 
-#: Queries under way or waiting. The server has 40 threads for requests: the others must find some free.
-MAX_QUERIES = 28
 #: Poses a computation takes at a time, so that short questions get between the blocks of a long one.
 _BLOCK = 16_384
+#: Poses whose values are computed between two breaths, at most.
+_STEP = 2_048
+#: A computation keeps its processor so long before another client's that waits has its turn.
+_TURN_S = 0.02
+_LOOK_S = 0.25
+_MOST_WAITING = 1_000
+
+
+class _Turn:
+    """A computation that has a processor."""
+
+    def __init__(self, slots: FairShare, question: Asked) -> None:
+        self._slots, self._question = slots, question
+        self._woken = threading.Event()
+        self._thread = threading.get_ident()
+        self._claim: Claim | None = None
+
+    def take(self) -> None:
+        """Wait for a processor, as long as the answer is wanted."""
+        self._question.check()
+        self._woken.clear()
+        try:
+            self._claim = claim = self._slots.claim(self._question.client, 1, self._woken.set)
+        except NoRoom:
+            raise busy("Too many questions wait for a processor: try again in a second", status=429) from None
+        while not claim.held and not self._woken.wait(_LOOK_S):
+            self._question.check()
+        self._since = time.monotonic()
+
+    def give(self) -> None:
+        claim, self._claim = self._claim, None
+        if claim is not None:
+            self._slots.release(claim)
+
+    def breathe(self) -> None:
+        """End here where the answer is no longer wanted, and let another client that waits have its turn."""
+        self._question.check()
+        if threading.get_ident() != self._thread or time.monotonic() - self._since < _TURN_S:
+            return
+        if self._slots.others_wait(self._question.client):
+            self.give()
+            self.take()
+
+
+_TURN: ContextVar[_Turn | None] = ContextVar("turn", default=None)
+
+
+def breathe() -> None:
+    """Call it between the blocks of a long computation; raises where nobody waits for its answer any more."""
+    turn = _TURN.get()
+    if turn is not None:
+        turn.breathe()
+
+
+def breathing(work: Callable[[Poses], NDArray[A]], step: str) -> Callable[[Poses], NDArray[A]]:
+    """The same, a value a pose, in steps between which it breathes; ``step`` is what they are of."""
+    question = asked()
+
+    def bounded(poses: Poses) -> NDArray[A]:
+        parts = []
+        for start in range(0, max(len(poses), 1), _STEP):
+            breathe()
+            part = poses[start : start + _STEP]
+            question.reached(step, len(part) + (question.done if question.step == step else 0))
+            parts.append(work(part))
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    return bounded
 
 
 class Compute:
-    """Runs computations on a bounded number of threads and refuses more queries than it can hold."""
+    """Computations on a bounded number of processors, clients in turn."""
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, threads: int, max_question_seconds: float = math.inf) -> None:
         self.threads = threads
-        self._pool = ThreadPoolExecutor(max_workers=threads, thread_name_prefix="graspdb-compute")
-        self._room = threading.BoundedSemaphore(MAX_QUERIES)
-
-    @contextmanager
-    def admitted(self) -> Iterator[None]:
-        """A query's place, from its first computation to its last; 429 where all are taken."""
-        if not self._room.acquire(blocking=False):
-            title = (
-                "All places for queries are taken: try again in a second, or ask for fewer poses at a time"
-            )
-            raise busy(title, status=429)
-        try:
-            yield
-        finally:
-            self._room.release()
+        self._most_seconds = max_question_seconds
+        # One client has at most as many as there are; a short question of another finds one more.
+        self._slots = FairShare(threads + 1, threads, _MOST_WAITING)
 
     def run(self, work: Callable[[], T]) -> T:
-        """Do ``work`` in the pool and wait for it. Never call it from inside the pool or a transaction."""
-        return self._pool.submit(work).result()
+        """Do ``work`` when it is this client's turn. Never call it within another or a transaction."""
+        with self._turn():
+            return work()
+
+    @contextmanager
+    def within(self, seconds: float | None = None) -> Iterator[None]:
+        """Answer a question within this, or what the service allows at most, from its coming.
+
+        503 ``deadline`` from a computation that finds it too late.
+        """
+        asked().within(seconds, self._most_seconds)
+        yield
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        turn = _Turn(self._slots, asked())
+        token = _TURN.set(turn)
+        try:
+            turn.take()
+            yield
+        finally:
+            turn.give()
+            _TURN.reset(token)
 
     def blocks(self, poses: Poses, work: Callable[[Poses], T]) -> list[T]:
         """What ``work`` answers for consecutive blocks of poses, one by one so that others get between."""
-        starts = range(0, len(poses), _BLOCK)
-        return [self.run(partial(work, poses[start : start + _BLOCK])) for start in starts]
-
-    def close(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        question, answers = asked(), []
+        for start in range(0, len(poses), _BLOCK):
+            question.reached("computing poses", start, len(poses))
+            answers.append(self.run(partial(work, poses[start : start + _BLOCK])))
+        return answers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,14 +29,18 @@ class Created:
 
 @dataclass(frozen=True)
 class Sent:
-    """A creating request: its Idempotency-Key, and its body with whatever else changes the body's meaning."""
+    """A creating request: its Idempotency-Key, its body, and what else changes the body's meaning."""
 
     key: str | None
     body: bytes
+    beside: bytes = b""
 
-    @property
+    @functools.cached_property
     def digest(self) -> str:
-        return hashlib.sha256(self.body).hexdigest()
+        # In two steps, for a large body is never copied.
+        found = hashlib.sha256(self.beside)
+        found.update(self.body)
+        return found.hexdigest()
 
 
 def replay_or(database: Database, scope: str, sent: Sent, create: Callable[[Tx], Created]) -> Created:
@@ -45,10 +50,11 @@ def replay_or(database: Database, scope: str, sent: Sent, create: Callable[[Tx],
     compute before. 422 where the key was used with another body, 409 where what it made has since been
     deleted.
     """
+    digest = "" if sent.key is None else sent.digest
     with database.write() as tx:
         if sent.key is None:
             return create(tx)
-        earlier = idempotency.claim(tx, scope, sent.key, sent.digest)
+        earlier = idempotency.claim(tx, scope, sent.key, digest)
         if earlier is None:
             made = create(tx)
             answer: dict[str, Any] = {"status": made.status, "location": made.location, "answer": made.body}

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import gc
 import math
+import sys
+import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -23,6 +28,34 @@ from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import PG70
 from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.runtime.compute import Compute
+
+#: Seconds after which a thread that computes in Python lets others have the interpreter; by default 5 ms,
+#: which a short answer that gives it up ten times would wait for ten times.
+_SWITCH_S = 0.0005
+_M_ARENA_MAX, _ARENAS = -8, 2
+#: The collector looks at young objects alone: at all of them, those of a large request included, it would
+#: hold the interpreter for half a second. All are looked at by `keep_tidy`, when there are few.
+_COLLECT = (20_000, 10, 1_000_000)
+_TIDY_S = 10.0
+
+
+def settle() -> None:
+    """Make this process one in which many threads share the interpreter, and that gives memory back."""
+    sys.setswitchinterval(_SWITCH_S)
+    gc.set_threshold(*_COLLECT)
+    with contextlib.suppress(OSError, AttributeError):  # glibc only
+        # Else every thread has an arena of its own, whose free pages no other thread can use.
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _ARENAS)
+
+
+def keep_tidy(is_quiet: Callable[[], bool]) -> None:
+    """Free what refers to itself, and give free memory back to the system, now and then while it is quiet."""
+    while True:
+        time.sleep(_TIDY_S)
+        if is_quiet():
+            gc.collect()
+            with contextlib.suppress(OSError, AttributeError):  # glibc only
+                ctypes.CDLL(None).malloc_trim(0)
 
 
 def warm_up(compute: Compute) -> None:

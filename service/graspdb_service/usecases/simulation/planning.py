@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +14,11 @@ from graspdb.wire import (
     GridSpec,
     GripperProfile,
     KernelInfo,
-    Pose,
-    PoseColumns,
     SampleSpec,
     Selection,
     SweepCreate,
 )
+from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
@@ -31,7 +29,6 @@ from graspdb_service.usecases import grippers
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.grasps import samples
-from graspdb_service.usecases.grasps.constraints import poses_of
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.simulation import feasibility
@@ -60,6 +57,14 @@ class _World:
 
 
 @dataclass(frozen=True)
+class Given:
+    """Poses to simulate, and the density each was drawn with, (n,) or (): NaN where it is not known."""
+
+    poses: Poses
+    proposal_density: Floats
+
+
+@dataclass(frozen=True)
 class _Plan:
     """What to simulate: a grid, or poses (n, 8) as :func:`sweeps.create` takes them."""
 
@@ -71,8 +76,11 @@ class _Plan:
     kernel: KernelInfo | None = None
 
 
-def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created:
-    """Check and queue a sweep: 409 while its object lacks its mesh, 422 for what can't be simulated."""
+def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Given | None) -> Created:
+    """Check and queue a sweep: 409 while its object lacks its mesh, 422 for what can't be simulated.
+
+    ``given`` are its poses where it has any, and a grid or draws otherwise.
+    """
     scope = f"POST /objects/{slug}/sweeps"
     earlier = replayed(ctx.database, scope, sent)
     if earlier is not None:
@@ -84,7 +92,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent) -> Created
         if row.mesh_info is not None and row.parts_sha256 is None:
             decompositions.check(tx, row)
     world = _world(row, profile)
-    plan = _plan(ctx, slug, spec, world)
+    plan = _plan(ctx, slug, spec, world, given)
     chunk = _chunk_size(ctx, spec, plan)
     # In memory and in one go, before the transaction, that it may be short.
     created_ms = time.time_ns() // 1_000_000
@@ -196,9 +204,9 @@ def _mass(row: ObjectRow) -> float | None:
     )
 
 
-def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan:
-    if spec.poses is not None:
-        return _given(ctx, spec.poses, spec.proposal_density)
+def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World, given: Given | None) -> _Plan:
+    if given is not None:
+        return _given(ctx, given)
     if spec.sample is not None:
         return _drawn(ctx, slug, spec, spec.sample)
     wish = spec.grid or GridSpec()
@@ -223,16 +231,11 @@ def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World) -> _Plan
     return _Plan("grid", count, grid=plan, full_count=full)
 
 
-def _given(
-    ctx: Estimators,
-    given: Sequence[Pose] | PoseColumns,
-    drawn: Sequence[float | None] | float | None,
-) -> _Plan:
-    poses = poses_of(given)
+def _given(ctx: Estimators, given: Given) -> _Plan:
+    poses, densities = given.poses, given.proposal_density
     limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
     if len(poses) > limit:
         raise invalid("poses", f"{len(poses)} are more than {limit}: make several sweeps of them")
-    densities = np.array(drawn, dtype=np.float64)
     if densities.shape not in ((), (len(poses),)):
         raise invalid("proposal_density", f"{len(densities)} values for {len(poses)} poses")
     table = np.column_stack([*poses, np.broadcast_to(densities, len(poses))])

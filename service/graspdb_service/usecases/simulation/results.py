@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from graspdb.wire import OUTCOME_CODES, OUTCOMES, ResultAccepted, SimulateResult
+from graspdb.wire import OUTCOME_CODES, OUTCOMES, ResultAccepted
 from graspdb.wire.states import JobState
+from graspdb_service.formats.sweep_outcomes import ChunkResult
 from graspdb_service.problems import busy, invalid
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Tx
@@ -50,7 +51,7 @@ class _Overtaken(Exception):
     """Another sweep over the same grid has finished a chunk since its chunks were read."""
 
 
-def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: SimulateResult) -> ResultAccepted:
+def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: ChunkResult) -> ResultAccepted:
     """Store a chunk's result in the transaction that completes its job.
 
     The same ``body`` under the same lease is answered the same again. 409 ``lease-lost``; 422 if the result
@@ -151,8 +152,8 @@ class _Chunk:
     counts: dict[str, dict[str, int]]
 
 
-def _outcomes(result: SimulateResult, job: JobRow) -> npt.NDArray[np.uint8]:
-    outcomes = np.frombuffer(result.outcomes, dtype=np.uint8)
+def _outcomes(result: ChunkResult, job: JobRow) -> npt.NDArray[np.uint8]:
+    outcomes = result.outcomes
     expected = job.stop - job.start
     if len(outcomes) != expected:
         raise invalid("outcomes", f"{expected} codes, one for every pose of the chunk, not {len(outcomes)}")
@@ -167,18 +168,17 @@ def _outcomes(result: SimulateResult, job: JobRow) -> npt.NDArray[np.uint8]:
 
 def _chunk(
     sweep: SweepRow,
-    result: SimulateResult,
+    result: ChunkResult,
     outcomes: npt.NDArray[np.uint8],
     poses: TrialColumns,
     fresh: Bools,
 ) -> _Chunk:
-    rows = result.rows
+    index = result.pose_index
     for name in ("width_m", "quality"):
-        if len(getattr(rows, name)) != len(rows.pose_index):
-            raise invalid(f"rows.{name}", f"as many values as pose_index has: {len(rows.pose_index)}")
-    if rows.pose_index and max(rows.pose_index) > poses.pose_index[-1]:
-        raise invalid("rows.pose_index", f"{max(rows.pose_index)} is no pose of this chunk")
-    index = np.array(rows.pose_index, dtype=np.int64)
+        if len(getattr(result, name)) != len(index):
+            raise invalid(f"rows.{name}", f"as many values as pose_index has: {len(index)}")
+    if len(index) and index.max() > poses.pose_index[-1]:
+        raise invalid("rows.pose_index", f"{index.max()} is no pose of this chunk")
     if np.any(np.diff(index) <= 0):
         raise invalid("rows.pose_index", "must be ascending, each pose once")
     place = np.searchsorted(poses.pose_index, index)
@@ -198,9 +198,8 @@ def _chunk(
         poses[kept],
         outcome=outcomes[kept],
         provenance=np.full(len(kept), sweep.provenance_id, dtype=np.int64),
-        # None becomes NaN, which stands for "none" in the columns.
-        quality=np.array(rows.quality, dtype=np.float64)[new],
-        width_m=np.array(rows.width_m, dtype=np.float64)[new],
+        quality=result.quality[new],
+        width_m=result.width_m[new],
     )
     packed = {} if sweep.purpose == "check" else _count(outcomes[fresh & ~is_row])
     counts: dict[str, dict[str, int]] = {

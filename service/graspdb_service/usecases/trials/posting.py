@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from graspdb.wire import BatchReceipt
+from graspdb_service.formats.json_pieces import Allowed
 from graspdb_service.formats.trials import parse
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage import grippers, objects
@@ -29,14 +30,16 @@ def add(
     422 ``implausible-poses`` for trials that can't be of the object, unless they are accepted.
     """
     scope = f"POST /objects/{slug}/trials"
-    meant = Sent(sent.key, media.encode() + b"\n" + sent.body)
+    meant = Sent(sent.key, sent.body, media.encode() + b"\n")
     with ctx.database.read() as tx:
         require(tx, slug)
     # What was stored once is answered so again, whatever is known of the object by now.
     earlier = replayed(ctx.database, scope, meant)
     if earlier is not None:
         return earlier
-    batch = parse(sent.body, media, limit=ctx.settings.max_batch_trials)
+    limits = ctx.settings
+    allowed = Allowed(limits.max_json_values, limits.max_json_depth)
+    batch = parse(sent.body, media, limit=limits.max_batch_trials, allowed=allowed)
     with ctx.database.read() as tx:
         known = require(tx, slug)
         profiles = inspection.profiles_of(tx, batch)
