@@ -17,7 +17,7 @@ from graspdb.options import Option, known_keywords
 from graspdb.poses import vector
 from graspdb.resources.pages import Resource
 from graspdb.resources.runs import RunProgress, computed
-from graspdb.resources.selection import Selection, TrialSelection, query
+from graspdb.resources.selection import Selection, SourceWeight, TrialSelection, query
 from graspdb.resources.sweeps import Sweep
 from graspdb.wire.reports import REPORT_NAMES
 
@@ -234,6 +234,8 @@ class Waiting(TypedDict, total=False):
 
 class TrialOptions(TrialSelection, Waiting, total=False):
     """Which trials a report is about."""
+
+    source_weight: SourceWeight
 
 
 class DensityOptions(Selection, Waiting, total=False):

@@ -66,7 +66,7 @@ def test_the_model_is_the_sum_over_attempts(seed: int) -> None:
     )
     grown = grown.extend(Poses.of(p[120:], q[120:]), won[120:], twin[120:])
     np.testing.assert_allclose(grown.evaluate(Poses.of(x, r)).probability, found.probability, atol=1e-5)
-    assert (grown.size, grown.successes) == (300, int(won.sum()))
+    assert (grown.size, grown.worth) == (300, (won.sum(), 300))
     every = SuccessModel.build(Poses.of(p, q), won, kernel=DiagonalKernel.of(WIDTHS))
     np.testing.assert_allclose(
         every.evaluate(Poses.of(x, se3.jaw_twin(r))).probability,

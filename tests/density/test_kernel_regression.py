@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import beta
 
@@ -50,7 +52,7 @@ def test_equals_its_definition(kernel: IsotropicKernel, parts: int, shell: Shell
     )
     for chunk in rest:
         model = model.extend(Poses.of(rows[0][chunk], rows[1][chunk]), won[chunk], flags[chunk])
-    assert (model.size, model.successes) == (4_000, int(won.sum()))
+    assert (model.size, model.worth) == (4_000, (won.sum(), 4_000))
     poses = shell(300, rng)
     poses[0][:20] += 5.0
     estimate = model.evaluate(Poses.of(*poses), threads=2)
@@ -132,3 +134,39 @@ def test_bad_input_is_refused() -> None:
         SuccessModel.build(Poses.of(p[:0], q[:0]), np.zeros(0, dtype=bool), kernel=KERNELS[0]).evaluate(
             Poses.of(p, q)
         )
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 50), st.integers(1, 4))
+def test_a_weight_is_as_many_attempts(seed: int, times: int) -> None:
+    """Attempts that weigh ``times`` tell what as many of each tell."""
+    rng = np.random.default_rng(seed)
+    rows = Poses(rng.normal(size=(60, 3)) * 0.02, se3.random_quaternions(60, rng))
+    won, heavy = rng.random(60) < 0.4, rng.random(60) < 0.5
+    weights = np.where(heavy, float(times), 1.0)
+    kernel = IsotropicKernel(0.015, 0.6)
+    weighed = SuccessModel.build(rows[:30], won[:30], kernel=kernel, weights=weights[:30])
+    weighed = weighed.extend(rows[30:], won[30:], weights=weights[30:])
+    often = np.repeat(np.arange(60), weights.astype(int))
+    repeated = SuccessModel.build(rows[often], won[often], kernel=kernel)
+    at = Poses(rng.normal(size=(20, 3)) * 0.02, se3.random_quaternions(20, rng))
+    (one, near), (other, far) = weighed.evaluate_near(at), repeated.evaluate_near(at)
+    for name in ("probability", "low", "high", "effective_trials"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(near.widths, far.widths, rtol=1e-5)
+    assert weighed.worth == pytest.approx(repeated.worth)
+    assert weighed.size == 60
+
+
+def test_attempts_that_count_less_say_less() -> None:
+    """A fifth of an attempt each: the same share, from a fifth of the trials, with a wider interval."""
+    rng = np.random.default_rng(0)
+    rows = Poses(rng.normal(size=(500, 3)) * 0.01, np.tile([0.0, 0.0, 0.0, 1.0], (500, 1)))
+    won = rng.random(500) < 0.5
+    kernel = IsotropicKernel(0.015, 0.6)
+    full = SuccessModel.build(rows, won, kernel=kernel).evaluate(rows[:50])
+    fifth = SuccessModel.build(rows, won, kernel=kernel, weights=np.full(500, 0.2)).evaluate(rows[:50])
+    np.testing.assert_allclose(fifth.effective_trials, 0.2 * full.effective_trials, rtol=1e-6)
+    assert (fifth.high - fifth.low > full.high - full.low).all()
+    with pytest.raises(ValueError, match="positive"):
+        SuccessModel.build(rows, won, kernel=kernel, weights=np.zeros(500))

@@ -225,7 +225,7 @@ def test_all_alike_or_nothing() -> None:
         assert not found.validated_position
         assert found.attempts == 500
     with pytest.raises(ValueError, match="at least one attempt"):
-        validate_reach(SuccessModel(ISOTROPIC, None, None))
+        validate_reach(SuccessModel(ISOTROPIC))
 
 
 def test_both_limits_hold() -> None:

@@ -141,7 +141,7 @@ def test_overlapping_grids_tell_of_the_field_what_one_does(box: httpx.Client, ct
     built = density_of(ctx, *PLAIN)
     assert built.density is not None
     rows = built.density.positions, built.density.quaternions_xyzw
-    weights = importance_weights(built.proposal_density)
+    weights = importance_weights(built.weighing.proposal)
     naive = GraspDensity.build(Poses.of(*rows), kernel=KERNEL, weights=weights).log_density(Poses.of(*poses))
     assert np.mean(naive[400:] - naive[:400]) > 0.3
 
@@ -248,26 +248,200 @@ def test_halves_of_one_lattice_weigh_by_how_much_was_tried(box: httpx.Client, ct
     np.testing.assert_allclose(built.density.weights, expected / expected.sum(), rtol=1e-9)
 
 
-def test_grids_beside_trials_that_know_their_own_density(
-    box: httpx.Client, ctx: Context, post: Callable[..., Any]
+def balance(built: Built, grid: PoseGrid, told: Floats, rows: slice, untold: Poses | None) -> Floats:
+    """1 / sum n_s g_s(x) at the successes of a density, by the definition: a grid, trials that tell their
+    density (these rows of the successes), and attempts of others that do not.
+    """
+    assert built.density is not None
+    kernel, poses = built.density.kernel, built.density.poses
+    total = exposure(poses.positions, [(grid, 1.0)])
+
+    def near(attempts: Poses, at: Poses) -> Floats:
+        both = [
+            np.exp([kernel.log_kernel(Poses(*pose), many) for pose in zip(*at, strict=True)]).sum(axis=1)
+            for many in (attempts, attempts.turned())
+        ]
+        return np.asarray(0.5 * (both[0] + both[1]))
+
+    if len(told):
+        other = np.ones(len(poses), dtype=bool)
+        other[rows] = False
+        total[other] += near(poses[rows], poses[other])
+        total[rows] += len(told) * told
+    if untold is not None:
+        total += near(untold, poses)
+    return np.asarray((1.0 / total) / (1.0 / total).sum())
+
+
+def test_sources_are_weighed_by_how_densely_each_tried(
+    box: httpx.Client, ctx: Context, post: Callable[..., Any], database_url: str
 ) -> None:
-    """What can't be evaluated elsewhere has 1 / g of its own; one that tells nothing takes the mean."""
+    """The balance heuristic over a grid, trials that tell their density, and a robot's that do not; what is
+    extended equals what is built at once.
+    """
     sweep(box, COARSE)
     work(box)
-    rng = np.random.default_rng(2)
-    poses = rng.normal(size=(40, 3)) * 0.01, np.tile([0.0, 0.0, 0.0, 1.0], (40, 1))
-    post(box, "thing", poses, gripper="pg70", protocol="wrench", source="robot")
-    assert weights_told(box)["kind"] == "equal"
-    before = density_of(ctx, *PLAIN)
-    g = rng.uniform(500.0, 5_000.0, 40)
-    post(box, "thing", poses, gripper="pg70", protocol="wrench", proposal_density=g)
-    told = weights_told(box)
-    assert (told["kind"], told["without_proposal_density"]) == ("mixture-and-own", 40)
-    built = density_of(ctx, *PLAIN)
-    assert before.density is not None
-    assert built.density is not None
     grid = PoseGrid((-0.02,) * 3, (0.02,) * 3, 0.01, 60.0, 0.02)
-    swept = before.density.size - 40
-    own = np.concatenate([np.full(swept, 8 * np.pi**2 * grid.volume_m3), np.full(40, np.nan), 1.0 / g])
-    own[np.isnan(own)] = np.nanmean(own)
-    np.testing.assert_allclose(built.density.weights, own / own.sum(), rtol=1e-6)
+    density_of(ctx, *PLAIN)
+    rng = np.random.default_rng(2)
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (40, 1))
+    robot = rng.normal(size=(40, 3)) * 0.01, turn
+    outcome = ["success" if number % 2 else "failure" for number in range(40)]
+    post(box, "thing", robot, outcome, gripper="pg70", protocol="wrench", source="robot")
+    told = weights_told(box)
+    assert (told["kind"], told["without_proposal_density"]) == ("balance", 20)
+    built = density_of(ctx, *PLAIN)
+    assert built.density is not None
+    nothing: Floats = np.empty(0)
+    expected = balance(built, grid, nothing, slice(0, 0), Poses.of(*robot))
+    np.testing.assert_allclose(built.density.weights, expected, rtol=1e-3)
+    g = rng.uniform(500.0, 5_000.0, 40)
+    away = robot[0] + [0.03, 0.0, 0.0], turn
+    post(box, "thing", away, gripper="pg70", protocol="wrench", source="human", proposal_density=g)
+    built = density_of(ctx, *PLAIN)
+    assert built.density is not None
+    size = built.density.size
+    expected = balance(built, grid, g, slice(size - 40, size), Poses.of(*robot))
+    np.testing.assert_allclose(built.density.weights, expected, rtol=1e-3)
+    other = create_app(Settings(database_url=database_url)).state.context
+    fresh = density_of(other, *PLAIN)
+    other.close()
+    assert fresh.density is not None
+    np.testing.assert_allclose(built.density.weights, fresh.density.weights, rtol=1e-5)
+    probe = built.density.poses[::50]
+    np.testing.assert_allclose(built.density.log_density(probe), fresh.density.log_density(probe), atol=1e-5)
+    sources = box.get("/objects/thing/density").json()["selection"]["sources"]
+    assert list(sources) == ["human", "robot", "simulation"]
+    assert sum(item["share_of_weight"] for item in sources.values()) == pytest.approx(1.0)
+    assert (sources["robot"]["trials"], sources["robot"]["successes"]) == (40, 20)
+    assert sources["simulation"]["trials"] == grid.total
+
+
+def test_one_grasp_tried_often_counts_as_the_volume_it_covers(
+    sqlite_http: httpx.Client, make_object: Callable[..., str], post: Callable[..., Any]
+) -> None:
+    """However often a robot repeats one grasp, its share of the weight stays as it is."""
+    make_object(sqlite_http)
+    rng = np.random.default_rng(3)
+    spread = rng.uniform(-0.05, 0.05, (400, 3)), se3.random_quaternions(400, rng)
+    post(sqlite_http, "thing", spread, source="simulation")
+    one = np.tile([0.2, 0.0, 0.0], (10, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (10, 1))
+    shares = []
+    for _ in range(4):
+        post(sqlite_http, "thing", one, source="robot")
+        info = sqlite_http.get("/objects/thing/density?sigma_position_m=0.01&sigma_rotation_deg=15").json()
+        shares.append(info["selection"]["sources"]["robot"]["share_of_weight"])
+    # The volume of one kernel, and that of 400 attempts that hardly overlap.
+    np.testing.assert_allclose(shares, shares[0], rtol=1e-4)
+    assert shares[0] == pytest.approx(1 / 401, rel=0.1)
+
+
+@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("sources", [["robot"], ["robot", "simulation"], ["robot", None, "human"]])
+def test_words_on_weights_are_true_of_the_trials(
+    sqlite_http: httpx.Client,
+    make_object: Callable[..., str],
+    post: Callable[..., Any],
+    sources: list[str | None],
+    told: bool,
+) -> None:
+    """Without a grid no grid is told of; one source that tells nothing weighs all alike."""
+    make_object(sqlite_http)
+    rng = np.random.default_rng(4)
+    for source in sources:
+        poses = rng.normal(size=(30, 3)) * 0.02, se3.random_quaternions(30, rng)
+        more = {"proposal_density": 1_000.0} if told else {}
+        post(sqlite_http, "thing", poses, **({} if source is None else {"source": source}), **more)
+    info = sqlite_http.get("/objects/thing/density").json()
+    weights, selected = info["weights"], info["selection"]["sources"]
+    assert "grid" not in weights["rule"]
+    assert weights["poses_tried"] is None
+    assert weights["without_proposal_density"] == (0 if told else 30 * len(sources))
+    assert set(selected) == {source or "unspecified" for source in sources}
+    assert weights["kind"] == ("balance" if len(sources) > 1 else "own" if told else "equal")
+    for source, item in selected.items():
+        assert (item["trials"], item["successes"]) == (30, 30)
+        assert ("estimated" in item["weights"]) == (len(sources) > 1 and not told), source
+
+
+@pytest.fixture
+def two_sources(
+    sqlite_http: httpx.Client, make_object: Callable[..., str], post: Callable[..., Any]
+) -> httpx.Client:
+    """A robot that succeeds on the right, and a simulation that succeeds on the left, at the same poses."""
+    make_object(sqlite_http)
+    rng = np.random.default_rng(5)
+    poses = rng.uniform(-0.03, 0.03, (300, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (300, 1))
+    for source, sign in (("robot", 1.0), ("simulation", -1.0)):
+        outcome = ["success" if won else "failure" for won in sign * poses[0][:, 0] > 0.0]
+        post(sqlite_http, "thing", poses, outcome, source=source)
+    return sqlite_http
+
+
+def asked(http: httpx.Client, where: str = "likelihood", **parameters: Any) -> dict[str, Any]:
+    at = {"position": "0.015,0,0", "quaternion_xyzw": "0,0,0,1"} if where == "likelihood" else {}
+    answer = http.get(f"/objects/thing/{where}", params={**at, **parameters})
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def test_a_source_counts_as_much_as_asked(two_sources: httpx.Client) -> None:
+    http = two_sources
+    plain = asked(http)
+    same = asked(http, source_weight="robot:3,simulation:3,human:3,import:3")
+    assert same["log_density"] == pytest.approx(plain["log_density"])
+    assert same["success_probability"] == pytest.approx(plain["success_probability"])
+    fifth = asked(http, source_weight="robot:1,simulation:0.2")
+    alone = asked(http, source="robot")
+    left_out = asked(http, source_weight="simulation:0")
+    for name in ("log_density", "success_probability", "effective_trials"):
+        assert left_out[name] == pytest.approx(alone[name]), name
+    assert plain["success_probability"][0] == pytest.approx(0.5, abs=0.05)
+    robot = alone["success_probability"][0]
+    expected = (robot + 0.2 * (1.0 - robot)) / 1.2
+    assert fifth["success_probability"][0] == pytest.approx(expected, abs=0.03)
+    assert fifth["effective_trials"][0] == pytest.approx(0.6 * plain["effective_trials"][0], rel=0.05)
+    sources = fifth["selection"]["sources"]
+    shares = {name: item["share_of_weight"] for name, item in plain["selection"]["sources"].items()}
+    expected = shares["robot"] / (shares["robot"] + 0.2 * shares["simulation"])
+    assert sources["robot"]["share_of_weight"] == pytest.approx(expected)
+    assert (sources["robot"]["source_weight"], sources["simulation"]["source_weight"]) == (1.0, 0.2)
+    assert left_out["selection"]["sources"]["simulation"]["trials"] == 0
+    # Whatever asks a density takes it, as an object or a string.
+    best = asked(http, "best-grasp", source_weight="robot:1,simulation:0.01")
+    assert best["grasps"][0]["position"][0] > 0.0
+    body = {"source_weight": {"simulation": 1, "robot": 0.01}}
+    assert http.post("/objects/thing/best-grasp", json=body).json()["grasps"][0]["position"][0] < 0.0
+    drawn = http.post("/objects/thing/samples", json={**body, "count": 100, "seed": 1}).json()
+    assert np.mean(np.array(drawn["position"])[:, 0] < 0.0) > 0.7
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "robot", "robot:", "robot:-1", "robot:nan", "robot:inf", "robot:1e300", "gripper:1", "", "robot:1,",
+        ":1", "robot:1,robot:2", "robot:0,simulation:0", "robot:0,simulation:0,human:0,import:0", "robot:1:2",
+    ],
+)  # fmt: skip
+def test_weights_that_mean_nothing_are_refused(two_sources: httpx.Client, wrong: str) -> None:
+    for where in ("density", "best-grasp"):
+        answer = two_sources.get(f"/objects/thing/{where}", params={"source_weight": wrong})
+        assert answer.status_code == 422, (wrong, answer.text)
+        assert "source_weight" in answer.json()["errors"][0]["field"]
+    for odd in ({}, {"robot": None}, {"robot": True}, {"robot": [1]}, [1], 3, {"robot": "x"}, {"dog": 1}):
+        answer = two_sources.post("/objects/thing/best-grasp", json={"source_weight": odd})
+        assert answer.status_code == 422, (odd, answer.text)
+
+
+def test_success_models_grow_by_weight(two_sources: httpx.Client, post: Callable[..., Any]) -> None:
+    """What is extended tells what is read at once, with weights, too."""
+    asked(two_sources, source_weight="robot:1,simulation:0.2")
+    rng = np.random.default_rng(6)
+    poses = rng.uniform(-0.03, 0.03, (50, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (50, 1))
+    for source in ("robot", "simulation", "human"):
+        post(two_sources, "thing", poses, ["success", "failure"] * 25, source=source)
+    grown = asked(two_sources, source_weight="robot:1,simulation:0.2")
+    fresh = asked(two_sources, source_weight="robot:10,simulation:2,human:10,import:10")
+    for name in ("log_density", "success_probability", "effective_trials"):
+        assert grown[name] == pytest.approx(fresh[name], rel=1e-4), name

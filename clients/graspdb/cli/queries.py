@@ -38,6 +38,7 @@ from graspdb.resources.results import (
     pose_columns,
 )
 from graspdb.resources.selection import Constraints, Selection
+from graspdb.wire import SelectionInfo
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")]
@@ -57,12 +58,24 @@ def density(state: State, id: ObjectId, selection: Selection) -> None:
         "outcomes": ", ".join(f"{n:,} {name}" for name, n in found.outcomes.items()) or "none",
         "memory": f"{found.bytes / 2**20:.1f} MiB",
     }
+    rows |= _sources_told(found.selection)
     rows |= {
         f"warning {number}": in_commands(warning) for number, warning in enumerate(found.warnings, start=1)
     }
     state.show(found, rows)
     if not state.json:
         show_findings(found.findings)
+
+
+def _sources_told(selection: SelectionInfo | None) -> dict[str, str]:
+    """Each source's trials and share of the weight, where there are several."""
+    sources = {} if selection is None else selection.sources
+    told = {
+        f"of {name}": f"{item.successes:,} successes of {item.trials:,} trials,"
+        f" {item.share_of_weight:.1%} of the weight"
+        for name, item in sources.items()
+    }
+    return told if len(told) > 1 else {}
 
 
 def best_grasp(

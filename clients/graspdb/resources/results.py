@@ -202,9 +202,9 @@ class Grasps(Sequence[Grasp]):
     ``conflict`` names the fewest constraints found that exclude each other, ``relax`` a value of each that
     would do.
     ``ranking`` says what they are ranked by, ``reach`` how far from an attempt success probabilities are
-    told. ``answer`` is the id that the service keeps them under, None where it does not; ``newer_revision``
-    the object's revision now, where a name keeps them of an older one. Where they were simulated before they
-    were answered (``verify=True``), those that held come first.
+    told, ``selection`` whose trials count. ``answer`` is the id that the service keeps them under, None where
+    it does not; ``newer_revision`` the object's revision now, where a name keeps them of an older one. Where
+    they were simulated before they were answered (``verify=True``), those that held come first.
     """
 
     def __init__(self, answer: wire.BestGrasps) -> None:
@@ -215,6 +215,7 @@ class Grasps(Sequence[Grasp]):
         self.reach = answer.reach
         self.estimator = answer.estimator
         self.warnings = list(answer.warnings)
+        self.selection = answer.selection
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
         self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest, answer.answer)
@@ -398,6 +399,7 @@ class LikelihoodArrays(Columns):
     ``support.enough`` is False; ``reach`` says how far from an attempt they are told, and why no farther.
     ``answer`` is the id that the service keeps them under, None where it does not; ``newer_revision`` the
     object's revision now, where a name keeps them of an older one.
+    ``selection`` says whose trials count, and each source's share of the density's weight.
     """
 
     revision: int
@@ -416,6 +418,7 @@ class LikelihoodArrays(Columns):
     warnings: Sequence[str] = ()
     answer: str | None = None
     newer_revision: int | None = None
+    selection: wire.SelectionInfo | None = None
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -439,6 +442,7 @@ class LikelihoodArrays(Columns):
             reach=answers[-1].reach,
             estimator=answers[-1].estimator,
             warnings=answers[-1].warnings,
+            selection=answers[-1].selection,
             interval=interval,
             answer=answers[0].answer if len(answers) == 1 else None,
             newer_revision=answers[-1].newer_revision,
@@ -514,9 +518,9 @@ class SampledPoses(PoseArrays):
     """N poses drawn from a density; ``proposal_density`` (N,) in 1/(m^3 rad^3) goes back with the trials.
 
     ``criterion`` says how proposals were drawn; None for plain samples. ``support`` says how far each is from
-    what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial. ``answer`` is
-    the id that the service keeps them under, None where it does not; ``newer_revision`` the object's revision
-    now, where a name keeps them of an older one.
+    what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial. ``selection``
+    says whose trials count. ``answer`` is the id that the service keeps them under, None where it does not;
+    ``newer_revision`` the object's revision now, where a name keeps them of an older one.
     """
 
     proposal_density: Floats
@@ -528,6 +532,7 @@ class SampledPoses(PoseArrays):
     prior: bool = False
     answer: str | None = None
     newer_revision: int | None = None
+    selection: wire.SelectionInfo | None = None
 
     @classmethod
     def from_wire(cls, answer: wire.Samples) -> SampledPoses:
@@ -544,6 +549,7 @@ class SampledPoses(PoseArrays):
             prior=answer.prior,
             answer=answer.answer,
             newer_revision=answer.newer_revision,
+            selection=answer.selection,
         )
 
     def _columns(self) -> dict[str, Any]:

@@ -28,8 +28,18 @@ class TrialSelection(TypedDict, total=False):
     source: Annotated[str | None, Option("Only trials from: simulation, robot, human, import.")]
 
 
+SourceWeight = Annotated[
+    Mapping[str, float] | str | None,
+    Option("How much trials of each source count, as in robot:1,simulation:0.2; 0 leaves one out."),
+]
+
+
 class Selection(TrialSelection, total=False):
     """Which trials a density is built from (:class:`TrialSelection`), and with which kernel.
+
+    ``source_weight`` is how much trials of each source count, ``{"robot": 1, "simulation": 0.2}``, relative
+    to the largest: so many times as much in the density, as so much of an attempt in success probabilities.
+    0 leaves a source out; one that is not named counts 1.
 
     ``kernel`` is ``isotropic`` (the default), ``anisotropic`` (the newest one fitted for this object and
     gripper), a stored kernel's id, or ``{"kind": "isotropic", "sigma_position_m": ..., "cutoff": ...}``.
@@ -37,6 +47,7 @@ class Selection(TrialSelection, total=False):
     by default chosen from the trials.
     """
 
+    source_weight: SourceWeight
     kernel: Annotated[Kernel | None, Option("isotropic, anisotropic, or a stored kernel's id.")]
     sigma_position_m: Annotated[float | None, Option("Kernel width in position, metres.")]
     sigma_rotation_deg: Annotated[float | None, Option("Kernel width in rotation, degrees.")]
@@ -122,6 +133,8 @@ def query(selection: Mapping[str, Any]) -> dict[str, Any]:
     ValueError for widths given twice, or a cut-off, which only questions about poses take.
     """
     fields = dict(selection)
+    if isinstance(fields.get("source_weight"), Mapping):
+        fields["source_weight"] = ",".join(f"{name}:{x}" for name, x in fields["source_weight"].items())
     if fields.get("kernel") is None or isinstance(fields["kernel"], str):
         return fields
     kernel = fields.pop("kernel")

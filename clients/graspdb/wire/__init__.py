@@ -78,6 +78,8 @@ from graspdb.wire.support import EstimatorInfo as EstimatorInfo
 from graspdb.wire.support import NearestAttempt as NearestAttempt
 from graspdb.wire.support import NearestAttemptColumns as NearestAttemptColumns
 from graspdb.wire.support import ReachInfo as ReachInfo
+from graspdb.wire.support import SelectedSource as SelectedSource
+from graspdb.wire.support import SelectionInfo as SelectionInfo
 from graspdb.wire.support import Support as Support
 from graspdb.wire.support import SupportColumns as SupportColumns
 from graspdb.wire.sweeps import GridSpec as GridSpec

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    model_validator,
+)
 
 Outcome = Literal[
     "failure",
@@ -108,6 +117,59 @@ GripperRef = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}(@[1
 Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: _no_nul(s))]
 Metadata = Annotated[dict[str, Any], AfterValidator(lambda value: _storable(value))]
 """Any JSON object of the user's: finite numbers only, at most 64 KiB as text."""
+
+MAX_SOURCE_WEIGHT = 1e6
+
+
+def _source_weights(value: Any) -> str:
+    """Weights by source, in a string or an object, as the one string that means them."""
+    if isinstance(value, str):
+        parts = [part.split(":") for part in value.split(",")]
+        if not all(len(part) == 2 for part in parts):
+            raise ValueError("source weights are names and numbers, as in robot:1,simulation:0.2")
+        pairs = [(name.strip(), number.strip()) for name, number in parts]
+    elif isinstance(value, Mapping):
+        pairs = list(value.items())
+    else:
+        raise ValueError('source weights are names and numbers, as in {"robot": 1, "simulation": 0.2}')
+    found: dict[str, float] = {}
+    for name, number in pairs:
+        if name not in SOURCES:
+            raise ValueError(f"{str(name)[:40]!r} is no source: there are {', '.join(SOURCES)}")
+        if name in found:
+            raise ValueError(f"{name} has two weights")
+        try:
+            weight = math.nan if isinstance(number, bool) else float(number)
+        except (TypeError, ValueError):
+            weight = math.nan
+        if not 0.0 <= weight <= MAX_SOURCE_WEIGHT:
+            raise ValueError(f"the weight of {name} is a number from 0 to {MAX_SOURCE_WEIGHT:g}")
+        found[name] = weight
+    if not found or (len(found) == len(SOURCES) and not any(found.values())):
+        raise ValueError("at least one source needs a weight above 0")
+    return ",".join(f"{name}:{found[name]!r}" for name in SOURCES if name in found)
+
+
+def source_weights(text: str | None) -> dict[str, float]:
+    """The weights that a :data:`SourceWeights` names, by source."""
+    pairs = (part.split(":") for part in text.split(",")) if text else ()
+    return {name: float(number) for name, number in pairs}
+
+
+SourceWeights = Annotated[
+    str,
+    BeforeValidator(_source_weights),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string"},
+                {"type": "object", "additionalProperties": {"type": "number", "minimum": 0}},
+            ],
+            "examples": ["robot:1,simulation:0.2"],
+        }
+    ),
+]
+"""How much trials of each source count: ``robot:1,simulation:0.2``, or an object of the same."""
 
 PositiveFloat = Annotated[float, Field(gt=0, le=1e12)]
 

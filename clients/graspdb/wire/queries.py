@@ -27,6 +27,7 @@ from graspdb.wire.base import (
     Revision,
     Slug,
     Source,
+    SourceWeights,
     ToolPosition,
     ToolPositions,
     ToolRotation,
@@ -38,7 +39,7 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
-from graspdb.wire.support import EstimatorInfo, ReachInfo, Support, SupportColumns
+from graspdb.wire.support import EstimatorInfo, ReachInfo, SelectionInfo, Support, SupportColumns
 from graspdb.wire.trials import Finding
 
 WidthM = Annotated[float, Field(gt=0, le=1.0)]
@@ -64,6 +65,13 @@ ReachField = Annotated[
     Field(
         description="How far from an attempt success probabilities are told; null before any attempt, and"
         " where none was asked for."
+    ),
+]
+SelectionField = Annotated[
+    SelectionInfo | None,
+    Field(
+        description="Which trials count, and what share of the density's weight came from which source; null"
+        " from services that do not say."
     ),
 ]
 PriorProbability = Annotated[
@@ -133,6 +141,10 @@ class TrialSelection(Request):
     """Only trials judged by this protocol, and those that name none; by default the one they name."""
     source: Source | None = None
     """Only trials from this source; by default from all."""
+    source_weight: SourceWeights | None = None
+    """How much trials of each source count, relative to the largest of these, as in
+    ``robot:1,simulation:0.2``: so many times as much in the density, and as so much of an attempt in success
+    probabilities; 0 leaves a source out. A source that is not named counts 1; by default all do."""
 
 
 class Selection(TrialSelection):
@@ -181,15 +193,17 @@ class KernelInfo(Response):
 class WeightsInfo(Response):
     """How successes were weighted to undo how poses were chosen (eq 1)."""
 
-    kind: Literal["equal", "mixture", "own", "mixture-and-own"]
+    kind: Literal["equal", "mixture", "own", "balance"]
     """``equal``; ``mixture``: 1 / sum n_k g_k(x) over grids of different regions or steps; ``own``: 1 / g of
-    each trial's own proposal density; ``mixture-and-own``: both, the grids as one strategy."""
+    each trial's own proposal density; ``balance``, where sources are mixed, or grids and
+    other trials: 1 / sum n_s g_s(x) over all that tried, g_s estimated from where the attempts
+    lie where it is not told."""
     rule: str
     """The same in words, with numbers."""
     poses_tried: int | None = None
     """How many distinct poses the grids tried, collisions included; null without grids."""
     without_proposal_density: int = 0
-    """How many successes have no proposal density and weigh the mean."""
+    """How many successes no grid tried and no proposal density came with."""
 
 
 class DensityInfo(Response):
@@ -212,6 +226,7 @@ class DensityInfo(Response):
     """How many successes of equal weight would tell as much."""
     weights: WeightsInfo | None = None
     """How successes were weighted; null where there are none."""
+    selection: SelectionField = None
     unit: str = "1/(m^3 rad^3)"
     """Unit of every density that is answered."""
     bytes: int
@@ -326,6 +341,7 @@ class Likelihoods(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    selection: SelectionField = None
 
 
 def _object_pose(value: Any) -> Any:
@@ -556,6 +572,7 @@ class BestGrasps(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    selection: SelectionField = None
 
 
 class SamplesRequest(Selection):
@@ -588,6 +605,7 @@ class Samples(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    selection: SelectionField = None
 
 
 Strategy = Literal["density", "uncertainty", "edges"]

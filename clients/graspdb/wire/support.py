@@ -1,10 +1,10 @@
-"""How far answers are from what was tried, and who estimated them."""
+"""What answers rest on: how far they are from what was tried, whose trials count, and who estimated them."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from graspdb.wire.base import Response
+from graspdb.wire.base import ChosenGripper, ChosenProtocol, Response
 
 
 class NearestAttempt(Response):
@@ -96,3 +96,29 @@ class EstimatorInfo(Response):
     """Name of the estimator."""
     state: Literal["fitting", "ready"] = "ready"
     """``ready``; or ``fitting``, while the kernel estimate answers in its place."""
+
+
+class SelectedSource(Response):
+    """Trials of one source in a selection."""
+
+    trials: int
+    """How many attempts it has in the selection, collisions and packed outcomes included."""
+    successes: int
+    """How many of them succeeded."""
+    share_of_weight: float
+    """Its successes' share of all weight in the density, 0 to 1."""
+    weights: str
+    """How its successes are weighed, in words."""
+    source_weight: float = 1.0
+    """How much its trials count by ``source_weight``, relative to the source that counts most; 0 leaves it
+    out."""
+
+
+class SelectionInfo(Response):
+    """Which trials count, and how much those of each source."""
+
+    gripper: ChosenGripper
+    protocol: ChosenProtocol
+    sources: dict[str, SelectedSource]
+    """The sources of the trials by their name, ``unspecified`` for trials that name none; those that a weight
+    was asked for, too."""

@@ -99,6 +99,15 @@ class GraspDensity:
         cells = self._cells.extend(more.over(self._unit))
         return GraspDensity(self._kernel, self._rows.joined(more), cells, self._unit)
 
+    def reweighted(self, weights: ArrayLike) -> GraspDensity:
+        """The same rows with other weights (N,), in the unit of the first ones; for the cost of a copy.
+
+        ValueError for weights that are not positive and finite.
+        """
+        rows = Rows.of(self.poses, weights, self.symmetric)
+        cells = self._cells.reweighted(rows.over(self._unit).twin_weights)
+        return GraspDensity(self._kernel, rows, cells, self._unit)
+
     # -- what it holds
 
     @property

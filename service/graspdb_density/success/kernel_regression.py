@@ -5,6 +5,10 @@ success), n the effective number of attempts ``(sum k)^2 / sum k^2``, m0 the sha
 attempts and a = 1. Kernels count once an attempt whatever its proposal density: a share of attempts needs no
 weighting. The interval is that of the Beta distribution with mean P and n + a trials.
 
+Attempts that are trusted less have a weight w below 1: an attempt then counts as w of one, in the sums of k,
+of k^2 and in m0 alike, so that twice the weight is the same as posting it twice (power prior, Ibrahim and
+Chen 2000).
+
 The kernel is isotropic, or a Gaussian with a bandwidth for every axis. The interval covers the truth smoothed
 by it, not the truth at a point.
 """
@@ -15,7 +19,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,14 +38,13 @@ __all__ = [
     "PRIOR_TRIALS",
     "SUCCESS_CUTOFF",
     "NearestAttempts",
+    "Part",
     "SuccessEstimate",
     "SuccessKernel",
     "SuccessModel",
 ]
 
 SuccessKernel = IsotropicKernel | DiagonalKernel
-Sums = tuple[Floats, Floats]
-"""Sums of kernels at M poses over the successes and over the failures."""
 
 #: Trials the prior share is worth.
 PRIOR_TRIALS = 1.0
@@ -99,13 +102,36 @@ class SuccessEstimate:
     level: float
 
 
+class Part(NamedTuple):
+    """Attempts that succeeded, or that failed, sorted; each counts as ``weight`` of one."""
+
+    cells: Cells
+    won: bool
+    weight: float
+
+    @property
+    def size(self) -> int:
+        return len(self.cells.rows)
+
+
+class _Sums(NamedTuple):
+    """Weighted sums of k and k^2 (M, 2) at poses over the successes and over the failures; of every part
+    (P, M) the nearest attempt's exponent and its place, where they were asked for.
+    """
+
+    won: Floats
+    lost: Floats
+    best: Floats
+    places: Floats
+
+
 class SuccessModel:
     """Attempts under a kernel, sorted for evaluation; immutable. Use `build` and `extend`."""
 
-    def __init__(self, kernel: SuccessKernel, succeeded: Cells | None, failed: Cells | None) -> None:
+    def __init__(self, kernel: SuccessKernel, parts: tuple[Part, ...] = ()) -> None:
         self.kernel = kernel
-        #: The attempts that succeeded and those that failed, sorted.
-        self.parts = succeeded, failed
+        #: The attempts by weight and outcome, successes first.
+        self.parts = parts
 
     @classmethod
     def build(
@@ -115,6 +141,7 @@ class SuccessModel:
         *,
         kernel: SuccessKernel,
         symmetric: ArrayLike | bool = True,
+        weights: ArrayLike | None = None,
     ) -> SuccessModel:
         """Sort attempts.
 
@@ -126,60 +153,81 @@ class SuccessModel:
         kernel
         symmetric : bool or (N,)
             Whether the row's jaw is mirror-symmetric.
+        weights : (N,) or None
+            As how much of an attempt each counts, positive, of few different values; None: 1.
 
         Raises
         ------
         ValueError
-            For wrong shapes.
+            For wrong shapes, or weights that are not positive and finite.
         """
-        return cls(kernel, None, None).extend(poses, success, symmetric)
+        return cls(kernel).extend(poses, success, symmetric, weights)
 
-    def extend(self, poses: Poses, success: ArrayLike, symmetric: ArrayLike | bool = True) -> SuccessModel:
+    def extend(
+        self,
+        poses: Poses,
+        success: ArrayLike,
+        symmetric: ArrayLike | bool = True,
+        weights: ArrayLike | None = None,
+    ) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
         won = checked_outcomes(success, len(poses))
-        attempts = Rows.of(self._along(poses), symmetric=symmetric)
-        parts: list[Cells | None] = []
-        for present, chosen in zip(self.parts, (won, ~won), strict=True):
-            rows = attempts[chosen]
-            if not len(rows):
-                parts.append(present)
-            elif present is None:
-                # No width is larger than the one the cells are made for, so their runs reach far enough.
-                parts.append(Cells.build(rows, self.widest_m))
-            else:
-                parts.append(present.extend(rows))
-        return SuccessModel(self.kernel, parts[0], parts[1])
+        attempts = Rows.of(self._along(poses), weights, symmetric)
+        worth = attempts.weights
+        # Weights are the parts': kernels count once.
+        attempts = Rows(attempts.poses, np.ones(len(attempts)), attempts.symmetric)
+        parts = {(part.won, part.weight): part.cells for part in self.parts}
+        for weight in np.unique(worth).tolist():
+            for outcome in (True, False):
+                rows = attempts[(won == outcome) & (worth == weight)]
+                present = parts.get((outcome, weight))
+                if present is not None:
+                    parts[outcome, weight] = present.extend(rows) if len(rows) else present
+                elif len(rows):
+                    # No width is larger than the one the cells are made for, so their runs reach far enough.
+                    parts[outcome, weight] = Cells.build(rows, self.widest_m)
+        # Heaviest successes first, whatever came first.
+        ordered = sorted(parts, reverse=True)
+        return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered))
 
     @property
     def size(self) -> int:
-        """Attempts."""
-        return sum(len(part.rows) for part in self.parts if part is not None)
+        """Attempts, whatever they weigh."""
+        return sum(part.size for part in self.parts)
 
     @property
-    def successes(self) -> int:
-        return 0 if self.parts[0] is None else len(self.parts[0].rows)
+    def worth(self) -> tuple[float, float]:
+        """As how many attempts those that succeeded count by their weights, and all of them."""
+        won = sum(part.weight * part.size for part in self.parts if part.won)
+        return won, sum(part.weight * part.size for part in self.parts)
 
     @property
     def prior_share(self) -> float:
-        """Share of successes among all attempts, nan without any."""
-        return self.successes / self.size if self.size else math.nan
+        """Share of successes among all attempts by their weights, nan without any."""
+        won, total = self.worth
+        return won / total if total else math.nan
 
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held."""
-        return sum(part.nbytes for part in self.parts if part is not None)
+        return sum(part.cells.nbytes for part in self.parts)
 
-    def drawn(self, count: int, rng: np.random.Generator) -> list[tuple[int, Poses]]:
-        """Of the successes and of the failures how many there are, and at most ``count`` drawn at random."""
+    def drawn(self, count: int, rng: np.random.Generator) -> list[tuple[float, Poses]]:
+        """As how many attempts the successes count, and the failures, and about ``count`` of each drawn at
+        random in proportion to their weights.
+        """
         found = []
-        for part in self.parts:
-            size = 0 if part is None else len(part.rows)
-            poses = Poses(np.empty((0, 3)), np.empty((0, 4)))
-            if part is not None:
-                poses = part.poses(rng.permutation(size)[:count])
+        for outcome in (True, False):
+            parts = [part for part in self.parts if part.won == outcome]
+            total = sum(part.weight * part.size for part in parts)
+            drawn = [Poses(np.empty((0, 3)), np.empty((0, 4)))]
+            for part in parts:
+                most = math.ceil(count * part.weight * part.size / total)
+                drawn.append(part.cells.poses(rng.permutation(part.size)[:most]))
+            poses = Poses.concatenate(drawn)
             if isinstance(self.kernel, DiagonalKernel):
                 poses = self.kernel.back(poses)
-            found.append((size, poses))
+            found.append((total, poses))
         return found
 
     def evaluate(self, poses: Poses, *, level: float = 0.9, threads: int = 1) -> SuccessEstimate:
@@ -199,7 +247,7 @@ class SuccessModel:
         sums = self._sums(poses, threads, nearest=True)
         return self._estimate(sums, level, threads), self._nearest(poses, sums, threads, everywhere=True)
 
-    def _estimate(self, sums: Sums, level: float, threads: int) -> SuccessEstimate:
+    def _estimate(self, sums: _Sums, level: float, threads: int) -> SuccessEstimate:
         if not 0.0 < level < 1.0:
             raise ValueError(f"level must be between 0 and 1, not {level!r}")
         probability, trials, alpha, beta = self._beta(sums)
@@ -239,38 +287,43 @@ class SuccessModel:
         low = _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
         if near is None:
             return low
-        _, _, alpha, beta = self._beta((np.zeros((1, 2)), np.zeros((1, 2))))
+        nothing = np.zeros((1, 2))
+        _, _, alpha, beta = self._beta(_Sums(nothing, nothing, nothing, nothing))
         untried = _quantiles(alpha, beta, 0.5 * (1.0 - level), 1)
         told = near(self._nearest(poses, sums, threads, everywhere=False))
         return np.where(told, low, np.minimum(low, untried))
 
-    def _beta(self, sums: Sums) -> tuple[Floats, Floats, Floats, Floats]:
+    def _beta(self, sums: _Sums) -> tuple[Floats, Floats, Floats, Floats]:
         """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""
         if not self.size:
             raise ValueError("a success probability needs at least one attempt")
-        won, lost = sums
         prior = self.prior_share
-        total, squares = (won[:, :2] + lost[:, :2]).T
-        probability, trials, share = shrunk_share(won[:, 0], total, squares, prior)
+        total, squares = (sums.won + sums.lost).T
+        probability, trials, share = shrunk_share(sums.won[:, 0], total, squares, prior)
         alpha = PRIOR_TRIALS * prior + trials * share
         beta = PRIOR_TRIALS * (1.0 - prior) + trials * (1.0 - share)
         # Without any success, or any failure, the matching Beta would be a point: the interval then starts
         # from the share that half a trial more of either would give.
         if prior in (0.0, 1.0):
-            softened = (self.successes + 0.5) / (self.size + 1.0)
+            won, attempts = self.worth
+            softened = (won + 0.5) / (attempts + 1.0)
             alpha, beta = alpha + (softened - prior), beta - (softened - prior)
         return probability, trials, alpha, beta
 
-    def _sums(self, poses: Poses, threads: int, *, nearest: bool = False) -> Sums:
-        """Sums of k and k^2 (M, 2) by outcome; (M, 4) with the nearest attempt's exponent and place."""
-        columns = 4 if nearest else 2
-        won, lost = (self._sums_of(part, poses, columns, threads) for part in self.parts)
-        return won, lost
+    def _sums(self, poses: Poses, threads: int, *, nearest: bool = False) -> _Sums:
+        """The kernel sums at poses; with the ``nearest`` attempt of every part."""
+        count = len(poses)
+        found = _Sums(np.zeros((count, 2)), np.zeros((count, 2)), *np.empty((2, len(self.parts), count)))
+        for number, part in enumerate(self.parts):
+            sums = self._sums_of(part.cells, poses, 4 if nearest else 2, threads)
+            outcome = found.won if part.won else found.lost
+            outcome += sums[:, :2] if part.weight == 1.0 else part.weight * sums[:, :2]
+            if nearest:
+                found.best[number], found.places[number] = sums[:, 2:].T
+        return found
 
-    def _sums_of(self, cells: Cells | None, poses: Poses, columns: int, threads: int) -> Floats:
+    def _sums_of(self, cells: Cells, poses: Poses, columns: int, threads: int) -> Floats:
         radius, kernel = scaled_radius(SUCCESS_CUTOFF), self.kernel
-        if cells is None:
-            return np.tile([0.0, 0.0, -1e30, -1.0][:columns], (len(poses), 1))
         arrays = cells.arrays
         if isinstance(kernel, DiagonalKernel):
             half, turning, block = self.half(cells), self.turning, _DIAGONAL_BLOCK
@@ -285,19 +338,19 @@ class SuccessModel:
 
         return cells.at_poses(loop, self._along(poses), columns=(columns,), block=block, threads=threads)
 
-    def _nearest(self, poses: Poses, sums: Sums, threads: int, *, everywhere: bool) -> NearestAttempts:
+    def _nearest(self, poses: Poses, sums: _Sums, threads: int, *, everywhere: bool) -> NearestAttempts:
         """How far the nearest attempts are; those that no sum reached are looked for ``everywhere``."""
         along = self._along(poses)
-        best, places = np.stack([part[:, 2:].T for part in sums], axis=1)
-        far = np.flatnonzero(np.maximum(*places) < 0.0)
+        best, places = sums.best, sums.places
+        far = np.flatnonzero(places.max(axis=0, initial=-1.0) < 0.0)
         if everywhere and far.size:
             best[:, far], places[:, far] = self._search(along[far], threads)
         distances = np.full((len(poses), 10), np.inf)
-        nearer = np.argmax(best, axis=0)
-        for number, cells in enumerate(self.parts):
+        nearer = np.argmax(best, axis=0) if self.parts else np.empty(0)
+        for number, part in enumerate(self.parts):
             rows = np.flatnonzero((nearer == number) & (places[number] >= 0.0))
-            if cells is not None and rows.size:
-                distances[rows] = self.displacements(cells, places[number, rows], along[rows])
+            if rows.size:
+                distances[rows] = self.displacements(part.cells, places[number, rows], along[rows])
         metres, radians, along, about = np.ascontiguousarray(distances[:, :4].T)
         return NearestAttempts(metres, radians, along, about, distances[:, 4:])
 
@@ -309,18 +362,16 @@ class SuccessModel:
         return out
 
     def _search(self, along: Poses, threads: int) -> Floats:
-        """Largest exponents and their places in either part, however far, (2, 2, M)."""
-        found = np.tile([[[-1e30]], [[-1.0]]], (1, 2, len(along)))
+        """Largest exponents and their places in every part, however far, (2, P, M)."""
+        found = np.empty((2, len(self.parts), len(along)))
         kernel = self.kernel
-        for number, cells in enumerate(self.parts):
-            if cells is None:
-                continue
-            arrays = cells.arrays
+        for number, part in enumerate(self.parts):
+            arrays = part.cells.arrays
             if isinstance(kernel, DiagonalKernel):
-                loop = partial(_nearest_diagonal, arrays, self.half(cells), self.turning)
+                loop = partial(_nearest_diagonal, arrays, self.half(part.cells), self.turning)
             else:
                 loop = partial(_nearest_anywhere, arrays, kernel.kappa)
-            best = cells.at_poses(loop, along, columns=(2,), block=_FAR_BLOCK, threads=threads)
+            best = part.cells.at_poses(loop, along, columns=(2,), block=_FAR_BLOCK, threads=threads)
             found[:, number] = best.T
         return found
 

@@ -30,7 +30,6 @@ from scipy.special import stdtrit
 
 from .._compiled import diagonal, isotropic
 from .._compiled.threads import for_blocks
-from ..kde.cell_list import Cells
 from ..kde.isotropic import scaled_radius
 from ..se3 import Floats, Poses
 from .calibration import assign_blocks
@@ -121,9 +120,9 @@ def validate_reach(model: SuccessModel, *, threads: int = 1) -> Reach:
 class _Judged:
     """Attempts (J) that are predicted again, their positions along the kernel's axes.
 
-    ``own`` (2, J) is each one's place among the sorted successes or failures, -1 in the other; ``weight``
-    (J,) what each stands for; ``sides`` (J, 6) directions of translation and rotation; ``pairs`` (K, 2) of
-    them, drawn at random.
+    ``own`` (P, J) is each one's place in its part of the model, -1 in the others; ``weight`` (J,) what each
+    stands for, ``worth`` (J,) as how much of an attempt it counts; ``sides`` (J, 6) directions of translation
+    and rotation; ``pairs`` (K, 2) of them, drawn at random.
     """
 
     model: SuccessModel
@@ -131,38 +130,41 @@ class _Judged:
     own: NDArray[np.int64]
     won: Bools
     weight: Floats
+    worth: Floats
     sides: Floats
     pairs: NDArray[np.int64]
 
     @classmethod
     def of(cls, model: SuccessModel, rng: np.random.Generator) -> _Judged:
         """Half of them successes, where there are as many: those are few among many failures."""
-        poses, own, weights = [], [], []
-        for number, cells in enumerate(model.parts):
-            size = 0 if cells is None else len(cells.rows)
-            if cells is None or not size:
-                continue
+        poses, own, successes, stands_for, counts = [], [], [], [], []
+        for number, part in enumerate(model.parts):
+            size = part.size
+            alike = sum(other.size for other in model.parts if other.won == part.won)
+            most = math.ceil(_JUDGED // 2 * size / alike)
             # By when they came, not by how they are sorted, which depends on how they were added.
-            places = np.argsort(cells.rows)[rng.permutation(size)[: _JUDGED // 2]]
-            poses.append(cells.poses(places))
-            both = np.full((2, len(places)), -1, dtype=np.int64)
-            both[number] = places
-            own.append(both)
-            weights.append(np.full(len(places), size / len(places)))
+            places = np.argsort(part.cells.rows)[rng.permutation(size)[:most]]
+            poses.append(part.cells.poses(places))
+            every = np.full((len(model.parts), len(places)), -1, dtype=np.int64)
+            every[number] = places
+            own.append(every)
+            successes.append(np.full(len(places), part.won))
+            stands_for.append(np.full(len(places), part.weight * size / len(places)))
+            counts.append(np.full(len(places), part.weight))
         rows = np.concatenate(own, axis=1)
         sides = rng.standard_normal((rows.shape[1], 6))
         pairs = rng.integers(0, rows.shape[1], (_DISPLACED, 2))
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-        return cls(model, Poses.concatenate(poses), rows, rows[0] >= 0, np.concatenate(weights), sides, pairs)
+        won, weights, worth = (np.concatenate(column) for column in (successes, stands_for, counts))
+        return cls(model, Poses.concatenate(poses), rows, won, weights, worth, sides, pairs)
 
     def ranges(self) -> Floats:
         """How far apart attempts near one another lie along and about each axis, metres and radians, (6,)."""
         found = []
-        for number, cells in enumerate(self.model.parts):
-            if cells is not None:
-                pairs = self.pairs[self.own[number, self.pairs[:, 0]] >= 0]
-                places = self.own[number, pairs[:, 0]].astype(np.float64)
-                found.append(self.model.displacements(cells, places, self.poses[pairs[:, 1]]))
+        for number, part in enumerate(self.model.parts):
+            pairs = self.pairs[self.own[number, self.pairs[:, 0]] >= 0]
+            places = self.own[number, pairs[:, 0]].astype(np.float64)
+            found.append(self.model.displacements(part.cells, places, self.poses[pairs[:, 1]]))
         apart = np.concatenate(found)
         near = apart[np.hypot(apart[:, 2], apart[:, 3]) <= SUCCESS_CUTOFF, 4:]
         if len(near) < _LEAST_PAIRS:
@@ -175,24 +177,21 @@ class _Judged:
         sums, nearest = np.zeros((count, 2, _SHELLS, 3)), np.full((count, 3), np.inf)
         radius = scaled_radius(SUCCESS_CUTOFF)
         step = max(1, math.ceil(self._visited(radius) / _PAIRS))
-        for number, cells in enumerate(model.parts):
-            if cells is not None:
-                work = partial(self._add, cells, number, step, radius, sums, nearest)
-                for_blocks(work, count, block=_BLOCK, threads=threads)
+        for number in range(len(model.parts)):
+            work = partial(self._add, number, step, radius, sums, nearest)
+            for_blocks(work, count, block=_BLOCK, threads=threads)
         return sums, nearest
 
     def _visited(self, radius: float) -> int:
         """Pairs of a judged attempt and one within the radius."""
         visited, count = 0, np.empty(len(self.poses), dtype=np.int64)
-        for cells in self.model.parts:
-            if cells is not None:
-                isotropic.reached(cells.arrays, *self.poses, radius, count)
-                visited += int(count.sum())
+        for part in self.model.parts:
+            isotropic.reached(part.cells.arrays, *self.poses, radius, count)
+            visited += int(count.sum())
         return visited
 
     def _add(
         self,
-        cells: Cells,
         number: int,
         step: int,
         radius: float,
@@ -201,13 +200,15 @@ class _Judged:
         begin: int,
         end: int,
     ) -> None:
-        """The sums of some judged attempts over the successes (0) or the failures (1)."""
-        part = slice(begin, end)
-        p, q = self.poses[part]
+        """The sums of some judged attempts over a part of the model."""
+        rows = slice(begin, end)
+        (cells, won, weight), (p, q) = self.model.parts[number], self.poses[rows]
+        added = np.zeros_like(sums[rows])
         diagonal.left_out_sums(
-            cells.arrays, number == 0, p, q, self.own[number, part], self.sides[part],
-            self.model.half(cells), self.model.turning, radius, step, _STEP, sums[part], nearest[part],
+            cells.arrays, won, p, q, self.own[number, rows], self.sides[rows],
+            self.model.half(cells), self.model.turning, radius, step, _STEP, added, nearest[rows],
         )  # fmt: skip
+        sums[rows] += weight * added
 
 
 def _validated(judged: _Judged, sums: Floats) -> float | None:
@@ -227,7 +228,8 @@ def _validated(judged: _Judged, sums: Floats) -> float | None:
         # All in one place.
         return None
     # Without the attempt itself: its own outcome must not be in the share that it is compared with.
-    share = (model.successes - won) / (model.size - 1)
+    successful, total_worth = model.worth
+    share = (successful - judged.worth * won) / (total_worth - judged.worth)
     beyond = np.cumsum(sums[:, ::-1], axis=1)[:, ::-1]
     reached: float | None = None
     for number in range(_SHELLS):

@@ -66,12 +66,21 @@ def page(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[Packed
 
 
 def collected(
-    tx: Tx, object_id: int, *, provenance_ids: Collection[int], after_revision: int = 0
+    tx: Tx,
+    object_id: int,
+    *,
+    provenance_ids: Collection[int],
+    after_revision: int = 0,
+    grids: bool = True,
 ) -> list[PackedChunk]:
-    """Chunks of an object's collecting sweeps stored after a revision, in commit order."""
+    """Chunks of an object's collecting sweeps stored after a revision, in commit order; of those whose plan
+    is no grid, or of all.
+    """
     query = _of_object(object_id, "collect").where(
         sweeps.c.provenance_id.in_(sorted(provenance_ids)), packed_outcomes.c.revision > after_revision
     )
+    if not grids:
+        query = query.where(sweeps.c.plan != "grid")
     ordered = query.order_by(packed_outcomes.c.revision, packed_outcomes.c.number)
     return all_as(tx, ordered, PackedChunk)
 

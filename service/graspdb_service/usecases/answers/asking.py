@@ -25,6 +25,7 @@ from graspdb_service.problems import ProblemError, conflict, invalid
 from graspdb_service.storage.answers import GivenAnswer
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.answers.references import answer_id
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.grasps import answer, proposals, samples
 from graspdb_service.usecases.grasps import likelihood as likelihoods
@@ -98,7 +99,7 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     if before is not None:
         return before
     built, reach, columns = likelihoods.likelihood(ctx, slug, request, poses, request.include)
-    head = _head(built.selected, built.kernel)
+    head = _head(built, built.kernel)
     if reach is not None:
         head["reach"] = reach.model_dump()
     asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, EstimatorInfo())
@@ -121,7 +122,7 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
         more = {"strategy": request.strategy, "criterion": criterion}
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
-    head = {**_head(drawn.selected, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more}
+    head = {**_head(drawn.built, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more}
     question = {**question, "seed": drawn.seed}
     asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo())
     return _in_columns(ctx, asked, few, head, drawn.columns())
@@ -162,12 +163,13 @@ def _question(request: Selection) -> dict[str, Any]:
     }
 
 
-def _head(selected: Selected, kernel: KernelInfo) -> dict[str, Any]:
+def _head(built: Built, kernel: KernelInfo) -> dict[str, Any]:
     return {
-        "revision": selected.row.revision,
+        "revision": built.revision,
         "kernel": kernel.model_dump(),
         "estimator": EstimatorInfo().model_dump(),
-        "warnings": list(selected.warnings),
+        "selection": built.selection.model_dump(),
+        "warnings": list(built.selected.warnings),
     }
 
 

@@ -1,21 +1,16 @@
-"""Densities made of trials: built from all of them, or extended by those that came since.
-
-Weights (eq 1). A success that a grid tried has the weight 1 / g of all the selection's grids seen as one
-strategy (`proposal_density`); where nothing else is selected, that is the balance
-heuristic ``1 / sum n_k g_k``. Other strategies can't be evaluated at poses that they did not draw: theirs
-have ``1 / g_own``. Who tells no proposal density takes the mean weight of the rest.
-"""
+"""Densities made of trials: built from all of them, or extended by those that came since."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from graspdb.wire import KernelInfo, WeightsInfo
+from graspdb.wire import KernelInfo, SelectedSource, SelectionInfo
 from graspdb_density import (
     DEFAULT_KERNEL,
     DiagonalKernel,
@@ -36,16 +31,26 @@ from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.densities import stored_kernel
-from graspdb_service.usecases.densities.proposal_density import Exposure
+from graspdb_service.usecases.densities.weighing import Weighing, weighed
 from graspdb_service.usecases.geometry.features import Axes
+from graspdb_service.usecases.trials.attempts import Stored
 from graspdb_service.usecases.trials.selection import Selected
 
 _DEFAULT_POSITION_M = DEFAULT_KERNEL.sigma_position_m
 _DEFAULT_ROTATION_DEG = round(math.degrees(DEFAULT_KERNEL.sigma_rotation), 9)
 #: Weights are told apart in float32: a row that counts less than this share of the heaviest gets this share.
 _LEAST_SHARE = 1e-30
-#: Weights that differ by less count as the same.
-_SAME = 1e-9
+#: Weights that differ by less count as the same; starts of searches ranked by weights that differ by up to
+#: this factor are ranked well enough.
+_SAME, _ABOUT = 1e-9, 1.25
+
+
+class Fresh(NamedTuple):
+    """Successes that came since, how all of them weigh, and attempts that came since where these tell it."""
+
+    rows: TrialColumns
+    weighing: Weighing
+    attempts: Stored | None
 
 
 class Grasps(NamedTuple):
@@ -77,23 +82,22 @@ class Built:
 
     ``density`` is None where no trial of the selection succeeded. With a stored kernel it is under the
     isotropic one of equal determinants, and ``shaped`` (of Gaussians) or ``sampled`` (of sampled components)
-    under the stored one; ``search`` is beside the one asked for. Rows (N,): ``seq`` ascending;
-    ``proposal_density`` as it came, NaN where unknown; ``swept``: a grid tried it. The first ``chosen_from``
+    under the stored one; ``search`` is beside the one asked for, its starts ranked by the weights
+    ``ranked_by``. Rows (N,): ``seq`` ascending; ``weighing`` how much each counts. The first ``chosen_from``
     of them chose the widths. ``success_kernel`` estimates success probabilities, where a kernel for those was
     asked for.
     """
 
     selected: Selected
-    exposure: Exposure
+    weighing: Weighing
     kernel: KernelInfo
     density: GraspDensity | None
     seq: Ints
-    proposal_density: Floats
-    swept: Bools
     chosen_from: int = 0
     shaped: MixtureDensity | None = None
     sampled: GraspDensity | None = None
     search: ModeSearch | None = None
+    ranked_by: Floats | None = None
     success_kernel: DiagonalKernel | None = None
 
     @property
@@ -112,41 +116,34 @@ class Built:
 
     @property
     def nbytes(self) -> int:
-        own = self.seq.nbytes + self.proposal_density.nbytes + self.swept.nbytes
-        parts = (self.density, self.shaped, self.sampled, self.search)
+        own = self.seq.nbytes + self.weighing.nbytes
+        parts = (self.density, self.shaped, self.sampled, self.search, self.ranked_by)
         held = sum(part.nbytes for part in parts if part is not None)
         return own + held + 4_096
 
-    @property
-    def weights_info(self) -> WeightsInfo:
-        """By which rule its rows were weighted."""
-        own = ~self.swept & ~np.isnan(self.proposal_density)
-        unknown = int((~self.swept & np.isnan(self.proposal_density)).sum())
-        grids = len(self.exposure.lattices) if self.swept.any() else 0
-        mixed = bool(self.swept.any()) and self.exposure.several
-        kind = "equal"
-        rule = "all equal: nothing tells that some grasps were tried more densely than others"
-        if grids:
-            rule = "all equal: their grid tried every pose of its region once"
-        if mixed:
-            kind = "mixture"
-            rule = (
-                "1 / sum n_k g_k(x) over the grids, n_k the distinct poses tried and g_k uniform over the"
-                " grid's region"
+    @cached_property
+    def selection(self) -> SelectionInfo:
+        """Which trials count, and how much those of each source."""
+        selected, weighing = self.selected, self.weighing
+        shares: Mapping[str, float] = {}
+        if self.density is not None:
+            shares = weighing.shares(self.density.weights)
+        sources = {
+            name: SelectedSource(
+                trials=sum(counts.values()) - counts.get("simulation_error", 0),
+                successes=counts.get("success", 0),
+                share_of_weight=shares.get(name, 0.0),
+                weights=weighing.of_source(name),
+                source_weight=selected.weights_by_source[name],
             )
-        if own.any():
-            kind = "mixture-and-own" if self.swept.any() else "own"
-            rule = "1 / g of each trial's own proposal density"
-            if self.swept.any():
-                rule += "; grids as one strategy, g = sum n_k g_k(x) / sum n_k, n_k the distinct poses tried"
-        if unknown and kind != "equal":
-            rule += "; trials without a proposal density take the mean weight of the rest"
-        return WeightsInfo(
-            kind=kind,
-            rule=rule,
-            poses_tried=self.exposure.tried if grids else None,
-            without_proposal_density=unknown,
-        )
+            for name, counts in selected.by_source.items()
+        }
+        for name, weight in selected.asked_weights.items():
+            if name not in sources:
+                words = "no trials" if weight else "left out: its weight is 0"
+                nothing = {"trials": 0, "successes": 0, "share_of_weight": 0.0}
+                sources[name] = SelectedSource(**nothing, weights=words, source_weight=weight)
+        return SelectionInfo(gripper=selected.gripper, protocol=selected.protocol, sources=sources)
 
 
 def build(
@@ -154,8 +151,7 @@ def build(
     stored: KernelRow | None,
     axes: Axes,
     selected: Selected,
-    exposure: Exposure,
-    rows: TrialColumns,
+    fresh: Fresh,
     before: Built | None,
     threads: int,
 ) -> Built:
@@ -163,59 +159,62 @@ def build(
 
     413 for more components than a density may have.
     """
-    fresh = Grasps(rows.poses, selected.symmetric(rows.provenance))
-    seq, proposal = rows.seq, rows.proposal_density
-    swept = np.isin(rows.batch, sorted(exposure.batches))
+    rows = fresh.rows
+    grasps = Grasps(rows.poses, selected.symmetric(rows.provenance))
     old = None if before is None else before.density
-    if before is not None and old is not None:
-        seq = np.concatenate([before.seq, seq])
-        proposal = np.concatenate([before.proposal_density, proposal])
-        swept = np.concatenate([before.swept, swept])
     # A kernel that predicts success shapes no density: that one is as if none was asked for.
     for_success = stored is not None and stored.kind == "probability"
+    seq = rows.seq if before is None else np.concatenate([before.seq, rows.seq])
     built = Built(
         selected=selected,
-        exposure=exposure,
+        weighing=fresh.weighing,
         kernel=_info(choice) if stored is None else stored_kernel.info_of(stored, _info(KernelChoice())),
         density=None,
         seq=seq,
-        proposal_density=proposal,
-        swept=swept,
         chosen_from=widths_prefix(len(seq)) if choice.by_default or for_success else 0,
         success_kernel=stored_kernel.load_success_kernel(stored, axes) if stored and for_success else None,
     )
     if not len(seq):
         return built
-
-    def everything() -> Grasps:
-        if old is None:
-            return fresh
-        return Grasps(
-            se3.Poses.concatenate([old.poses, fresh.poses]), np.concatenate([old.symmetric, fresh.symmetric])
-        )
-
-    weights = _weights(built, everything)
-    added = None if old is None else _in_units_of(old, weights, len(rows))
-    shaping = None if for_success else stored
+    everything = grasps
+    if old is not None:
+        symmetric = np.concatenate([old.symmetric, grasps.symmetric])
+        everything = Grasps(se3.Poses.concatenate([old.poses, grasps.poses]), symmetric)
     same_widths = before is not None and before.chosen_from == built.chosen_from
     if before is not None and same_widths:
         built = replace(built, kernel=before.kernel)
     elif built.chosen_from:
-        chosen = _choose(everything(), proposal, built.chosen_from, threads)
+        chosen = _choose(everything, built.weighing.proposal, built.chosen_from, threads)
         built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
+    widths = stored_kernel.isotropic(built.kernel)
+    weighing = weighed(built.weighing, widths, selected, fresh.attempts, everything.poses, threads)
+    built = replace(built, weighing=weighing)
+    weights = weighing.weights(*everything)
+    shaping = None if for_success else stored
     if shaping is not None and shaping.kind == "sampled":
-        _check_components(stored_kernel.load_sampled(shaping), everything().symmetric)
-    if before is not None and same_widths and old is not None and added is not None:
-        return _searched(_extended(built, before, old, shaping, axes, fresh, added), before)
-    return _searched(_made(built, shaping, axes, everything(), weights), None)
+        _check_components(stored_kernel.load_sampled(shaping), everything.symmetric)
+    if before is not None and old is not None and same_widths:
+        unit = _in_units_of(old, weights, len(everything.symmetric))
+        if unit is not None and (unit.same or (before.shaped is None and before.sampled is None)):
+            return _extended(built, before, old, shaping, axes, grasps, unit)
+    return _searched(_made(built, shaping, axes, everything, weights), None)
 
 
 def _searched(built: Built, before: Built | None) -> Built:
-    """With the search in its density, an extended one where that is what there was before, extended."""
+    """With the search in its density: an extended one where that is what there was before, extended, and its
+    rows weigh about what they did when they were ranked.
+    """
     assert built.asked is not None
-    if before is None or before.search is None:
-        return replace(built, search=ModeSearch(built.asked, built.density))
-    return replace(built, search=before.search.extended(built.asked, built.density))
+    assert built.density is not None
+    now = built.density.raw_weights
+    if before is not None and before.search is not None and before.ranked_by is not None:
+        known = before.ranked_by
+        change = now[: len(known)] / known
+        if change.max() <= _ABOUT and change.min() >= 1.0 / _ABOUT:
+            ranked_by = np.concatenate([known, now[len(known) :]])
+            search = before.search.extended(built.asked, built.density)
+            return replace(built, search=search, ranked_by=ranked_by)
+    return replace(built, search=ModeSearch(built.asked, built.density), ranked_by=now)
 
 
 def _made(
@@ -242,20 +241,24 @@ def _extended(
     shaping: KernelRow | None,
     axes: Axes,
     fresh: Grasps,
-    added: Floats,
+    unit: _InUnit,
 ) -> Built:
-    """The density ``old`` of ``before`` with further grasps, weights in its unit."""
+    """The density ``old`` of ``before`` with further grasps, and its rows weighed anew where that is due."""
     poses, symmetric = fresh
+    added = unit.weights[old.size :]
     if before.shaped is not None:
         frames = stored_kernel.axes_at(axes, poses)
         shaped = before.shaped.extend(poses, weights=added, symmetric=symmetric, frames=frames)
-        return replace(built, density=shaped.isotropic, shaped=shaped)
+        return _searched(replace(built, density=shaped.isotropic, shaped=shaped), before)
     sampled = before.sampled
     if sampled is not None and shaping is not None and len(added):
         more = stored_kernel.load_sampled(shaping).placed(poses, weights=added, symmetric=symmetric)
         total = float(added.sum())
         sampled = sampled.extend(more.poses, weights=more.weights * total, symmetric=more.symmetric)
-    return replace(built, density=old.extend(poses, added, symmetric), sampled=sampled)
+    if not unit.same:
+        old = old.reweighted(unit.weights[: old.size])
+    density = old.extend(poses, added, symmetric)
+    return _searched(replace(built, density=density, sampled=sampled), before)
 
 
 def _check_components(kernel: SampledKernel, symmetric: Bools) -> None:
@@ -278,37 +281,34 @@ def _check_components(kernel: SampledKernel, symmetric: Bools) -> None:
     )
 
 
-# -- weights -----------------------------------------------------------------------------------------------
+# -- weights and widths -------------------------------------------------------------------------------------
 
 
-def _weights(built: Built, everything: Callable[[], Grasps]) -> Floats | None:
-    """Weights (N,) of eq 1, their mean 1, no row lost to rounding; None where all are equal."""
-    g, swept = built.proposal_density, built.swept
-    if swept.any():
-        positions = everything().poses.positions if built.exposure.several else None
-        g = g.copy()
-        g[swept] = built.exposure.uniform if positions is None else built.exposure.density(positions[swept])
-    known = g[~np.isnan(g)]
-    if not len(known) or (known == known[0]).all():
-        return None
-    weights = importance_weights(g)
-    weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
-    return np.asarray(weights / weights.mean(), dtype=np.float64)
+class _InUnit(NamedTuple):
+    """Weights (N,) of rows of which the first are those of a density, in its unit; whether they weigh there
+    what they did.
+    """
+
+    weights: Floats
+    same: bool
 
 
-def _in_units_of(old: GraspDensity, weights: Floats | None, count: int) -> Floats | None:
-    """Weights (count,) of rows after those of a density, in its unit; None where those of its own changed.
+def _in_units_of(old: GraspDensity, weights: Floats | None, count: int) -> _InUnit | None:
+    """Weights (count,), None where all are equal, in the unit of a density of the first rows; None where
+    none of that unit would do.
 
     Every density is built with weights of mean 1, so its raw ones are in the unit that it is extended in.
     """
     raw = old.raw_weights
     if weights is None:
-        return None if np.ptp(raw) > _SAME * raw[0] else np.full(count, raw[0])
+        weights = np.ones(count)
     factor = raw / weights[: len(raw)]
-    if np.ptp(factor) > _SAME * factor[0]:
-        return None
-    added = weights[len(raw) :] * factor[0]
-    return added if np.isfinite(added).all() and (added > 0.0).all() else None
+    same = bool(np.ptp(factor) <= _SAME * factor[0])
+    found = weights * (factor[0] if same else float(np.median(factor)))
+    if same:
+        found[: len(raw)] = raw
+    usable = np.isfinite(found).all() and (found > 0.0).all()
+    return _InUnit(np.asarray(found), same) if usable else None
 
 
 def _choose(grasps: Grasps, proposal: Floats, count: int, threads: int) -> KernelInfo:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from graspdb.wire import KernelSpec, Selection
 from graspdb.wire.queries import TrialSelection
 from graspdb_density.kde.isotropic import CUTOFF
@@ -16,7 +18,8 @@ from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.trials import rows as trial_rows
 from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.densities import build, proposal_density, stored_kernel
-from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.densities.build import Built, Fresh, KernelChoice
+from graspdb_service.usecases.densities.weighing import Weighing, codes_of, fetch_tried, mixes
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
@@ -138,11 +141,27 @@ class Densities:
             exposure = proposal_density.read(tx, selected)
             after_seq = 0 if before is None else before.object_row.last_seq
             rows = trial_rows.successes(tx, row.id, selected.provenances, after_seq=after_seq)
+            swept = np.isin(rows.batch, sorted(exposure.batches))
+            weighing = Weighing(
+                exposure,
+                codes_of(selected, rows.provenance, rows.proposal_density, swept),
+                rows.proposal_density,
+                selected.weights_by_source,
+            )
+            known = None if before is None else before.weighing
+            if known is not None:
+                weighing = known.followed_by(weighing)
+            attempts = None
+            if mixes(selected, exposure, weighing.codes):
+                since = before.selected if before is not None and before.weighing.tried is not None else None
+                attempts = fetch_tried(tx, selected, since)
         # Failures of one grid change no weight, those of several do.
-        if before is not None and not len(rows) and (exposure == before.exposure or not exposure.several):
-            return replace(before, selected=selected, exposure=exposure)
+        if before is not None and not len(rows) and known is not None:
+            alike = exposure == known.exposure or not (exposure.several or known.tried)
+            mixed_as_before = (attempts is None) == (known.tried is None)
+            if alike and mixed_as_before and (attempts is None or attempts.empty):
+                return replace(before, selected=selected, weighing=replace(known, exposure=exposure))
         threads = self._compute.threads
         axes = None if stored is None else stored_kernel.axes(stored.alignment, selected, self._features)
-        return self._compute.run(
-            lambda: build.build(kernel, stored, axes, selected, exposure, rows, before, threads)
-        )
+        fresh = Fresh(rows, weighing, attempts)
+        return self._compute.run(lambda: build.build(kernel, stored, axes, selected, fresh, before, threads))

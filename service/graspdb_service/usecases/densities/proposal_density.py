@@ -88,6 +88,10 @@ class Exposure:
         centre = 0.5 * (np.array([plan.lower]) + np.array([plan.upper]))
         return float(self.density(centre)[0])
 
+    def per_volume(self, positions: Floats) -> Floats:
+        """How many poses the grids tried per m^3 rad^3 at positions (n, 3): 0 where none did."""
+        return self.tried * self.density(positions) if self.lattices else np.zeros(len(positions))
+
     def density(self, positions: Floats) -> Floats:
         """What trials (n, 3) of these grids were drawn with, all grids seen as one: 1/(m^3 rad^3)."""
         columns = np.stack([lattice.proposal(positions) for lattice in self.lattices], axis=1)

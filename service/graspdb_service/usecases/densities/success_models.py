@@ -275,8 +275,9 @@ def _share_of_held(model: Model | None, test: CollisionTest, threads: int) -> fl
 
 
 def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts) -> Stored:
-    since = {"after_seq": before.last_seq, "after_revision": before.revision}
-    return attempts.fetch(tx, selected, without=without, **since)
+    return attempts.fetch(
+        tx, selected, without=without, after_seq=before.last_seq, after_revision=before.revision
+    )
 
 
 def _extended(
@@ -287,4 +288,6 @@ def _extended(
         return old
     if old is None:
         return new.success_model(kernel, rows)
-    return old.extend(new.poses[rows], new.success[rows], symmetric=new.symmetric[rows])
+    return old.extend(
+        new.poses[rows], new.success[rows], symmetric=new.symmetric[rows], weights=new.weight[rows]
+    )

@@ -56,6 +56,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     told = {
         "revision": built.revision,
         "estimator": EstimatorInfo(),
+        "selection": built.selection,
         "warnings": list(built.selected.warnings),
     }
     return BestGrasps.model_validate({**told, **answer}), built.selected

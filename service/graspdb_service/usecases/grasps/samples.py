@@ -26,13 +26,14 @@ _CUTOFF = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with.
+    """Poses (n, 3), (n, 4) drawn from a density, and the density (n,) they were drawn with; ``built`` are the
+    object's trials.
 
     ``selected`` are the trials that it is about; ``support``: columns of how far the draws are from what was
     tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial.
     """
 
-    selected: Selected
+    built: Built
     kernel: KernelInfo
     seed: int
     position: Floats
@@ -42,8 +43,8 @@ class Draw:
     prior: bool = False
 
     @property
-    def revision(self) -> int:
-        return self.selected.row.revision
+    def selected(self) -> Selected:
+        return self.built.selected
 
     def columns(self) -> dict[str, Any]:
         """Those of an answer, by name."""
@@ -89,7 +90,7 @@ def drawn_from(
     chosen = secrets.randbits(63) if seed is None else seed
     poses = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
     return Draw(
-        selected=built.selected,
+        built=built,
         kernel=kernel,
         seed=chosen,
         position=poses.positions,

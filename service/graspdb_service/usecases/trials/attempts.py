@@ -31,15 +31,18 @@ _SUCCESS = OUTCOME_CODES["success"]
 class AllTrials:
     """Attempts (n,): the rows posted first, then those of sweeps; each pose of a grid once.
 
-    ``proposal`` is in 1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal where two
-    poses of the one grid share them; None unless all are of one grid. ``left_out`` attempts that collided are
-    not here, where fewer were asked for: those that are stand for all, each as much as the other.
+    ``provenance`` are internal ids, ``weight`` how much each counts by its source; ``proposal`` is in
+    1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal where two poses of the one
+    grid share them; None unless all are of one grid. ``left_out`` attempts that collided are not here, where
+    fewer were asked for: those that are stand for all, each as much as the other.
     """
 
     poses: Poses
     success: Bools
     collided: Bools
     symmetric: Bools
+    provenance: Ints
+    weight: Floats
     proposal: Floats
     keys: tuple[Ints, Ints] | None
     left_out: int = 0
@@ -61,7 +64,11 @@ class AllTrials:
     def success_model(self, kernel: SuccessKernel, rows: Bools | Ints) -> SuccessModel:
         """How likely success is by some of them."""
         return SuccessModel.build(
-            self.poses[rows], self.success[rows], kernel=kernel, symmetric=self.symmetric[rows]
+            self.poses[rows],
+            self.success[rows],
+            kernel=kernel,
+            symmetric=self.symmetric[rows],
+            weights=self.weight[rows],
         )
 
     def density(
@@ -92,6 +99,10 @@ class Stored:
     without: Sequence[int]
 
     @property
+    def empty(self) -> bool:
+        return not len(self.rows) and not self.swept
+
+    @property
     def repeat_keys(self) -> dict[str, str]:
         """What tells whether two sweeps are of one grid, by sweep."""
         return {
@@ -118,14 +129,15 @@ def fetch(
     without: Sequence[int] = (NO_ATTEMPT,),
     after_seq: int = 0,
     after_revision: int = 0,
+    grids: bool = True,
 ) -> Stored:
-    """Attempts stored since, those with the outcome codes ``without`` left out.
+    """Attempts stored since, those with the outcome codes ``without`` left out, and those of ``grids``.
 
     Sweeps that share poses with chunks from before count them again: who extends what there was compares
     :attr:`Stored.repeat_keys`, and reads all of it where two sweeps are of one grid.
     """
     chunks = outcomes.collected(
-        tx, selected.row.id, provenance_ids=selected.tried, after_revision=after_revision
+        tx, selected.row.id, provenance_ids=selected.tried, after_revision=after_revision, grids=grids
     )
     known = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
     swept = []
@@ -163,12 +175,14 @@ def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
     def column(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    code = column("outcome")
+    code, provenance = column("outcome"), column("provenance")
     return AllTrials(
         poses=Poses(column("position"), column("quaternion_xyzw")),
         success=code == _SUCCESS,
         collided=code == COLLISION,
-        symmetric=stored.selected.symmetric(column("provenance")),
+        symmetric=stored.selected.symmetric(provenance),
+        provenance=provenance,
+        weight=stored.selected.weights(provenance),
         proposal=column("proposal_density"),
         keys=_keys(stored, parts, grids),
         left_out=left_out,

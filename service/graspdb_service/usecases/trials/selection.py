@@ -9,21 +9,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graspdb.wire import OUTCOMES, GripperProfile
+from graspdb.wire import OUTCOMES, SOURCES, GripperProfile
+from graspdb.wire.base import source_weights
 from graspdb.wire.grippers import SHAPE_FIELDS
 from graspdb.wire.queries import TrialSelection
-from graspdb_service.problems import conflict, found
+from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import Bools, Ints, Provenance, gripper_parts, is_gripper
+from graspdb_service.trial_columns import Bools, Floats, Ints, Provenance, gripper_parts, is_gripper
 from graspdb_service.usecases.objects import require
 
 _KEPT = 4_096
 #: Versions that a warning tells of.
 _TOLD = 5
+UNSPECIFIED = "unspecified"
+"""What the source of trials that name none is called."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,19 +35,23 @@ class Selected:
 
     ``row`` is the object; ``gripper`` and ``protocol`` are the one named, else the only one among the trials,
     else None. ``provenances`` are internal ids of the selected trials' provenances, each with whether its jaw
-    is mirror-symmetric; ``tried`` those of sources that post failures, too: only they tell how likely a
-    success is. ``outcomes`` counts selected trials by outcome, packed ones included. ``gripper`` may be one
-    version, as in ``panda@1``; else ``profile`` is the newest's, whatever ``versions`` the trials are of, and
-    ``warnings`` say so. ``stamp`` is another one whenever the profile is.
+    is mirror-symmetric; ``sources`` the source of each; ``tried`` those of sources that post failures, too:
+    only they tell how likely a success is. ``outcomes`` counts selected trials by outcome, packed ones
+    included, ``by_source`` those of each source. ``gripper`` may be one version, as in ``panda@1``; else
+    ``profile`` is the newest's, whatever ``versions`` the trials are of, and ``warnings`` say so. ``stamp``
+    is another one whenever the profile is.
     """
 
     row: ObjectRow
     gripper: str | None
     protocol: str | None
     source: str | None
+    source_weight: str | None
     profile: GripperProfile | None
     provenances: Mapping[int, bool]
+    sources: Mapping[int, str]
     outcomes: Mapping[str, int]
+    by_source: Mapping[str, Mapping[str, int]]
     tried: frozenset[int]
     versions: Sequence[int]
     stamp: int | None
@@ -53,7 +60,29 @@ class Selected:
     @property
     def filters(self) -> TrialSelection:
         """What selects the same trials whatever else is added to the object."""
-        return TrialSelection(gripper=self.gripper, protocol=self.protocol, source=self.source)
+        names = ("gripper", "protocol", "source", "source_weight")
+        return TrialSelection(**{name: getattr(self, name) for name in names})
+
+    @property
+    def asked_weights(self) -> dict[str, float]:
+        """The weights that were asked for, by source, the largest of all 1."""
+        asked = source_weights(self.source_weight)
+        return {name: weight / _largest(asked) for name, weight in asked.items()}
+
+    @property
+    def weights_by_source(self) -> dict[str, float]:
+        """How much trials count by their source, 1 for those that count most of all."""
+        asked = source_weights(self.source_weight)
+        return {name: asked.get(name, 1.0) / _largest(asked) for name in self.by_source}
+
+    def weights(self, provenance: Ints) -> Floats:
+        """How much trials (n,) of the selection count by their provenances' sources."""
+        found = np.ones(len(provenance))
+        by_source = self.weights_by_source
+        for number, source in self.sources.items():
+            if by_source[source] != 1.0:
+                found[provenance == number] = by_source[source]
+        return found
 
     @property
     def key(self) -> tuple[int, TrialSelection, int | None]:
@@ -73,6 +102,11 @@ class Selected:
         return self.outcomes.get("success", 0)
 
 
+def _largest(asked: Mapping[str, float]) -> float:
+    """The largest weight, that of sources which none was asked for included."""
+    return max([*asked.values(), *([1.0] if len(asked) < len(SOURCES) else [])])
+
+
 class Selections:
     """The selections of one service process, each resolved once for a revision of its object."""
 
@@ -85,7 +119,7 @@ class Selections:
         """The object as it is now, and which of its trials a request is about (404, 409 where ambiguous)."""
         with self._database.read() as tx:
             row = require(tx, slug)
-            key = row.id, asked.gripper, asked.protocol, asked.source
+            key = row.id, asked.gripper, asked.protocol, asked.source, asked.source_weight
             with self._lock:
                 known = self._resolved.get(key)
             if known is not None and _still_holds(tx, known, row):
@@ -118,8 +152,8 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
     """Find the provenances that a request is about.
 
     A trial without gripper or protocol fits every selection and makes none ambiguous, nor do several versions
-    of a gripper. 404 for an unknown
-    gripper; 409 ``ambiguous-selection`` where several grippers or protocols are left and none is named.
+    of a gripper. 404 for an unknown gripper; 422 for source weights that leave no trial; 409
+    ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
     named_gripper = None if asked.gripper is None else _gripper(tx, asked.gripper)
     counts = outcome_counts(tx, row.id)
@@ -132,6 +166,7 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
         and (asked.gripper is None or item.gripper is None or is_gripper(item.gripper, asked.gripper))
         and (asked.protocol is None or item.protocol in (None, asked.protocol))
     }
+    candidates = _weighing(candidates, asked)
     items = candidates.values()
     named = {
         "gripper": distinct(item.gripper and gripper_parts(item.gripper)[0] for item in items),
@@ -151,11 +186,23 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
         named_gripper = _gripper(tx, gripper)
     profile = None if named_gripper is None else GripperProfile.model_validate(named_gripper.profile)
     names = {"gripper": gripper, "protocol": protocol, "source": asked.source}
-    selected = of_provenances(row, candidates, counts, profile=profile, **names)
+    selected = of_provenances(
+        row, candidates, counts, profile=profile, source_weight=asked.source_weight, **names
+    )
     if named_gripper is None or profile is None:
         return selected
     warnings = _of_other_versions(tx, named_gripper, profile, selected.versions)
     return replace(selected, stamp=named_gripper.version_id, warnings=warnings)
+
+
+def _weighing(candidates: dict[int, Provenance], asked: TrialSelection) -> dict[int, Provenance]:
+    """Those of sources that weigh anything."""
+    weights = source_weights(asked.source_weight)
+    left = {n: item for n, item in candidates.items() if item.source is None or weights.get(item.source, 1.0)}
+    if candidates and not left:
+        names = ", ".join(distinct(item.source for item in candidates.values()))
+        raise invalid("source_weight", f"leaves no trial: all there are of {names}, and weigh nothing")
+    return left
 
 
 def of_provenances(
@@ -167,6 +214,7 @@ def of_provenances(
     protocol: str | None,
     source: str | None,
     profile: GripperProfile | None,
+    source_weight: str | None = None,
 ) -> Selected:
     """The selection of provenances of no other gripper than this; ``counts`` of each are by outcome."""
     failing = {
@@ -176,14 +224,21 @@ def of_provenances(
     }
     symmetric = profile is None or profile.symmetric
     items = chosen.values()
+    sources = {number: item.source or UNSPECIFIED for number, item in chosen.items()}
     return Selected(
         row=row,
         gripper=gripper,
         protocol=protocol,
         source=source,
+        source_weight=source_weight,
         profile=profile,
         provenances={number: item.gripper is None or symmetric for number, item in chosen.items()},
+        sources=sources,
         outcomes=total([counts[number] for number in chosen]),
+        by_source={
+            source: total([counts[number] for number in chosen if sources[number] == source])
+            for source in sorted(set(sources.values()))
+        },
         tried=frozenset(number for number, item in chosen.items() if item.source in failing),
         versions=sorted({gripper_parts(item.gripper)[1] or 0 for item in items if item.gripper is not None}),
         stamp=None,
