@@ -16,16 +16,20 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from datetime import UTC, datetime
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from sqlalchemy import text
 
-from fault_lab import BOX_M, Follower, Lab, Sender, box_stl
+from fault_lab import BOX_M, GRIPPER, PROTOCOL, SOURCE, Follower, Lab, Sender, box_stl
 from grid_truth import full_grid, matrices
 from postgres_server import PostgresServer
 from real_processes import Process, wait_for
@@ -181,6 +185,72 @@ def test_after_faults_everything_is_as_the_clients_know_it(lab: Lab, seed: int) 
     assert lab.http.delete(f"/objects/{slug}").is_success
 
 
+@pytest.mark.parametrize("lab", ["postgres"], indirect=True)
+def test_two_replicas_are_one_service(lab: Lab) -> None:
+    """What one has stored the other knows; jobs are given out once; a dead one's report is taken over."""
+    lab.heal()
+    first, second = (replica.http for replica in lab.replicas)
+    assert first.post("/objects", json={"id": "shared", "mass_kg": 0.16}).status_code == 201
+    for number in range(10):
+        one, other = (first, second) if number % 2 else (second, first)
+        receipt = one.post("/objects/shared/trials", json=successes(800, number)).json()
+        assert other.get(f"/objects/shared/batches/{receipt['batch']}").json()["inserted"] == 800
+        density = other.get("/objects/shared/density").json()
+        assert (density["revision"], density["size"]) == (receipt["revision"], 800 * (number + 1))
+
+    report = "/objects/shared/reports/convergence"
+    asked = [http.get(report) for http in (first, second)]
+    assert [answer.status_code for answer in asked] == [202, 202]
+    (run,) = {answer.headers["location"] for answer in asked}
+    lab.replicas[0].process.kill()
+    assert second.get(run).json()["state"] == "running"
+    with lab.database.write() as tx:  # as if the dead replica's lease had run out
+        tx.execute(text("UPDATE report_runs SET lease_expires_at = 0"))
+    done = wait_for("the other replica takes over", lambda: done_run(second, run), every=0.1)
+    lab.heal()
+    assert first.get(run).json()["result"] == done["result"]
+
+    mesh = first.put("/objects/shared/mesh", content=box_stl(), headers={"Content-Type": "model/stl"})
+    assert mesh.is_success, mesh.text
+    for worker in lab.workers:
+        worker.pause()
+    sweep = first.post("/objects/shared/sweeps", json={"grid": GRID, "chunk_poses": 50}).json()
+    with ThreadPoolExecutor(8) as pool:
+        claimed = [*chain(*pool.map(lambda n: claim_all([first, second][n % 2], f"c{n}"), range(8)))]
+    assert len(set(claimed)) == len(claimed)
+    # A worker that was paused with a claim on its way may have got one, too.
+    assert sweep["chunks"] - len(lab.workers) <= len(claimed) <= sweep["chunks"]
+    assert second.post(f"/sweeps/{sweep['id']}/cancel").json()["state"] == "cancelled"
+    lab.heal()
+    assert first.delete("/objects/shared").is_success
+
+
+def successes(count: int, seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    turns = rng.normal([1.0, 0.0, 0.0, 0.0], 0.1, (count, 4))
+    columns = {
+        "position": rng.normal(0.0, 0.01, (count, 3)).tolist(),
+        "quaternion_xyzw": (turns / np.linalg.norm(turns, axis=1, keepdims=True)).tolist(),
+        "outcome": [True] * count,
+    }
+    return {"columns": columns, "gripper": GRIPPER, "source": SOURCE, "protocol": PROTOCOL}
+
+
+def done_run(http: httpx.Client, run: str) -> dict[str, Any] | None:
+    now: dict[str, Any] = http.get(run).json()
+    assert now["state"] in ("running", "done"), now
+    return now if now["state"] == "done" else None
+
+
+def claim_all(http: httpx.Client, worker: str) -> list[str]:
+    """Ids of jobs that a worker gets, until there is none left."""
+    got: list[str] = []
+    body = {"worker": worker, "capabilities": ["simulate"], "limit": 3}
+    while jobs := http.post("/jobs/claim", json=body).json()["jobs"]:
+        got += [job["id"] for job in jobs]
+    return got
+
+
 # --- what must hold -------------------------------------------------------------------------------------
 
 
@@ -198,6 +268,7 @@ def check(lab: Lab, slug: str, sweep: dict[str, Any], senders: list[Sender], fol
         check_batches(sender, settled)
     check_sweep(lab, sweep, settled)
     check_counts(lab, slug, sweep, settled)
+    check_times(lab, slug, sweep)
     follower.finish.set()
     follower.join(120)
     follower.look()
@@ -251,6 +322,18 @@ def check_again(sender: Sender) -> None:
         assert {name: sent.receipt[name] for name in first} == first
     other = sender.post((len(sender.sent) - 1) // 2 + 1, sender.sent[0].key) if len(sender.sent) > 1 else None
     assert other is None or other.status_code == 422, other.text
+
+
+def check_times(lab: Lab, slug: str, sweep: dict[str, Any]) -> None:
+    """All replicas write down the database's time, whatever their own clocks say."""
+    if lab.postgres is None:
+        return  # the clock of a SQLite database is the service's
+    batches = lab.http.get(f"/objects/{slug}/batches", params={"limit": 1_000}).json()["items"]
+    times = [batch["created_at"] for batch in batches]
+    times += [sweep[name] for name in ("created_at", "started_at", "finished_at")]
+    times.append(lab.http.get(f"/objects/{slug}").json()["updated_at"])
+    now = datetime.now(UTC)
+    assert all(abs((datetime.fromisoformat(each) - now).total_seconds()) < 1_200 for each in times)
 
 
 def check_sweep(lab: Lab, sweep: dict[str, Any], rows: list[dict[str, Any]]) -> None:

@@ -257,6 +257,30 @@ def test_a_result_after_its_lease_ran_out_is_accepted_while_nobody_else_came(
     assert stored_indices(box) == expected_indices()
 
 
+def test_a_lease_of_a_clock_that_was_set_back_does_not_last_for_ever(
+    http: httpx.Client, box: Database
+) -> None:
+    """A clock that is set back by a day makes a lease granted before end a day late."""
+    start_sweep(http, 5_000)
+    held = claim(http, "a")[0]
+
+    def set_back(seconds: float) -> None:
+        with box.write() as tx:
+            statement = text(
+                "UPDATE jobs SET lease_expires_at = lease_expires_at + :by WHERE state = 'leased'"
+            )
+            tx.execute(statement, {"by": seconds})
+            tx.execute(text("UPDATE workers SET last_seen = last_seen + :by"), {"by": seconds})
+
+    set_back(600.0)
+    assert claim(http, "b") == [], "a clock's correction, or a replica with longer leases, takes no job away"
+    set_back(86_400.0)
+    again = claim(http, "b")[0]
+    assert again["id"] == held["id"]
+    assert is_lost(put_result(http, held))
+    assert put_result(http, again).status_code == 200
+
+
 def test_renewing_keeps_a_job(http: httpx.Client, box: Database) -> None:
     start_sweep(http, 2_000)
     job = claim(http)[0]

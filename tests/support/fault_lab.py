@@ -36,6 +36,7 @@ SETTINGS = {
     "GRASPDB_RETRY_AFTER_S": "0.2",
     # Each killed worker costs an attempt, and so may a service that is away for longer than a lease.
     "GRASPDB_MAX_ATTEMPTS": "100",
+    "GRASPDB_REPORT_WAIT_S": "0",
 }
 
 

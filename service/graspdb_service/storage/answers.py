@@ -5,12 +5,12 @@ from __future__ import annotations
 import zlib
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from typing import Any
 
 from sqlalchemy import Select, and_, delete, or_, select, update
 
-from graspdb_service.storage.database import Tx, all_as, insert_or
+from graspdb_service.storage.database import Tx, all_as, clock, insert_or, utc_now
 from graspdb_service.storage.tables import answer_names, answers, objects
 
 #: However many were given since, an answer is kept for so long: who asked may still be on the way with it.
@@ -61,7 +61,7 @@ def add(tx: Tx, given: Iterable[GivenAnswer]) -> None:
     """Store answers that are not there yet, and note when the others were given again; those of objects that
     are gone are left out.
     """
-    now = datetime.now(UTC)
+    now = clock(tx)
     # In one order everywhere, so that two writers never wait for each other.
     ordered = sorted(given, key=lambda item: item.id)
     query = select(objects.c.id).where(objects.c.id.in_({item.object_id for item in ordered}))
@@ -100,7 +100,7 @@ def purge(tx: Tx, object_id: int, kind: str, *, most: int) -> None:
             answers.c.kind == kind,
             answers.c.trial_count == 0,
             answers.c.asked_at < newest,
-            answers.c.asked_at < datetime.now(UTC) - SHORTEST_LIFE,
+            answers.c.asked_at < clock(tx) - SHORTEST_LIFE,
             answers.c.number.not_in(select(answer_names.c.answer_number)),
         )
     )
@@ -154,7 +154,7 @@ def page(
 def put_name(tx: Tx, id: str, name: str) -> bool:
     """Name a stored answer; False where the name is another's."""
     # The row is written, so that whoever is about to purge the answer looks at it again.
-    touched = update(answers).where(answers.c.id == id).values(asked_at=datetime.now(UTC))
+    touched = update(answers).where(answers.c.id == id).values(asked_at=utc_now())
     number = tx.execute(touched.returning(answers.c.number)).scalar_one()
     new = insert_or(tx, answer_names).values(name=name, answer_number=number).on_conflict_do_nothing()
     tx.execute(new)

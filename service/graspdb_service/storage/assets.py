@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from datetime import UTC, datetime
 
 from sqlalchemy import delete, exists, or_, select
 from sqlalchemy.exc import IntegrityError
 
-from graspdb_service.storage.database import Tx, insert_or
+from graspdb_service.storage.database import Tx, insert_or, utc_now
 from graspdb_service.storage.tables import assets, objects
 
 
 def put(tx: Tx, content: bytes, media_type: str) -> str:
     """Store bytes unless they are there already; returns their SHA-256."""
     sha256 = hashlib.sha256(content).hexdigest()
-    values = {"sha256": sha256, "media_type": media_type, "content": content, "created_at": datetime.now(UTC)}
+    values = {"sha256": sha256, "media_type": media_type, "content": content, "created_at": utc_now()}
     # An update that changes nothing still locks a row that exists: nobody drops it before we refer to it.
     tx.execute(
         insert_or(tx, assets)

@@ -4,15 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from typing import Any, TypeAlias, TypeVar
 
-from sqlalchemy import Connection, Double, Engine, Executable, Table, create_engine, event, make_url
+from sqlalchemy import (
+    Connection,
+    Double,
+    Engine,
+    Executable,
+    Table,
+    create_engine,
+    event,
+    make_url,
+    select,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolExhausted
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
+
+from graspdb_service.storage.tables import UtcDateTime
 
 T = TypeVar("T")
 Tx: TypeAlias = Connection
@@ -38,6 +51,29 @@ def _sqlite_now(element: unix_now, compiler: Any, **_: Any) -> str:
 @compiles(unix_now, "postgresql")
 def _postgres_now(element: unix_now, compiler: Any, **_: Any) -> str:
     return "extract(epoch from clock_timestamp())::double precision"
+
+
+class utc_now(GenericFunction[datetime]):
+    """The time by the database's own clock, as rows keep it: replicas whose clocks differ agree on it."""
+
+    type = UtcDateTime()
+    inherit_cache = True
+
+
+@compiles(utc_now, "sqlite")
+def _sqlite_utc_now(element: utc_now, compiler: Any, **_: Any) -> str:
+    # With microseconds, as SQLAlchemy reads it.
+    return "(strftime('%Y-%m-%d %H:%M:%f', 'now') || '000')"
+
+
+@compiles(utc_now, "postgresql")
+def _postgres_utc_now(element: utc_now, compiler: Any, **_: Any) -> str:
+    return "statement_timestamp()"
+
+
+def clock(tx: Tx) -> datetime:
+    """The time by the database's own clock, as a value to compare and to reckon with."""
+    return datetime.fromtimestamp(tx.execute(select(unix_now())).scalar_one(), UTC)
 
 
 def insert_or(tx: Tx, table: Table) -> postgresql.Insert:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Select, and_, delete, exists, func, insert, or_, select, update
 
-from graspdb_service.storage.database import Tx, all_as, first_as, insert_new
+from graspdb_service.storage.database import Tx, all_as, first_as, insert_new, utc_now
 from graspdb_service.storage.tables import (
     gripper_versions,
     grippers,
@@ -129,7 +129,7 @@ def page(tx: Tx, *, after: str, limit: int) -> list[GripperRow]:
 
 def create(tx: Tx, gripper: str, name: str | None, profile: dict[str, Any], *, builtin: bool = False) -> bool:
     """Insert a gripper with its first version; False where the id is taken."""
-    now = datetime.now(UTC)
+    now = utc_now()
     if not insert_new(tx, grippers, id=gripper, name=name, builtin=builtin, created_at=now):
         return False
     add_version(tx, gripper, 1, profile, None)
@@ -148,7 +148,7 @@ def add_version(
     tx: Tx, gripper: str, version: int, profile: dict[str, Any], changed: Sequence[str] | None
 ) -> None:
     """Insert a version of a gripper, under its lock."""
-    values = {"gripper": gripper, "version": version, "profile": profile, "created_at": datetime.now(UTC)}
+    values = {"gripper": gripper, "version": version, "profile": profile, "created_at": utc_now()}
     told = None if changed is None else list(changed)
     tx.execute(insert(gripper_versions).values(**values, changed=told))
 

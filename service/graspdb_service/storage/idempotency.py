@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import select, update
 
-from graspdb_service.storage.database import Tx, first_as, insert_new
+from graspdb_service.storage.database import Tx, first_as, insert_new, utc_now
 from graspdb_service.storage.tables import idempotency_keys
 
 
@@ -30,7 +29,7 @@ def claim(tx: Tx, scope: str, key: str, request_sha256: str) -> Remembered | Non
     PostgreSQL at the unique index, SQLite at BEGIN IMMEDIATE.
     """
     fresh = {"request_sha256": request_sha256, "status": 0, "answer": None, "revoked": False}
-    if insert_new(tx, idempotency_keys, scope=scope, key=key, **fresh, created_at=datetime.now(UTC)):
+    if insert_new(tx, idempotency_keys, scope=scope, key=key, **fresh, created_at=utc_now()):
         return None
     found = find(tx, scope, key)
     assert found is not None

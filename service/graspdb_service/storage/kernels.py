@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import delete, insert, select
 
-from graspdb_service.storage.database import Tx, all_as, first_as
+from graspdb_service.storage.database import Tx, all_as, first_as, utc_now
 from graspdb_service.storage.tables import kernels
 from graspdb_service.trial_columns import gripper_parts
 
@@ -40,7 +40,7 @@ class KernelRow(NewKernel):
 def create(tx: Tx, id: str, kernel: NewKernel) -> KernelRow:
     """Insert a kernel."""
     values = {**vars(kernel), **_gripper_columns(kernel.gripper)}
-    statement = insert(kernels).values(id=id, **values, created_at=datetime.now(UTC))
+    statement = insert(kernels).values(id=id, **values, created_at=utc_now())
     return _row(**tx.execute(statement.returning(*kernels.c)).one()._mapping)
 
 

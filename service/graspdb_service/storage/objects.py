@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import and_, delete, exists, or_, select, update
 
-from graspdb_service.storage.database import Tx, all_as, first_as, insert_new
+from graspdb_service.storage.database import Tx, all_as, first_as, insert_new, utc_now
 from graspdb_service.storage.simulation.jobs import OPEN
 from graspdb_service.storage.tables import batches, idempotency_keys, jobs, objects, sweeps, trials
 
@@ -42,7 +42,7 @@ class ObjectRow:
 
 def create(tx: Tx, slug: str, properties: Mapping[str, Any]) -> bool:
     """Insert an object with these column values; False where the slug is taken."""
-    now = datetime.now(UTC)
+    now = utc_now()
     values = {"slug": slug, "revision": 0, "epoch": 0, "last_seq": 0, "created_at": now, "updated_at": now}
     return insert_new(tx, objects, **{**properties, **values})
 
@@ -73,7 +73,7 @@ def advance(tx: Tx, object_id: int, *, rows: int = 0, append: bool) -> tuple[int
             revision=revision,
             epoch=objects.c.epoch if append else revision,
             last_seq=objects.c.last_seq + rows,
-            updated_at=datetime.now(UTC),
+            updated_at=utc_now(),
         )
         .returning(objects.c.revision, objects.c.last_seq)
     )

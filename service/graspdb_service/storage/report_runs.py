@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
-from sqlalchemy import ColumnElement, and_, delete, or_, select, update
+from sqlalchemy import ColumnElement, and_, delete, not_, or_, select, update
 
 from graspdb.wire.states import RunState
-from graspdb_service.storage.database import Tx, first_as, insert_new, unix_now
+from graspdb_service.storage.database import Tx, first_as, insert_new, unix_now, utc_now
 from graspdb_service.storage.tables import objects, report_runs
 
 #: The option that stands for the checks there are: another one whenever they change.
@@ -63,7 +63,7 @@ def ask(tx: Tx, key: RunKey, *, id: str, lease_id: str) -> bool:
     request, or whose holder is gone. False where it is done or somebody else's.
     """
     lease = {"lease_id": lease_id, "lease_expires_at": unix_now() + LEASE_S}
-    fresh = {"state": RunState.RUNNING, "progress": 0.0, "created_at": datetime.now(UTC)}
+    fresh = {"state": RunState.RUNNING, "progress": 0.0, "created_at": utc_now()}
     if not insert_new(tx, report_runs, id=id, **vars(key), **fresh, **lease):
         return _take(tx, _same(key), lease)
     _delete_superseded(tx, key)
@@ -78,7 +78,7 @@ def _delete_superseded(tx: Tx, key: RunKey) -> None:
         report_runs.c.object_id == key.object_id,
         report_runs.c.report == key.report,
         report_runs.c.revision <= key.revision,
-        or_(report_runs.c.state != RunState.RUNNING, report_runs.c.lease_expires_at < unix_now()),
+        or_(report_runs.c.state != RunState.RUNNING, _ran_out()),
     )
     wanted = _without_checks(key.parameters)
     superseded = [
@@ -131,7 +131,7 @@ def finish(
         "problem": problem,
         "lease_id": None,
         "lease_expires_at": None,
-        "finished_at": datetime.now(UTC),
+        "finished_at": utc_now(),
     }
     return bool(tx.execute(update(report_runs).where(_held(id, lease_id)).values(**values)).rowcount)
 
@@ -146,7 +146,7 @@ def cancel(tx: Tx, id: str) -> None:
     tx.execute(
         update(report_runs)
         .where(report_runs.c.id == id, report_runs.c.state == RunState.RUNNING)
-        .values(state=RunState.CANCELLED, lease_id=None, lease_expires_at=None, finished_at=datetime.now(UTC))
+        .values(state=RunState.CANCELLED, lease_id=None, lease_expires_at=None, finished_at=utc_now())
     )
 
 
@@ -159,10 +159,16 @@ def _take(tx: Tx, which: ColumnElement[bool], lease: dict[str, Any]) -> bool:
     free = or_(
         report_runs.c.state == RunState.CANCELLED,
         and_(report_runs.c.state == RunState.FAILED, report_runs.c.problem.is_(None)),
-        and_(report_runs.c.state == RunState.RUNNING, report_runs.c.lease_expires_at < unix_now()),
+        and_(report_runs.c.state == RunState.RUNNING, _ran_out()),
     )
     fresh = {"state": RunState.RUNNING, "progress": 0.0, "problem": None, "finished_at": None}
     return bool(tx.execute(update(report_runs).where(which, free).values(**fresh, **lease)).rowcount)
+
+
+def _ran_out() -> ColumnElement[bool]:
+    """Whether a lease is over; one that ends later than any granted now is of a clock that was set back."""
+    ends = report_runs.c.lease_expires_at
+    return or_(ends < unix_now(), ends > unix_now() + 2.0 * LEASE_S)
 
 
 def _held(id: str, lease_id: str) -> ColumnElement[bool]:
@@ -181,7 +187,7 @@ def _same(key: RunKey) -> ColumnElement[bool]:
 
 def _one(tx: Tx, which: ColumnElement[bool]) -> RunRow | None:
     stored = [report_runs.c[name] for name in RunRow.__dataclass_fields__ if name in report_runs.c]
-    live = and_(report_runs.c.lease_expires_at.is_not(None), report_runs.c.lease_expires_at >= unix_now())
+    live = and_(report_runs.c.lease_expires_at.is_not(None), not_(_ran_out()))
     query = (
         select(*stored, objects.c.slug.label("object"), live.label("live"))
         .join(objects, objects.c.id == report_runs.c.object_id)

@@ -27,6 +27,10 @@ from graspdb_service.storage.tables import jobs, workers
 OPEN = (JobState.WAITING, JobState.QUEUED, JobState.LEASED)
 """States of a job that is still to be done."""
 
+CLOCK_SLACK_S = 3600.0
+"""Leases that end later than any granted now could, by more than this, are from before the database's clock
+was set back: without their workers they would last until it has caught up."""
+
 STALE_LEASE_ERROR = (
     "the lease ran out {attempts} times: the job stalls or kills its worker"
     " (out of memory, a crash of the physics engine)"
@@ -103,11 +107,18 @@ def _held(job_id: str, lease_id: str | None) -> ColumnElement[bool]:
     return and_(jobs.c.id == job_id, jobs.c.lease_id == lease_id, jobs.c.state == JobState.LEASED)
 
 
-def _claimable(capabilities: Sequence[str], max_attempts: int) -> ColumnElement[bool]:
-    # The states are named once more so that both databases search the index on (state, capability).
-    ran_out = and_(
-        jobs.c.state == JobState.LEASED, jobs.c.lease_expires_at < unix_now(), jobs.c.attempts < max_attempts
+def _ran_out(lease_s: float) -> ColumnElement[bool]:
+    """Whether a job's lease has run out; one of a clock that has been set back has, too."""
+    ends = jobs.c.lease_expires_at
+    return and_(
+        jobs.c.state == JobState.LEASED,
+        or_(ends < unix_now(), ends > unix_now() + lease_s + CLOCK_SLACK_S),
     )
+
+
+def _claimable(capabilities: Sequence[str], lease_s: float, max_attempts: int) -> ColumnElement[bool]:
+    # The states are named once more so that both databases search the index on (state, capability).
+    ran_out = and_(_ran_out(lease_s), jobs.c.attempts < max_attempts)
     return and_(
         jobs.c.state.in_([JobState.QUEUED, JobState.LEASED]),
         jobs.c.capability.in_(capabilities),
@@ -115,9 +126,9 @@ def _claimable(capabilities: Sequence[str], max_attempts: int) -> ColumnElement[
     )
 
 
-def any_claimable(tx: Tx, capabilities: Sequence[str], max_attempts: int) -> bool:
+def any_claimable(tx: Tx, capabilities: Sequence[str], *, lease_s: float, max_attempts: int) -> bool:
     """Whether a claim would get anything: lets an idle worker ask without a write lock."""
-    query = select(exists().where(_claimable(capabilities, max_attempts)))
+    query = select(exists().where(_claimable(capabilities, lease_s, max_attempts)))
     return bool(tx.scalar(query))
 
 
@@ -132,7 +143,7 @@ def claim(
     """
     chosen: Select[tuple[str]] = (
         select(jobs.c.id)
-        .where(_claimable(capabilities, max_attempts))
+        .where(_claimable(capabilities, lease_s, max_attempts))
         .order_by(jobs.c.id)
         .limit(limit)
         .with_for_update(skip_locked=True)
@@ -210,19 +221,17 @@ def fail(tx: Tx, job_id: str, lease_id: str, *, error: str, max_attempts: int) -
     return JobState.QUEUED if again.rowcount == 1 else None
 
 
-def exhausted(tx: Tx, max_attempts: int) -> list[JobRow]:
+def exhausted(tx: Tx, *, lease_s: float, max_attempts: int) -> list[JobRow]:
     """Jobs whose last allowed lease has run out."""
-    query = select(*COLUMNS).where(
-        jobs.c.state == JobState.LEASED, jobs.c.lease_expires_at < unix_now(), jobs.c.attempts >= max_attempts
-    )
+    query = select(*COLUMNS).where(_ran_out(lease_s), jobs.c.attempts >= max_attempts)
     return all_as(tx, query, JobRow)
 
 
-def expire(tx: Tx, job: JobRow) -> bool:
+def expire(tx: Tx, job: JobRow, *, lease_s: float) -> bool:
     """Fail a job found by :func:`exhausted`, unless its worker came back meanwhile."""
     statement = (
         update(jobs)
-        .where(_held(job.id, job.lease_id), jobs.c.lease_expires_at < unix_now())
+        .where(_held(job.id, job.lease_id), _ran_out(lease_s))
         .values(
             state=JobState.FAILED,
             error=job.error or STALE_LEASE_ERROR.format(attempts=job.attempts),

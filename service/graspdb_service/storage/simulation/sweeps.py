@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, 
 
 from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import FailedChunk
-from graspdb_service.storage.database import Tx, all_as, first_as, unix_now
+from graspdb_service.storage.database import Tx, all_as, first_as, unix_now, utc_now
 from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, provenances, sweeps
 from graspdb_service.trial_columns import Floats
@@ -115,7 +115,7 @@ def create(
         "poses": None if poses is None else np.ascontiguousarray(poses, dtype="<f8").tobytes(),
         "chunks": len(job_ids),
         "cancelled": False,
-        "created_at": datetime.now(UTC),
+        "created_at": utc_now(),
     }
     tx.execute(insert(sweeps).values(values))
     for first in range(0, len(job_ids), _JOBS_PER_INSERT):
@@ -232,7 +232,7 @@ def note_started(tx: Tx, sweep_ids: Sequence[str]) -> None:
     tx.execute(
         update(sweeps)
         .where(sweeps.c.id.in_(sweep_ids), sweeps.c.started_at.is_(None))
-        .values(started_at=datetime.now(UTC))
+        .values(started_at=utc_now())
     )
 
 
@@ -249,7 +249,7 @@ def note_finished(tx: Tx, sweep_id: str) -> None:
         tx.execute(
             update(sweeps)
             .where(sweeps.c.id == sweep_id, sweeps.c.finished_at.is_(None))
-            .values(finished_at=datetime.now(UTC))
+            .values(finished_at=utc_now())
         )
 
 
@@ -262,7 +262,7 @@ def cancel(tx: Tx, sweep_id: str) -> None:
         .values(state=JobState.CANCELLED, completed_at=unix_now())
     )
     if stopped.rowcount:
-        ended = {"cancelled": True, "finished_at": datetime.now(UTC)}
+        ended = {"cancelled": True, "finished_at": utc_now()}
         tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(ended))
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import uuid
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Select, and_, case, delete, distinct, func, insert, or_, select, update
 
-from graspdb_service.storage.database import Tx, all_as, first_as
+from graspdb_service.storage.database import Tx, all_as, first_as, utc_now
 from graspdb_service.storage.simulation import outcomes
 from graspdb_service.storage.tables import (
     batches,
@@ -64,7 +64,7 @@ def create(
             inserted=0,
             packed=0,
             metadata=metadata,
-            created_at=datetime.now(UTC),
+            created_at=utc_now(),
         )
         .returning(batches.c.id)
     )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, NamedTuple
 
 from sqlalchemy import insert, select, update
 
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, utc_now
 from graspdb_service.storage.tables import trial_changes, trials
 
 
@@ -58,7 +58,7 @@ def change(
             revision=revision,
             before=before,
             reason=reason,
-            changed_at=datetime.now(UTC),
+            changed_at=utc_now(),
         )
     )
 

@@ -36,12 +36,14 @@ def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
     if not capabilities:
         raise invalid("capabilities", "name at least one, such as simulate")
     with ctx.database.read() as tx:
-        exhausted = jobs.exhausted(tx, settings.max_attempts)
+        exhausted = jobs.exhausted(tx, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
         age = jobs.worker_age(tx, request.worker)
-        work = jobs.any_claimable(tx, capabilities, settings.max_attempts)
+        work = jobs.any_claimable(
+            tx, capabilities, lease_s=settings.lease_s, max_attempts=settings.max_attempts
+        )
     for job in exhausted:
         _expire(ctx, job)
-    if not work and age is not None and age < WORKER_NOTED_EVERY_S:
+    if not work and age is not None and 0.0 <= age < WORKER_NOTED_EVERY_S:
         return ClaimResponse(jobs=[], retry_after_s=settings.retry_after_s)
     with ctx.database.write() as tx:
         claimed = jobs.claim(
@@ -105,7 +107,7 @@ def _expire(ctx: Runtime, job: JobRow) -> None:
     """Fail a job whose last lease has run out."""
     with ctx.database.write() as tx:
         sweeps.lock_object(tx, job.object_id)
-        if jobs.expire(tx, job):
+        if jobs.expire(tx, job, lease_s=ctx.settings.lease_s):
             _failed(tx, require(jobs.find(tx, job.id), job.id))
 
 

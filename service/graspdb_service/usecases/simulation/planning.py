@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import uuid
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,7 @@ from graspdb.wire import (
 )
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict, invalid
-from graspdb_service.storage.database import Tx
+from graspdb_service.storage.database import Tx, clock
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.trials import batches, provenances
@@ -86,6 +85,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
     if earlier is not None:
         return earlier
     with ctx.database.read() as tx:
+        created_ms = int(clock(tx).timestamp() * 1000)
         row = require(tx, slug)
         gripper = grippers.named(tx, spec.gripper)
         profile = GripperProfile.model_validate(gripper.profile)
@@ -95,7 +95,6 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
     plan = _plan(ctx, slug, spec, world, given)
     chunk = _chunk_size(ctx, spec, plan)
     # In memory and in one go, before the transaction, that it may be short.
-    created_ms = time.time_ns() // 1_000_000
     numbers = jobs.job_ids(created_ms, -(-plan.count // chunk), urgent=spec.purpose == "check")
     snapshot = _snapshot(world, plan, spec)
 

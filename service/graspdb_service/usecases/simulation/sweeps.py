@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 from graspdb.wire import OUTCOMES, SweepInfo
 from graspdb.wire.states import JobState, SweepState
 from graspdb_service.problems import conflict, found
-from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.database import Database, Tx, clock
 from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import Progress, SweepRow
 from graspdb_service.usecases.geometry import decompositions
@@ -63,7 +61,9 @@ def retry(database: Database, sweep_id: str) -> SweepInfo:
             raise conflict("batch-deleted", "This sweep's batch was deleted: make a new sweep")
         waiting = False
         if row.finished_at is not None and decompositions.lacks_parts(row):
-            waiting = decompositions.again(tx, require(tx, row.object), row, time.time_ns() // 1_000_000)
+            waiting = decompositions.again(
+                tx, require(tx, row.object), row, int(clock(tx).timestamp() * 1000)
+            )
         sweeps.retry(tx, sweep_id, waiting=waiting)
         return sweep_info(tx, require_sweep(tx, sweep_id))
 
