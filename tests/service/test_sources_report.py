@@ -118,3 +118,28 @@ def test_what_is_missing_is_said(sqlite_http: httpx.Client, make_object: Make, p
     assert away["sources"][0]["trials"] == 20
     assert any("lie where nothing was simulated" in text for text in away["warnings"])
     assert http.get(PATH + "?source=robot").status_code == 422
+
+
+def test_a_robot_that_holds_less_has_a_correction(simulated: httpx.Client, post: Post) -> None:
+    """Half of what simulation promises: the map says so, by trials it has not seen; few are undecided."""
+    http = simulated
+    path = PATH + "?sigma_position_m=0.008&sigma_rotation_deg=12"
+    (p, q), won = field(400, 7)
+    held = won & (np.random.default_rng(8).random(400) < 0.4)
+    post(http, "thing", (p[:6], q[:6]), told(held[:6]), gripper="pg70", protocol="wrench", source="robot")
+    few = ok(http.get(path))["sources"][0]["correction"]
+    assert few is None or (few["judged"], few["brier"]) == ("undecided", None)
+    post(http, "thing", (p, q), told(held), gripper="pg70", protocol="wrench", source="robot")
+    body = ok(http.get(path))
+    found = body["sources"][0]["correction"]
+    assert found["judged"] == "better"
+    assert found["brier"] < found["uncorrected_brier"]
+    assert found["corrected"][12] < found["predicted"][12] - 0.1
+    assert all(
+        low < middle < high
+        for low, middle, high in zip(found["low"], found["corrected"], found["high"], strict=True)
+    )
+    assert found["effective_trials"] <= found["trials"]
+    assert "corrected, simulation predicts left-out trials better" in body["text"]
+    png = http.get(path, headers={"Accept": "image/png"})
+    assert png.content.startswith(b"\x89PNG")

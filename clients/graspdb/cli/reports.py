@@ -218,9 +218,14 @@ def _sources(raw: wire.reports.SourcesReport) -> Iterator[Table]:
         "predicted": lambda s: number(s.predicted),
         "agreement": lambda s: _range(s.agreement),
         "Brier skill": lambda s: _range(s.skill),
+        "correction": lambda s: None if s.correction is None else _correction(s.correction),
         "density similarity": lambda s: _alike(s.similarity),
     }
     yield raw.sources, columns
+
+
+def _correction(found: wire.reports.SourceMap) -> str:
+    return f"{found.judged}: sigmoid({found.shift:+.2f} {found.slope:+.2f} logit p)"
 
 
 def _alike(found: wire.reports.SourceSimilarity | None) -> str:

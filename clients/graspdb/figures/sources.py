@@ -28,6 +28,14 @@ def draw_sources(report: SourcesReport) -> Figure:
 
 def _calibrated(axes: Axes, item: SourceComparison, level: float) -> None:
     axes.plot([0, 1], [0, 1], color=GREY, linestyle="--", linewidth=1)
+    correction = item.correction
+    if correction is not None:
+        axes.fill_between(correction.predicted, correction.low, correction.high, color=ORANGE, alpha=0.2)
+        axes.plot(
+            correction.predicted, correction.corrected, color=ORANGE, linewidth=1.5,
+            label=f"correction: {correction.judged} on left-out trials",
+        )  # fmt: skip
+        axes.legend(fontsize=8, loc="center left", framealpha=0.9)
     known = show_bins(axes, item.bins, linewidth=1.3)
     for b in known:
         axes.annotate(

@@ -682,6 +682,47 @@ class SourceSimilarity(Response):
     than chance."""
 
 
+class SourceMap(Response):
+    """How a simulated success probability p should be corrected for a source: sigmoid(shift + slope logit p).
+
+    Fitted to its trials within the reach of simulation's predictions, those that collide by geometry left
+    out, with a prior on no correction, so that few trials change little. Trials of one spot are not
+    independent: a block of space counts as ten at most, and blocks are left out whole to judge.
+    """
+
+    shift: float
+    """Added to the logit; 0 changes nothing."""
+    slope: float
+    """What the logit is multiplied by: 1 changes nothing, 0 says that simulation tells nothing."""
+    trials: int
+    """How many trials it is fitted to."""
+    effective_trials: float
+    """As how many independent trials they count."""
+    blocks: int
+    """How many blocks of space they lie in."""
+    judged: Literal["better", "worse", "undecided"]
+    """Whether it predicts trials of left-out blocks ``better`` than the uncorrected probabilities, ``worse``,
+    or it can't be told."""
+    brier: float | None
+    """Mean squared error on left-out blocks, corrected; null where too few trials or blocks tell."""
+    uncorrected_brier: float | None
+    """The same of the uncorrected probabilities; null where too few tell."""
+    share_brier: float | None
+    """The same of the share of successes in the other blocks alone; null where too few tell."""
+    gain: ReportRange
+    """By how much the corrected error is smaller, with its interval by blocks."""
+    informative: bool
+    """Whether the better of corrected and uncorrected predicts better than the share alone."""
+    predicted: list[float]
+    """Simulated probabilities that the next three are of, 0 to 1."""
+    corrected: list[float]
+    """Corrected probabilities of these."""
+    low: list[float]
+    """Lower ends of the map's own interval at these."""
+    high: list[float]
+    """Upper ends of the map's own interval at these."""
+
+
 class SourceComparison(Response):
     """One source of real trials against simulation."""
 
@@ -715,6 +756,9 @@ class SourceComparison(Response):
     """Chance that a success ranks above a failure; null where the agreement is."""
     bins: list[CalibrationBin] = Field(default_factory=list)
     """Predictions and how often they came true."""
+    correction: SourceMap | None = None
+    """How a simulated probability should be corrected for this source; null where it posts successes only, or
+    no trial is within reach of simulation's predictions."""
     similarity: SourceSimilarity | None = None
     """How alike its density and simulation's are; null where it has too few."""
 

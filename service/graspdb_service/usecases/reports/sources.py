@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from graspdb.wire.reports import (
     CalibrationBin,
     ReportRange,
     SourceComparison,
+    SourceMap,
     SourceSimilarity,
     SourcesOptions,
     SourcesReport,
@@ -19,7 +21,12 @@ from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
-from graspdb_density.success.calibration import calibrate
+from graspdb_density.success.calibration import assign_blocks, calibrate
+from graspdb_density.success.source_map import (
+    LEAST_BLOCKS,
+    fit_source_map,
+    judge_source_map,
+)
 from graspdb_service.problems import too_few_trials
 from graspdb_service.storage.trials import provenances
 from graspdb_service.trial_columns import Bools, Floats, Ints, Provenance, is_gripper
@@ -49,6 +56,10 @@ _WITHIN_REACH = 1.0
 #: Subsets of simulated successes that tell what chance alone would do.
 _SUBSETS = 10
 _POINTS = 8_000
+#: Edge of the blocks of space that trials are left out in, in kernel widths.
+_BLOCK_WIDTHS = 3.0
+#: Simulated probabilities at which a correction is shown.
+_CURVE = np.linspace(0.02, 0.98, 25)
 
 
 def sources_report(
@@ -70,8 +81,8 @@ def sources_report(
     for number, (source, selected) in enumerate(real.items()):
         progress(0.5 + 0.5 * number / len(real))
         everything = trials_of[source]
-        predicted, reached = _predictions(everything, model, test, inputs.threads)
-        compared.append(_compared(inputs, built, selected, everything, predicted, reached))
+        predictions = _predictions(everything, model, test, inputs.threads)
+        compared.append(_compared(inputs, built, selected, everything, predictions))
     report = SourcesReport(
         **{**head(built), "source": None},
         warnings=_warnings(compared, collisions_known=test is not None),
@@ -103,22 +114,33 @@ def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str,
     return real
 
 
+class _Predictions(NamedTuple):
+    """What simulation predicts at trials (n,), whether they are within its reach, and whether they collide by
+    geometry.
+    """
+
+    probability: Floats
+    known: Bools
+    collides: Bools
+
+
 def _predictions(
     everything: AllTrials, model: SuccessModel | None, test: CollisionTest | None, threads: int
-) -> tuple[Floats, Bools]:
-    """What simulation predicts at the poses of trials, and whether they are within its reach."""
+) -> _Predictions:
+    """What simulation predicts at the poses of trials."""
     predicted = np.zeros(len(everything))
     reached = np.zeros(len(everything), dtype=bool)
     if model is not None:
         answer = model.evaluate(everything.poses, threads=threads)
         predicted = answer.probability.copy()
         reached = answer.effective_trials >= _WITHIN_REACH
+    collides = np.zeros(len(everything), dtype=bool)
     if test is not None:
-        free = test.free(everything.poses, threads=threads)
-        predicted[~free] = 0.0
+        collides = ~test.free(everything.poses, threads=threads)
+        predicted[collides] = 0.0
         # Geometry tells of a collision wherever it is.
-        reached |= ~free
-    return predicted, reached
+        reached |= collides
+    return _Predictions(predicted, reached & np.isfinite(predicted), collides)
 
 
 def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | None:
@@ -160,13 +182,12 @@ def _compared(
     built: Built,
     selected: Selected,
     everything: AllTrials,
-    predicted: Floats,
-    reached: Bools,
+    predictions: _Predictions,
 ) -> SourceComparison:
     won = everything.success
     count = len(everything)
     successes = int(won.sum())
-    known = reached & np.isfinite(predicted)
+    predicted, known, collides = predictions
     assert selected.source is not None
     comparison = SourceComparison(
         source=selected.source,
@@ -180,6 +201,11 @@ def _compared(
         within_reach=int(known.sum()),
         similarity=_similarity(inputs, built, everything),
     )
+    if selected.tried:
+        told = known & ~collides
+        kernel_m = built.kernel.sigma_position_m
+        correction = _correction(everything.poses.positions[told], predicted[told], won[told], kernel_m)
+        comparison = comparison.model_copy(update={"correction": correction})
     if not selected.tried or int(known.sum()) < LEAST_TRIALS:
         return comparison
     p, y = predicted[known], won[known]
@@ -200,6 +226,36 @@ def _compared(
             "auc": finite(whole.auc),
             "bins": [as_model(CalibrationBin, item) for item in whole.bins],
         }
+    )
+
+
+def _correction(positions: Floats, predicted: Floats, won: Bools, sigma_m: float) -> SourceMap | None:
+    """How predictions at trials (n,) should be corrected for their source; None without any."""
+    if not len(won):
+        return None
+    try:
+        blocks = assign_blocks(positions, edge_m=_BLOCK_WIDTHS * sigma_m).block
+    except ValueError:
+        # All in one place.
+        blocks = np.zeros(len(won), dtype=np.int64)
+    fitted, judged = fit_source_map(predicted, won, blocks), judge_source_map(predicted, won, blocks)
+    low, high = fitted.interval(_CURVE, _CURVE, _CURVE, level=LEVEL)
+    return SourceMap(
+        shift=fitted.shift,
+        slope=fitted.slope,
+        trials=fitted.trials,
+        effective_trials=fitted.effective_trials,
+        blocks=judged.blocks,
+        judged=judged.verdict,
+        brier=finite(judged.brier),
+        uncorrected_brier=finite(judged.uncorrected_brier),
+        share_brier=finite(judged.share_brier),
+        gain=interval(judged.gain, judged.gain_low, judged.gain_high),
+        informative=judged.informative,
+        predicted=_CURVE.tolist(),
+        corrected=fitted.probability(_CURVE).tolist(),
+        low=low.tolist(),
+        high=high.tolist(),
     )
 
 
@@ -253,6 +309,13 @@ def _warnings(found: list[SourceComparison], *, collisions_known: bool) -> list[
                 else "it posts successes only: post the trials that failed, too"
             )
             warnings.append(f"{item.source}: agreement can't be told: {why}")
+        correction = item.correction
+        if correction is not None and correction.brier is None:
+            warnings.append(
+                f"{item.source}: whether the correction helps can't be told from {correction.trials} trials"
+                f" in {correction.blocks} blocks of space; {LEAST_TRIALS} in {LEAST_BLOCKS} are needed, for"
+                " trials of one spot are not independent"
+            )
         if item.similarity is None:
             warnings.append(
                 f"{item.source}: the densities' similarity can't be told from {item.successes} successes;"
@@ -271,11 +334,26 @@ def _text(report: SourcesReport) -> str:
             told += f", simulation predicts {100.0 * item.predicted:.0f} % at their poses"
         if item.agreement is not None:
             told += f" and agrees on {_percent(item.agreement)}"
+        told += _correction_told(item.correction)
         if item.similarity is not None:
             s, e = item.similarity, item.similarity.expected
             told += f"; densities alike to {s.value:.2f} (by chance alone {e.low:.2f} to {e.high:.2f})"
         parts.append(told)
     return ". ".join(parts) + "."
+
+
+def _correction_told(correction: SourceMap | None) -> str:
+    """Whether simulated probabilities should be corrected, in words."""
+    if correction is None or correction.brier is None or correction.uncorrected_brier is None:
+        return ""
+    errors = f"Brier {correction.brier:.3f} instead of {correction.uncorrected_brier:.3f}"
+    verdict = {
+        "better": f"; corrected, simulation predicts left-out trials better ({errors})",
+        "worse": f"; corrected, simulation predicts left-out trials worse ({errors}): leave it as it is",
+        "undecided": f"; whether a correction helps is undecided ({errors} on left-out trials)",
+    }
+    told = verdict[correction.judged]
+    return told if correction.informative else told + "; it predicts no better than their share of successes"
 
 
 def _percent(value: ReportRange) -> str:
