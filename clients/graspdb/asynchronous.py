@@ -207,6 +207,7 @@ class AsyncReports(Mirror[Reports]):
     bandwidth = _awaited(Reports.bandwidth)
     kernel_similarity = _awaited(Reports.kernel_similarity)
     sources = _awaited(Reports.sources)
+    promises = _awaited(Reports.promises)
     simulate = _mirrored(Reports.simulate, lambda sweeps: [AsyncSweep(sweep) for sweep in sweeps])
 
 

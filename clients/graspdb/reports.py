@@ -199,6 +199,20 @@ class Sources(Report[wire.reports.SourcesReport]):
         return {item.source: item for item in self.raw.sources}
 
 
+class Promises(Report[wire.reports.PromisesReport]):
+    """What answers promised against what happened."""
+
+    @property
+    def verdict(self) -> str:
+        """``undecided``, ``as-promised``, ``over-promised`` or ``under-promised``."""
+        return self.raw.verdict
+
+    @property
+    def difference(self) -> wire.reports.ReportRange:
+        """What happened less what was promised, with its interval."""
+        return self.raw.difference
+
+
 class Summary(Report[wire.reports.SummaryReport]):
     """Every object's trials by outcome, and success rates by each way of counting."""
 
@@ -274,6 +288,11 @@ class KernelSimilarityOptions(TrialOptions, total=False):
     component_rotation_deg: Annotated[float | None, Option("kernel-similarity: width of a sample.")]
 
 
+class PromisesOptions(TrialOptions, total=False):
+    match_position_m: Annotated[float | None, Option("promises: trials farther off tried another grasp.")]
+    match_rotation_deg: Annotated[float | None, Option("promises: trials turned farther tried another.")]
+
+
 class SourcesOptions(Waiting, total=False):
     gripper: str | None
     protocol: str | None
@@ -340,6 +359,15 @@ class Reports(Resource):
         ``protocol`` is that of the simulated trials; real ones of it are taken where there are any, else all.
         """
         return Sources(self._get(wire.reports.SourcesReport, SourcesOptions, options))
+
+    def promises(self, **options: Unpack[PromisesOptions]) -> Promises:
+        """What answers promised against what became of the trials that name them.
+
+        Only what promised much was tried, so it speaks of that range only, and says what choosing the highest
+        of many estimates explains. A trial farther than the match's limits from every grasp of its answer
+        tried something else.
+        """
+        return Promises(self._get(wire.reports.PromisesReport, PromisesOptions, options))
 
     def simulate(self, calls: Iterable[wire.reports.CheckCall | Mapping[str, Any]]) -> list[Sweep]:
         """Make the sweeps that a report names as missing: checks, which enter no density.

@@ -53,7 +53,9 @@ class TrialColumns:
     ``width_m`` are NaN where a trial has none, ``pose_index`` -1 where it is of no sweep. ``measured_at``
     (aware), ``pose_covariance`` (6x6 nested lists) and ``metadata`` are a value or None a trial, the latter
     two as JSON text where they came in a request: many objects of Python's take long to free. ``seq`` is
-    ascending, ``batch`` internal, ``withdrawn`` (n,) whether it counts no more.
+    ascending, ``batch`` internal, ``withdrawn`` (n,) whether it counts no more. ``answer`` is which answer
+    was tried, -1 for none: its place in a list that comes with the columns, once stored its number.
+    ``achieved`` (n, 7) is where the tool was after all, position and quaternion, NaN where that is unknown.
     """
 
     position: Floats
@@ -70,6 +72,8 @@ class TrialColumns:
     seq: Ints = field(default_factory=_ints)
     revision: Ints = field(default_factory=_ints)
     batch: Ints = field(default_factory=_ints)
+    answer: Ints = field(default_factory=_ints)
+    achieved: Floats = field(default_factory=_floats)
     withdrawn: NDArray[np.bool_] = field(default_factory=_flags)
 
     def __len__(self) -> int:
@@ -77,7 +81,7 @@ class TrialColumns:
 
     @classmethod
     def joined(cls, parts: Sequence[TrialColumns]) -> TrialColumns:
-        """Trials of several parts in order; a column that only some have is NaN or None in others."""
+        """Trials of several parts in order; a column that only some have is NaN, -1 or None in others."""
         if len(parts) == 1:
             return parts[0]
         columns: dict[str, Any] = {}
@@ -86,9 +90,13 @@ class TrialColumns:
             if not any(len(piece) for piece in pieces):
                 columns[name] = blank
             elif isinstance(blank, np.ndarray):
-                lengths = zip(parts, pieces, strict=True)
+                some = next(piece for piece in pieces if len(piece))
+                missing = -1 if some.dtype.kind == "i" else np.nan
                 columns[name] = np.concatenate(
-                    [piece if len(piece) else np.full(len(part), np.nan) for part, piece in lengths]
+                    [
+                        piece if len(piece) else np.full((len(part), *some.shape[1:]), missing, some.dtype)
+                        for part, piece in zip(parts, pieces, strict=True)
+                    ]
                 )
             else:
                 lengths = zip(parts, pieces, strict=True)
@@ -97,8 +105,12 @@ class TrialColumns:
 
     @property
     def poses(self) -> Poses:
-        """Where the tool was, as the maths takes it."""
-        return Poses(self.position, self.quaternion_xyzw)
+        """Where the tool was, as the maths takes it: the achieved pose where it is known."""
+        if not len(self.achieved):
+            return Poses(self.position, self.quaternion_xyzw)
+        known = ~np.isnan(self.achieved[:, :1])
+        position = np.where(known, self.achieved[:, :3], self.position)
+        return Poses(position, np.where(known, self.achieved[:, 3:], self.quaternion_xyzw))
 
     def __getitem__(self, rows: slice | Bools | Ints) -> TrialColumns:
         """Some of the trials: a slice of any, else of those whose columns are all arrays."""
@@ -141,7 +153,7 @@ class TrialBatch:
     """Checked trials of one request, ready to store.
 
     ``field_of_gripper`` names the field that a gripper came in, ``field_of`` that of a trial's place and
-    name, for what only the database can tell.
+    name, for what only the database can tell. ``answers`` are ids or names of those that trials tried.
     """
 
     columns: TrialColumns
@@ -149,6 +161,7 @@ class TrialBatch:
     metadata: dict[str, Any] | None
     field_of_gripper: Callable[[str], str]
     field_of: Callable[[int, str], str]
+    answers: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,3 +171,4 @@ class TrialPage:
     columns: TrialColumns
     provenances: Mapping[int, Provenance]
     batches: Mapping[int, BatchOrigin]
+    answers: Mapping[int, str]

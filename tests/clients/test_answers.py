@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,3 +91,73 @@ def test_answers_on_the_command_line(tried: GraspObject, run: Run) -> None:
     code, _, err = run("answers", "get", name)
     assert code == 1
     assert "--name" in err
+
+
+def test_a_grasp_reports_what_became_of_it(db: Client, tried: GraspObject) -> None:
+    best = tried.best_grasp()
+    achieved = best.matrix
+    achieved[0, 3] += 0.002
+    receipt = best.report(False, achieved_pose=achieved, width_m=0.03)
+    (trial,) = tried.trials.list(batch=receipt.batch)
+    assert (trial.answer, trial.gripper, trial.protocol, trial.source) == (
+        best.answer,
+        "pg70",
+        "lift",
+        "robot",
+    )
+    assert trial.achieved_pose is not None
+    assert np.allclose(trial.achieved_pose.position, achieved[:3, 3])
+    assert np.allclose(trial.position, best.position)
+    again = db.answers.get(best.answer or "")
+    assert again.trials == 1
+    assert isinstance(again.result, Grasps)
+    again.result[0].report("success", protocol=None)
+    assert pickle.loads(pickle.dumps(best)).answer == best.answer
+    with pytest.raises(Conflict, match="stays with"):
+        db.answers.delete(again.id)
+
+
+def test_achieved_poses_in_arrays_and_files(tried: GraspObject, run: Run, tmp_path: Path) -> None:
+    drawn = tried.samples(3)
+    moved = drawn.matrices
+    moved[:, 0, 3] += 0.001
+    one = tried.trials.add(drawn, True, answer=drawn.answer, achieved_poses=moved)
+    two = tried.trials.add(
+        drawn, [True, False, True], answer=[drawn.answer, None, None], achieved_poses=[None, moved[1], None]
+    )
+    with pytest.raises(ValueError, match="achieved_poses has 2 poses for 3"):
+        tried.trials.add(drawn, True, achieved_poses=moved[:2])
+    found = tried.trials.list(batch=one.batch).arrays()
+    assert np.allclose(found.achieved.position, moved[:, :3, 3])
+    assert [t.answer for t in found.trials] == [drawn.answer] * 3
+    other = tried.trials.list(batch=two.batch).arrays()
+    assert np.isnan(other.achieved.position[:, 0]).tolist() == [True, False, True]
+    assert {"achieved_x", "achieved_qw", "answer"} <= set(other.columns())
+    file = tmp_path / "tried.csv"
+    names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    rows = [[*pose, "success", *(["" for _ in pose] if i else pose)] for i, pose in enumerate(drawn.poses)]
+    header = [*names, "outcome", *(f"achieved_{name}" for name in names)]
+    file.write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]))
+    code, out, _ = run("--json", "trials", "add", tried.id, str(file), "--answer", drawn.answer or "")
+    assert code == 0
+    stored = tried.trials.list(batch=json.loads(out)["batches"][0]).arrays()
+    assert [t.answer for t in stored.trials] == [drawn.answer] * 3
+    assert np.isnan(stored.achieved.position[:, 0]).tolist() == [False, True, True]
+    code, _, err = run("trials", "add", tried.id, str(file), "--answer", "nothing")
+    assert code == 1
+    assert "no answer about this object" in err
+
+
+def test_the_promises_report(tried: GraspObject, run: Run, tmp_path: Path) -> None:
+    for _ in range(2):
+        tried.best_grasp().report(True)
+    report = tried.reports.promises()
+    assert report.verdict == "undecided"
+    assert report.difference.low is not None
+    assert "too little" in report.text
+    figure = tmp_path / "promises.svg"
+    code, out, err = run("report", tried.id, "promises", "--figure", str(figure))
+    assert code == 0
+    assert "answers tried" in out
+    assert "Only what promised" in err
+    assert figure.read_text().startswith("<?xml")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from typing import Any
 
@@ -118,6 +119,16 @@ def test_draws_without_a_seed_are_repeated_by_name(http: httpx.Client, thing: st
     seeded = {"count": 4, "name": "draws", "seed": first["seed"]}
     assert http.post(path, json=seeded).json() == first
     assert http.post(path, json={**seeded, "seed": first["seed"] ^ 1}).status_code == 409
+
+
+def test_one_of_many_who_ask_under_a_name_at_once_fixes_the_answer(http: httpx.Client, thing: str) -> None:
+    def ask(_: int) -> Any:
+        return http.post(f"/objects/{thing}/samples", json={"count": 3, "name": "race"}).json()
+
+    with ThreadPoolExecutor(8) as pool:
+        first, *others = pool.map(ask, range(8))
+    assert all(other == first for other in others)
+    assert http.get("/answers/race").json()["result"] == first
 
 
 def test_names_that_can_not_be(http: httpx.Client, thing: str) -> None:

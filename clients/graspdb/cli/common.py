@@ -71,7 +71,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name != "raw"}
+        fields = {
+            f.name: getattr(value, f.name)
+            for f in dataclasses.fields(value)
+            if f.name not in ("raw", "reporter")
+        }
         return {name: plain(item) for name, item in fields.items()}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}

@@ -22,6 +22,7 @@ from graspdb.reports import (
     ConvergenceOptions,
     KernelSimilarityOptions,
     ProjectionOptions,
+    PromisesOptions,
     Reports,
 )
 from graspdb.wire.reports import REPORT_NAMES, REPORTS, ReportRange
@@ -31,7 +32,14 @@ Columns = dict[str, Callable[[Any], Any]]
 Table = tuple[Sequence[Any], Columns]
 
 
-class Options(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, total=False):
+class Options(
+    ConvergenceOptions,
+    AnisotropyOptions,
+    ProjectionOptions,
+    KernelSimilarityOptions,
+    PromisesOptions,
+    total=False,
+):
     """Of all reports."""
 
 
@@ -228,6 +236,36 @@ def _correction(found: wire.reports.SourceMap) -> str:
     return f"{found.judged}: sigmoid({found.shift:+.2f} {found.slope:+.2f} logit p)"
 
 
+def _promises(raw: wire.reports.PromisesReport) -> Iterator[Table]:
+    promised = raw.promised
+    rows = {
+        "answers tried": f"{raw.answers:,} of {raw.answers_given:,} best grasps kept; {raw.trials:,} trials",
+        "promised": f"{number(promised.value)} on average, {number(promised.low)} to {number(promised.high)}",
+        "happened": _range(raw.happened),
+        "difference": _range(raw.difference),
+        "Brier skill": _range(raw.skill),
+        "explained by choosing the highest": f"at most {number(raw.selection.at_most)}",
+        "of other grasps": f"{raw.unmatched:,} trials",
+        "without a probability": f"{raw.without_promise:,} trials",
+        "by geometry alone": f"{raw.prior.trials:,} trials",
+    }
+    if raw.placement.trials:
+        place = raw.placement
+        rows["misplaced"] = (
+            f"{1e3 * (place.position_m or 0.0):.1f} mm, {place.rotation_deg or 0.0:.1f}° in the middle of"
+            f" {place.trials:,} trials"
+        )
+    yield list(rows.items()), {"": lambda row: row[0], " ": lambda row: row[1]}
+    columns: Columns = {
+        "promised": lambda b: f"{b.lower:.1f} to {b.upper:.1f}",
+        "answers": lambda b: b.answers,
+        "trials": lambda b: b.trials,
+        "mean": lambda b: number(b.promised),
+        "happened": lambda b: _range(b.happened),
+    }
+    yield [item for item in raw.bins if item.answers], columns
+
+
 def _alike(found: wire.reports.SourceSimilarity | None) -> str:
     return "unknown" if found is None else f"{found.value:.2f} (chance alone {_range(found.expected)})"
 
@@ -256,6 +294,7 @@ _TABLES: dict[str, Callable[[Any], Iterator[Table]]] = {
     "calibration": _calibration,
     "convergence": _convergence,
     "kernel-similarity": _kernel_similarity,
+    "promises": _promises,
     "sources": _sources,
     "summary": _summary,
 }

@@ -32,6 +32,9 @@ def add_trials(
     gripper: Annotated[str | None, typer.Option(help="Gripper of all trials that name none.")] = None,
     source: Annotated[str | None, typer.Option(help="simulation, robot, human or import.")] = None,
     protocol: Annotated[str | None, typer.Option(help="How the trials were judged.")] = None,
+    answer: Annotated[
+        str | None, typer.Option(help="Id or name of the answer that trials tried which name none.")
+    ] = None,
     unit: Annotated[str, typer.Option(help="What the file's positions are in: m, cm, mm or in.")] = "m",
     quaternion_order: Annotated[
         str, typer.Option(help="The order of the file's quaternions: xyzw, or wxyz whatever their names say.")
@@ -40,14 +43,15 @@ def add_trials(
     """Store the trials of a file, and say what looks doubtful about them.
 
     CSV has the columns x,y,z,qx,qy,qz,qw,outcome and optionally gripper, source, protocol,
-    proposal_density, quality, width_m, measured_at.
+    proposal_density, quality, width_m, measured_at, answer, and achieved_x to achieved_qw for where the tool
+    was after all.
     """
     records, shared = read_trials(file)
     try:
         records = as_stated(records, unit=unit, quaternion_order=quaternion_order)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
-    given = {"gripper": gripper, "source": source, "protocol": protocol}
+    given = {"gripper": gripper, "source": source, "protocol": protocol, "answer": answer}
     shared |= {name: value for name, value in given.items() if value is not None}
     upload["progress"] = not state.json and len(records) > 1_000
     with warnings.catch_warnings():
@@ -79,6 +83,7 @@ def list_trials(
             "source": lambda t: t.source,
             "protocol": lambda t: t.protocol,
             "batch": lambda t: t.batch,
+            "answer": lambda t: t.answer,
         },
         empty="No trials match.",
     )

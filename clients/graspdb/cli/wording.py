@@ -17,6 +17,7 @@ from graspdb.reports import (
     ConvergenceOptions,
     KernelSimilarityOptions,
     ProjectionOptions,
+    PromisesOptions,
 )
 from graspdb.resources.kernels import KernelOptions
 from graspdb.resources.objects import ObjectProperties
@@ -51,7 +52,7 @@ COMMANDS: Mapping[str, str] = {
 
 _PARAMETERS = option_names(
     *(Constraints, SweepOptions, KernelOptions, ObjectProperties, TrialFilters, Upload),
-    *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions),
+    *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, PromisesOptions),
 ) | {"unit", "mesh"}
 _CALL = re.compile(r"\b(GET|POST|PUT|DELETE|PATCH) (/[\w{}./-]*[\w}])(?:\?([\w=]+)(?:=\.\.\.|\.\.\.)?)?")
 _PARAMETER = re.compile(r"(?<![\w.\-])(?:\w+\([^()]*\)|([a-z_]+)=([\w.-]*)|([a-z]+(?:_[a-z]+)+))")

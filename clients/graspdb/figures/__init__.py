@@ -18,6 +18,7 @@ from graspdb.figures.canvas import Figure
 from graspdb.figures.convergence import draw_convergence
 from graspdb.figures.kernel_similarity import draw_kernel_similarity
 from graspdb.figures.projection import draw_projection
+from graspdb.figures.promises import draw_promises
 from graspdb.figures.sources import draw_sources
 from graspdb.figures.summary import draw_summary
 from graspdb.wire import reports
@@ -36,6 +37,7 @@ _DRAW: dict[type[Any], Callable[[Any], Figure]] = {
     reports.ConvergenceReport: draw_convergence,
     reports.KernelSimilarityReport: draw_kernel_similarity,
     reports.ProjectionReport: draw_projection,
+    reports.PromisesReport: draw_promises,
     reports.SourcesReport: draw_sources,
     reports.SummaryReport: draw_summary,
 }

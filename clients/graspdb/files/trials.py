@@ -1,8 +1,9 @@
 """Trials and poses in files: JSON, NDJSON and CSV, and poses in .npy.
 
 CSV has a header line. A pose is ``x,y,z,qx,qy,qz,qw``; a trial adds ``outcome`` and, where wanted,
-``gripper``, ``source``, ``protocol``, ``proposal_density``, ``quality``, ``width_m``, ``measured_at``;
-an empty cell is a value not given. JSON is what the HTTP interface takes: one trial, a list of trials,
+``gripper``, ``source``, ``protocol``, ``proposal_density``, ``quality``, ``width_m``, ``measured_at``,
+``answer``, and the pose that was achieved as ``achieved_x`` to ``achieved_qw``; an empty cell is a value not
+given. JSON is what the HTTP interface takes: one trial, a list of trials,
 ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values shared by all beside them.
 """
 
@@ -22,7 +23,8 @@ from numpy.typing import NDArray
 
 from graspdb.poses import POSE_COLUMNS, as_poses
 
-_TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at"})
+_TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at", "answer"})
+_ACHIEVED_COLUMNS = tuple(f"achieved_{name}" for name in POSE_COLUMNS)
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
 
 
@@ -69,20 +71,27 @@ def as_stated(
         raise ValueError(f"quaternion_order is {quaternion_order!r}; expected xyzw or wxyz")
     converted = []
     for record in records:
-        changed = dict(record)
-        with suppress(KeyError, TypeError, ValueError, IndexError):
-            changed["position"] = [float(x) * METRES[unit] for x in record["position"]]
-        with suppress(KeyError, TypeError, ValueError, IndexError):
-            rows = [list(row) for row in record["matrix"]]
-            for row in rows[:3]:
-                row[3] = float(row[3]) * METRES[unit]
-            changed["matrix"] = rows
-        if quaternion_order == "wxyz":
-            with suppress(KeyError, TypeError, ValueError):
-                w, x, y, z = record["quaternion_xyzw"]
-                changed["quaternion_xyzw"] = [x, y, z, w]
+        changed = _pose_as_stated(record, unit, quaternion_order)
+        if isinstance(record.get("achieved_pose"), dict):
+            changed["achieved_pose"] = _pose_as_stated(record["achieved_pose"], unit, quaternion_order)
         converted.append(changed)
     return converted
+
+
+def _pose_as_stated(record: dict[str, Any], unit: str, quaternion_order: str) -> dict[str, Any]:
+    changed = dict(record)
+    with suppress(KeyError, TypeError, ValueError, IndexError):
+        changed["position"] = [float(x) * METRES[unit] for x in record["position"]]
+    with suppress(KeyError, TypeError, ValueError, IndexError):
+        rows = [list(row) for row in record["matrix"]]
+        for row in rows[:3]:
+            row[3] = float(row[3]) * METRES[unit]
+        changed["matrix"] = rows
+    if quaternion_order == "wxyz":
+        with suppress(KeyError, TypeError, ValueError):
+            w, x, y, z = record["quaternion_xyzw"]
+            changed["quaternion_xyzw"] = [x, y, z, w]
+    return changed
 
 
 class DrawnPoses(NamedTuple):
@@ -194,10 +203,11 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
     with io.StringIO(_text(path), newline="") as file:
         reader = csv.DictReader(file, skipinitialspace=True)
         names = set(reader.fieldnames or ())
+        known = _TEXT_COLUMNS | _NUMBER_COLUMNS | set(_ACHIEVED_COLUMNS)
         wanted = {*POSE_COLUMNS, "outcome"} if trials else set(POSE_COLUMNS)
         if missing := sorted(wanted - names):
             raise FileProblem(f"{path} needs a header line with {','.join(POSE_COLUMNS)}; it lacks {missing}")
-        if trials and (unknown := sorted(names - wanted - _TEXT_COLUMNS - _NUMBER_COLUMNS)):
+        if trials and (unknown := sorted(names - wanted - known)):
             raise FileProblem(f"{path} has unknown columns {unknown}")
         records = []
         for row in reader:
@@ -212,6 +222,10 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
                     if text:
                         record[name] = _number(where, name, text) if name in _NUMBER_COLUMNS else text
                 record["outcome"] = _outcome(record.get("outcome"))
+                cells = [(row.get(name) or "").strip() for name in _ACHIEVED_COLUMNS]
+                if any(cells):
+                    achieved = [_number(where, *cell) for cell in zip(_ACHIEVED_COLUMNS, cells, strict=True)]
+                    record["achieved_pose"] = {"position": achieved[:3], "quaternion_xyzw": achieved[3:]}
             elif (row.get("proposal_density") or "").strip():
                 record["proposal_density"] = _number(where, "proposal_density", row["proposal_density"])
             records.append(record)

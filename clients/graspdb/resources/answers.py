@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 from graspdb import wire
 from graspdb.resources.pages import Listing, Resource, segment
-from graspdb.resources.results import Grasps, LikelihoodArrays, SampledPoses, table_html
+from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses, table_html
+from graspdb.resources.trials import Receipt, Trials
+from graspdb.transport import Transport
 
 Result = Grasps | LikelihoodArrays | SampledPoses
 
@@ -40,11 +43,17 @@ class KeptAnswer:
     raw: wire.Answer
 
     @classmethod
-    def from_wire(cls, answer: wire.Answer) -> KeptAnswer:
-        """From the service's answer."""
+    def from_wire(cls, answer: wire.Answer, transport: Transport) -> KeptAnswer:
+        """From the service's answer; trials of its grasps are posted over the transport."""
         names = ("object", "kind", "revision", "object_revision", "gripper", "protocol", "source")
         fields = {name: getattr(answer, name) for name in (*names, "trials", "created_at", "question")}
-        return cls(id=answer.answer, names=tuple(answer.names), result=_result(answer), raw=answer, **fields)
+        return cls(
+            id=answer.answer,
+            names=tuple(answer.names),
+            result=_result(answer, transport),
+            raw=answer,
+            **fields,
+        )
 
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
@@ -77,7 +86,8 @@ class Answers(Resource):
         """The answer with this id or name, as it was given; ``now``: to its question asked again today."""
         params = {"now": "true"} if now else None
         path = f"{self._path}/{segment(answer)}"
-        return KeptAnswer.from_wire(self._transport.model(wire.Answer, "GET", path, params=params))
+        found = self._transport.model(wire.Answer, "GET", path, params=params)
+        return KeptAnswer.from_wire(found, self._transport)
 
     def delete(self, answer: str) -> None:
         """Delete an answer by its id; Conflict where trials name it.
@@ -94,10 +104,22 @@ class Answers(Resource):
         return Listing(self._transport, f"/objects/{segment(object)}/answers", wire.AnswerInfo, params)
 
 
-def _result(answer: wire.Answer) -> Result:
+def report_grasp(transport: Transport, object: str, grasp: Grasp, outcome: Any, **trial: Any) -> Receipt:
+    """Post a trial of a grasp that an answer gave: of the answer's gripper and protocol, unless others are
+    named.
+    """
+    if grasp.answer is not None:
+        answer = transport.model(wire.Answer, "GET", f"/answers/{segment(grasp.answer)}")
+        named = {"gripper": answer.gripper, "protocol": answer.protocol, "answer": grasp.answer}
+        trial = named | trial
+    return Trials(transport, f"/objects/{segment(object)}/trials").add(grasp, outcome, **trial)
+
+
+def _result(answer: wire.Answer, transport: Transport) -> Result:
     """What the question's method gives."""
     if answer.kind == "best-grasp":
-        return Grasps(wire.BestGrasps.model_validate(answer.result))
+        reporter = partial(report_grasp, transport, answer.object)
+        return Grasps(wire.BestGrasps.model_validate(answer.result), reporter)
     if answer.kind == "likelihood":
         return LikelihoodArrays.from_wire([wire.Likelihoods.model_validate(answer.result)])
     model = wire.Samples if answer.kind == "samples" else wire.Proposals

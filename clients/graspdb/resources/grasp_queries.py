@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Unpack, get_args
 
 import numpy as np
@@ -12,6 +13,7 @@ from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
 from graspdb.poses import as_poses
+from graspdb.resources.answers import report_grasp
 from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
@@ -116,9 +118,8 @@ class GraspQueries(Resource):
         """
         given = known_keywords(Constraints, constraints, "best_grasps")
         request = best_grasp_request(count, given)
-        grasps = Grasps(
-            self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
-        )
+        answer = self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
+        grasps = Grasps(answer, partial(report_grasp, self._transport, self.id))
         if len(grasps):
             return self._simulated(grasps, given, verify_timeout_s) if verify else grasps
         if grasps.status == "no_successes":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import html
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
@@ -16,6 +16,8 @@ from graspdb import wire
 from graspdb.poses import Poses, as_poses, matrices
 
 Floats = NDArray[np.float64]
+Reporter = Callable[..., Any]
+"""Posts a trial of a grasp: takes the grasp, its outcome, and what else ``trials.add`` takes."""
 
 
 def to_pandas(columns: Mapping[str, Any]) -> Any:
@@ -106,10 +108,13 @@ class Grasp:
     prior: bool = False
     answer: str | None = None
     raw: wire.Grasp | None = field(default=None)
+    reporter: Reporter | None = field(default=None)
 
     @classmethod
-    def from_wire(cls, grasp: wire.Grasp, answer: str | None = None) -> Grasp:
-        """From the service's answer, by the id that this has."""
+    def from_wire(
+        cls, grasp: wire.Grasp, answer: str | None = None, reporter: Reporter | None = None
+    ) -> Grasp:
+        """From the service's answer, by the id that this has; ``reporter`` posts what became of it."""
         fields = {name: getattr(grasp, name) for name in wire.Grasp.model_fields}
         world = grasp.world
         fields |= {
@@ -119,7 +124,26 @@ class Grasp:
             "nearest_trials": tuple(grasp.nearest_trials),
             "active_constraints": tuple(grasp.active_constraints),
         }
-        return cls(**fields, answer=answer, raw=grasp)
+        return cls(**fields, answer=answer, raw=grasp, reporter=reporter)
+
+    def report(
+        self, outcome: bool | str, *, achieved_pose: Any | None = None, source: str = "robot", **trial: Any
+    ) -> Any:
+        """Post what became of the grasp: a trial that names the answer, with its gripper and protocol.
+
+        ``achieved_pose`` is where the tool was after all, (4, 4) or x y z qx qy qz qw in the object frame;
+        what else is known of the trial as ``trials.add`` takes it (``width_m``, ...). The receipt.
+
+        It waits for the service, also in an asynchronous program: there call ``trials.add`` with ``answer``.
+        """
+        if self.reporter is None:
+            raise ValueError("this grasp is of no object's answer: use trials.add(grasp, outcome, ...)")
+        achieved = {} if achieved_pose is None else {"achieved_poses": achieved_pose}
+        return self.reporter(self, outcome, source=source, **achieved, **trial)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A connection goes to no other process."""
+        return {**vars(self), "reporter": None}
 
     @property
     def matrix(self) -> Floats:
@@ -207,7 +231,7 @@ class Grasps(Sequence[Grasp]):
     they were simulated before they were answered (``verify=True``), those that held come first.
     """
 
-    def __init__(self, answer: wire.BestGrasps) -> None:
+    def __init__(self, answer: wire.BestGrasps, reporter: Reporter | None = None) -> None:
         self.status = answer.status
         self.revision = answer.revision
         self.kernel = answer.kernel
@@ -218,10 +242,12 @@ class Grasps(Sequence[Grasp]):
         self.selection = answer.selection
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
-        self.nearest = None if answer.nearest is None else Grasp.from_wire(answer.nearest, answer.answer)
+        self.nearest = (
+            None if answer.nearest is None else Grasp.from_wire(answer.nearest, answer.answer, reporter)
+        )
         self.conflict = tuple(answer.conflict)
         self.relax = dict(answer.relax)
-        self._grasps = tuple(Grasp.from_wire(grasp, answer.answer) for grasp in answer.grasps)
+        self._grasps = tuple(Grasp.from_wire(grasp, answer.answer, reporter) for grasp in answer.grasps)
 
     @overload
     def __getitem__(self, index: int) -> Grasp: ...
@@ -567,6 +593,16 @@ class TrialArrays(TriedPoses):
     seq: NDArray[np.int64]
     trials: tuple[wire.TrialOut, ...]
 
+    @property
+    def achieved(self) -> Poses:
+        """Where the tool was after all, NaN where that is unknown: the other poses are then what was
+        commanded.
+        """
+        known = [trial.achieved_pose for trial in self.trials]
+        rows = [[np.nan] * 7 if p is None else [*p.position, *p.quaternion_xyzw] for p in known]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+        return Poses(table[:, :3], table[:, 3:])
+
     @classmethod
     def of(cls, trials: Sequence[wire.TrialOut]) -> TrialArrays:
         """The columns of these trials."""
@@ -580,8 +616,9 @@ class TrialArrays(TriedPoses):
 
     def _columns(self) -> dict[str, Any]:
         names = ["gripper", "source", "protocol", "batch", "sweep", "pose_index", "quality", "width_m"]
-        names += ["proposal_density", "measured_at", "revision", "withdrawn"]
+        names += ["proposal_density", "measured_at", "revision", "withdrawn", "answer"]
         columns = {"seq": self.seq, **pose_columns(self), "outcome": self.outcome}
+        columns |= {f"achieved_{name}": x for name, x in pose_columns(self.achieved).items()}
         return columns | {name: [getattr(t, name) for t in self.trials] for name in names}
 
     def __repr__(self) -> str:

@@ -119,6 +119,8 @@ class Trials(Resource):
         pose_covariance: ArrayLike | None = None,
         measured_at: datetime | Sequence[datetime | None] | ArrayLike | None = None,
         metadata: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
+        answer: str | Sequence[str | None] | None = None,
+        achieved_poses: ArrayLike | Any | None = None,
         **upload: Unpack[Upload],
     ) -> Receipt:
         """Store grasp trials; how they are sent: :class:`Upload`. ValueError if shapes or poses are wrong.
@@ -134,6 +136,9 @@ class Trials(Resource):
         - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
         - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, tool frame.
         - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial; NumPy's times are UTC.
+        - ``answer``: id or name of the answer that was tried, one for all or one a trial: ``best.answer``.
+        - ``achieved_poses``: where the tool was after all, as ``poses``, which are then what was commanded;
+          in a list None where it is unknown. Estimates take the achieved pose where there is one.
         """
         given = as_poses(poses)
         count = len(given.position)
@@ -150,6 +155,12 @@ class Trials(Resource):
             shared["metadata"] = dict(metadata)
         elif metadata is not None:
             columns["metadata"] = _each("metadata", metadata, Mapping, count)
+        if isinstance(answer, str):
+            shared["answer"] = answer
+        elif answer is not None:
+            columns["answer"] = _each("answer", answer, str, count)
+        if achieved_poses is not None:
+            columns["achieved_pose"] = _achieved(achieved_poses, count)
 
         def part(start: int, stop: int) -> dict[str, Any]:
             return {"columns": {name: values[start:stop] for name, values in columns.items()}}
@@ -170,7 +181,7 @@ class Trials(Resource):
         """Store trials given as mappings with the fields of the HTTP interface; sent as :meth:`add` does.
 
         ``shared`` stands once for all that do not say it themselves: ``gripper``, ``source``, ``protocol``,
-        ``proposal_density``, ``metadata``.
+        ``proposal_density``, ``metadata``, ``answer``.
         """
         trials = [dict(record) for record in records]
         if not trials:
@@ -320,6 +331,22 @@ def _outcomes(outcomes: ArrayLike | str | bool, count: int) -> list[Any]:
                 f"outcome {index} is {value!r}; expected a bool or one of {', '.join(wire.OUTCOMES)}"
             )
     return values
+
+
+def _achieved(poses: Any, count: int) -> list[Any]:
+    """A pose a trial as requests take it, None where it is unknown."""
+    unknown = [False] * count
+    if isinstance(poses, (list, tuple)) and any(pose is None for pose in poses):
+        unknown = [pose is None for pose in poses]
+        poses = [pose for pose in poses if pose is not None]
+        if not poses:
+            return [None] * count
+    given = as_poses(poses)
+    if len(unknown) != count or len(given.position) != count - sum(unknown):
+        raise ValueError(f"achieved_poses has {len(given.position)} poses for {count} trials")
+    rows = zip(given.position.tolist(), given.quaternion_xyzw.tolist(), strict=True)
+    known = ({"position": position, "quaternion_xyzw": quaternion} for position, quaternion in rows)
+    return [None if missing else next(known) for missing in unknown]
 
 
 def _each(name: str, values: Any, kind: type[Any], count: int) -> list[Any]:

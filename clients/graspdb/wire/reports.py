@@ -43,6 +43,7 @@ ReportName = Literal[
     "bandwidth",
     "kernel-similarity",
     "sources",
+    "promises",
 ]
 REPORT_NAMES: tuple[ReportName, ...] = get_args(ReportName)
 Method = Literal["empirical", "density"]
@@ -777,6 +778,15 @@ class SourcesOptions(Request):
     """Standard deviation of the kernel about each axis, degrees; by default chosen from the trials."""
 
 
+class PromisesOptions(TrialSelection):
+    """Which trials count, and from where on one is of no grasp of the answer that it names."""
+
+    match_position_m: Annotated[float, Field(gt=0, le=1.0)] = 0.02
+    """A trial commanded farther than this from every grasp of its answer tried none of them, metres."""
+    match_rotation_deg: Annotated[float, Field(gt=0, le=180.0)] = 20.0
+    """A trial turned farther than this from every grasp of its answer tried none of them, degrees."""
+
+
 ReportOptions = TrialSelection | SourcesOptions
 
 
@@ -851,6 +861,139 @@ class SummaryReport(Response):
     warnings: Warnings = Field(default_factory=list)
 
 
+class PromiseBin(Response):
+    """Answers that promised about as much."""
+
+    lower: float
+    """Lower end of the promised success probability, 0 to 1."""
+    upper: float
+    """Upper end of the promised success probability, 0 to 1."""
+    answers: int
+    """How many answers promised so much and were tried."""
+    trials: int
+    """How many trials tried them."""
+    promised: float | None
+    """Mean promise over the answers, 0 to 1; null without any."""
+    happened: ReportRange
+    """Share of successes over the answers, each counted once, with its interval."""
+
+
+class PromiseSelection(Response):
+    """How much too high promises may be because only the highest were tried."""
+
+    share_of_all: float | None
+    """Share of successes among the attempts that name no answer, 0 to 1; null without any."""
+    at_most: float
+    """By how much the mean promise may be too high from choosing the highest of many estimates: 2.5 of their
+    standard errors, as of the largest of a hundred of one truth."""
+    more_than_selection: bool | None
+    """Whether what happened lies below even that, so the estimates themselves promise too much; null where
+    undecided."""
+    came_true: ReportRange
+    """Of what was promised above ``share_of_all``, the part that came true, with its interval: what a promise
+    should be shrunk by towards that share; null where promises are no higher than it."""
+
+
+class PromisedPrior(Response):
+    """Promises of geometry alone, where no attempt was near enough."""
+
+    trials: int
+    """How many trials tried such grasps."""
+    promised: float | None
+    """Mean prior success probability, 0 to 1; null without any."""
+    happened: ReportRange
+    """Share of successes among these trials with its interval, as of independent ones."""
+
+
+class PromisePlacement(Response):
+    """How far from the commanded poses the tool was, where trials tell the achieved ones."""
+
+    trials: int
+    """How many trials tell the pose that they achieved."""
+    position_m: float | None
+    """Median distance of the achieved from the commanded position, metres; null without any."""
+    position_p90_m: float | None
+    """The distance that 9 of 10 trials stay below, metres; null without any."""
+    rotation_deg: float | None
+    """Median angle of the achieved from the commanded rotation, degrees; null without any."""
+    rotation_p90_deg: float | None
+    """The angle that 9 of 10 trials stay below, degrees; null without any."""
+    position_held_m: float | None
+    """Median distance where the grasp held, metres; null where none did."""
+    position_failed_m: float | None
+    """Median distance where the grasp failed, metres; null where none did."""
+    rotation_held_deg: float | None
+    """Median angle where the grasp held, degrees; null where none did."""
+    rotation_failed_deg: float | None
+    """Median angle where the grasp failed, degrees; null where none did."""
+    commanded_probability: float | None
+    """Mean success probability at the commanded poses, by today's attempts without these trials, over those
+    where both it and the next are known; null without any."""
+    achieved_probability: float | None
+    """The same at the achieved poses: what it lies below, misplacing explains by the estimate; null without
+    any."""
+
+
+class PromisesReport(Report):
+    """What was promised against what happened: trials that name the answer they tried.
+
+    It speaks only of the range that was promised: what promised little was not tried.
+    """
+
+    question: ClassVar[str] = (
+        "What was promised against what happened: success probabilities of answers that were tried, mindful"
+        " that only promising grasps were."
+    )
+    options: ClassVar[type[Request]] = PromisesOptions
+    report: Literal["promises"] = "promises"
+    """Name of the report, as in its path."""
+    level: IntervalLevel
+    verdict: Literal["undecided", "as-promised", "over-promised", "under-promised"]
+    """``undecided`` below 10 answers; ``as-promised`` where the interval of the difference holds 0."""
+    answers_given: int
+    """How many best grasps about the object are kept, whatever they selected; those that nothing keeps are
+    deleted in time."""
+    answers_never_tried: int
+    """How many of these no trial names: nothing is known of what they promised."""
+    trials: int
+    """How many trials of the selection name an answer."""
+    unmatched: int
+    """How many of these lie farther from every grasp of their answer than the limits: they tried something
+    else."""
+    match_position_m: float | None
+    """Median distance of the others' commanded poses from the grasp that they tried, metres; null without
+    any."""
+    match_rotation_deg: float | None
+    """Median angle of the others' commanded poses from the grasp that they tried, degrees; null without
+    any."""
+    without_promise: int
+    """How many tried grasps that were told by their density alone: no probability was promised."""
+    prior: PromisedPrior
+    """Those that geometry alone promised, which enter nothing below."""
+    answers: int
+    """How many answers promised a probability and were tried: each counts once, with the mean of its
+    trials."""
+    judged: int
+    """How many trials tried these."""
+    promised: ReportRange
+    """Mean promise, with the least and the highest promise as its ends."""
+    happened: ReportRange
+    """Share of successes over the answers, with its interval."""
+    difference: ReportRange
+    """What happened less what was promised, with its interval; below 0 was promised too much."""
+    brier: float | None
+    """Mean squared error of the promises, 0 is perfect; null without any."""
+    skill: ReportRange
+    """Part of the squared error of always telling the share that happened which the promises spare, with its
+    interval; null where all held or none did."""
+    selection: PromiseSelection
+    """What choosing the highest estimates explains."""
+    placement: PromisePlacement
+    """How far from the commanded poses the tool was, and what that explains."""
+    bins: list[PromiseBin]
+    """By what was promised, from 0 to 1."""
+
+
 REPORTS: Mapping[str, type[Report]] = {
     model.model_fields["report"].default: model
     for model in (
@@ -861,6 +1004,7 @@ REPORTS: Mapping[str, type[Report]] = {
         BandwidthReport,
         KernelSimilarityReport,
         SourcesReport,
+        PromisesReport,
     )
 }
 

@@ -57,6 +57,8 @@ class TrialDefaults(Request):
     """Density that the pose was drawn with, 1/(m^3 rad^3), which weights the trial; null if unknown."""
     metadata: Metadata | None = None
     """Any JSON object of the user's; null for none."""
+    answer: Slug | None = None
+    """Id or name of the answer that was tried, one about this object; null for none."""
 
 
 class TrialIn(Pose, TrialDefaults):
@@ -73,6 +75,9 @@ class TrialIn(Pose, TrialDefaults):
     if unknown."""
     measured_at: datetime | None = None
     """When it was tried; a time without a zone is UTC; null if unknown."""
+    achieved_pose: Pose | None = None
+    """Where the tool was after all, in the object frame, where the other pose is what was commanded:
+    estimates take this one; null if unknown."""
 
 
 class TrialsIn(TrialDefaults):
@@ -110,6 +115,11 @@ class TrialColumns(Request):
     """When each was tried; a time without a zone is UTC; null if unknown."""
     metadata: list[Metadata | None] | None = None
     """Any JSON object of the user's of each; null for none."""
+    answer: list[Slug | None] | None = None
+    """Id or name of the answer that each tried; null for none."""
+    achieved_pose: list[Pose | None] | None = None
+    """Where the tool was after all in each, in the object frame: estimates take this pose; null if
+    unknown."""
 
 
 class TrialColumnsIn(TrialDefaults):
@@ -117,6 +127,13 @@ class TrialColumnsIn(TrialDefaults):
 
     columns: TrialColumns
     """The trials' columns, stored as one batch."""
+
+
+class AchievedPose(Response):
+    """The pose that a trial achieved."""
+
+    position: ToolPosition
+    quaternion_xyzw: ToolRotation
 
 
 class TrialOut(Response):
@@ -155,6 +172,10 @@ class TrialOut(Response):
     """Id of the sweep that simulated it; null for a posted trial."""
     pose_index: int | None = None
     """Its index in that sweep's plan; null for a posted trial."""
+    answer: str | None = None
+    """Id of the answer that it tried; null where it names none."""
+    achieved_pose: AchievedPose | None = None
+    """Where the tool was after all, in the object frame: estimates take this pose; null if unknown."""
     withdrawn: bool = False
     """Whether it is kept, but out of every count and estimate."""
 

@@ -63,7 +63,7 @@ def add_trials(
     object than ten times its size and the gripper's together are refused (`implausible-poses`).
     """
     media = media_type(request)
-    made = posting.add(ctx, id, ctx.scenes, sent, media, accept_implausible=accept_implausible)
+    made = posting.add(ctx, id, ctx.scenes, ctx.answers, sent, media, accept_implausible=accept_implausible)
     return sent.answered(made)
 
 

@@ -31,8 +31,8 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
 
     Columns have the names of a trial's fields; ``outcome`` is text (or a dictionary of it) or boolean,
     ``measured_at`` a timestamp (UTC where it names no zone) or text, ``metadata`` a struct or JSON text,
-    ``pose_covariance`` lists of lists or of 36 numbers. What holds for the whole batch stands as JSON in the
-    schema's metadata, key ``graspdb``.
+    ``pose_covariance`` lists of lists or of 36 numbers, ``achieved_pose`` a struct. What holds for the whole
+    batch stands as JSON in the schema's metadata, key ``graspdb``.
     """
     table = arrow.Table(body, NAMES)
     if not table.count:
@@ -47,13 +47,19 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
         values = table.scalars(name)
         if values is not None:
             lists[name] = values
-    for name in Provenance._fields:
+    for name in (*Provenance._fields, "answer"):
         found = table.texts(name)
         if found is not None:
             texts, which = found
             # The last one stands for null, whose place is -1.
             lists[name] = np.array([*texts, None], dtype=object)[which].tolist()
-    for name, convert in (("measured_at", None), ("pose_covariance", _square), ("metadata", _document)):
+    converted = {
+        "measured_at": None,
+        "achieved_pose": None,
+        "pose_covariance": _square,
+        "metadata": _document,
+    }
+    for name, convert in converted.items():
         items = table.objects(name)
         if items is not None:
             lists[name] = items if convert is None else [None if x is None else convert(x) for x in items]
@@ -109,6 +115,7 @@ def stream(pages: Iterable[TrialPage], told: dict[str, Any] | None = None) -> It
 def _schema(told: dict[str, Any] | None = None) -> Any:
     """The columns of stored trials, as ``GET /objects/{id}/trials`` has them."""
     pa = arrow.library()
+    achieved = [("position", arrow.vector_type(3)), ("quaternion_xyzw", arrow.vector_type(4))]
     return arrow.schema_of(
         [
             ("seq", pa.int64()),
@@ -127,6 +134,8 @@ def _schema(told: dict[str, Any] | None = None) -> Any:
             ("metadata", pa.string()),
             ("sweep", pa.string()),
             ("pose_index", pa.int64()),
+            ("answer", pa.string()),
+            ("achieved_pose", pa.struct(achieved)),
             ("withdrawn", pa.bool_()),
         ],
         told,

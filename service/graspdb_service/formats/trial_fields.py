@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, SOURCES
-from graspdb.wire.base import Metadata
+from graspdb.wire.base import Metadata, expand_matrix
 from graspdb.wire.trials import TrialDefaults
 from graspdb_service.formats.poses import near, no_vectors, unit, vectors
 from graspdb_service.problems import ProblemError, invalid_fields
@@ -26,7 +26,7 @@ from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, 
 DEFAULTS = frozenset(TrialDefaults.model_fields)
 REQUIRED = ("position", "quaternion_xyzw", "outcome")
 SCALARS = ("proposal_density", "quality", "width_m")
-_OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at")
+_OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at", "achieved_pose")
 NAMES = frozenset(REQUIRED) | frozenset(_OPTIONAL) | DEFAULTS
 _SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _GRIPPER = re.compile(_SLUG.pattern + r"(@[1-9][0-9]{0,8})?")
@@ -36,6 +36,7 @@ _NAME_RULES = {
     "gripper": (_GRIPPER, _GRIPPER_RULE),
     "source": (re.compile("|".join(SOURCES)), f"one of {', '.join(SOURCES)}"),
     "protocol": (_SLUG, _SLUG_RULE),
+    "answer": (_SLUG, _SLUG_RULE),
 }
 _METADATA: TypeAdapter[Any] = TypeAdapter(Metadata)
 _TIME: TypeAdapter[datetime] = TypeAdapter(datetime)
@@ -121,18 +122,26 @@ def check_blocks(blocks: Iterable[Fields], defaults: TrialDefaults, place: Place
         refuse_too_many(count, limit)
         parts.append(_check(block, defaults))
     numbers: dict[Provenance, int] = {}
+    answers: dict[str, int] = {}
     columns = []
     for part in parts:
         own = [numbers.setdefault(item, len(numbers)) for item in part.provenances]
+        # The last one stands for none, whose place is -1.
+        tried = [*(answers.setdefault(name, len(answers)) for name in part.answers), -1]
         columns.append(
-            replace(part.columns, provenance=np.array(own, dtype=np.int64)[part.columns.provenance])
+            replace(
+                part.columns,
+                provenance=np.array(own, dtype=np.int64)[part.columns.provenance],
+                answer=np.array(tried, dtype=np.int64)[part.columns.answer],
+            )
         )
 
     def field_of_gripper(gripper: str) -> str:
         named = (part.field_of_gripper(gripper) for part in parts)
         return next((name for name in named if name != "gripper"), "gripper")
 
-    return TrialBatch(TrialColumns.joined(columns), list(numbers), defaults.metadata, field_of_gripper, place)
+    joined = TrialColumns.joined(columns)
+    return TrialBatch(joined, list(numbers), defaults.metadata, field_of_gripper, place, list(answers))
 
 
 def blocks_of(
@@ -169,7 +178,9 @@ def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         measured_at=_each(fields, "measured_at", _time),
         pose_covariance=_each(fields, "pose_covariance", _covariance),
         metadata=_each(fields, "metadata", _metadata),
+        achieved=_achieved(fields),
     )
+    answers, answer = _answers(fields, defaults)
     provenances, provenance = _provenances(fields, defaults)
     fields.faults.raise_if_any()
     proposal = columns.proposal_density
@@ -177,11 +188,12 @@ def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         proposal = proposal if len(proposal) else np.full(fields.count, np.nan)
         proposal = np.where(np.isnan(proposal), defaults.proposal_density, proposal)
     return TrialBatch(
-        replace(columns, provenance=provenance, proposal_density=proposal),
+        replace(columns, provenance=provenance, proposal_density=proposal, answer=answer),
         provenances,
         defaults.metadata,
         _fields_of_grippers(fields),
         fields.place,
+        answers,
     )
 
 
@@ -267,6 +279,55 @@ def _names(fields: Fields, name: str, default: str | None) -> list[str | None] |
         fields.refuse(name, good, rule)
         return None
     return [default if value is None else value for value in values]
+
+
+def _answers(fields: Fields, defaults: TrialDefaults) -> tuple[list[str], Ints]:
+    """The answers that trials name, and which of them each has (n,), -1 for none; empty where none has."""
+    names = _names(fields, "answer", defaults.answer) or (
+        [] if defaults.answer is None else [defaults.answer] * fields.count
+    )
+    number = {name: i for i, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
+    if not number:
+        return [], np.empty(0, dtype=np.int64)
+    return list(number), np.array([-1 if name is None else number[name] for name in names], dtype=np.int64)
+
+
+def _achieved(fields: Fields) -> Floats:
+    """(n, 7) position and quaternion of the poses that were achieved, NaN for null; empty without any."""
+    rows, poses = [], []
+    for row, value in enumerate(fields.lists.get("achieved_pose", ())):
+        if value is None:
+            continue
+        try:
+            pose = expand_matrix(value)
+        except ValueError as error:
+            fields.fault("achieved_pose", row, str(error))
+            continue
+        if not isinstance(pose, dict) or pose.keys() != {"position", "quaternion_xyzw"}:
+            fields.fault(
+                "achieved_pose", row, "a pose: {position, quaternion_xyzw} or {matrix}; null if unknown"
+            )
+            continue
+        rows.append(row)
+        poses.append(pose)
+    if not rows:
+        return np.empty(0)
+
+    def refuse(name: str, row: int, message: str) -> None:
+        fields.faults.add(f"{fields.place(rows[row], 'achieved_pose')}.{name}", message)
+
+    parts = []
+    for name, width in (("position", 3), ("quaternion_xyzw", 4)):
+        values = [list(x) if isinstance(x := pose[name], tuple) else x for pose in poses]
+        try:
+            parts.append(vectors(values, width))
+        except ValueError:
+            for row, told in no_vectors(values, width):
+                refuse(name, row, told)
+            return np.empty(0)
+    table = np.full((fields.count, 7), np.nan)
+    table[rows] = np.concatenate([near(parts[0], refuse), unit(parts[1], refuse)], axis=1)
+    return table
 
 
 def _fields_of_grippers(fields: Fields) -> Callable[[str], str]:

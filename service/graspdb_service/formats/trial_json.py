@@ -257,6 +257,8 @@ def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
         "metadata": [batch.metadata if value is None else value for value, batch in own],
         "sweep": [batch.sweep for batch in batches],
         "pose_index": columns.pose_index,
+        "answer": [page.answers.get(number) for number in columns.answer.tolist()],
+        "achieved_pose": [_pose(row) for row in columns.achieved.tolist()],
         "withdrawn": columns.withdrawn,
     }
 
@@ -270,6 +272,11 @@ def documents(page: TrialPage) -> list[dict[str, Any]]:
     for name in SCALARS:
         values[name] = [None if value != value else value for value in values[name]]
     return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
+
+
+def _pose(row: list[float]) -> dict[str, list[float]] | None:
+    """An achieved pose, NaN where it is unknown."""
+    return None if row[0] != row[0] else {"position": row[:3], "quaternion_xyzw": row[3:]}
 
 
 def lines(page: TrialPage) -> bytes:

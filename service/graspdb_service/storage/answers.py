@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Select, and_, delete, or_, select, update
+from sqlalchemy import Select, and_, bindparam, delete, func, or_, select, update
 
 from graspdb_service.storage.database import Tx, all_as, clock, insert_or, utc_now
 from graspdb_service.storage.tables import answer_names, answers, objects
 
 #: However many were given since, an answer is kept for so long: who asked may still be on the way with it.
 SHORTEST_LIFE = timedelta(minutes=10)
+#: Ids and names that one statement looks for.
+_AT_ONCE = 500
 _KEPT_COLUMNS = ("id", "object_id", "kind", "revision", "gripper", "protocol", "source", "version")
 
 
@@ -113,11 +115,66 @@ def find(tx: Tx, reference: str) -> AnswerRow | None:
     return next(iter(all_as(tx, query, AnswerRow)), None)
 
 
+def find_many(tx: Tx, object_id: int, references: Collection[str]) -> dict[str, int]:
+    """Numbers of an object's answers by the ids or names that they are called by here."""
+    found: dict[str, int] = {}
+    listed = sorted(references)
+    own = answers.c.object_id == object_id
+    for start in range(0, len(listed), _AT_ONCE):
+        some = listed[start : start + _AT_ONCE]
+        by_id = select(answers.c.id, answers.c.number).where(own, answers.c.id.in_(some))
+        by_name = (
+            select(answer_names.c.name, answers.c.number)
+            .join(answers, answers.c.number == answer_names.c.answer_number)
+            .where(own, answer_names.c.name.in_(some))
+        )
+        for query in (by_id, by_name):
+            found |= {str(reference): int(number) for reference, number in tx.execute(query)}
+    return found
+
+
+def count_trials(tx: Tx, more: Mapping[int, int]) -> bool:
+    """Count trials that name answers, by the answers' numbers; False where one of these is gone."""
+    statement = (
+        update(answers)
+        .where(answers.c.number == bindparam("which"))
+        .values(trial_count=answers.c.trial_count + bindparam("more"))
+    )
+    counts = [tx.execute(statement, {"which": n, "more": more[n]}).rowcount for n in sorted(more)]
+    return all(counts)
+
+
+def ids(tx: Tx, numbers: Collection[int]) -> dict[int, str]:
+    """Ids of answers by number."""
+    if not numbers:
+        return {}
+    query = select(answers.c.number, answers.c.id).where(answers.c.number.in_(sorted(numbers)))
+    return {int(number): str(id) for number, id in tx.execute(query)}
+
+
 def content(tx: Tx, number: int) -> tuple[bytes, bytes]:
     """Question and result of an answer, JSON."""
     query = select(answers.c.question, answers.c.result).where(answers.c.number == number)
     question, result = tx.execute(query).one()
     return zlib.decompress(question), zlib.decompress(result)
+
+
+def many(tx: Tx, numbers: Collection[int]) -> Iterator[tuple[int, str, bytes, bytes]]:
+    """Answers by their numbers: number, kind, question and result."""
+    listed = sorted(numbers)
+    columns = (answers.c.number, answers.c.kind, answers.c.question, answers.c.result)
+    for start in range(0, len(listed), _AT_ONCE):
+        query = select(*columns).where(answers.c.number.in_(listed[start : start + _AT_ONCE]))
+        for number, kind, question, result in tx.execute(query):
+            yield int(number), str(kind), zlib.decompress(question), zlib.decompress(result)
+
+
+def tally(tx: Tx, object_id: int, kind: str) -> tuple[int, int]:
+    """How many answers of an object and kind are kept, and how many of these trials name."""
+    tried = func.count().filter(answers.c.trial_count > 0)
+    query = select(func.count(), tried).where(answers.c.object_id == object_id, answers.c.kind == kind)
+    given, named = tx.execute(query).one()
+    return int(given), int(named)
 
 
 def is_kept(tx: Tx, id: str) -> bool:

@@ -217,6 +217,18 @@ trials = Table(
     Column("metadata", JSON(none_as_null=True)),
     # True: kept, and out of every count and estimate. Null otherwise, so that rows from before need no value.
     Column("withdrawn", Boolean),
+    # The answer that it tried; no foreign key, as above: an answer that trials name is not deleted.
+    Column("answer_number", BigInteger),
+    # Where the tool was after all, where that is known: all of it or nothing.
+    *(Column(f"achieved_{name}", Double) for name in ("px", "py", "pz", "qx", "qy", "qz", "qw")),
+    # Few trials name an answer: found without reading the rest.
+    Index(
+        "ix_trials_of_answers",
+        "object_id",
+        "seq",
+        sqlite_where=text("answer_number IS NOT NULL"),
+        postgresql_where=text("answer_number IS NOT NULL"),
+    ),
     # Successes are what densities are built of and few among the trials: found without reading the rest.
     Index(
         "ix_trials_successes",

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Select, and_, case, delete, distinct, func, insert, or_, select, update
 
+from graspdb_service.storage import answers
 from graspdb_service.storage.database import Tx, all_as, first_as, utc_now
 from graspdb_service.storage.simulation import outcomes
 from graspdb_service.storage.tables import (
@@ -177,6 +178,7 @@ def remove(tx: Tx, batch: BatchRow) -> None:
             provenances.add_packed(tx, batch.provenance_id, {code: -n for code, n in packed.items()})
         tx.execute(delete(packed_outcomes).where(packed_outcomes.c.sweep_id == batch.sweep_id))
     if batch.first_seq is not None:
+        answers.count_trials(tx, {number: -n for number, n in _tried(tx, batch).items()})
         changed = select(trials.c.seq).where(*_rows(batch))
         tx.execute(delete(trial_changes).where(*_changes(batch), trial_changes.c.seq.in_(changed)))
         tx.execute(delete(trials).where(*_rows(batch)))
@@ -192,6 +194,14 @@ def _rows(batch: BatchRow) -> tuple[Any, ...]:
         trials.c.seq.between(batch.first_seq, batch.last_seq),
         trials.c.batch_id == batch.id,
     )
+
+
+def _tried(tx: Tx, batch: BatchRow) -> dict[int, int]:
+    """How many trials of a batch name each answer."""
+    query = select(trials.c.answer_number, func.count()).where(
+        *_rows(batch), trials.c.answer_number.is_not(None)
+    )
+    return {int(number): int(n) for number, n in tx.execute(query.group_by(trials.c.answer_number))}
 
 
 def _changes(batch: BatchRow) -> tuple[Any, ...]:

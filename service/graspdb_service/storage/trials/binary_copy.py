@@ -19,7 +19,16 @@ from graspdb_service.trial_columns import Bools, json_text
 HEADER = b"PGCOPY\n\xff\r\n\x00" + struct.pack(">ii", 0, 0)
 END = struct.pack(">h", -1)
 
-_INTEGERS = ("object_id", "seq", "revision", "batch_id", "provenance_id", "pose_index", "measured_at")
+_INTEGERS = (
+    "object_id",
+    "seq",
+    "revision",
+    "batch_id",
+    "provenance_id",
+    "pose_index",
+    "measured_at",
+    "answer_number",
+)
 _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 
 

@@ -26,6 +26,7 @@ COPY_ROWS = 50_000
 
 _POSE = ("px", "py", "pz", "qx", "qy", "qz", "qw")
 _OPTIONAL = ("proposal_density", "quality", "width_m", "pose_index")
+_ACHIEVED = tuple(f"achieved_{name}" for name in _POSE)
 _DOCUMENTS = ("pose_covariance", "metadata")
 
 
@@ -53,6 +54,8 @@ def _numbers(columns: TrialColumns, first_seq: int) -> dict[str, NDArray[Any]]:
         "outcome": columns.outcome,
         **dict(zip(_POSE, (*columns.position.T, *columns.quaternion_xyzw.T), strict=True)),
         **{name: getattr(columns, name) for name in _OPTIONAL},
+        "answer_number": np.where(columns.answer < 0, np.nan, columns.answer),
+        **dict(zip(_ACHIEVED, columns.achieved.T if len(columns.achieved) else (), strict=False)),
     }
     return {name: values for name, values in found.items() if not np.isnan(values).all()}
 
@@ -85,7 +88,10 @@ def _sqlite_time(value: datetime) -> str:
 
 def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
     values: dict[str, Any] = {**shared, **_numbers(columns, first_seq)}
-    nulls = {name: np.isnan(values[name]) for name in _OPTIONAL if name in values}
+    maybe = (*_OPTIONAL, "answer_number", *_ACHIEVED)
+    nulls = {name: np.isnan(values[name]) for name in maybe if name in values}
+    if "answer_number" in values:
+        values["answer_number"] = np.where(nulls["answer_number"], 0, values["answer_number"])
     times = columns.measured_at
     if times:
         nulls["measured_at"] = np.array([time is None for time in times])
@@ -122,7 +128,10 @@ _READ = ("seq", *_POSE, "proposal_density", "provenance_id", "outcome")
 
 
 def successes(tx: Tx, object_id: int, provenance_ids: Collection[int], *, after_seq: int = 0) -> TrialColumns:
-    """Successes after a sequence number, ascending ``seq``, with the batch each came in; none withdrawn."""
+    """Successes after a sequence number, ascending ``seq``, with the batch each came in; none withdrawn.
+
+    Each at the pose that was achieved, where that is known.
+    """
     # Said literally, as the partial index has it.
     return _read(tx, object_id, provenance_ids, after_seq, (*_READ, "batch_id"), f"outcome = {SUCCESS}")
 
@@ -135,8 +144,8 @@ def posted(
     after_seq: int = 0,
     without: Collection[int] = (),
 ) -> TrialColumns:
-    """Trials that no sweep stored, ascending ``seq``, but for those with the outcome codes ``without`` and
-    those withdrawn.
+    """Trials that no sweep stored, at the poses achieved, ascending ``seq``, but for those with the outcome
+    codes ``without`` and those withdrawn.
     """
     codes = ", ".join(str(int(code)) for code in without)
     # Only a sweep's trials have a place in a plan.
@@ -153,8 +162,11 @@ def _read(
     *conditions: str,
 ) -> TrialColumns:
     where = [*_after(object_id, after_seq), "withdrawn IS NULL", *conditions, _of_provenances(provenance_ids)]
-    # NULL would make an array of Python objects; no proposal density is negative.
-    names = ", ".join(f"coalesce({name}, -1.0)" if name == "proposal_density" else name for name in columns)
+    # NULL would make an array of Python objects; no proposal density is negative. What held or failed was
+    # the achieved pose.
+    known = {name: f"coalesce({achieved}, {name})" for name, achieved in zip(_POSE, _ACHIEVED, strict=True)}
+    known["proposal_density"] = "coalesce(proposal_density, -1.0)"
+    names = ", ".join(known.get(name, name) for name in columns)
     query = f"SELECT {names} FROM trials WHERE {' AND '.join(where)} ORDER BY seq"
     table = (_tuples if tx.dialect.name == "sqlite" else _copied)(tx, query, columns)
     proposal = table["proposal_density"].astype(np.float64)
@@ -217,9 +229,11 @@ def _fetch(tx: Tx, query: str) -> list[Any]:
 _ALL = (
     "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, "proposal_density", "quality",
     "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS, "withdrawn IS NOT NULL",
+    "coalesce(answer_number, -1)", *_ACHIEVED,
 )  # fmt: skip
 
 
+# long: every column of a trial in one list.
 def page(
     tx: Tx,
     object_id: int,
@@ -232,9 +246,10 @@ def page(
     batch_id: int | None = None,
     since_revision: int | None = None,
     withdrawn: bool | None = None,
+    answered: bool = False,
 ) -> TrialColumns:
     """Up to ``limit`` trials after a sequence number; ``since_revision`` keeps what was stored, corrected or
-    withdrawn after it.
+    withdrawn after it, ``answered`` what names an answer.
     """
     where = _after(object_id, after_seq)
     if provenance_ids is not None:
@@ -250,6 +265,9 @@ def page(
             where.append(f"{condition} {int(value)}")
     if withdrawn is not None:
         where.append(f"withdrawn IS {'NOT NULL' if withdrawn else 'NULL'}")
+    if answered:
+        # Said literally, as the partial index has it.
+        where.append("answer_number IS NOT NULL")
     rows = _fetch(
         tx,
         f"SELECT {', '.join(_ALL)} FROM trials WHERE {' AND '.join(where)} ORDER BY seq LIMIT {int(limit)}",
@@ -274,6 +292,8 @@ def page(
         pose_covariance=[_document(value) for value in cells[17]],
         metadata=[_document(value) for value in cells[18]],
         withdrawn=np.array(cells[19], dtype=np.bool_),
+        answer=np.array(cells[20], dtype=np.int64),
+        achieved=np.array(cells[21:28], dtype=np.float64).T.reshape(-1, 7),
     )
 
 

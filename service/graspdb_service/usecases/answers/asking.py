@@ -123,8 +123,9 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
     head = {**_head(drawn.built, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more}
+    seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
-    asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo())
+    asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo(), seed)
     return _in_columns(ctx, asked, few, head, drawn.columns())
 
 
@@ -142,7 +143,7 @@ def ask(ctx: Asking, slug: str, kind: str, question: Mapping[str, Any]) -> Told:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A question with what answered it."""
+    """A question with what answered it; ``drawn`` names what the answer made up of it, its seed."""
 
     kind: AnswerKind
     name: str | None
@@ -150,6 +151,7 @@ class _Asked:
     selected: Selected
     kernel: KernelInfo
     estimator: EstimatorInfo | None
+    drawn: str | None = None
 
 
 def _question(request: Selection) -> dict[str, Any]:
@@ -215,9 +217,14 @@ def _kept(ctx: Asking, asked: _Asked, make: Callable[[str | None], bytes]) -> tu
             errors=[("name", f"keeps at most {_MOST_BYTES} bytes")],
         )
     kept = ctx.answers.name(given, asked.name)
-    if kept is None:
+    if kept is not None:
+        return id, kept
+    # Somebody else has just taken the name, perhaps for the same question.
+    own = {key: value for key, value in asked.question.items() if key != asked.drawn}
+    before = _under_name(ctx, row.slug, asked.kind, asked.name, own)
+    if before is None:
         raise _name_taken(asked.name)
-    return id, kept
+    return before.id, before.json
 
 
 def _refuse_many(name: str | None, few: bool) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from graspdb_service.problems import ProblemError, busy
 from graspdb_service.storage import answers
 from graspdb_service.storage.answers import AnswerRow, GivenAnswer
-from graspdb_service.storage.database import UNAVAILABLE, Database
+from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database
 from graspdb_service.usecases.answers.references import is_answer_id
 
 log = logging.getLogger("graspdb")
@@ -172,7 +172,7 @@ class AnswerKeeper:
                 answers.add(tx, batch)
                 for object_id, kind in self._due(batch):
                     answers.purge(tx, object_id, kind, most=self._most)
-        except UNAVAILABLE as error:
+        except (*UNAVAILABLE, CommitUnknown) as error:
             if not self._failing:
                 log.warning("answers can't be kept now: %s", error)
             unwritable = True

@@ -27,6 +27,7 @@ from graspdb_service.usecases.reports.common import KeptCurves, ReportInputs
 from graspdb_service.usecases.reports.convergence import convergence_report
 from graspdb_service.usecases.reports.kernel_similarity import kernel_similarity_report
 from graspdb_service.usecases.reports.projection import projection_report
+from graspdb_service.usecases.reports.promises.report import promises_report
 from graspdb_service.usecases.reports.sources import sources_report
 from graspdb_service.usecases.runtime.runs import Result, RunKind
 
@@ -41,6 +42,7 @@ _COMPUTE: Mapping[str, Callable[[ReportInputs, Built, Any, Progress], Report]] =
     "convergence": convergence_report,
     "kernel-similarity": kernel_similarity_report,
     "projection": projection_report,
+    "promises": promises_report,
     "sources": sources_report,
 }
 

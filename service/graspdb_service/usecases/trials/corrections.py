@@ -10,10 +10,10 @@ from graspdb_service.problems import conflict, found
 from graspdb_service.storage import objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.trials import batches, changes, findings, provenances, rows
+from graspdb_service.storage.trials import changes, findings, provenances, rows
 from graspdb_service.storage.trials.changes import TrialRow
-from graspdb_service.trial_columns import TrialPage
 from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.trials.listing import page_of
 
 
 def get(database: Database, slug: str, seq: int) -> TrialInfo:
@@ -95,6 +95,6 @@ def _read(tx: Tx, row: ObjectRow, seq: int) -> TrialInfo:
     _require(tx, row, seq)
     columns = rows.page(tx, row.id, after_seq=seq - 1, up_to_seq=seq, limit=1)
     names = provenances.of_object(tx, row.id)
-    page = TrialPage(columns, names, batches.origins(tx, columns.batch.tolist()))
+    page = page_of(tx, columns, names)
     history = [change._asdict() for change in changes.of_trial(tx, row.id, seq)]
     return TrialInfo.model_validate({**documents(page)[0], "history": history})

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from graspdb.wire import OUTCOME_CODES
+from graspdb_service.storage import answers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import batches, provenances, rows
-from graspdb_service.trial_columns import TrialPage, is_gripper
+from graspdb_service.trial_columns import Provenance, TrialColumns, TrialPage, is_gripper
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 
@@ -59,6 +60,12 @@ def pages(database: Database, slug: str, chosen: TrialFilter, *, after: int) -> 
     return read(after)
 
 
+def page_of(tx: Tx, columns: TrialColumns, names: Mapping[int, Provenance]) -> TrialPage:
+    """Stored trials with their batches and answers."""
+    tried = {number for number in columns.answer.tolist() if number >= 0}
+    return TrialPage(columns, names, batches.origins(tx, columns.batch.tolist()), answers.ids(tx, tried))
+
+
 def _read(
     tx: Tx, row: ObjectRow, chosen: TrialFilter, after: int, limit: int, up_to: int | None = None
 ) -> TrialPage:
@@ -90,4 +97,4 @@ def _read(
         since_revision=chosen.since_revision,
         withdrawn=chosen.withdrawn,
     )
-    return TrialPage(columns, names, batches.origins(tx, columns.batch.tolist()))
+    return page_of(tx, columns, names)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -11,10 +12,10 @@ from graspdb.wire import BatchReceipt
 from graspdb_service.formats.json_pieces import Allowed
 from graspdb_service.formats.trials import parse
 from graspdb_service.problems import ProblemError
-from graspdb_service.storage import grippers, objects
+from graspdb_service.storage import answers, grippers, objects
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.trials import batches, findings, provenances, rows
-from graspdb_service.trial_columns import Provenance, TrialBatch
+from graspdb_service.trial_columns import Ints, Provenance, TrialBatch
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runtime import Runtime
@@ -22,8 +23,22 @@ from graspdb_service.usecases.trials.findings import inspection, words
 from graspdb_service.usecases.trials.findings.inspection import Concern, Geometries
 
 
+class GivenAnswers(Protocol):
+    """The answers that trials may name."""
+
+    def settle(self, references: Collection[str]) -> None:
+        """Wait until what was given under these ids is stored."""
+
+
 def add(
-    ctx: Runtime, slug: str, geometries: Geometries, sent: Sent, media: str, *, accept_implausible: bool
+    ctx: Runtime,
+    slug: str,
+    geometries: Geometries,
+    given: GivenAnswers,
+    sent: Sent,
+    media: str,
+    *,
+    accept_implausible: bool,
 ) -> Created:
     """Store the trials of one request as a batch, and say what is doubtful about them.
 
@@ -46,6 +61,7 @@ def add(
     concerns = inspection.inspect(ctx.compute, geometries, known, profiles, batch)
     if not accept_implausible:
         _refuse_implausible(batch, concerns)
+    given.settle(batch.answers)
     return replay_or(ctx.database, scope, meant, lambda tx: _store(tx, slug, batch, concerns))
 
 
@@ -56,7 +72,9 @@ def _store(tx: Tx, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) ->
     revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
     ids = np.array([provenances.ensure(tx, row.id, item) for item in named])
     batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
-    columns = replace(batch.columns, provenance=ids[batch.columns.provenance])
+    columns = replace(
+        batch.columns, provenance=ids[batch.columns.provenance], answer=_answers(tx, row.id, batch)
+    )
     rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first_seq)
     last_seq = first_seq + count - 1
     batches.grow(tx, batch_id, first_seq=first_seq, last_seq=last_seq, inserted=count, packed=0)
@@ -73,6 +91,39 @@ def _store(tx: Tx, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) ->
         receipt.model_dump(mode="json"),
         location=f"/objects/{slug}/batches/{batch_key}",
         batch_key=batch_key,
+    )
+
+
+def _answers(tx: Tx, object_id: int, batch: TrialBatch) -> Ints:
+    """The numbers of the answers that trials tried (n,), -1 for none, counted as theirs; 422 for those there
+    are not.
+    """
+    if not batch.answers:
+        return batch.columns.answer
+    found = answers.find_many(tx, object_id, batch.answers)
+    unknown = [place for place, name in enumerate(batch.answers) if name not in found]
+    if unknown:
+        raise _unknown_answers(batch, unknown)
+    numbers = np.array([*(found[name] for name in batch.answers), -1], dtype=np.int64)
+    tried = numbers[batch.columns.answer]
+    which, counts = np.unique(tried[tried >= 0], return_counts=True)
+    if not answers.count_trials(tx, dict(zip(which.tolist(), counts.tolist(), strict=True))):
+        raise _unknown_answers(batch, [place for place, number in enumerate(numbers[:-1]) if number in which])
+    return tried
+
+
+def _unknown_answers(batch: TrialBatch, places: Sequence[int]) -> ProblemError:
+    errors = []
+    for place in places[: inspection.FIRST]:
+        row = int(np.flatnonzero(batch.columns.answer == place)[0])
+        told = f"{batch.answers[place]!r} is no answer about this object"
+        errors.append((batch.field_of(row, "answer"), told))
+    return ProblemError(
+        422,
+        "unknown-answer",
+        "Trials name an answer that is not about this object or is no longer kept; none was stored: name= in"
+        " a question keeps its answer",
+        errors=errors,
     )
 
 

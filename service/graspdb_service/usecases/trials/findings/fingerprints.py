@@ -23,8 +23,8 @@ _Words = NDArray[np.uint64]
 def fingerprints(columns: TrialColumns, object_id: int) -> tuple[Ints, Ints]:
     """Ascending places of the rows that are compared, and a digest of each.
 
-    Rows have one digest where pose (to :data:`_STEP`), outcome, width, quality and time agree, whatever
-    gripper, source or protocol they name: who forgot those and posts again posts the same rows.
+    Rows have one digest where pose (to :data:`_STEP`), achieved pose, outcome, width, quality and time agree,
+    whatever gripper, source or protocol they name: who forgot those and posts again posts the same rows.
     """
     words = np.full(len(columns), object_id, dtype=np.uint64)
     quaternions = columns.quaternion_xyzw
@@ -44,6 +44,12 @@ def fingerprints(columns: TrialColumns, object_id: int) -> tuple[Ints, Ints]:
             numbers = np.ascontiguousarray(values[rows])
             known = _mixed(kept ^ numbers.view(np.uint64) ^ np.uint64(salt))
             kept = np.where(np.isnan(numbers), kept, known)
+    if len(columns.achieved):
+        achieved = columns.achieved[rows]
+        known, here = ~np.isnan(achieved[:, 0]), kept
+        for column in np.nan_to_num(achieved).T:
+            here = _mixed(here ^ np.rint(column / _STEP).astype(np.int64).view(np.uint64))
+        kept = np.where(known, here, kept)
     if len(columns.measured_at):
         times = [columns.measured_at[row] for row in rows.tolist()]
         passed = np.array([microseconds(time) for time in times], dtype=np.int64).view(np.uint64)

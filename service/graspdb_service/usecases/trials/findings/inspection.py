@@ -78,11 +78,12 @@ def inspect(
     """What about the poses of a batch is doubtful, by its provenances. Never call it in a transaction."""
     columns = batch.columns
     held = columns.outcome == OUTCOME_CODES["success"]
+    tried = columns.poses
     concerns = []
     for provenance, rows in _groups(batch):
         name = None if provenance is None else batch.provenances[provenance].gripper
         target = geometries.target(row, None if name is None else profiles.get(name))
-        poses = ToolPoses(columns.position[rows], columns.quaternion_xyzw[rows])
+        poses = ToolPoses(*tried[rows])
         for doubt in compute.run(partial(doubts, poses, held[rows], target)):
             concern = _concern(batch, provenance, rows, doubt, target)
             if len(concern.rows):

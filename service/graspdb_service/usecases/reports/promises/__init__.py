@@ -1,0 +1,1 @@
+"""What answers promised against what became of the trials that tried them."""
