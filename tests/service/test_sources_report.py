@@ -143,3 +143,53 @@ def test_a_robot_that_holds_less_has_a_correction(simulated: httpx.Client, post:
     assert "corrected, simulation predicts left-out trials better" in body["text"]
     png = http.get(path, headers={"Accept": "image/png"})
     assert png.content.startswith(b"\x89PNG")
+
+
+def test_probabilities_are_calibrated_for_a_robot(simulated: httpx.Client, post: Post) -> None:
+    """By the sources report's correction; too few real trials, and other sources, are refused."""
+    http, widths = simulated, {"sigma_position_m": 0.008, "sigma_rotation_deg": 12}
+    at = {"position": "0,0,0", "quaternion_xyzw": "0,0,0,1", **widths}
+    path = "/objects/thing/likelihood"
+    none = http.get(path, params={**at, "calibrated_for": "robot"})
+    assert (none.status_code, none.json()["type"].rsplit(":")[-1]) == (409, "too-few-real-trials")
+    (p, q), won = field(400, 7)
+    held = won & (np.random.default_rng(8).random(400) < 0.4)
+    post(http, "thing", (p, q), told(held), gripper="pg70", protocol="wrench", source="robot")
+    plain = ok(http.get(path, params={**at, "source": "simulation"}))
+    found = ok(http.get(path, params={**at, "calibrated_for": "robot"}))
+    info = found["calibration"]
+    assert (info["source"], info["applied"], info["judged"]) == ("robot", True, "better")
+    assert list(found["selection"]["sources"]) == ["simulation"]
+    chance = plain["success_probability"][0]
+    logit = info["shift"] + info["slope"] * math.log(chance / (1.0 - chance))
+    assert found["success_probability"][0] == pytest.approx(1.0 / (1.0 + math.exp(-logit)), abs=0.01)
+    assert found["density"] == pytest.approx(plain["density"])
+    assert plain["calibration"] is None if "calibration" in plain else True
+    best = ok(
+        http.get(
+            "/objects/thing/best-grasp",
+            params={**widths, "calibrated_for": "robot", "objective": "success_probability"},
+        )
+    )
+    grasp = best["grasps"][0]
+    assert best["calibration"]["applied"]
+    assert grasp["score"] == pytest.approx(grasp["interval"]["low"], abs=1e-6)
+    sure = {**widths, "calibrated_for": "robot", "min_success_probability": 0.99}
+    assert ok(http.get("/objects/thing/best-grasp", params=sure))["status"] == "infeasible"
+    for wrong in ({"source": "robot"}, {"source_weight": "robot:1"}, {"calibrated_for": "simulation"}):
+        answer = http.get(path, params={**at, "calibrated_for": "robot", **wrong})
+        assert answer.status_code == 422
+        assert next(iter(wrong)) in answer.json()["errors"][0]["field"]
+
+
+def test_a_correction_that_does_not_help_is_not_applied(simulated: httpx.Client, post: Post) -> None:
+    """Where simulation is right, its probabilities stay, with wider intervals, and the answer says so."""
+    poses, won = field(40, 9)
+    post(simulated, "thing", poses, told(won), gripper="pg70", protocol="wrench", source="robot")
+    at = {"position": "0.01,0,0", "quaternion_xyzw": "0,0,0,1", "sigma_position_m": 0.02}
+    plain = ok(simulated.get("/objects/thing/likelihood", params={**at, "source": "simulation"}))
+    found = ok(simulated.get("/objects/thing/likelihood", params={**at, "calibrated_for": "robot"}))
+    assert not found["calibration"]["applied"]
+    assert "not corrected" in found["calibration"]["reason"]
+    assert found["success_probability"] == pytest.approx(plain["success_probability"], abs=1e-6)
+    assert found["interval"]["low"][0] < plain["interval"]["low"][0]

@@ -37,7 +37,7 @@ from graspdb.resources.results import (
     chance,
     pose_columns,
 )
-from graspdb.resources.selection import Constraints, Selection
+from graspdb.resources.selection import Constraints, LikelihoodSelection, Selection
 from graspdb.wire import SelectionInfo
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
@@ -195,7 +195,7 @@ def _distance(position_m: float, rotation_deg: float) -> str:
 def likelihood(
     state: State,
     id: ObjectId,
-    selection: Selection,
+    selection: LikelihoodSelection,
     file: Annotated[
         str | None, typer.Argument(help="Poses: .csv (x,y,z,qx,qy,qz,qw), .npy, .json, NDJSON.")
     ] = None,

@@ -18,6 +18,7 @@ from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
     Constraints,
+    LikelihoodSelection,
     Selection,
     best_grasp_request,
     names,
@@ -57,7 +58,7 @@ class GraspQueries(Resource):
         include: Sequence[str] | None = None,
         chunk: int = QUERY_POSES,
         name: str | None = None,
-        **selection: Unpack[Selection],
+        **selection: Unpack[LikelihoodSelection],
     ) -> LikelihoodArrays:
         """How likely these grasps are, as NumPy arrays in the poses' order.
 
@@ -67,7 +68,7 @@ class GraspQueries(Resource):
         ``prior_success_probability``; by default all. ``name`` keeps the answer of at most 1,000 poses, as in
         :class:`Constraints`.
         """
-        options = known_keywords(Selection, selection, "likelihood")
+        options = known_keywords(LikelihoodSelection, selection, "likelihood")
         given = as_poses(poses)
         options |= {"include": None if include is None else names(include), "name": name}
         # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.

@@ -240,6 +240,7 @@ class Grasps(Sequence[Grasp]):
         self.estimator = answer.estimator
         self.warnings = list(answer.warnings)
         self.selection = answer.selection
+        self.calibration = answer.calibration
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
         self.nearest = (
@@ -445,6 +446,7 @@ class LikelihoodArrays(Columns):
     answer: str | None = None
     newer_revision: int | None = None
     selection: wire.SelectionInfo | None = None
+    calibration: wire.CalibrationInfo | None = None
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -469,6 +471,7 @@ class LikelihoodArrays(Columns):
             estimator=answers[-1].estimator,
             warnings=answers[-1].warnings,
             selection=answers[-1].selection,
+            calibration=answers[-1].calibration,
             interval=interval,
             answer=answers[0].answer if len(answers) == 1 else None,
             newer_revision=answers[-1].newer_revision,

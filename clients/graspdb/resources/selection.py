@@ -53,6 +53,20 @@ class Selection(TrialSelection, total=False):
     sigma_rotation_deg: Annotated[float | None, Option("Kernel width in rotation, degrees.")]
 
 
+CalibratedFor = Annotated[
+    str | None,
+    Option("Correct simulated success probabilities for these real trials: robot, human or import."),
+]
+
+
+class LikelihoodSelection(Selection, total=False):
+    """A :class:`Selection`, and ``calibrated_for``: the source of real trials (``robot``, ``human``,
+    ``import``) that success probabilities of simulated trials, which are then selected, are corrected for.
+    """
+
+    calibrated_for: CalibratedFor
+
+
 class Constraints(Selection, total=False):
     """What a best grasp is chosen by, besides the :class:`Selection`.
 
@@ -74,6 +88,8 @@ class Constraints(Selection, total=False):
     - ``max_width_m``: how far apart the fingers are at most, once both touch the object.
     - ``min_success_probability``, ``min_effective_trials``: how likely a grasp is at least, and from how many
       effective trials; one too far from every attempt for a success probability fails either.
+    - ``calibrated_for``: the source of real trials, such as ``robot``, that success probabilities of
+      simulated trials, which are then selected, are corrected for; ``calibration`` says whether that helped.
     - ``candidates``: rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is its place.
     - ``exclude``: poses to stay away from, by the separation.
     - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``.
@@ -87,6 +103,7 @@ class Constraints(Selection, total=False):
       can't.
     """
 
+    calibrated_for: CalibratedFor
     objective: Annotated[
         str | None, Option("density, success_probability (its interval's lower end) or robust.")
     ]

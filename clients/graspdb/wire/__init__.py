@@ -74,6 +74,7 @@ from graspdb.wire.queries import SamplesRequest as SamplesRequest
 from graspdb.wire.queries import Selection as Selection
 from graspdb.wire.queries import WeightsInfo as WeightsInfo
 from graspdb.wire.queries import WorldPose as WorldPose
+from graspdb.wire.support import CalibrationInfo as CalibrationInfo
 from graspdb.wire.support import EstimatorInfo as EstimatorInfo
 from graspdb.wire.support import NearestAttempt as NearestAttempt
 from graspdb.wire.support import NearestAttemptColumns as NearestAttemptColumns

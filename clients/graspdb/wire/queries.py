@@ -39,7 +39,14 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
-from graspdb.wire.support import EstimatorInfo, ReachInfo, SelectionInfo, Support, SupportColumns
+from graspdb.wire.support import (
+    CalibrationInfo,
+    EstimatorInfo,
+    ReachInfo,
+    SelectionInfo,
+    Support,
+    SupportColumns,
+)
 from graspdb.wire.trials import Finding
 
 WidthM = Annotated[float, Field(gt=0, le=1.0)]
@@ -66,6 +73,17 @@ ReachField = Annotated[
         description="How far from an attempt success probabilities are told; null before any attempt, and"
         " where none was asked for."
     ),
+]
+CalibratedFor = Annotated[
+    Literal["robot", "human", "import"] | None,
+    Field(
+        description="Source of real trials that success probabilities of simulated ones are corrected for, as"
+        " the sources report tells; simulated trials alone are then selected; by default none."
+    ),
+]
+CalibrationField = Annotated[
+    CalibrationInfo | None,
+    Field(description="How success probabilities were corrected; null unless ``calibrated_for`` asks."),
 ]
 SelectionField = Annotated[
     SelectionInfo | None,
@@ -286,6 +304,7 @@ class LikelihoodRequest(Selection):
     """Poses of the tool frame in the object frame, in a list or in columns; 1 to 1,000,000."""
     include: IncludedColumns = None
     name: AnswerName = None
+    calibrated_for: CalibratedFor = None
 
 
 class Intervals(Response):
@@ -341,6 +360,7 @@ class Likelihoods(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    calibration: CalibrationField = None
     selection: SelectionField = None
 
 
@@ -462,6 +482,7 @@ class GraspConstraints(Selection):
     min_separation_deg: Angle | None = None
     """Grasps are distinct from this angle between them on, degrees; by default 20."""
     name: AnswerName = None
+    calibrated_for: CalibratedFor = None
 
 
 class BestGraspRequest(GraspConstraints):
@@ -572,6 +593,7 @@ class BestGrasps(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    calibration: CalibrationField = None
     selection: SelectionField = None
 
 
@@ -649,6 +671,7 @@ class LikelihoodQuery(SelectionQuery):
     """Rotation of the tool frame in the object frame: a unit quaternion x,y,z,w."""
     include: Annotated[IncludedColumns, BeforeValidator(_listed)] = None
     name: AnswerName = None
+    calibrated_for: CalibratedFor = None
 
 
 class BestGraspQuery(GraspConstraints):
@@ -663,6 +686,7 @@ class LikelihoodOptions(Selection):
 
     include: IncludedColumns = None
     name: AnswerName = None
+    calibrated_for: CalibratedFor = None
 
 
 # -- answers that are kept

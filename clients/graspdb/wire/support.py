@@ -122,3 +122,29 @@ class SelectionInfo(Response):
     sources: dict[str, SelectedSource]
     """The sources of the trials by their name, ``unspecified`` for trials that name none; those that a weight
     was asked for, too."""
+
+
+class CalibrationInfo(Response):
+    """How simulated success probabilities were corrected for real trials."""
+
+    source: str
+    """The source of real trials that they are calibrated for."""
+    applied: bool
+    """Whether they are corrected: only where the correction predicts left-out real trials better. Where
+    false they are as simulated; the interval is wider by the doubt about the correction either way."""
+    judged: Literal["better", "worse", "undecided"]
+    """Whether the correction predicts real trials in left-out blocks of space better than no correction."""
+    trials: int
+    """How many real trials within the reach of simulation it is learned from."""
+    effective_trials: float
+    """As how many independent ones they count: those of one spot are not independent."""
+    blocks: int
+    """How many blocks of space they lie in."""
+    shift: float
+    """Added to the logit of the probability, where applied."""
+    slope: float
+    """What the logit is multiplied by, where applied."""
+    informative: bool
+    """Whether what is answered predicts real trials better than their share of successes alone."""
+    reason: str
+    """The same in words."""

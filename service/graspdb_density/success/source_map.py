@@ -13,6 +13,7 @@ of successes in the other blocks.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,10 +21,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, stdtrit
 
-from ..se3 import Floats
-from .kernel_regression import checked_outcomes
+from ..se3 import Floats, Poses
+from .kernel_regression import NearestAttempts, SuccessEstimate, SuccessModel, checked_outcomes
 
-__all__ = ["LEAST_BLOCKS", "LEAST_TRIALS", "Judged", "SourceMap", "fit_source_map", "judge_source_map"]
+__all__ = [
+    "LEAST_BLOCKS",
+    "LEAST_TRIALS",
+    "Judged",
+    "MappedModel",
+    "SourceMap",
+    "fit_source_map",
+    "judge_source_map",
+]
 
 #: Standard deviations of the priors of a and of b.
 PRIOR_SHIFT, PRIOR_SLOPE = 0.5, 0.3
@@ -79,6 +88,43 @@ class SourceMap:
         """Variance of the corrected logit."""
         (a, c), (_, b) = self.covariance
         return np.asarray(np.maximum(a + 2.0 * c * logit + b * logit * logit, 0.0))
+
+
+class MappedModel(SuccessModel):
+    """A success model whose probabilities are corrected, their intervals wider by the map's uncertainty."""
+
+    def __init__(self, model: SuccessModel, correction: SourceMap) -> None:
+        super().__init__(model.kernel, model.parts)
+        self.correction = correction
+
+    def evaluate_near(
+        self, poses: Poses, *, level: float = 0.9, threads: int = 1
+    ) -> tuple[SuccessEstimate, NearestAttempts]:
+        found, nearest = super().evaluate_near(poses, level=level, threads=threads)
+        low, high = self.correction.interval(found.probability, found.low, found.high, level=level)
+        p = self.correction.probability(found.probability)
+        return SuccessEstimate(p, low, high, found.effective_trials, level), nearest
+
+    def probability(self, poses: Poses, *, threads: int = 1) -> Floats:
+        return self.correction.probability(super().probability(poses, threads=threads))
+
+    def without_interval(
+        self, poses: Poses, *, everywhere: bool = False, threads: int = 1
+    ) -> tuple[Floats, Floats, NearestAttempts]:
+        p, trials, nearest = super().without_interval(poses, everywhere=everywhere, threads=threads)
+        return self.correction.probability(p), trials, nearest
+
+    def lower_end(
+        self,
+        poses: Poses,
+        *,
+        level: float = 0.9,
+        near: Callable[[NearestAttempts], NDArray[np.bool_]] | None = None,
+        threads: int = 1,
+    ) -> Floats:
+        low = super().lower_end(poses, level=level, near=near, threads=threads)
+        p = super().probability(poses, threads=threads)
+        return self.correction.interval(p, low, low, level=level)[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,10 +98,12 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     before = _under_name(ctx, slug, "likelihood", request.name, question)
     if before is not None:
         return before
-    built, reach, columns = likelihoods.likelihood(ctx, slug, request, poses, request.include)
+    built, reach, calibration, columns = likelihoods.likelihood(ctx, slug, request, poses, request.include)
     head = _head(built, built.kernel)
     if reach is not None:
         head["reach"] = reach.model_dump()
+    if calibration is not None:
+        head["calibration"] = calibration.model_dump()
     asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, EstimatorInfo())
     return _in_columns(ctx, asked, few, head, columns)
 

@@ -21,6 +21,7 @@ from graspdb.wire import (
 )
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
+from graspdb_service.usecases.densities.calibrations import of_simulation
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
 from graspdb_service.usecases.densities.support import reach_info, support_of
@@ -40,6 +41,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     there, and as the selection.
     """
     choice, _ = kernel_of(request)
+    request = of_simulation(request)
     with ctx.compute.within():
         selected = ctx.densities.selections.resolve(slug, request)
         limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
@@ -51,6 +53,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "kernel": question.kernel,
                 "ranking": question.ranking,
                 "reach": reach_info(question.model),
+                "calibration": question.calibration,
                 **_answer(ctx, request, question),
             }
     told = {

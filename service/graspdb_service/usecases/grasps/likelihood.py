@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.wire import ReachInfo, Selection
+from graspdb.wire import CalibrationInfo, ReachInfo, Selection
 from graspdb.wire.queries import LikelihoodColumn
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
@@ -16,6 +16,7 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
+from graspdb_service.usecases.densities.calibrations import calibrated, of_simulation
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.densities.support import reach_info, support_columns
@@ -36,22 +37,19 @@ def likelihood(
     request: Selection,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> tuple[Built, ReachInfo | None, dict[str, Any]]:
+) -> tuple[Built, ReachInfo | None, CalibrationInfo | None, dict[str, Any]]:
     """How likely poses (n,) in the object frame are under the density of the successes, and that density;
-    how far from an attempt success probabilities are told.
+    how far from an attempt success probabilities are told, and how they were calibrated.
 
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
     is minus infinity where the density is exactly zero; NaN stands for not known.
     """
     count = len(poses)
-    if count > ctx.settings.max_query_poses:
-        raise ProblemError(
-            413,
-            "too-many-poses",
-            f"{count} poses are over the limit of {ctx.settings.max_query_poses}: send several requests",
-            errors=[("poses", f"at most {ctx.settings.max_query_poses}")],
-        )
+    _refuse_many(ctx, count)
     _, cutoff = kernel_of(request)
+    request = of_simulation(request)
+    source: str | None = getattr(request, "calibrated_for", None)
+    calibration = None
 
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
@@ -77,6 +75,8 @@ def likelihood(
                 free = np.concatenate(ctx.compute.blocks(poses, partial(test.free, threads=threads)))
         if chances:
             model = ctx.successes.model(built, collisions_known=free is not None)
+            if model is not None and source is not None:
+                model, calibration = calibrated(ctx, built, model, test, source)
             reach = reach_info(model)
             estimates = ctx.successes.estimate(model, poses, free)
             columns["success_probability"] = estimates.probability
@@ -88,7 +88,18 @@ def likelihood(
                 columns["prior_success_probability"] = estimates.prior
         columns["collision_free"] = free
     known = {name: column for name, column in columns.items() if column is not None and asked(name)}
-    return built, reach, known
+    return built, reach, calibration, known
+
+
+def _refuse_many(ctx: Estimators, count: int) -> None:
+    """413 for more poses than the service allows."""
+    if count > ctx.settings.max_query_poses:
+        raise ProblemError(
+            413,
+            "too-many-poses",
+            f"{count} poses are over the limit of {ctx.settings.max_query_poses}: send several requests",
+            errors=[("poses", f"at most {ctx.settings.max_query_poses}")],
+        )
 
 
 def log_density(ctx: Estimators, density: SearchedDensity, poses: Poses, cutoff: float | None) -> Floats:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from graspdb.wire import GraspConstraints, KernelInfo, Ranking
+from graspdb.wire import CalibrationInfo, GraspConstraints, KernelInfo, Ranking
 from graspdb_density import ModeSearch, Separation
 from graspdb_density.search.mode_search import DISTINCT
 from graspdb_density.search.scored_poses import Admissible, distinct_from
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
+from graspdb_service.usecases.densities.calibrations import calibrated
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import Model
@@ -45,6 +46,7 @@ class Question:
     bounds: Bounds
     engine: Engine
     ranking: Ranking
+    calibration: CalibrationInfo | None
 
     @property
     def prior(self) -> bool:
@@ -67,6 +69,9 @@ def question_of(
         return None
     chances = _wants_chances(request, built)
     model = ctx.successes.model(built, collisions_known=test is not None) if chances else None
+    calibration = None
+    if model is not None and request.calibrated_for is not None:
+        model, calibration = calibrated(ctx, built, model, test, request.calibrated_for)
     by_success = _by_success(request, model)
     if (by_success or asks_chance(request)) and model is None:
         if built.search is None:
@@ -97,7 +102,9 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
-        return Question(built, search, kernel, limits, test, chances, model, bounds, engine, ranking)
+        return Question(
+            built, search, kernel, limits, test, chances, model, bounds, engine, ranking, calibration
+        )
 
     return ctx.compute.run(complete)
 
@@ -113,7 +120,7 @@ def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:
     """Whether grasps come with a success probability; the same for the same request and revision."""
-    if request.objective == "success_probability" or asks_chance(request):
+    if request.objective == "success_probability" or asks_chance(request) or request.calibrated_for:
         return True
     if request.objective == "robust" and request.robust_of != "density":
         return True

@@ -21,16 +21,14 @@ from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel
 from graspdb_density.kde.bhattacharyya import bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
-from graspdb_density.success.calibration import assign_blocks, calibrate
+from graspdb_density.success.calibration import calibrate
 from graspdb_density.success.source_map import (
     LEAST_BLOCKS,
-    fit_source_map,
-    judge_source_map,
 )
 from graspdb_service.problems import too_few_trials
-from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import Bools, Floats, Ints, Provenance, is_gripper
+from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.calibrations import learned, real_trials
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
@@ -45,7 +43,7 @@ from graspdb_service.usecases.reports.common import (
 )
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.attempts import AllTrials
-from graspdb_service.usecases.trials.selection import Selected, of_provenances, outcome_counts
+from graspdb_service.usecases.trials.selection import Selected
 
 REAL = ("robot", "human", "import")
 #: Fewest trials for a calibration and for a density's similarity, and attempts to predict from.
@@ -56,8 +54,6 @@ _WITHIN_REACH = 1.0
 #: Subsets of simulated successes that tell what chance alone would do.
 _SUBSETS = 10
 _POINTS = 8_000
-#: Edge of the blocks of space that trials are left out in, in kernel widths.
-_BLOCK_WIDTHS = 3.0
 #: Simulated probabilities at which a correction is shown.
 _CURVE = np.linspace(0.02, 0.98, 25)
 
@@ -105,7 +101,11 @@ def _real(inputs: ReportInputs, built: Built, simulated: AllTrials) -> dict[str,
             f" are {len(simulated)} and {built.selected.successes}: sweep a grid"
             f" (POST /objects/{slug}/sweeps)",
         )
-    real = {source: found for source in REAL if (found := _selected(inputs, built, source)) is not None}
+    real = {
+        source: found
+        for source in REAL
+        if (found := real_trials(inputs.database, built.selected, source)) is not None
+    }
     if not real:
         raise too_few_trials(
             "There are no trials of a robot, a human or an import to compare simulation with: post at least"
@@ -141,34 +141,6 @@ def _predictions(
         # Geometry tells of a collision wherever it is.
         reached |= collides
     return _Predictions(predicted, reached & np.isfinite(predicted), collides)
-
-
-def _selected(inputs: ReportInputs, built: Built, source: str) -> Selected | None:
-    """A source's trials with the gripper of the simulated ones, of their protocol where it has any, else all;
-    None without trials.
-    """
-    chosen = built.selected
-    with inputs.database.read() as tx:
-        counts = outcome_counts(tx, built.object_row.id)
-        own = {
-            number: item
-            for number, item in provenances.of_object(tx, built.object_row.id).items()
-            if number in counts and item.source == source and _of_the_gripper(item, chosen)
-        }
-    if any(item.protocol == chosen.protocol for item in own.values()):
-        own = {number: item for number, item in own.items() if item.protocol in (None, chosen.protocol)}
-    if not own:
-        return None
-    protocols = sorted({item.protocol for item in own.values() if item.protocol is not None})
-    names = {"gripper": chosen.gripper, "protocol": ", ".join(protocols) or None, "source": source}
-    return of_provenances(chosen.row, own, counts, profile=chosen.profile, **names)
-
-
-def _of_the_gripper(item: Provenance, chosen: Selected) -> bool:
-    """Whether trials are of the selection's gripper, or may be."""
-    if item.gripper is None or chosen.gripper is None:
-        return item.gripper is None
-    return is_gripper(item.gripper, chosen.gripper)
 
 
 def _all(inputs: ReportInputs, built: Built, selected: Selected) -> AllTrials:
@@ -233,12 +205,7 @@ def _correction(positions: Floats, predicted: Floats, won: Bools, sigma_m: float
     """How predictions at trials (n,) should be corrected for their source; None without any."""
     if not len(won):
         return None
-    try:
-        blocks = assign_blocks(positions, edge_m=_BLOCK_WIDTHS * sigma_m).block
-    except ValueError:
-        # All in one place.
-        blocks = np.zeros(len(won), dtype=np.int64)
-    fitted, judged = fit_source_map(predicted, won, blocks), judge_source_map(predicted, won, blocks)
+    fitted, judged = learned(positions, predicted, won, sigma_m)
     low, high = fitted.interval(_CURVE, _CURVE, _CURVE, level=LEVEL)
     return SourceMap(
         shift=fitted.shift,
