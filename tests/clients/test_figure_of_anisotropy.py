@@ -182,3 +182,27 @@ def test_the_files_are_what_they_are_called_and_alike_every_time() -> None:
     assert render(report(), "png").startswith(b"\x89PNG")
     assert b"<svg" in render(report(), "svg")[:500]
     assert render(report(), "png") == render(report(), "png")
+
+
+def test_a_lower_bound_is_drawn_as_one_and_few_pairs_apart() -> None:
+    """Where a profile falls by a few pairs beyond what the words tell, no half width is drawn."""
+    count = [1_234] * 14 + [3, 2]
+    bounded = tolerance("rx", beyond=True, low=0.3, tried=(-1.5, 1.5), count=count)
+    told = [bounded if axis == "rx" else tolerance(axis) for axis in ("x", "y", "z", "rx", "ry", "rz")]
+    found = report(tolerances=told)
+    assert found.tolerances[3].in_words().startswith("at least 17 deg")
+    figure = draw(found)
+    panels = {axes.get_title().partition(":")[0]: axes for axes in figure.axes}
+    ends = {
+        name: [
+            line.get_xdata()[0] for line in panels[f"forgives {name}"].lines if line.get_linestyle() == ":"
+        ]
+        for name in ("about x", "about y")
+    }
+    assert (len(ends["about x"]), len(ends["about y"])) == (0, 2)
+    marks = [line for line in panels["forgives about x"].lines if line.get_marker() in "<>"]
+    assert sorted(line.get_xdata()[0] for line in marks) == pytest.approx(
+        [-math.degrees(0.3), math.degrees(0.3)]
+    )
+    hollow = [line for line in panels["forgives about x"].lines if line.get_linestyle() == "None"]
+    assert any(len(line.get_xdata()) == 2 for line in hollow)

@@ -20,6 +20,8 @@ from graspdb.wire.reports import (
 )
 
 #: Inches: the figure's width, left and right of the panels, a line of the words above them.
+#: A displacement with fewer pairs of trials is drawn apart: what they share may be chance.
+_FEW_PAIRS = 5
 _WIDTH, _LEFT, _RIGHT, _LINE = 10.0, 0.75, 0.25, 0.19
 #: A panel of every kind: its height, and what its title and labels take above and below.
 _SQUARE, _PROFILE, _ROW = 2.15, 1.45, 0.27
@@ -172,6 +174,7 @@ def _profile(axes: Axes, item: AnisotropyTolerance, reach: float, level: float, 
             np.asarray(values, dtype=np.float64)
             for values in (item.probability, item.profile_low, item.profile_high)
         )
+        few = np.asarray(item.count) < _FEW_PAIRS
         if not (np.abs(at) < 0.02 * np.abs(at).max()).any():
             # No trial is where the success itself is: a line across would hide it.
             place = int(np.searchsorted(at, 0.0))
@@ -179,17 +182,28 @@ def _profile(axes: Axes, item: AnisotropyTolerance, reach: float, level: float, 
             ends = np.insert(at, place, 0.0), np.insert(told, place, 1.0)
             axes.plot(*ends, color=BLUE, linewidth=0.8, linestyle="--")
             at, told, low, high = (np.insert(values, place, np.nan) for values in (at, told, low, high))
+            few = np.insert(few, place, False)
         axes.fill_between(at, low, high, color=BLUE, alpha=0.2, linewidth=0, label=f"{level:.0%} interval")
-        axes.plot(at, told, color=BLUE, marker=".", markersize=4, linewidth=1.2)
+        many = np.where(few, np.nan, told)
+        axes.plot(at, many, color=BLUE, marker=".", markersize=4, linewidth=1.2)
+        axes.plot(
+            at[few], told[few], color=BLUE, marker="o", markersize=3, markerfacecolor="white", linestyle=""
+        )
         if item.axis == "x":
             axes.legend(fontsize=7, loc="lower center", framealpha=0.9)
     axes.axhline(0.5, color=GREY, linestyle="--", linewidth=0.8)
     if item.tried is not None:
         _hatch_untried(axes, *(factor * at for at in (*item.tried, max(1.05 * reach, 1e-6))))
-    if item.half_width is not None:
-        for end, sign in ((item.minus, -1.0), (item.plus, 1.0)):
-            if end is not None:
-                axes.axvline(sign * factor * end, color=ORANGE, linestyle=":", linewidth=1.2)
+    for end, sign in ((item.minus, -1.0), (item.plus, 1.0)):
+        if item.half_width is None or end is None:
+            continue
+        if item.least is None:
+            axes.axvline(sign * factor * end, color=ORANGE, linestyle=":", linewidth=1.2)
+        else:
+            # Where the profile seems to fall is no half width then: at least as far as the title says.
+            axes.plot(
+                sign * factor * item.least, 0.5, color=ORANGE, marker=">" if sign > 0 else "<", markersize=5
+            )
     axes.set_title(f"forgives {name}: {item.in_words()}\nn = {sum(item.count):,}", fontsize=8)
     axes.set_ylim(0.0, 1.02)
     axes.set_xlabel(f"{name} [{unit}]", fontsize=8)

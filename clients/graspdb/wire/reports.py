@@ -225,6 +225,15 @@ class AnisotropyTolerance(Response):
     count: list[int]
     """How many pairs of trials lie at each displacement."""
 
+    @property
+    def least(self) -> float | None:
+        """The half width is at least so much, in ``unit``, where that is all that trials tell: of what lies
+        beyond what was tried nothing is known. Else None.
+        """
+        if self.half_width is None or self.within or not self.beyond:
+            return None
+        return self.half_width if self.low is None else self.low
+
     def in_words(self) -> str:
         """The half width, mm or degrees, with its interval or as the bound that it is."""
         factor, unit = (math.degrees(1.0), "deg") if self.unit == "rad" else (1e3, "mm")
@@ -232,11 +241,11 @@ class AnisotropyTolerance(Response):
             some = "too little tried" if any(self.tried or ()) else "nothing tried"
             return "hidden by the kernel" if self.within else some
         width, low, high = (factor * (value or 0.0) for value in (self.half_width, self.low, self.high))
+        least = self.least
         if self.within:
             return f"less than {width:.0f} {unit}"
-        if self.beyond:
-            # Surely so much; of what lies beyond what was tried nothing is known.
-            least = round(width if self.low is None else low)
+        if least is not None:
+            least = round(factor * least)
             ends = [round(factor * at) for at in self.tried or (0.0, 0.0)]
             tried = f"to {ends[1]}" if ends[0] == -ends[1] else f"{ends[0]} to {ends[1]}"
             return f"at least {least} {unit}" + (
