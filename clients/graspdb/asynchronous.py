@@ -231,6 +231,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
     summary = _at_once(GraspObject.summary, _same)
     refresh = _chained(GraspObject.refresh)
     patch = _chained(GraspObject.patch)
+    copy = _mirrored(GraspObject.copy, lambda item: AsyncGraspObject(item))
     delete = _awaited(GraspObject.delete)
     upload_mesh = _awaited(GraspObject.upload_mesh)
     download_mesh = _awaited(GraspObject.download_mesh)

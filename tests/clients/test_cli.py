@@ -306,6 +306,12 @@ def test_bad_trials_name_the_trial_and_field(run: Run, fresh_id: str, tmp_path: 
     assert json.loads(run("--json", "objects", "show", fresh_id)[1])["trials"] == 0
 
 
+def test_an_object_is_copied(run: Run, fresh_id: str) -> None:
+    assert run("objects", "create", fresh_id)[0] == 0
+    assert f"{fresh_id}, revision 0" in run("objects", "copy", fresh_id, f"{fresh_id}-2", "--trials")[1]
+    assert "already" in run("objects", "copy", fresh_id, f"{fresh_id}-2")[2]
+
+
 def test_grippers(run: Run, fresh_id: str, tmp_path: Path) -> None:
     assert "pg70" in run("grippers", "list")[1]
     profile = json.loads(run("--json", "grippers", "show", "pg70")[1])["profile"]

@@ -124,6 +124,15 @@ def test_examples_come_with_mesh_parts_and_mass(db: Client) -> None:
     made.delete()
 
 
+def test_a_copy_takes_the_trials_along(db: Client, fresh_id: str) -> None:
+    item = db.objects.create(fresh_id, mass_kg=0.1)
+    item.trials.add([0, 0, 0.1, 0, 0, 0, 1], True)
+    copy = item.copy(f"{fresh_id}-2", trials=True)
+    assert (copy.info.trials, copy.info.mass_kg) == (1, 0.1)
+    assert copy.summary()["copied from"] == f"{fresh_id}, revision 1"
+    assert item.copy(f"{fresh_id}-3").info.trials == 0
+
+
 def test_grippers(db: Client, fresh_id: str) -> None:
     assert {"pg70", "panda"} <= {g.id for g in db.grippers.list()}
     profile = db.grippers.get("pg70").profile.model_dump(exclude_none=True)

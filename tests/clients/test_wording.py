@@ -34,6 +34,12 @@ REQUEST = re.compile(r"(GET|POST|PUT|DELETE|PATCH) /")
         ("PUT /objects/mug/mesh?unit=... again", "`graspdb objects set-mesh mug FILE --unit ...` again"),
         ("  approach_cone_deg: the half angle", "  --approach-cone-deg: the half angle"),
         ("name one (gripper=) or use alignment=gripper", "name one (--gripper) or use --alignment gripper"),
+        (
+            "post them with ?accept_implausible=true (on the command line --accept-implausible)",
+            "post them with --accept-implausible",
+        ),
+        ("by 0.001 (on the command line --unit mm)", "by 0.001 (--unit mm)"),
+        ("collision_free=false would do", "--no-collision-free would do"),
         ("trials.1.quaternion_xyzw: norm 3", "trials.1.quaternion_xyzw: norm 3"),
         ("GET /somewhere/else is unknown", "GET /somewhere/else is unknown"),
     ],

@@ -98,6 +98,18 @@ def set_convex_parts(
     state.show(info, item.summary())
 
 
+@objects.command("copy")
+def copy_object(
+    state: State,
+    id: ObjectId,
+    copy: Annotated[str, typer.Argument(metavar="COPY", help="Id of the copy.", show_default=False)],
+    trials: Annotated[bool, typer.Option("--trials", help="Copy its trials and sweeps, too.")] = False,
+) -> None:
+    """Copy an object; the copy takes one other mesh though it has trials."""
+    item = state.db.objects.get(id).copy(copy, trials=trials)
+    state.show(item.info, item.summary())
+
+
 @objects.command("delete")
 def delete_object(state: State, id: ObjectId, yes: Yes = False) -> None:
     """Delete an object with its trials and sweeps."""

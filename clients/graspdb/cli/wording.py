@@ -29,6 +29,7 @@ COMMANDS: Mapping[str, str] = {
     "GET /objects": "objects list",
     "POST /objects": "objects create",
     "PATCH /objects/OBJECT": "objects change OBJECT",
+    "POST /objects/OBJECT/copies": "objects copy OBJECT COPY --trials",
     "PUT /objects/OBJECT/mesh": "objects set-mesh OBJECT FILE",
     "PUT /objects/OBJECT/convex-parts": "objects set-convex-parts OBJECT FILE",
     "GET /objects/OBJECT/trials": "trials list OBJECT",
@@ -55,11 +56,14 @@ _PARAMETERS = option_names(
     *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, PromisesOptions),
 ) | {"unit", "mesh"}
 _CALL = re.compile(r"\b(GET|POST|PUT|DELETE|PATCH) (/[\w{}./-]*[\w}])(?:\?([\w=]+)(?:=\.\.\.|\.\.\.)?)?")
-_PARAMETER = re.compile(r"(?<![\w.\-])(?:\w+\([^()]*\)|([a-z_]+)=([\w.-]*)|([a-z]+(?:_[a-z]+)+))")
+_FOR_BOTH = re.compile(r"(\?\w+=\w+)? \(on the command line (--[^()]+)\)")
+_PARAMETER = re.compile(r"(?<![\w.\-])\??(?:\w+\([^()]*\)|([a-z_]+)=([\w.-]*)|([a-z]+(?:_[a-z]+)+))")
 
 
 def in_commands(text: str) -> str:
     """The text with commands in the place of requests, and options in that of parameters."""
+    # What is said for both is said for one: the option, not the parameter beside it.
+    text = _FOR_BOTH.sub(lambda found: found[2] if found[1] else f" ({found[2]})", text)
     said, at = "", 0
     for call in _CALL.finditer(text):
         if call.start() < at:
@@ -126,8 +130,9 @@ def _option(found: re.Match[str]) -> str:
     name = found[1] or found[3]
     if name not in _PARAMETERS:
         return found[0]
-    flag = _flag(name)
-    return f"{flag} {found[2]}" if found[2] else flag
+    if found[2] in ("true", "false"):
+        return _flag(name if found[2] == "true" else f"no_{name}")
+    return f"{_flag(name)} {found[2]}" if found[2] else _flag(name)
 
 
 def _flag(name: str) -> str:

@@ -54,6 +54,17 @@ class GraspObject(GraspQueries):
         # Nulls are meant in a patch.
         return self._update(self._transport.json("PATCH", self._path, body=changes))
 
+    def copy(self, id: str, *, trials: bool = False) -> GraspObject:
+        """Copy the object with mesh and convex parts, and with all its ``trials`` if asked.
+
+        The copy takes one other mesh (:meth:`upload_mesh`) though it has trials. These, and what sweeps
+        found, are of the mesh before then, as answers warn.
+        """
+        request = validate(wire.CopyRequest, {"id": id, "trials": trials})
+        path = f"{self._path}/copies"
+        info = self._transport.model(wire.ObjectInfo, "POST", path, body=request, idempotent=True)
+        return GraspObject(self._transport, info)
+
     def delete(self) -> None:
         """Delete the object with everything that belongs to it."""
         self._transport.request("DELETE", self._path)
@@ -136,6 +147,11 @@ class GraspObject(GraspQueries):
                 rows[f"mesh warning {number}"] = warning
         if info.convex_parts is not None:
             rows["convex parts"] = f"{info.convex_parts.parts}"
+        if info.copied_from is not None:
+            origin = info.copied_from
+            rows["copied from"] = f"{origin.object}, revision {origin.revision}" + (
+                ", then given another mesh" if origin.other_mesh else ""
+            )
         rows["trials"] = f"{info.trials:,}"
         if info.outcomes:
             rows["outcomes"] = ", ".join(f"{n:,} {name}" for name, n in info.outcomes.items())

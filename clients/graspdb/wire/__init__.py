@@ -45,6 +45,8 @@ from graspdb.wire.kernels import KernelWidths as KernelWidths
 from graspdb.wire.kernels import KernelWindow as KernelWindow
 from graspdb.wire.kernels import StoredKernel as StoredKernel
 from graspdb.wire.objects import BoundingBox as BoundingBox
+from graspdb.wire.objects import CopiedFrom as CopiedFrom
+from graspdb.wire.objects import CopyRequest as CopyRequest
 from graspdb.wire.objects import MeshInfo as MeshInfo
 from graspdb.wire.objects import ObjectCreate as ObjectCreate
 from graspdb.wire.objects import ObjectInfo as ObjectInfo

@@ -103,6 +103,28 @@ class PartsInfo(Response):
     warnings: Warnings = Field(default_factory=list)
 
 
+class CopyRequest(Request):
+    """A copy of an object to make."""
+
+    id: Slug
+    """Id of the copy."""
+    trials: bool = False
+    """Whether it has all trials, too, with their batches, history and findings, and what sweeps found."""
+
+
+class CopiedFrom(Response):
+    """Where a copy comes from."""
+
+    object: str
+    """Id of the object that it was copied from."""
+    revision: int
+    """Revision of that object then."""
+    takes_mesh: bool = False
+    """Whether it still takes another mesh, once, though it has trials or sweeps."""
+    other_mesh: bool = False
+    """Whether it took one: the trials that were copied are of the mesh before."""
+
+
 class ObjectInfo(Response):
     """An object, its properties, and how many trials it has."""
 
@@ -126,6 +148,8 @@ class ObjectInfo(Response):
     """The mesh as it was checked; null where there is none."""
     convex_parts: PartsInfo | None = None
     """The convex parts; null where there are none yet."""
+    copied_from: CopiedFrom | None = None
+    """What it is a copy of; null for none."""
     trials: int = 0
     """How many collected trials there are, packed outcomes included."""
     outcomes: OutcomeCounts = Field(default_factory=dict)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Request, Response
 
-from graspdb.wire import ObjectCreate, ObjectInfo, ObjectPatch, Page
+from graspdb.wire import CopyRequest, ObjectCreate, ObjectInfo, ObjectPatch, Page
 from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import etag, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
 from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId
 from graspdb_service.api.routing.scopes import scope
-from graspdb_service.usecases import objects
+from graspdb_service.usecases import copies, objects
 
 router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 
@@ -39,6 +39,15 @@ def get_object(ctx: Ctx, id: ObjectId, request: Request) -> Response:
 def change_object(ctx: Ctx, id: ObjectId, request: ObjectPatch) -> ObjectInfo:
     """Change properties: a field left out stays, an explicit null clears it."""
     return objects.change(ctx.database, id, request)
+
+
+@router.post("/objects/{id}/copies", status_code=201, response_model=ObjectInfo, **scope("admin"))
+def copy_object(ctx: Ctx, id: ObjectId, request: CopyRequest, sent: Creating) -> object:
+    """Copy an object with its mesh and convex parts, and its trials if asked: the copy takes one other mesh.
+
+    What sweeps have finished is copied with the trials, checks are not; 409 while a sweep runs.
+    """
+    return sent.answered(copies.create(ctx.database, id, request, sent))
 
 
 @router.delete("/objects/{id}", status_code=204, **scope("admin"))

@@ -12,6 +12,7 @@ from sqlalchemy import (
     Double,
     Engine,
     Executable,
+    String,
     Table,
     create_engine,
     event,
@@ -74,6 +75,28 @@ def _postgres_utc_now(element: utc_now, compiler: Any, **_: Any) -> str:
 def clock(tx: Tx) -> datetime:
     """The time by the database's own clock, as a value to compare and to reckon with."""
     return datetime.fromtimestamp(tx.execute(select(unix_now())).scalar_one(), UTC)
+
+
+class new_uuid(GenericFunction[str]):
+    """A random UUID (version 4) as text, another one for every row."""
+
+    type = String(36)
+    inherit_cache = True
+
+
+@compiles(new_uuid, "sqlite")
+def _sqlite_uuid(element: new_uuid, compiler: Any, **_: Any) -> str:
+    digits = "lower(hex(randomblob({})))".format
+    variant = "substr('89ab', 1 + (abs(random()) % 4), 1)"
+    return (
+        f"({digits(4)} || '-' || {digits(2)} || '-4' || substr({digits(2)}, 2) || '-' || {variant}"
+        f" || substr({digits(2)}, 2) || '-' || {digits(6)})"
+    )
+
+
+@compiles(new_uuid, "postgresql")
+def _postgres_uuid(element: new_uuid, compiler: Any, **_: Any) -> str:
+    return "gen_random_uuid()::text"
 
 
 def insert_or(tx: Tx, table: Table) -> postgresql.Insert:

@@ -38,6 +38,7 @@ class ObjectRow:
     parts_info: dict[str, Any] | None
     created_at: datetime
     updated_at: datetime
+    copied_from: dict[str, Any] | None
 
 
 def create(tx: Tx, slug: str, properties: Mapping[str, Any]) -> bool:

@@ -122,6 +122,8 @@ objects = Table(
     Column("parts_info", JSON),
     Column("created_at", UtcDateTime, nullable=False),
     Column("updated_at", UtcDateTime, nullable=False),
+    # Of a copy: what it was copied from, and whether its mesh may be, or was, changed in spite of its trials.
+    Column("copied_from", JSON(none_as_null=True)),
     sqlite_autoincrement=True,
 )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import and_, insert, select, update
+from sqlalchemy import and_, delete, insert, select, update
 
 from graspdb.wire.states import JobState
 from graspdb_service.storage.database import Tx, first_as, unix_now
@@ -82,3 +82,8 @@ def cancel(tx: Tx, object_id: int) -> None:
         )
         .values(state=JobState.CANCELLED, completed_at=unix_now())
     )
+
+
+def forget(tx: Tx, object_id: int) -> None:
+    """Delete the object's decomposition, whatever became of it: its mesh is another."""
+    tx.execute(delete(jobs).where(jobs.c.object_id == object_id, jobs.c.kind == "decompose"))

@@ -59,6 +59,11 @@ def ask(tx: Tx, row: ObjectRow, created_ms: int) -> None:
     decompositions.ask(tx, row.id, job_id)
 
 
+def forget(tx: Tx, row: ObjectRow) -> None:
+    """The object (locked) gets another mesh: what was asked for the one before is of no use."""
+    decompositions.forget(tx, row.id)
+
+
 def settle(tx: Tx, row: ObjectRow) -> None:
     """The object (locked) has parts: complete the snapshots of sweeps that waited, release their chunks."""
     for sweep_id in decompositions.waiting_sweeps(tx, row.id):

@@ -55,6 +55,9 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
         objects.advance(tx, row.id, append=False)
         assets.put(tx, content, media)
         values: dict[str, Any] = {"mesh_sha256": sha256, "mesh_info": info.model_dump(mode="json")}
+        if _is_used(tx, row):
+            values["copied_from"] = {**(row.copied_from or {}), "takes_mesh": False, "other_mesh": True}
+            decompositions.forget(tx, row)
         if own is not None:
             values |= _parts_values(tx, own, _parts_info(own, inspection.parts, info))
         elif row.mesh_sha256 is not None:
@@ -185,13 +188,27 @@ def _is_stored(row: ObjectRow, sha256: str, media: str, unit: str) -> bool:
 
 
 def _refuse_another_mesh(tx: Tx, row: ObjectRow) -> None:
-    if row.mesh_sha256 is None:
+    if not _is_used(tx, row):
         return
-    if objects.has_sweeps(tx, row.id) or any(provenances.outcome_counts(tx, [row.id])[row.id].values()):
+    if not (row.copied_from or {}).get("takes_mesh"):
         raise conflict(
             "mesh-in-use",
-            f"{row.slug!r} has trials or sweeps made with its mesh: register another object for another mesh",
+            f"{row.slug!r} has trials or sweeps made with its mesh: register another object for another mesh,"
+            f" or take a copy, which takes one (POST /objects/{row.slug}/copies)",
         )
+    if objects.has_running_sweep(tx, row.id):
+        raise conflict(
+            "sweep-running",
+            f"A sweep of {row.slug!r} with its mesh is running: cancel it (POST /sweeps/{{id}}/cancel) or"
+            " wait for its end",
+        )
+
+
+def _is_used(tx: Tx, row: ObjectRow) -> bool:
+    """Whether trials or sweeps were made with the mesh that there is."""
+    if row.mesh_sha256 is None:
+        return False
+    return objects.has_sweeps(tx, row.id) or any(provenances.outcome_counts(tx, [row.id])[row.id].values())
 
 
 def _refuse_other_parts(tx: Tx, row: ObjectRow) -> None:

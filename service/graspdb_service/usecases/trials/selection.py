@@ -14,7 +14,7 @@ from graspdb.wire.base import source_weights
 from graspdb.wire.grippers import SHAPE_FIELDS
 from graspdb.wire.queries import TrialSelection
 from graspdb_service.problems import conflict, found, invalid
-from graspdb_service.storage import grippers
+from graspdb_service.storage import copies, grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.storage.objects import ObjectRow
@@ -189,10 +189,12 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
     selected = of_provenances(
         row, candidates, counts, profile=profile, source_weight=asked.source_weight, **names
     )
-    if named_gripper is None or profile is None:
-        return selected
-    warnings = _of_other_versions(tx, named_gripper, profile, selected.versions)
-    return replace(selected, stamp=named_gripper.version_id, warnings=warnings)
+    warnings = _of_another_mesh(tx, row)
+    stamp = None
+    if named_gripper is not None and profile is not None:
+        stamp = named_gripper.version_id
+        warnings += _of_other_versions(tx, named_gripper, profile, selected.versions)
+    return replace(selected, stamp=stamp, warnings=warnings)
 
 
 def _weighing(candidates: dict[int, Provenance], asked: TrialSelection) -> dict[int, Provenance]:
@@ -263,6 +265,20 @@ def total(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
 
 def _gripper(tx: Tx, name: str) -> GripperRow:
     return found(grippers.find(tx, name), "gripper", name, "GET /grippers lists those there are")
+
+
+def _of_another_mesh(tx: Tx, row: ObjectRow) -> list[str]:
+    """Warnings of trials that came with a copy whose mesh has been changed since."""
+    origin = row.copied_from
+    if origin is None or not origin["other_mesh"]:
+        return []
+    if not copies.has_copied(tx, row.id, last_seq=origin["last_seq"], revision=origin["revision"]):
+        return []
+    return [
+        f"trials copied from {origin['object']!r} count, and the mesh is another than they were made with:"
+        " their outcomes, simulated ones above all, are of the mesh before (source=robot leaves those out);"
+        " collisions are told by the mesh that there is"
+    ]
 
 
 def _of_other_versions(
