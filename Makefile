@@ -24,12 +24,15 @@ demo: install  ## Real physics on the mug: from nothing to a best grasp (KEEP=1 
 	$(BIN)/graspdb demo $(if $(KEEP),--keep)
 
 test: check  ## Every check and every test, on SQLite and on a real PostgreSQL
+	@sh .ci/faketime
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long" --ignore tests/architecture
 
 test-core: install  ## The tests without a browser
+	@sh .ci/faketime
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long and not browser"
 
 test-long: install  ## Also what takes many minutes
+	@sh .ci/faketime
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 check: install  ## Format, lint, types, import rules, the rules of the house

@@ -30,6 +30,7 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
 from postgres_server import PostgresPrograms, PostgresServer
+from small_disk import Guard
 
 # A machine's hiccup is no failure of the code: speed is measured in benchmarks.
 # The same examples every time, so that a change is judged by what it changed; the variable HYPOTHESIS_RANDOM
@@ -87,11 +88,13 @@ def descendants(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
 
 @contextmanager
 def _temporary_folder(prefix: str) -> Iterator[Path]:
+    """A folder that is gone afterwards, with whatever works in it, also when this process is killed."""
     folder = Path(tempfile.mkdtemp(prefix=prefix))
+    guard = Guard(folder)
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        guard.close()
 
 
 @pytest.fixture(scope="session")

@@ -129,7 +129,7 @@ class Lab:
 
     def heal(self) -> None:
         """Have everything run again."""
-        self.disk.free()
+        self.disk.free(self.writers())
         self.proxy.share = 0.0
         self.clock.set(0.0)
         if self.postgres is not None:

@@ -28,7 +28,7 @@ def free_port() -> int:
 
 
 class Process:
-    """A command of ours, as its own process group."""
+    """A command of ours, as its own process group. The file ``pids`` in ``cwd`` gets a line each start."""
 
     def __init__(self, log: Path, *command: str, cwd: Path | None = None, **environment: str) -> None:
         self._log = log
@@ -47,6 +47,9 @@ class Process:
                 env={**os.environ, **self._environment},
                 start_new_session=True,
             )
+        if self._cwd is not None:
+            with (self._cwd / "pids").open("a") as pids:
+                pids.write(f"{self.pid}\n")
 
     @property
     def pid(self) -> int:
