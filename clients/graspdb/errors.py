@@ -84,6 +84,10 @@ class ServiceError(GraspDBError):
     """5xx: the service failed."""
 
 
+class DeadlineExceeded(ServiceError):
+    """503: no answer within ``timeout_s``, or within what the service allows."""
+
+
 class Infeasible(GraspDBError):
     """No admissible grasp lies within any kernel's reach, or the object has no success yet.
 
@@ -116,6 +120,7 @@ class SweepFailed(GraspDBError):
 _BY_TYPE: dict[str, type[GraspDBError]] = {
     "ambiguous-selection": AmbiguousSelection,
     "checks-needed": ChecksNeeded,
+    "deadline": DeadlineExceeded,
     "lease-lost": LeaseLost,
 }
 _BY_STATUS: dict[int, type[GraspDBError]] = {

@@ -122,7 +122,7 @@ class Transport:
             else:
                 if response.is_success or response.status_code == 304:
                     return response
-                if last or response.status_code not in _RETRIED:
+                if last or response.status_code not in _RETRIED or _is_deadline(response):
                     raise error_for(_problem(response))
                 wait = max(wait, _retry_after(response))
             self._sleep(wait)
@@ -151,6 +151,11 @@ def _retry_after(response: httpx.Response) -> float:
         return min(float(response.headers.get("Retry-After", "0")), 60.0)
     except ValueError:
         return 0.0
+
+
+def _is_deadline(response: httpx.Response) -> bool:
+    """Whether time ran out for a question: asked again, it would take as long again."""
+    return response.status_code == 503 and b":deadline" in response.content
 
 
 def _problem(response: httpx.Response) -> Problem:

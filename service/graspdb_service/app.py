@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import json
 import logging
@@ -48,7 +49,7 @@ from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
-from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database
+from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database, is_full, why
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.usecases.grippers import seed
 
@@ -88,7 +89,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     SQLite is created and migrated here; a PostgreSQL schema that is not current is refused (StaleSchema).
     """
     settings = settings or Settings()
-    database = Database(settings.database_url)
+    database = Database(
+        settings.database_url,
+        pool_size=settings.max_database_connections,
+        statement_s=settings.max_statement_seconds,
+    )
     try:
         if database.is_sqlite:
             schema.upgrade(database)
@@ -106,7 +111,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         admission.open()
         await anyio.to_thread.run_sync(ctx.health.start)
+        watching = asyncio.create_task(_cut_what_hangs(ctx))
         yield
+        watching.cancel()
         ctx.close()
 
     app = FastAPI(
@@ -128,6 +135,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(Decoding, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(RequestTrace)
     return app
+
+
+async def _cut_what_hangs(ctx: Context) -> None:
+    """Have nobody wait for a PostgreSQL that accepts and never answers."""
+    while not ctx.database.is_sqlite:
+        await asyncio.sleep(1.0)
+        if ctx.health.is_stuck:
+            await anyio.to_thread.run_sync(ctx.database.cut)
 
 
 @functools.cache
@@ -227,14 +242,8 @@ def _add_problems(app: FastAPI) -> None:
         return answer(request, ProblemError(404, "not-found", "The object has just been deleted"))
 
     def on_database(request: Request, error: Exception) -> Response:
-        log.error("request %s: %s", getattr(request.state, "request_id", ""), error)
-        problem = ProblemError(
-            503,
-            "database-unavailable",
-            "The database does not answer or is busy; nothing was stored: try again",
-            headers={"Retry-After": "2"},
-        )
-        return answer(request, problem)
+        log.error("request %s: %s", getattr(request.state, "request_id", ""), why(error))
+        return answer(request, _database_problem(error))
 
     for unavailable in UNAVAILABLE:
         app.exception_handler(unavailable)(on_database)
@@ -262,6 +271,19 @@ def _add_problems(app: FastAPI) -> None:
         }.get(error.status_code, str(error.detail))
         headers = {"Allow": allowed(request.scope)} if error.status_code == 405 else error.headers
         return answer(request, ProblemError(error.status_code, kind, title, headers=headers))
+
+
+def _database_problem(error: Exception) -> ProblemError:
+    if is_full(error):
+        title = "The database's disk is full, and nothing was stored: make room on it, then try again"
+        return ProblemError(507, "disk-full", title, headers={"Retry-After": "30"})
+    return ProblemError(
+        503,
+        "database-unavailable",
+        "The database does not answer or is busy; nothing was stored: try again",
+        detail=why(error),
+        headers={"Retry-After": "2"},
+    )
 
 
 def problem_of_validation(errors: Any) -> ProblemError:

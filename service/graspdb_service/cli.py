@@ -9,20 +9,22 @@ import os
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 NEEDS = "graspdb-server needs {}: pip install 'graspdb[service]'"
 
 try:
     import typer
-    import uvicorn
 
     from graspdb.processes import LIFELINE_HELP, end_with_parent
+    from graspdb_service import connections
     from graspdb_service.commands import upkeep
     from graspdb_service.commands.options import DatabaseUrl, fail, settings_from
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
-    from graspdb_service.storage.database import Database, UnsupportedDatabase
+    from graspdb_service.storage.database import CANNOT_OPEN, Database, UnsupportedDatabase, why
 except ModuleNotFoundError as error:
     sys.exit(NEEDS.format(error.name))
 
@@ -50,20 +52,10 @@ def serve(
     # Before NumPy is imported: its BLAS would start a thread a core inside each compute thread.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s")
-    try:
+    with _opening(settings):
         app = _application(settings)
-    except (schema.StaleSchema, UnsupportedDatabase) as error:
-        fail(str(error))
     _warm_up(app)
-    uvicorn.run(
-        app,
-        host=settings.host,
-        port=settings.port,
-        # h11 refuses headers over 64 KiB; httptools would collect them without end.
-        http="h11",
-        log_level=log_level,
-        timeout_graceful_shutdown=10,
-    )
+    connections.serve(app, settings, log_level)
 
 
 def _warm_up(app: Any) -> None:
@@ -82,11 +74,21 @@ def _warm_up(app: Any) -> None:
 @cli.command()
 def migrate(database_url: DatabaseUrl = None) -> None:
     """Bring the database's schema to this version; safe to run from several places at once."""
+    settings = settings_from(database_url=database_url)
+    with _opening(settings):
+        typer.echo(f"The schema is at {schema.upgrade(Database(settings.database_url))}.")
+
+
+@contextmanager
+def _opening(settings: Settings) -> Iterator[None]:
+    """End with a line, not a traceback, where the database can't be opened."""
     try:
-        database = Database(settings_from(database_url=database_url).database_url)
-        typer.echo(f"The schema is at {schema.upgrade(database)}.")
+        yield
     except (schema.StaleSchema, UnsupportedDatabase) as error:
         fail(str(error))
+    except CANNOT_OPEN as error:
+        url = Database(settings.database_url).url.render_as_string(hide_password=True)
+        fail(f"The database {url} cannot be opened: {why(error)}")
 
 
 @cli.command()

@@ -32,6 +32,14 @@ class Settings(BaseSettings):
     max_body_seconds: Annotated[float, Field(gt=0)] = 300.0
     """A body arrives within this, and after 10 s at ``min_body_bytes_per_second`` or faster."""
     min_body_bytes_per_second: Annotated[int, Field(ge=0)] = 16 * 2**10
+    max_header_seconds: Annotated[float, Field(gt=0)] = 15.0
+    """A request's head arrives within this, from its first byte or the connection's opening on."""
+    max_idle_seconds: Annotated[int, Field(gt=0)] = 30
+    """A connection is kept so long for another request."""
+    max_reader_stall_seconds: Annotated[float, Field(gt=0)] = 30.0
+    """Who takes an answer more slowly than ``min_body_bytes_per_second`` over this time is cut off."""
+    max_connections: Annotated[int, Field(ge=10)] = 1_000
+    """One more closes the one that has waited longest for a request; never more than open files allow."""
     max_json_values: Annotated[int, Field(ge=1_000)] = 50_000_000
     max_json_depth: Annotated[int, Field(ge=8, le=200)] = 32
 
@@ -60,6 +68,10 @@ class Settings(BaseSettings):
     """So many answers of each object and kind of question are kept, those given last, beside those that a
     name or a trial keeps; none is deleted within ten minutes."""
 
+    max_database_connections: Annotated[int, Field(ge=4)] = 40
+    """Connections of this process to its database; who finds none for 10 s is told 503."""
+    max_statement_seconds: Annotated[float, Field(gt=0)] = 120.0
+    """A statement, or a transaction that does nothing, ends on PostgreSQL after this."""
     min_free_disk_bytes: Annotated[int, Field(ge=0)] = 4 * 2**20
     """With less free under a SQLite database the service says that it is not ready."""
     probe_seconds: Annotated[float, Field(gt=0)] = 3.0

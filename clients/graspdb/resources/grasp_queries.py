@@ -58,6 +58,7 @@ class GraspQueries(Resource):
         include: Sequence[str] | None = None,
         chunk: int = QUERY_POSES,
         name: str | None = None,
+        timeout_s: float | None = None,
         **selection: Unpack[LikelihoodSelection],
     ) -> LikelihoodArrays:
         """How likely these grasps are, as NumPy arrays in the poses' order.
@@ -65,12 +66,16 @@ class GraspQueries(Resource):
         ``poses`` are (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples, sent ``chunk`` a
         request. ``include`` are the columns to compute: ``density``, ``log_density``, ``relative``,
         ``success_probability``, ``interval``, ``effective_trials``, ``collision_free``, ``support``,
-        ``prior_success_probability``; by default all. ``name`` keeps the answer of at most 1,000 poses, as in
-        :class:`Constraints`.
+        ``prior_success_probability``; by default all. ``name`` keeps the answer of at most 1,000 poses, and
+        ``timeout_s`` bounds the time for every request, as in :class:`Constraints`.
         """
         options = known_keywords(LikelihoodSelection, selection, "likelihood")
         given = as_poses(poses)
-        options |= {"include": None if include is None else names(include), "name": name}
+        options |= {
+            "include": None if include is None else names(include),
+            "name": name,
+            "timeout_s": timeout_s,
+        }
         # Checked once with a single pose: the arrays are checked already, and a model of a million is slow.
         probe = validate(wire.LikelihoodRequest, {**options, "poses": given.columns(slice(1))})
         request = probe.model_dump(mode="json", exclude_unset=True)
@@ -158,6 +163,7 @@ class GraspQueries(Resource):
         *,
         seed: int | None = None,
         name: str | None = None,
+        timeout_s: float | None = None,
         **selection: Unpack[Selection],
     ) -> SampledPoses:
         """Poses drawn from the density; the same seed and revision give the same poses.
@@ -165,7 +171,7 @@ class GraspQueries(Resource):
         ``name`` keeps the answer, as in :class:`Constraints`; of at most 1,000 poses.
         """
         fields = known_keywords(Selection, selection, "samples")
-        fields |= {"count": count, "seed": seed, "name": name}
+        fields |= {"count": count, "seed": seed, "name": name, "timeout_s": timeout_s}
         request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
         return SampledPoses.from_wire(answer)
@@ -177,6 +183,7 @@ class GraspQueries(Resource):
         strategy: str = "density",
         seed: int | None = None,
         name: str | None = None,
+        timeout_s: float | None = None,
         **selection: Unpack[Selection],
     ) -> SampledPoses:
         """Grasps to try next; send ``proposal_density`` back with their trials.
@@ -186,7 +193,7 @@ class GraspQueries(Resource):
         edges or points; some of what it draws collides. ``name`` keeps the answer, as for :meth:`samples`.
         """
         fields = known_keywords(Selection, selection, "proposals")
-        fields |= {"count": count, "seed": seed, "strategy": strategy, "name": name}
+        fields |= {"count": count, "seed": seed, "strategy": strategy, "name": name, "timeout_s": timeout_s}
         request = validate(wire.ProposalsRequest, fields)
         answer = self._transport.model(wire.Proposals, "POST", f"{self._path}/proposals", body=request)
         return SampledPoses.from_wire(answer)

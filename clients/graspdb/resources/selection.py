@@ -98,6 +98,7 @@ class Constraints(Selection, total=False):
       along where the objective needs it or there are at most 500,000 attempts.
     - ``name``: keeps the answer under this name: the same question is answered exactly so again, until it is
       deleted (``db.answers``).
+    - ``timeout_s``: answer within this time, or DeadlineExceeded.
     - ``prior``: whether an object with geometry and no success yet may answer from its edges; such grasps
       have ``grasp.prior``. By default it does where a gripper is known; True says what is missing where it
       can't.
@@ -141,6 +142,7 @@ class Constraints(Selection, total=False):
     min_separation_m: Annotated[float | None, Option("Distinct from this distance on.")]
     min_separation_deg: Annotated[float | None, Option("Distinct from this angle on.")]
     name: Annotated[str | None, Option("Keep the answer under this name.")]
+    timeout_s: Annotated[float | None, Option("Answer within so many seconds.")]
     prior: Annotated[bool | None, Option("Before any success: whether to choose by the edges.")]
 
 

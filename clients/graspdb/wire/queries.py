@@ -118,6 +118,15 @@ AnswerName = Annotated[
         " name is answered exactly so again. By default it has no name."
     ),
 ]
+TimeoutS = Annotated[
+    float | None,
+    Field(
+        gt=0,
+        le=3600,
+        description="Answer within this time, seconds from the request on, or with 503 `deadline`, which"
+        " tells what was reached; by default within the service's `max_question_seconds`, which is the most.",
+    ),
+]
 AnswerId = Annotated[
     str | None,
     Field(
@@ -183,6 +192,12 @@ class SelectionQuery(Selection):
     """A selection in a query string, where a kernel is a name with widths beside it."""
 
     kernel: NamedKernel = None
+
+
+class DensityQuery(SelectionQuery):
+    """A selection whose density is asked for."""
+
+    timeout_s: TimeoutS = None
 
 
 class KernelInfo(Response):
@@ -305,6 +320,7 @@ class LikelihoodRequest(Selection):
     include: IncludedColumns = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    timeout_s: TimeoutS = None
 
 
 class Intervals(Response):
@@ -483,6 +499,7 @@ class GraspConstraints(Selection):
     """Grasps are distinct from this angle between them on, degrees; by default 20."""
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    timeout_s: TimeoutS = None
 
 
 class BestGraspRequest(GraspConstraints):
@@ -605,6 +622,7 @@ class SamplesRequest(Selection):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
     """The same seed and revision give the same poses; by default a new one."""
     name: AnswerName = None
+    timeout_s: TimeoutS = None
 
 
 class Samples(Response):
@@ -672,6 +690,7 @@ class LikelihoodQuery(SelectionQuery):
     include: Annotated[IncludedColumns, BeforeValidator(_listed)] = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    timeout_s: TimeoutS = None
 
 
 class BestGraspQuery(GraspConstraints):
@@ -687,6 +706,7 @@ class LikelihoodOptions(Selection):
     include: IncludedColumns = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    timeout_s: TimeoutS = None
 
 
 # -- answers that are kept

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
-from graspdb_service.storage.probe import Probe
+from graspdb_service.storage.upkeep.probe import Probe
 from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
@@ -32,6 +32,11 @@ class Context(Asking):
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
+        probe = Probe(database, min_free_bytes=settings.min_free_disk_bytes)
+        health = Health(probe.look, settings.probe_seconds, may_hang=not database.is_sqlite)
+        # From here on a file that is gone is no empty database, and what hangs is not waited for.
+        database.keep_file()
+        database.down = health.down
         compute = Compute(settings.threads, settings.max_question_seconds)
         features = Features(database, compute)
         densities = Densities(
@@ -50,9 +55,7 @@ class Context(Asking):
             successes=Successes(database, compute, settings.max_density_cache_bytes),
             answers=AnswerKeeper(database, most=settings.max_answers),
             reports=reports,
-            health=Health(
-                Probe(database, min_free_bytes=settings.min_free_disk_bytes).look, settings.probe_seconds
-            ),
+            health=health,
             runs=Runs(database, wait_s=settings.report_wait_s, kinds={fit.RUN: fits, **reports.run_kinds()}),
         )
 

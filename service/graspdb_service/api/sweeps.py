@@ -35,7 +35,7 @@ PosesLimit = Annotated[
 def create_sweep(ctx: Ctx, id: ObjectId, request: Request, sent: Creating) -> object:
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
     draws from its density. Workers take its chunks."""
-    content = read_object(request, sent.body or b"{}")
+    content = read_object(request, sent.body or b"{}", status=422)
     given: planning.Given | None = None
     poses = content.get("poses")
     if poses is not None:

@@ -16,16 +16,18 @@ from graspdb_service.problems import ProblemError, invalid
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def read_object(request: Request, body: bytes, allowed: Allowed | None = None) -> dict[str, Any]:
+def read_object(
+    request: Request, body: bytes, allowed: Allowed | None = None, *, status: int = 400
+) -> dict[str, Any]:
     """A JSON object, its long arrays as :class:`LongArray`; NaN and Infinity are refused here.
 
-    415 for another media type, 400 where the body is no JSON, 422 where it is no object.
+    415 for another media type, ``status`` where the body is no JSON, 422 where it is no object.
     """
     require_json(request)
     try:
         value = loads(body, allowed=allowed)
     except orjson.JSONDecodeError as error:
-        raise no_json(error) from None
+        raise no_json(error, status) from None
     if not isinstance(value, dict):
         raise invalid("body", "must be a JSON object")
     return value
@@ -55,10 +57,10 @@ def _as_lists(content: Any, most: int) -> Any:
     return items
 
 
-def no_json(error: ValueError) -> ProblemError:
-    """400 for a body that is no JSON."""
+def no_json(error: ValueError, status: int = 400) -> ProblemError:
+    """A body that is no JSON."""
     return ProblemError(
-        400,
+        status,
         "invalid-json",
         "The body is not valid JSON (NaN and Infinity are none)",
         detail=str(error)[:200],

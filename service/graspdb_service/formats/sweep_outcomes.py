@@ -8,6 +8,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+import orjson
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from graspdb.wire import OUTCOMES, SimulateResult
 from graspdb.wire.jobs import ResultRows
 from graspdb_service.formats import arrow
 from graspdb_service.formats.columns import columns_json
-from graspdb_service.formats.json_bodies import read_object, validated
+from graspdb_service.formats.json_bodies import no_json, read_object, validated
 from graspdb_service.formats.json_pieces import LongArray
 from graspdb_service.formats.negotiation import ARROW
 from graspdb_service.problems import invalid
@@ -41,7 +42,13 @@ class ChunkResult:
 
 def read_result(request: Request, body: bytes) -> ChunkResult:
     """A body as a chunk's result; refused as :class:`graspdb.wire.SimulateResult` would refuse it."""
-    content = read_object(request, body)
+    try:
+        return _read_result(read_object(request, body, status=422))
+    except orjson.JSONDecodeError as error:
+        raise no_json(error, 422) from None
+
+
+def _read_result(content: dict[str, Any]) -> ChunkResult:
     rows = content.get("rows")
     long: dict[str, list[NDArray[Any]]] = {}
     if isinstance(rows, dict):

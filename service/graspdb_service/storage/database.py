@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Any, TypeAlias, TypeVar
+from weakref import WeakSet
 
 from sqlalchemy import (
     Connection,
@@ -33,8 +37,33 @@ Tx: TypeAlias = Connection
 """An open transaction, as the use cases pass it on."""
 
 SQLITE_BUSY_MS = 30_000
-UNAVAILABLE = (OperationalError, PoolExhausted)
+CONNECT_S = 5
+#: Seconds after which a connection whose other end is gone, without a word, is given up.
+_SILENT_S = 30
+
+
+class DatabaseDown(Exception):
+    """The database can't be used, as is known already: nothing was asked of it."""
+
+
+UNAVAILABLE = (OperationalError, PoolExhausted, DatabaseDown)
 """What a database raises that does not answer, is full, or has no connection free."""
+CANNOT_OPEN = (DBAPIError, PoolExhausted, OSError)
+"""What opening a database raises that is not there, or is none."""
+
+
+def why(error: Exception) -> str:
+    """What a database complains about, in a line."""
+    told = str(getattr(error, "orig", None) or error).strip() or type(error).__name__
+    return told.splitlines()[0]
+
+
+def is_full(error: Exception) -> bool:
+    """Whether an error says that the database's disk is full."""
+    cause = getattr(error, "orig", None)
+    if isinstance(cause, sqlite3.Error):
+        return getattr(cause, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_FULL
+    return getattr(cause, "sqlstate", None) == "53100"
 
 
 class unix_now(GenericFunction[float]):
@@ -151,16 +180,24 @@ class Database:
     lock. On PostgreSQL a reader sees one snapshot (REPEATABLE READ, read only).
     """
 
-    def __init__(self, url: str, *, pool_size: int = 40) -> None:
+    def __init__(self, url: str, *, pool_size: int = 40, statement_s: float | None = None) -> None:
         self.url = _normalised(url)
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self.path = self.url.database if self.is_sqlite else None
         """The file of a SQLite database."""
+        self.down: Callable[[], str | None] = lambda: None
+        """Says why the database can't be used, where that is known without asking it."""
+        self._may_create = True
+        self._drivers: WeakSet[Any] = WeakSet()
         if self.is_sqlite:
             self._writer = _sqlite_engine(self.url, "BEGIN IMMEDIATE", pool_size=2, query_only=False)
             self._reader = _sqlite_engine(self.url, "BEGIN", pool_size=pool_size, query_only=True)
+            for engine in (self._writer, self._reader):
+                event.listen(engine, "do_connect", self._refuse_a_new_file)
         else:
-            self._writer = create_engine(self.url, pool_size=pool_size, max_overflow=0, pool_pre_ping=True)
+            self._writer = self.postgres_engine(
+                statement_s, pool_size=pool_size, max_overflow=0, pool_timeout=10, pool_pre_ping=True
+            )
             self._reader = self._writer.execution_options(
                 isolation_level="REPEATABLE READ", postgresql_readonly=True
             )
@@ -168,6 +205,7 @@ class Database:
     @contextmanager
     def read(self) -> Iterator[Tx]:
         """A read-only transaction: one snapshot of everything."""
+        self._refuse_if_down()
         with self._reader.begin() as tx, _drivers_errors(tx):
             yield tx
 
@@ -177,6 +215,7 @@ class Database:
 
         CommitUnknown where the connection broke while it was committed.
         """
+        self._refuse_if_down()
         with self._writer.connect() as tx:
             transaction = tx.begin()
             with _drivers_errors(tx):
@@ -187,6 +226,44 @@ class Database:
                 if not error.connection_invalidated:
                     raise
                 raise CommitUnknown(str(error.orig)) from error
+
+    def _refuse_if_down(self) -> None:
+        reason = self.down()
+        if reason is not None:
+            raise DatabaseDown(reason)
+
+    def _refuse_a_new_file(self, _dialect: Any, _record: Any, arguments: Any, _options: Any) -> None:
+        if not self._may_create and not os.path.exists(arguments[0]):
+            raise sqlite3.OperationalError(f"{arguments[0]} is gone")
+
+    def postgres_engine(self, statement_s: float | None, **pool: Any) -> Engine:
+        """An engine whose connections notice that nobody is there; ``statement_s`` bounds every statement."""
+        told: dict[str, Any] = {
+            "connect_timeout": CONNECT_S,
+            "keepalives": 1,
+            "keepalives_idle": _SILENT_S,
+            "keepalives_interval": 5,
+            "keepalives_count": 3,
+            "tcp_user_timeout": _SILENT_S * 1000,
+        }
+        if statement_s is not None:
+            limit = round(1000 * statement_s)
+            told["options"] = f"-c statement_timeout={limit} -c idle_in_transaction_session_timeout={limit}"
+        # What the address itself says comes first.
+        told = {name: value for name, value in told.items() if name not in self.url.query}
+        engine = create_engine(self.url, connect_args=told, **pool)
+        event.listen(engine, "connect", lambda connection, _: self._drivers.add(connection))
+        return engine
+
+    def cut(self) -> None:
+        """Break every connection to a PostgreSQL that hangs: whoever waits for an answer gets an error."""
+        for connection in list(self._drivers):
+            with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
+                line.shutdown(socket.SHUT_RDWR)
+
+    def keep_file(self) -> None:
+        """From now on a SQLite file that is missing is an error: a new one must not take its place."""
+        self._may_create = False
 
     def dispose(self) -> None:
         """Close every pooled connection."""
@@ -229,7 +306,8 @@ def _sqlite_engine(url: URL, begin: str, *, pool_size: int, query_only: bool) ->
         # FULL: what was acknowledged survives a power cut, too.
         cursor.execute("PRAGMA synchronous=FULL")
         cursor.execute("PRAGMA foreign_keys=ON")
-        cursor.execute("PRAGMA cache_size=-65536")
+        # KiB a connection; there are many readers.
+        cursor.execute(f"PRAGMA cache_size={-8_192 if query_only else -65_536}")
         if query_only:
             cursor.execute("PRAGMA query_only=ON")
         cursor.close()

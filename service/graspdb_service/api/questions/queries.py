@@ -23,9 +23,9 @@ from graspdb.wire import (
 from graspdb.wire.queries import (
     MAX_OBSTACLE_POINTS,
     BestGraspQuery,
+    DensityQuery,
     LikelihoodOptions,
     LikelihoodQuery,
-    SelectionQuery,
 )
 from graspdb_density.se3 import Poses
 from graspdb_service.api.context import Context
@@ -49,11 +49,11 @@ Q = TypeVar("Q", bound=Selection)
 
 @router.get("/objects/{id}/density", response_model=DensityInfo, **scope("read", work="queries"))
 def get_density(
-    ctx: Ctx, id: ObjectId, request: Request, query: Annotated[SelectionQuery, Query()]
+    ctx: Ctx, id: ObjectId, request: Request, query: Annotated[DensityQuery, Query()]
 ) -> Response:
     """The density of a selection of trials: kernel, widths and their rule, counts, effective sample size."""
 
-    def answer(query: SelectionQuery) -> Response:
+    def answer(query: DensityQuery) -> Response:
         info, selected = density_info(ctx, id, query)
         tag = answer_tag(selected, info.revision, query)
         return Response(info.model_dump_json(), media_type=JSON, headers={"ETag": tag})

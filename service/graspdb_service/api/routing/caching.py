@@ -23,7 +23,9 @@ def answer_tag(selected: Selected, revision: int, query: Selection, kept: str | 
     """What an answer depends on: object, revision, the gripper's profile, the question, and who answers;
     beside that the id that it is ``kept`` under.
     """
-    question = hashlib.sha256(f"{type(query).__name__} {query.model_dump_json()}".encode()).hexdigest()[:24]
+    question = hashlib.sha256(
+        f"{type(query).__name__} {query.model_dump_json(exclude={'timeout_s'})}".encode()
+    ).hexdigest()[:24]
     parts = (selected.row.id, revision, selected.stamp, question, __version__)
     return etag(*parts) if kept is None else etag(*parts, kept)
 

@@ -192,6 +192,9 @@ def listing(
 
 def progress(tx: Tx, sweep: SweepRow) -> Progress:
     """Chunks by state, outcomes of every finished one, and how fast the last ones went."""
+    if sweep.started_at is None and sweep.finished_at is None:
+        # Its chunks, maybe a hundred thousand, have nothing to tell.
+        return Progress({}, 0, {}, [], 0, _WINDOW_S)
     totals = (
         select(jobs.c.state, func.count(), func.sum(jobs.c.stop - jobs.c.start))
         .where(jobs.c.sweep_id == sweep.id)

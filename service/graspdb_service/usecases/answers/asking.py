@@ -159,7 +159,7 @@ class _Asked:
 def _question(request: Selection) -> dict[str, Any]:
     """What was asked, as a request takes it: the name apart, and what says no more than its default."""
     fields = type(request).model_fields
-    given = request.model_dump(mode="json", exclude_unset=True, exclude={"name"})
+    given = request.model_dump(mode="json", exclude_unset=True, exclude={"name", "timeout_s"})
     return {
         name: value
         for name, value in given.items()

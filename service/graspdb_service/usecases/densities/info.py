@@ -12,7 +12,7 @@ from graspdb_service.usecases.trials.selection import Selected
 
 def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[DensityInfo, Selected]:
     """What is known of a density, and the selection of trials that it is made of."""
-    with ctx.compute.within():
+    with ctx.compute.within(request):
         built = ctx.densities.requested(slug, request)
     density, selected = built.density, built.selected
     size = 0 if density is None else density.size

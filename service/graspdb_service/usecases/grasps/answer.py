@@ -42,7 +42,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     """
     choice, _ = kernel_of(request)
     request = of_simulation(request)
-    with ctx.compute.within():
+    with ctx.compute.within(request):
         selected = ctx.densities.selections.resolve(slug, request)
         limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
         built = ctx.densities.get(selected, choice)

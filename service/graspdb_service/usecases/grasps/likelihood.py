@@ -54,7 +54,7 @@ def likelihood(
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
 
-    with ctx.compute.within():
+    with ctx.compute.within(request):
         built = ctx.densities.requested(slug, request)
         columns: dict[str, Any] = {}
         free = test = reach = None

@@ -61,7 +61,7 @@ def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw
 
 
 def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
-    with ctx.compute.within():
+    with ctx.compute.within(request):
         built = ctx.densities.requested(slug, request)
         density = built.density
         if density is None:
@@ -89,7 +89,7 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
     choice, _ = kernel_of(request)
     if choice.stored is not None:
         raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
-    with ctx.compute.within():
+    with ctx.compute.within(request):
         selected = ctx.densities.selections.resolve(slug, request)
         prior = ctx.priors.get(selected, choice)
         built = ctx.densities.get(selected, KernelChoice())

@@ -68,7 +68,7 @@ def draw(
     413 over the limit; 409 ``no-successes`` where there is nothing to draw from; as the selection.
     """
     check_count(ctx, count)
-    with ctx.compute.within():
+    with ctx.compute.within(selection):
         built = ctx.densities.requested(slug, selection)
         if built.asked is None:
             raise no_successes(slug)

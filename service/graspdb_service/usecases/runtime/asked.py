@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -34,6 +35,9 @@ class Asked:
 
     def check(self) -> None:
         """Raise where the work is no longer wanted: 503 ``deadline``, or nobody is there to be told."""
+        if _CLOSING.is_set():
+            title = "The service is shutting down: ask again in a few seconds"
+            raise ProblemError(503, "shutting-down", title, headers={"Retry-After": "5"})
         if self.gone:
             raise ProblemError(499, "client-gone", "The client hung up before the answer")
         if self.seconds is not None and time.monotonic() - self.started > self.seconds:
@@ -48,12 +52,18 @@ class Asked:
             )
 
 
+_CLOSING = threading.Event()
 _ASKED: ContextVar[Asked | None] = ContextVar("asked", default=None)
 
 
 def asked() -> Asked:
     """What this thread works on; the service's own work where nobody asked."""
     return _ASKED.get() or Asked("")
+
+
+def end_all() -> None:
+    """Have every computation of this process end at its next breath, for it shuts down."""
+    _CLOSING.set()
 
 
 def begin(question: Asked) -> None:

@@ -109,12 +109,12 @@ class Compute:
             return work()
 
     @contextmanager
-    def within(self, seconds: float | None = None) -> Iterator[None]:
-        """Answer a question within this, or what the service allows at most, from its coming.
+    def within(self, request: object = None) -> Iterator[None]:
+        """Answer within the request's ``timeout_s``, or what the service allows at most, from its coming.
 
         503 ``deadline`` from a computation that finds it too late.
         """
-        asked().within(seconds, self._most_seconds)
+        asked().within(getattr(request, "timeout_s", None), self._most_seconds)
         yield
 
     @contextmanager

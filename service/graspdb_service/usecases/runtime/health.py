@@ -12,6 +12,9 @@ from graspdb_service.problems import ProblemError
 
 log = logging.getLogger("graspdb")
 
+#: A look that takes longer hangs.
+_HANGS_S = 6.0
+
 
 @dataclass(frozen=True)
 class Looked:
@@ -20,13 +23,15 @@ class Looked:
     at: float
     well: tuple[str, ...] = ()
     trouble: str | None = None
+    blocks: bool = False
+    """Whether nothing may be asked of the database until this is mended."""
 
 
 class Health:
     """The last look at the database, by ``look``, which names what is well or raises."""
 
-    def __init__(self, look: Callable[[], list[str]], seconds: float) -> None:
-        self._look, self._seconds = look, seconds
+    def __init__(self, look: Callable[[], list[str]], seconds: float, *, may_hang: bool) -> None:
+        self._look, self._seconds, self._may_hang = look, seconds, may_hang
         self._last = Looked(time.monotonic(), trouble="The service starts")
         self._starts = True
         self._closed = threading.Event()
@@ -48,9 +53,21 @@ class Health:
     @property
     def trouble(self) -> str | None:
         """What is wrong: what the last look found, or that there is none of late; None where all is well."""
-        if self.age_s > 2.0 * self._seconds + 3.0:
+        if self.age_s > self._seconds + _HANGS_S:
             return f"The database has not answered for {self.age_s:.0f} s"
         return self._last.trouble
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether a look has not come back: the database hangs."""
+        return self.age_s > self._seconds + _HANGS_S
+
+    def down(self) -> str | None:
+        """Why nothing may be asked of the database now; None where it may be."""
+        if self.is_stuck and self._may_hang:
+            return self.trouble or f"The database has not answered for {self.age_s:.0f} s"
+        last = self._last
+        return last.trouble if last.blocks else None
 
     def ready(self) -> dict[str, object]:
         """That the service is ready, how long ago that was found, and what was looked at; else 503."""
@@ -77,7 +94,9 @@ class Health:
             line = (str(error).strip() or type(error).__name__).splitlines()[0]
             log.debug("the look at the database failed", exc_info=True)
             known = isinstance(error, RuntimeError)
-            found = Looked(time.monotonic(), trouble=line if known else f"The database can't be used: {line}")
+            told = line if known else f"The database can't be used: {line}"
+            blocks = getattr(error, "blocks", False) or "timeout" in line.lower()
+            found = Looked(time.monotonic(), trouble=told, blocks=blocks)
         self._last = found
         if found.trouble != before and not self._starts:
             log.warning("%s", found.trouble or "The database can be used again")

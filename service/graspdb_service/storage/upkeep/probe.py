@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import quote
 
 from alembic.script import ScriptDirectory
-from sqlalchemy import create_engine, text
+from sqlalchemy import text
 from sqlalchemy.pool import NullPool
 
 from graspdb_service.storage.database import Database
@@ -21,7 +21,11 @@ _SECONDS = 3
 
 
 class Trouble(RuntimeError):
-    """What is wrong with the database, and the way out, in words."""
+    """What is wrong with the database, and the way out, in words; ``blocks``: nothing may be asked of it."""
+
+    def __init__(self, told: str, *, blocks: bool = False) -> None:
+        super().__init__(told)
+        self.blocks = blocks
 
 
 class Probe:
@@ -32,11 +36,9 @@ class Probe:
         self._head = ScriptDirectory(str(migrations_directory())).get_current_head()
         self._path = database.path
         self._file = None if self._path is None else _identity(self._path)
-        wait = {"connect_timeout": _SECONDS, "options": f"-c statement_timeout={1000 * _SECONDS}"}
-        url = database.url
-        self._engine = (
-            None if database.is_sqlite else create_engine(url, poolclass=NullPool, connect_args=wait)
-        )
+        self._engine = None
+        if not database.is_sqlite:
+            self._engine = database.postgres_engine(_SECONDS, poolclass=NullPool)
 
     def look(self) -> list[str]:
         """What was looked at and is well; Trouble for the first that is not, or what the driver raises."""
@@ -53,7 +55,8 @@ class Probe:
         if _identity(path) != self._file:
             raise Trouble(
                 f"The database's file {path} was moved or replaced while the service runs: put it back, or"
-                " restart the service"
+                " restart the service",
+                blocks=True,
             )
         disk = os.statvfs(os.path.dirname(os.path.abspath(path)))
         free = disk.f_bavail * disk.f_frsize
