@@ -405,13 +405,17 @@ class JobProtocol(RuleBasedStateMachine):
             assert sum(info["outcomes"].values()) == len(done)
         for slug in self.has_parts:
             self._check_object(slug)
-        if self.decomposition is not None:
-            with self.database.read() as tx:
-                query = text(
-                    "SELECT state FROM jobs WHERE kind = 'decompose' AND object_id ="
-                    " (SELECT id FROM objects WHERE slug = :slug)"
-                )
-                assert tx.scalar(query, {"slug": self.decomposition.object}) == self.decomposition.state
+        query = text(
+            "SELECT o.slug, j.sweep_id, j.number, j.state, j.attempts FROM jobs j"
+            " JOIN objects o ON o.id = j.object_id WHERE o.slug IN (:first, :second)"
+        )
+        first, second = self.has_parts
+        with self.database.read() as tx:
+            stored = {tuple(row) for row in tx.execute(query, {"first": first, "second": second})}
+        assert stored == {
+            (job.object, job.sweep and job.sweep.id, job.number, job.state, job.attempts)
+            for job in self._jobs()
+        }
 
     def _check_object(self, slug: str) -> None:
         """Every pose that any undeleted sweep has done is the object's, once, whoever did it first."""
