@@ -19,7 +19,7 @@ import httpx
 #: Asks paths one after the other until its input ends, and writes how long each took and what was answered.
 _WITNESS = """
 import http.client, json, sys, threading, time
-host, port, paths = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
+host, port, source, paths = sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4:]
 stop = threading.Event()
 threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
 seen = []
@@ -27,7 +27,7 @@ while not stop.is_set():
     for path in paths:
         started = time.monotonic()
         try:
-            connection = http.client.HTTPConnection(host, port, timeout=30)
+            connection = http.client.HTTPConnection(host, port, timeout=30, source_address=(source, 0))
             connection.request("GET", path)
             answer = connection.getresponse()
             answer.read()
@@ -54,12 +54,15 @@ class Seen:
 
 
 @contextmanager
-def witness(url: str, *paths: str) -> Iterator[dict[str, Seen]]:
-    """Ask paths of a server all the time, from another process; what it saw is there when the block ends."""
+def witness(url: str, *paths: str, source: str = "127.0.0.1") -> Iterator[dict[str, Seen]]:
+    """Ask paths of a server all the time, from another process; what it saw is there when the block ends.
+
+    ``source`` is the address to ask from: another one is another client.
+    """
     base = httpx.URL(url)
     seen: dict[str, Seen] = {}
     with subprocess.Popen(
-        [sys.executable, "-c", _WITNESS, base.host, str(base.port), *paths],
+        [sys.executable, "-c", _WITNESS, base.host, str(base.port), source, *paths],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
