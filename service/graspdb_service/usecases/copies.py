@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from graspdb.wire import CopyRequest
 from graspdb_service.problems import conflict
-from graspdb_service.storage import copies, grippers, objects
+from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.storage.trials import provenances
+from graspdb_service.storage.trials import copies, provenances
 from graspdb_service.usecases.objects import info, require
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 

@@ -14,11 +14,11 @@ from graspdb.wire.base import source_weights
 from graspdb.wire.grippers import SHAPE_FIELDS
 from graspdb.wire.queries import TrialSelection
 from graspdb_service.problems import conflict, found, invalid
-from graspdb_service.storage import copies, grippers
+from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.trials import provenances
+from graspdb_service.storage.trials import copies, provenances
 from graspdb_service.trial_columns import Bools, Floats, Ints, Provenance, gripper_parts, is_gripper
 from graspdb_service.usecases.objects import require
 
