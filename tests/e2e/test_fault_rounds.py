@@ -144,7 +144,7 @@ def test_after_faults_everything_is_as_the_clients_know_it(lab: Lab, seed: int) 
     assert lab.http.post("/objects", json={"id": slug, "mass_kg": 0.16}).status_code == 201
     mesh = lab.http.put(f"/objects/{slug}/mesh", content=box_stl(), headers={"Content-Type": "model/stl"})
     assert mesh.is_success, mesh.text
-    made = lab.http.post(f"/objects/{slug}/sweeps", json={"grid": GRID, "chunk_poses": 210})
+    made = lab.http.post(f"/objects/{slug}/sweeps", json={"grid": GRID, "chunk_poses": 150})
     assert made.status_code == 202, made.text
     senders = [
         Sender(0, lab.proxy.url, slug, retrying=True),

@@ -29,7 +29,7 @@ from real_processes import Process, free_port, wait_for
 from small_disk import Guard, SmallDisk
 
 BATCH = 60
-BOX_M = (0.04, 0.04, 0.08)
+BOX_M = (0.04, 0.04, 0.04)
 GRIPPER, SOURCE, PROTOCOL = "pg70", "robot", "wrench"
 SETTINGS = {
     "GRASPDB_LEASE_S": "2",
@@ -286,7 +286,7 @@ class Follower(threading.Thread):
             self.seen += [(row["seq"], row["revision"]) for row in rows]
 
     def run(self) -> None:
-        while not self.finish.wait(0.05):
+        while not self.finish.wait(0.1):
             with suppress(httpx.TransportError):
                 self.look()
 
