@@ -141,7 +141,7 @@ async def _cut_what_hangs(ctx: Context) -> None:
     """Have nobody wait for a PostgreSQL that accepts and never answers."""
     while not ctx.database.is_sqlite:
         await asyncio.sleep(1.0)
-        if ctx.health.is_stuck:
+        if ctx.health.down() is not None:
             await anyio.to_thread.run_sync(ctx.database.cut)
 
 

@@ -10,6 +10,7 @@ import json
 import os
 import socket
 import sqlite3
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +25,9 @@ import pytest
 from attack import RealServer, Seen, real_server, witness
 from graspdb import Client
 from graspdb.errors import DeadlineExceeded
+from graspdb_service.storage import schema
+from graspdb_service.storage.database import Database
+from postgres_server import PostgresPrograms, PostgresServer
 
 JSON = {"Content-Type": "application/json"}
 ROW = b'{"position":[0.0,0.01,0.09],"quaternion_xyzw":[1,0,0,0],"outcome":true}'
@@ -275,3 +279,32 @@ def test_readiness_is_true(tmp_path: Path, eventually: Callable[..., Any]) -> No
             database.execute("UPDATE alembic_version SET version_num = 'newer'")
         answer = eventually(lambda: (found := ready(server)).status_code == 503 and found)
         assert "schema newer" in answer.json()["title"]
+
+
+def test_a_hanging_postgresql_is_not_waited_for(tmp_path: Path, eventually: Callable[..., Any]) -> None:
+    """It accepts and never answers: refusals, also to who asked before that was known; then it goes on."""
+    with ExitStack() as stack:
+        # A user without privileges has to read it.
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspdb-postgres-")))
+        postgres = PostgresServer(folder, PostgresPrograms(folder))
+        stack.callback(postgres.stop)
+        database = Database(postgres.url)
+        schema.upgrade(database)
+        database.dispose()
+        server = stack.enter_context(real_server(tmp_path, postgres.url, probe_seconds=0.5))
+        http = stack.enter_context(httpx.Client(base_url=server.url, timeout=120))
+        assert http.post("/objects", json={"id": "mug"}).status_code == 201
+        postgres.pause()
+        asked_early = http.get("/objects/mug")
+        assert (asked_early.status_code, asked_early.json()["type"].rpartition(":")[2]) == (
+            503,
+            "database-unavailable",
+        )
+        assert http.get("/livez").status_code == 200
+        assert http.get("/readyz").status_code == 503
+        started = time.monotonic()
+        assert http.get("/objects/mug").status_code == 503
+        assert time.monotonic() - started < 5.0
+        postgres.resume()
+        eventually(lambda: http.get("/objects/mug").status_code == 200)
+        eventually(lambda: http.get("/readyz").status_code == 200)
