@@ -23,6 +23,9 @@ from graspdb_service.trial_columns import Bools, Floats, Ints
 #: Key of the schema's metadata that holds, as JSON, what else a request or an answer says.
 METADATA = b"graspdb"
 
+#: Whole numbers up to here are floats as well.
+_WHOLE = 2**53
+_LAST_MICROSECOND = 253_402_300_799_999_999
 _INSTALL = "pip install 'graspdb[service,arrow]' where the service runs"
 
 
@@ -131,7 +134,7 @@ class Table:
         if flat.null_count:
             null = np.flatnonzero(_numpy(flat.is_null()))[0]
             self.fault(name, int(null) // width, f"a list of {width} numbers")
-        values = _numpy(flat).astype(np.float64).reshape(-1, width)
+        values = self._doubles(name, flat, width).reshape(-1, width)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if bad.size:
             self.fault(name, int(bad[0]), "every number must be finite")
@@ -144,7 +147,7 @@ class Table:
             return None
         if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
             raise self._wrong(name, f"numbers or nulls; this column is {column.type}")
-        null, values = _numpy(column.is_null()), _numpy(column).astype(np.float64)
+        null, values = _numpy(column.is_null()), self._doubles(name, column)
         bad = np.flatnonzero(~null & ~np.isfinite(values))
         if bad.size:
             self.fault(name, int(bad[0]), "a finite number or null")
@@ -173,13 +176,38 @@ class Table:
             return None
         if not _plain(pa, column.type):
             raise self._wrong(name, f"plain lists, structs, text or times; it is {column.type}")
-        if pa.types.is_timestamp(column.type):
-            column = column.cast(pa.timestamp("us", column.type.tz), safe=False)
         try:
+            if pa.types.is_timestamp(column.type):
+                column = self._microseconds(name, column)
             found: list[Any] = column.to_pylist()
-        except (ValueError, OverflowError) as error:
+        # A time zone that nobody knows is a LookupError.
+        except (ValueError, OverflowError, LookupError) as error:
             raise self._wrong(name, str(error)[:200]) from None
         return found
+
+    def _microseconds(self, name: str, column: Any) -> Any:
+        """Times in the unit that they are stored in; 422 naming the first that none of it is."""
+        pa = self._pa
+        ticks = _numpy(column.cast(pa.int64()).fill_null(0))
+        each = {"s": 10**6, "ms": 10**3}.get(column.type.unit, 1)
+        parts = 1000 if column.type.unit == "ns" else 1
+        lost = np.flatnonzero(ticks % parts)
+        if lost.size:
+            self.fault(name, int(lost[0]), "times are stored in microseconds: round it to them")
+        last = _LAST_MICROSECOND // each
+        far = np.flatnonzero((ticks // parts > last) | (ticks // parts < -last))
+        if far.size:
+            self.fault(name, int(far[0]), "a time between the years 1900 and 2500")
+        return column.cast(pa.timestamp("us", column.type.tz))
+
+    def _doubles(self, name: str, column: Any, width: int = 1) -> Floats:
+        """Numbers as float64, NaN for null; 422 naming the first row that has one it can't hold."""
+        values = _numpy(column)
+        if np.issubdtype(values.dtype, np.integer):
+            long = np.flatnonzero((values > _WHOLE) | (values < -_WHOLE))
+            if long.size:
+                self.fault(name, int(long[0]) // width, "a whole number beyond 2^53 is no float64")
+        return np.asarray(values, dtype=np.float64)
 
     def booleans(self, name: str) -> Bools | None:
         """(n,) where a column holds true and false; None where it holds something else."""
