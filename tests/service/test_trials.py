@@ -142,7 +142,7 @@ def _trials(draw: st.DrawFn) -> list[dict[str, Any]]:
             "gripper": st.sampled_from(["pg70", "panda"]),
             "source": st.sampled_from(SOURCES),
             "protocol": st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,9}", fullmatch=True),
-            "proposal_density": st.floats(0, 1e15, exclude_min=True, **finite),
+            "proposal_density": st.floats(1e-30, 1e15, **finite),
             "quality": st.floats(-1e9, 1e9, **finite),
             "width_m": st.floats(0, 10, **finite),
             "metadata": st.dictionaries(

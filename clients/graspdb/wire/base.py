@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import sys
 from collections.abc import Mapping
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
@@ -47,6 +49,12 @@ UNIT_TOLERANCE = 1e-3
 MAX_NESTING = 32
 """How deep a user's metadata may nest: every JSON library on its way can still read and write that."""
 
+MAX_METADATA_LENGTH = 65_536
+"""Most characters of a user's metadata as JSON."""
+
+MAX_COMPONENT = 1e6
+"""Numbers of a direction, a plane or a world pose beyond this are most likely a mistake."""
+
 
 _DESCRIBED = ConfigDict(use_attribute_docstrings=True)
 """The docstring under a field is its description in the OpenAPI document: what it is, unit, frame, null."""
@@ -76,7 +84,7 @@ def _split_commas(value: Any) -> Any:
 
 
 def _within_reach(value: tuple[float, ...]) -> tuple[float, ...]:
-    if any(abs(x) > MAX_COORDINATE_M for x in value):
+    if not all(abs(x) <= MAX_COORDINATE_M for x in value):
         raise ValueError(
             f"coordinates are metres and at most {MAX_COORDINATE_M:g} from the origin: is the unit right?"
         )
@@ -84,7 +92,7 @@ def _within_reach(value: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _unit(value: tuple[float, ...]) -> tuple[float, ...]:
-    norm = math.sqrt(sum(x * x for x in value))
+    norm = math.hypot(*value)
     if not abs(norm - 1.0) <= UNIT_TOLERANCE:
         raise ValueError(
             f"a quaternion (x, y, z, w) must have norm 1 within {UNIT_TOLERANCE:g}; this one has {norm:.6g}"
@@ -93,30 +101,61 @@ def _unit(value: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _direction(value: tuple[float, ...]) -> tuple[float, ...]:
-    norm = math.sqrt(sum(x * x for x in value))
-    if norm < 1e-9 or not math.isfinite(norm):
+    norm = math.hypot(*value)
+    if norm < 1e-9:
         raise ValueError("a direction must not be the zero vector")
+    if not norm <= 2 * MAX_COMPONENT:
+        raise ValueError(f"the numbers of a direction are at most {MAX_COMPONENT:g}: only their ratio counts")
     return tuple(x / norm for x in value)
 
+
+def _limits(lower: float, upper: float, **more: Any) -> WithJsonSchema:
+    """Limits that the schema tells; a validator of all the numbers together says why in better words."""
+    return WithJsonSchema({"type": "number", "minimum": lower, "maximum": upper, **more})
+
+
+_Coordinate = Annotated[float, _limits(-MAX_COORDINATE_M, MAX_COORDINATE_M)]
+_OfUnit = Annotated[float, _limits(-1.0 - UNIT_TOLERANCE, 1.0 + UNIT_TOLERANCE)]
+_Component = Annotated[float, _limits(-MAX_COMPONENT, MAX_COMPONENT)]
+_Radius = Annotated[
+    float, WithJsonSchema({"type": "number", "exclusiveMinimum": 0, "maximum": MAX_COMPONENT})
+]
 
 Triple = tuple[float, float, float]
 Quadruple = tuple[float, float, float, float]
 
-Position = Annotated[Triple, BeforeValidator(_split_commas), AfterValidator(_within_reach)]
+Position = Annotated[
+    tuple[_Coordinate, _Coordinate, _Coordinate],
+    BeforeValidator(_split_commas),
+    AfterValidator(_within_reach),
+]
 """Three coordinates in metres."""
-Quaternion = Annotated[Quadruple, BeforeValidator(_split_commas), AfterValidator(_unit)]
+Quaternion = Annotated[
+    tuple[_OfUnit, _OfUnit, _OfUnit, _OfUnit], BeforeValidator(_split_commas), AfterValidator(_unit)
+]
 """A unit quaternion (x, y, z, w); ``q`` and ``-q`` are the same rotation."""
-Direction = Annotated[Triple, BeforeValidator(_split_commas), AfterValidator(_direction)]
+Direction = Annotated[
+    tuple[_Component, _Component, _Component], BeforeValidator(_split_commas), AfterValidator(_direction)
+]
 """A direction; normalised on arrival."""
-Vector4 = Annotated[Quadruple, BeforeValidator(_split_commas)]
-Vector7 = Annotated[tuple[float, float, float, float, float, float, float], BeforeValidator(_split_commas)]
+Plane = Annotated[tuple[_Component, _Component, _Component, _Component], BeforeValidator(_split_commas)]
+"""A normal and a distance."""
+Ball = Annotated[tuple[_Component, _Component, _Component, _Radius], BeforeValidator(_split_commas)]
+"""A centre and a radius, metres."""
+Vector7 = Annotated[
+    tuple[_Component, _Component, _Component, _OfUnit, _OfUnit, _OfUnit, _OfUnit],
+    BeforeValidator(_split_commas),
+]
 Slug = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """An identifier that stands in a URL: letters, digits, ``.``, ``_``, ``-``; at most 64 characters."""
 GripperRef = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}(@[1-9][0-9]{0,8})?$")]
 """A gripper's id, or one version of it, as in ``panda@1``."""
 Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: _no_nul(s))]
-Metadata = Annotated[dict[str, Any], AfterValidator(lambda value: _storable(value))]
-"""Any JSON object of the user's: finite numbers only, at most 64 KiB as text."""
+Metadata = Annotated[dict[str, Any], Field(max_length=1_000), AfterValidator(lambda value: _storable(value))]
+"""Any JSON object of the user's: finite numbers, whole ones within 64 bits; at most 1,000 names, 32 levels
+and 65,536 characters."""
+StoredMetadata = dict[str, Any]
+"""A user's JSON object as it was stored, whatever the limits are now."""
 
 MAX_SOURCE_WEIGHT = 1e6
 
@@ -140,7 +179,7 @@ def _source_weights(value: Any) -> str:
             raise ValueError(f"{name} has two weights")
         try:
             weight = math.nan if isinstance(number, bool) else float(number)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             weight = math.nan
         if not 0.0 <= weight <= MAX_SOURCE_WEIGHT:
             raise ValueError(f"the weight of {name} is a number from 0 to {MAX_SOURCE_WEIGHT:g}")
@@ -162,8 +201,12 @@ SourceWeights = Annotated[
     WithJsonSchema(
         {
             "anyOf": [
-                {"type": "string"},
-                {"type": "object", "additionalProperties": {"type": "number", "minimum": 0}},
+                {"type": "string", "maxLength": 400},
+                {
+                    "type": "object",
+                    "maxProperties": len(SOURCES),
+                    "additionalProperties": {"type": "number", "minimum": 0, "maximum": MAX_SOURCE_WEIGHT},
+                },
             ],
             "examples": ["robot:1,simulation:0.2"],
         }
@@ -171,7 +214,8 @@ SourceWeights = Annotated[
 ]
 """How much trials of each source count: ``robot:1,simulation:0.2``, or an object of the same."""
 
-PositiveFloat = Annotated[float, Field(gt=0, le=1e12)]
+MANY = Field(json_schema_extra={"maxItems": 1_000_000})
+"""A list whose length the service limits by a setting, which ``GET /info`` tells; this is the default."""
 
 # -- fields that many models have, described once
 
@@ -241,16 +285,29 @@ def _is_deeper(value: Any, depth: int) -> bool:
     return any(isinstance(item, (dict, list, tuple)) for item in level)
 
 
+_NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
+_LONG_NUMBER = re.compile(r"\d{19}")
+
+
+def _fits(value: Any) -> bool:
+    """Whether all whole numbers in it fit in 64 bits: no JSON library reads longer ones as they are."""
+    if isinstance(value, (dict, list, tuple)):
+        return all(_fits(item) for item in (value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, int) or -(2**63) <= value < 2**64
+
+
 def _storable(value: dict[str, Any]) -> dict[str, Any]:
     if _is_deeper(value, MAX_NESTING):
         raise ValueError(f"metadata nests at most {MAX_NESTING} lists and objects")
     try:
         text = json.dumps(value, allow_nan=False, ensure_ascii=False)
-    except (ValueError, RecursionError):
+    except (TypeError, ValueError, RecursionError):
         raise ValueError("metadata must be JSON with finite numbers") from None
-    if len(text) > 65_536:
-        raise ValueError("metadata is at most 65,536 characters of JSON")
-    if "\\u0000" in text:
+    if len(text) > MAX_METADATA_LENGTH:
+        raise ValueError(f"metadata is at most {MAX_METADATA_LENGTH:,} characters of JSON")
+    if _LONG_NUMBER.search(text) and not _fits(value):
+        raise ValueError("a whole number of metadata fits in 64 bits: send a longer one as text")
+    if _NUL.search(text):
         raise ValueError("text must not contain the NUL character")
     _no_nul(text)
     return value
@@ -294,12 +351,15 @@ def pose_from_matrix(matrix: Any) -> tuple[Triple, Quadruple]:
     for row in matrix:
         if not (isinstance(row, (list, tuple)) and len(row) == 4):
             raise ValueError("a pose's matrix has shape (4, 4)")
-        if not all(isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in row):
+        numbers = [x for x in row if isinstance(x, (int, float)) and not isinstance(x, bool)]
+        if len(numbers) < 4 or not all(abs(x) <= sys.float_info.max for x in numbers):
             raise ValueError("a pose's matrix holds 16 finite numbers")
-        rows.append([float(x) for x in row])
+        rows.append([float(x) for x in numbers])
     if any(abs(x - y) > 1e-6 for x, y in zip(rows[3], (0.0, 0.0, 0.0, 1.0), strict=True)):
         raise ValueError("the last row of a pose's matrix is 0, 0, 0, 1")
-    return (rows[0][3], rows[1][3], rows[2][3]), rotation_to_quaternion(rows)
+    position = rows[0][3], rows[1][3], rows[2][3]
+    _within_reach(position)
+    return position, rotation_to_quaternion(rows)
 
 
 def expand_matrix(data: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Base64Bytes, Field
 
-from graspdb.wire.base import ObjectId, Request, Response, Text, ToolPositions, ToolRotations, Triple
+from graspdb.wire.base import MANY, ObjectId, Request, Response, Text, ToolPositions, ToolRotations, Triple
 from graspdb.wire.grippers import GripperProfile
 from graspdb.wire.sweeps import Fidelity, Protocol
 
@@ -21,7 +21,7 @@ class ClaimRequest(Request):
 
     worker: WorkerName
     """The worker's name, as ``GET /workers`` lists it."""
-    capabilities: Annotated[list[Capability], Field(max_length=32)] = Field(
+    capabilities: Annotated[list[Capability], Field(min_length=1, max_length=32)] = Field(
         default_factory=lambda: ["simulate"]
     )
     """Job kinds the worker can do, and ``lift`` where it has that protocol."""
@@ -148,11 +148,11 @@ class LeaseRenewed(Response):
 class ResultRows(Request):
     """What physics measured, for the poses of the chunk that met it, in columns."""
 
-    pose_index: list[Annotated[int, Field(ge=0)]]
+    pose_index: Annotated[list[Annotated[int, Field(ge=0, lt=2**53)]], MANY]
     """Index of each pose in the sweep's plan, ascending."""
-    width_m: list[Annotated[float, Field(ge=0, le=10)] | None]
+    width_m: Annotated[list[Annotated[float, Field(ge=0, le=10)] | None], MANY]
     """Distance between the fingers at the end, metres; null where it was not measured."""
-    quality: list[Annotated[float, Field(ge=-1e9, le=1e9)] | None]
+    quality: Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)] | None], MANY]
     """Margin by which the protocol was met, without a unit; null where it was not measured."""
 
 

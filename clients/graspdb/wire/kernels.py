@@ -16,7 +16,7 @@ MAX_FITTED = 16
 MAX_SAMPLED, SAMPLED = 5_000, 900
 """Most displacements of a sampled kernel, and how many are drawn by default (the paper's number)."""
 
-Six = Annotated[list[float], Field(min_length=6, max_length=6)]
+Six = Annotated[list[Annotated[float, Field(ge=-1e3, le=1e3)]], Field(min_length=6, max_length=6)]
 
 
 class KernelComponent(Request):
@@ -35,18 +35,18 @@ class KernelComponent(Request):
 class KernelWindow(Request):
     """Displacements a fit looks at."""
 
-    position_m: Annotated[float, Field(gt=0, le=1.0)] = 0.03
+    position_m: Annotated[float, Field(ge=1e-4, le=1.0)] = 0.03
     """Largest translation along any axis, metres."""
-    rotation_deg: Annotated[float, Field(gt=0, le=90.0)] = 45.0
+    rotation_deg: Annotated[float, Field(ge=0.1, le=90.0)] = 45.0
     """Largest angle of rotation, degrees."""
 
 
 class KernelWidths(Request):
     """Standard deviations per axis."""
 
-    sigma_position_m: Annotated[float, Field(gt=0, le=1.0)] = 0.005
+    sigma_position_m: Annotated[float, Field(ge=1e-5, le=1.0)] = 0.005
     """Standard deviation of position along each axis, metres."""
-    sigma_rotation_deg: Annotated[float, Field(gt=0, le=40.0)] = 5.0
+    sigma_rotation_deg: Annotated[float, Field(ge=0.1, le=40.0)] = 5.0
     """Standard deviation of rotation about each axis, degrees."""
 
 

@@ -7,7 +7,17 @@ from typing import Annotated
 
 from pydantic import Field
 
-from graspdb.wire.base import Metadata, OutcomeCounts, Request, Response, Slug, Text, Triple, Warnings
+from graspdb.wire.base import (
+    Metadata,
+    OutcomeCounts,
+    Request,
+    Response,
+    Slug,
+    StoredMetadata,
+    Text,
+    Triple,
+    Warnings,
+)
 
 Mass = Annotated[float, Field(gt=0, le=10_000)]
 MassDensity = Annotated[float, Field(gt=0, le=30_000)]
@@ -138,7 +148,7 @@ class ObjectInfo(Response):
     """Mass density, kg/m^3; null if unknown."""
     friction: float | None = None
     """Coulomb's coefficient of friction, without a unit; null if unknown."""
-    metadata: Metadata | None = None
+    metadata: StoredMetadata | None = None
     """The user's own JSON object; null where there is none."""
     revision: int
     """Rises with every change of trials, mesh, parts or properties."""

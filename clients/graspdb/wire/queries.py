@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from graspdb.wire.base import (
+    MANY,
+    Ball,
     ChosenGripper,
     ChosenProtocol,
     ChosenSource,
@@ -18,6 +20,7 @@ from graspdb.wire.base import (
     IntervalLevel,
     ObjectId,
     OutcomeCounts,
+    Plane,
     Pose,
     Position,
     Quadruple,
@@ -33,7 +36,6 @@ from graspdb.wire.base import (
     ToolRotation,
     ToolRotations,
     Triple,
-    Vector4,
     Vector7,
     Warnings,
     _split_commas,
@@ -49,12 +51,12 @@ from graspdb.wire.support import (
 )
 from graspdb.wire.trials import Finding
 
-WidthM = Annotated[float, Field(gt=0, le=1.0)]
-WidthDeg = Annotated[float, Field(gt=0, le=90.0)]
+WidthM = Annotated[float, Field(ge=1e-5, le=1.0)]
+WidthDeg = Annotated[float, Field(ge=0.1, le=90.0)]
 Angle = Annotated[float, Field(gt=0, le=180.0)]
 NoiseM = Annotated[float, Field(ge=0, le=1.0)]
 NoiseDeg = Annotated[float, Field(ge=0, le=60.0)]
-Extent = Annotated[float, Field(gt=0, le=1_000.0)]
+Extent = Annotated[float, Field(ge=1e-6, le=1_000.0)]
 
 
 NamedKernel = Annotated[
@@ -273,9 +275,9 @@ class DensityInfo(Response):
 class PoseColumns(Request):
     """Poses in columns of equal length."""
 
-    position: Annotated[list[Position], Field(min_length=1)]
+    position: Annotated[list[Position], Field(min_length=1), MANY]
     """Origins of the tool frame in the object frame, one x, y, z a pose, metres."""
-    quaternion_xyzw: Annotated[list[Quaternion], Field(min_length=1)]
+    quaternion_xyzw: Annotated[list[Quaternion], Field(min_length=1), MANY]
     """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a pose."""
 
     @model_validator(mode="after")
@@ -300,11 +302,10 @@ LikelihoodColumn = Literal[
 ]
 
 
-IncludedColumns = Annotated[
-    list[LikelihoodColumn] | None, Field(description="Columns to compute; by default all of them.")
-]
+_Columns = Annotated[list[LikelihoodColumn], Field(max_length=20)]
+IncludedColumns = Annotated[_Columns | None, Field(description="Columns to compute; by default all of them.")]
 IncludedScores = Annotated[
-    list[LikelihoodColumn] | None,
+    _Columns | None,
     Field(
         description="Scores of a grasp to compute; by default all, the success probability where the"
         " objective needs it or the selection has few enough attempts to give it at once."
@@ -315,7 +316,7 @@ IncludedScores = Annotated[
 class LikelihoodRequest(Selection):
     """Poses to say the likelihood of."""
 
-    poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns
+    poses: Annotated[list[Pose], Field(min_length=1), MANY] | PoseColumns
     """Poses of the tool frame in the object frame, in a list or in columns; 1 to 1,000,000."""
     include: IncludedColumns = None
     name: AnswerName = None
@@ -388,7 +389,7 @@ def _object_pose(value: Any) -> Any:
     if isinstance(value, (list, tuple)) and len(value) == 7:
         try:
             numbers = [float(x) for x in value]
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             return value
         return (*numbers[:3], *_unit(tuple(numbers[3:])))
     return value
@@ -461,10 +462,10 @@ class GraspConstraints(Selection):
     """Lower corner x,y,z of the box that the tool's origin lies in, in ``frame``, metres; by default none."""
     box_max: Position | None = None
     """Upper corner x,y,z of the box that the tool's origin lies in, in ``frame``, metres; by default none."""
-    sphere: Vector4 | None = None
+    sphere: Ball | None = None
     """Centre x,y,z and radius r of the ball that the tool's origin lies in, in ``frame``, metres; by default
     none."""
-    above_plane: Vector4 | None = None
+    above_plane: Plane | None = None
     """nx,ny,nz,d: keeps n.x >= d at the tool's origin x, in ``frame``, d in metres; by default none."""
     approach: Direction | None = None
     """Direction x,y,z in ``frame`` that the tool's z axis points in; by default any."""
@@ -485,7 +486,7 @@ class GraspConstraints(Selection):
     opens."""
     min_success_probability: Annotated[float, Field(ge=0, le=1)] | None = None
     """Least success probability; a grasp too far from every attempt to have one fails it; by default none."""
-    min_effective_trials: Annotated[float, Field(ge=0)] | None = None
+    min_effective_trials: Annotated[float, Field(ge=0, le=1e12)] | None = None
     """Fewest effective trials that the success probability rests on, with the nearest attempt within the
     estimator's reach; by default none."""
     object_pose: ObjectPose | None = None
@@ -505,7 +506,7 @@ class GraspConstraints(Selection):
 class BestGraspRequest(GraspConstraints):
     """The constrained maximum (figure 2)."""
 
-    half_spaces: Annotated[list[Vector4], Field(max_length=MAX_HALF_SPACES)] | None = None
+    half_spaces: Annotated[list[Plane], Field(max_length=MAX_HALF_SPACES)] | None = None
     """Rows nx, ny, nz, d that keep n.x >= d at the tool's origin x, in ``frame``, d in metres; by default
     none."""
     obstacles: Obstacles | None = None

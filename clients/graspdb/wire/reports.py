@@ -635,9 +635,9 @@ class SimilarityPoint(Response):
 class KernelSimilarityOptions(TrialSelection):
     """Of which trials, which displacements count, and how wide a component is."""
 
-    window_position_m: Annotated[float, Field(gt=0, le=1.0)] = 0.04
+    window_position_m: Annotated[float, Field(ge=1e-4, le=1.0)] = 0.04
     """Largest translation along any axis that counts, metres."""
-    window_rotation_deg: Annotated[float, Field(gt=0, le=180.0)] = 180.0
+    window_rotation_deg: Annotated[float, Field(ge=0.1, le=180.0)] = 180.0
     """Largest angle of rotation that counts, degrees."""
     component_position_m: Annotated[float, Field(ge=0.001, le=0.2)] = 0.01
     """Standard deviation of a component along each axis, metres."""

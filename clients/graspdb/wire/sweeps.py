@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from graspdb.wire.base import (
+    MANY,
     GripperRef,
     ObjectId,
     OneGripperVersion,
@@ -56,7 +57,7 @@ class GridSpec(Request):
     """How far positions reach beyond the mesh's bounding box, metres."""
     region: Region | None = None
     """Box that positions are cut to, object frame, metres; null for the whole grid."""
-    max_poses: Annotated[int, Field(ge=1)] | None = None
+    max_poses: Annotated[int, Field(ge=1, le=10**12)] | None = None
     """Takes so many first poses of a seeded permutation of the same grid; null for all."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     """Chooses the permutation that ``max_poses`` cuts."""
@@ -80,9 +81,9 @@ class SweepCreate(Request):
 
     grid: GridSpec | None = None
     """Simulate a grid about the object; null for another plan."""
-    poses: Annotated[list[Pose], Field(min_length=1)] | PoseColumns | None = None
+    poses: Annotated[list[Pose], Field(min_length=1), MANY] | PoseColumns | None = None
     """Simulate exactly these poses of the tool frame in the object frame; null for another plan."""
-    proposal_density: list[ProposalDensity | None] | ProposalDensity | None = None
+    proposal_density: Annotated[list[ProposalDensity | None], MANY] | ProposalDensity | None = None
     """Density that each of ``poses`` was drawn with, or all of them, 1/(m^3 rad^3), as proposals have it: it
     weighs their trials; null where it is not known."""
     sample: SampleSpec | None = None

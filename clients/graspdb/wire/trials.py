@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from graspdb.wire.base import (
+    MANY,
     GripperRef,
     Metadata,
     ObjectId,
@@ -21,6 +22,7 @@ from graspdb.wire.base import (
     Response,
     Slug,
     Source,
+    StoredMetadata,
     StoredRevision,
     Text,
     ToolPosition,
@@ -36,10 +38,11 @@ def _outcome_of_bool(value: Any) -> Any:
 
 OutcomeIn = Annotated[Outcome, BeforeValidator(_outcome_of_bool)]
 """An outcome's name; true and false mean success and failure."""
-ProposalDensity = Annotated[float, Field(gt=0, le=1e15)]
+ProposalDensity = Annotated[float, Field(ge=1e-30, le=1e15)]
 Quality = Annotated[float, Field(ge=-1e9, le=1e9)]
 Width = Annotated[float, Field(ge=0, le=10)]
-Row6 = tuple[float, float, float, float, float, float]
+_Covariance = Annotated[float, Field(ge=-1e6, le=1e6)]
+Row6 = tuple[_Covariance, _Covariance, _Covariance, _Covariance, _Covariance, _Covariance]
 Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
 
 
@@ -83,37 +86,37 @@ class TrialIn(Pose, TrialDefaults):
 class TrialsIn(TrialDefaults):
     """Trials in a list, and what holds for all of them."""
 
-    trials: Annotated[list[TrialIn], Field(min_length=1)]
+    trials: Annotated[list[TrialIn], Field(min_length=1), MANY]
     """The trials, stored as one batch."""
 
 
 class TrialColumns(Request):
     """Trials as columns of equal length: position (N, 3), quaternion_xyzw (N, 4), outcome (N,), ..."""
 
-    position: list[Position]
+    position: Annotated[list[Position], MANY]
     """Origins of the tool frame in the object frame, one x, y, z a trial, metres."""
-    quaternion_xyzw: list[Quaternion]
+    quaternion_xyzw: Annotated[list[Quaternion], MANY]
     """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a trial."""
-    outcome: list[OutcomeIn]
+    outcome: Annotated[list[OutcomeIn], MANY]
     """What became of each, by name; true and false mean success and failure."""
-    gripper: list[GripperRef | None] | None = None
+    gripper: Annotated[list[GripperRef | None], MANY] | None = None
     """Id of the gripper of each, or one version of it; null if unknown."""
-    source: list[Source | None] | None = None
+    source: Annotated[list[Source | None], MANY] | None = None
     """Who tried each; null if unknown."""
-    protocol: list[Slug | None] | None = None
+    protocol: Annotated[list[Slug | None], MANY] | None = None
     """How each outcome was judged; null if unknown."""
-    proposal_density: list[ProposalDensity | None] | None = None
+    proposal_density: Annotated[list[ProposalDensity | None], MANY] | None = None
     """Density that each pose was drawn with, 1/(m^3 rad^3); null if unknown."""
-    quality: list[Quality | None] | None = None
+    quality: Annotated[list[Quality | None], MANY] | None = None
     """Any score of each, without a unit; null for none."""
-    width_m: list[Width | None] | None = None
+    width_m: Annotated[list[Width | None], MANY] | None = None
     """Distance between the fingers at the end of each, metres; null if unknown."""
-    pose_covariance: list[Matrix6 | None] | None = None
+    pose_covariance: Annotated[list[Matrix6 | None], MANY] | None = None
     """6x6 of each pose in the tool frame, translation in metres first, then rotation vector in radians; null
     if unknown."""
-    measured_at: list[datetime | None] | None = None
+    measured_at: Annotated[list[datetime | None], MANY] | None = None
     """When each was tried; a time without a zone is UTC; null if unknown."""
-    metadata: list[Metadata | None] | None = None
+    metadata: Annotated[list[Metadata | None], MANY] | None = None
     """Any JSON object of the user's of each; null for none."""
     answer: list[Slug | None] | None = None
     """Id or name of the answer that each tried; null for none."""
@@ -166,7 +169,7 @@ class TrialOut(Response):
     if unknown."""
     measured_at: datetime | None = None
     """When it was tried, UTC; null if unknown."""
-    metadata: Metadata | None = None
+    metadata: StoredMetadata | None = None
     """The user's own JSON object; null where there is none."""
     sweep: str | None = None
     """Id of the sweep that simulated it; null for a posted trial."""
@@ -259,7 +262,7 @@ class BatchInfo(Response):
     """How many of its trials are withdrawn: they are in no count by outcome."""
     sweep: str | None = None
     """Id of the sweep that wrote it; null for posted trials."""
-    metadata: Metadata | None = None
+    metadata: StoredMetadata | None = None
     """What was posted with it as metadata of all; null where nothing was."""
     outcomes: OutcomeCounts = Field(default_factory=dict)
     grippers: list[str] = Field(default_factory=list)

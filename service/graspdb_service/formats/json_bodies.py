@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any, TypeVar
 
 import orjson
@@ -14,23 +15,36 @@ from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid
 
 Model = TypeVar("Model", bound=BaseModel)
+#: Bytes that Python's own parser, which holds up all other requests, may look at once more.
+_SHORT = 2**16
 
 
 def read_object(
     request: Request, body: bytes, allowed: Allowed | None = None, *, status: int = 400
 ) -> dict[str, Any]:
-    """A JSON object, its long arrays as :class:`LongArray`; NaN and Infinity are refused here.
+    """A JSON object, its long arrays as :class:`LongArray`.
 
-    415 for another media type, ``status`` where the body is no JSON, 422 where it is no object.
+    415 for another media type, ``status`` where the body is no JSON, 422 where it is no object. A short one
+    may hold NaN, Infinity and numbers beyond all floats, so that its model names the field.
     """
     require_json(request)
     try:
         value = loads(body, allowed=allowed)
     except orjson.JSONDecodeError as error:
-        raise no_json(error, status) from None
+        value = _with_any_number(body, error, status)
     if not isinstance(value, dict):
         raise invalid("body", "must be a JSON object")
     return value
+
+
+def _with_any_number(body: bytes, error: orjson.JSONDecodeError, status: int) -> Any:
+    """What orjson refused, where nothing but a number is wrong with it."""
+    if len(body) > _SHORT:
+        raise no_json(error, status)
+    try:
+        return json.loads(body)
+    except (ValueError, RecursionError):
+        raise no_json(error, status) from None
 
 
 def validated(content: Any, model: type[Model], *, most: int = 0) -> Model:

@@ -172,7 +172,7 @@ def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         position=near(position, refuse),
         quaternion_xyzw=unit(quaternion, refuse),
         outcome=_outcomes(fields),
-        proposal_density=_scalars(fields, "proposal_density", 0.0, 1e15, above=True),
+        proposal_density=_scalars(fields, "proposal_density", 1e-30, 1e15),
         quality=_scalars(fields, "quality", -1e9, 1e9),
         width_m=_scalars(fields, "width_m", 0.0, 10.0),
         measured_at=_each(fields, "measured_at", _time),
@@ -217,7 +217,7 @@ def _float(number: float) -> float:
         return np.inf
 
 
-def _scalars(fields: Fields, name: str, lower: float, upper: float, *, above: bool = False) -> Floats:
+def _scalars(fields: Fields, name: str, lower: float, upper: float) -> Floats:
     """(n,) numbers between the bounds with NaN for null; empty where the field is absent."""
     values = fields.lists.get(name)
     if values is None:
@@ -230,10 +230,9 @@ def _scalars(fields: Fields, name: str, lower: float, upper: float, *, above: bo
     else:
         fields.refuse(name, lambda value: type(value) in (int, float, type(None)), "a number or null")
         return np.empty(0)
-    inside = (table > lower if above else table >= lower) & (table <= upper)
-    bounds = f"above {lower:g} and at most {upper:g}" if above else f"from {lower:g} to {upper:g}"
+    inside = (table >= lower) & (table <= upper)
     for row in np.flatnonzero(given & ~inside):
-        fields.fault(name, int(row), f"a finite number {bounds}")
+        fields.fault(name, int(row), f"a finite number from {lower:g} to {upper:g}")
     return table
 
 

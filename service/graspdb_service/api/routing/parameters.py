@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends, Header, Path, Request, Response
+from pydantic import WithJsonSchema
 
 from graspdb_service.api.context import Context
 from graspdb_service.problems import invalid
@@ -22,22 +23,24 @@ async def context(request: Request) -> Context:
 Ctx = Annotated[Context, Depends(context)]
 
 
-ObjectId = Annotated[str, Path(description="Id of the object, as it was registered.")]
+def _id(description: str) -> Any:
+    """An id in a path; a longer one is of nothing, 404 as any other."""
+    return Path(description=description, json_schema_extra={"maxLength": 200})
+
+
+ObjectId = Annotated[str, _id("Id of the object, as it was registered.")]
 GripperId = Annotated[
-    str,
-    Path(
-        description="Id of the gripper, as `GET /grippers` lists it; read, too, one version, as in `panda@1`."
-    ),
+    str, _id("Id of the gripper, as `GET /grippers` lists it; read, too, one version, as in `panda@1`.")
 ]
-BatchId = Annotated[str, Path(description="Id of the batch, as posting its trials answered it.")]
-KernelId = Annotated[str, Path(description="Id of the kernel, as fitting or storing it answered it.")]
-AnswerRef = Annotated[str, Path(description="Id of the answer, or a name that it was given.")]
-RunId = Annotated[str, Path(description="Id of the run, as the 202 that started it answered it.")]
-SweepId = Annotated[str, Path(description="Id of the sweep, as planning it answered it.")]
-JobId = Annotated[str, Path(description="Id of the job, as the claim answered it.")]
+BatchId = Annotated[str, _id("Id of the batch, as posting its trials answered it.")]
+KernelId = Annotated[str, _id("Id of the kernel, as fitting or storing it answered it.")]
+AnswerRef = Annotated[str, _id("Id of the answer, or a name that it was given.")]
+RunId = Annotated[str, _id("Id of the run, as the 202 that started it answered it.")]
+SweepId = Annotated[str, _id("Id of the sweep, as planning it answered it.")]
+JobId = Annotated[str, _id("Id of the job, as the claim answered it.")]
 
 _KeyHeader = Annotated[
-    str | None,
+    Annotated[str, WithJsonSchema({"type": "string", "maxLength": 200, "pattern": r"^[\x21-\x7e]+$"})] | None,
     Header(
         description="1 to 200 printable ASCII characters, best a UUID: the same request with the same key"
         " again is answered the same and stores nothing twice."

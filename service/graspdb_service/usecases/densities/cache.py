@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +9,7 @@ import numpy as np
 from graspdb.wire import KernelSpec, Selection
 from graspdb.wire.queries import TrialSelection
 from graspdb_density.kde.isotropic import CUTOFF
-from graspdb_density.kernels.isotropic import POSITION_LIMITS_M, ROTATION_LIMITS
-from graspdb_service.problems import conflict, invalid, invalid_fields, not_found
+from graspdb_service.problems import conflict, invalid_fields, not_found
 from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
@@ -25,10 +23,7 @@ from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected, Selections, as_of
 
-_WIDTHS: dict[str, tuple[float, float]] = {
-    "sigma_position_m": POSITION_LIMITS_M,
-    "sigma_rotation_deg": (math.degrees(ROTATION_LIMITS[0]), math.degrees(ROTATION_LIMITS[1])),
-}
+_WIDTHS = ("sigma_position_m", "sigma_rotation_deg")
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
 
@@ -50,9 +45,6 @@ def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
         title = "A width is given both in kernel and beside it"
         raise invalid_fields([(name, told) for name in twice], title)
     widths = {name: getattr(inside, name) if width is None else width for name, width in beside.items()}
-    for name, (low, high) in _WIDTHS.items():
-        if widths[name] is not None and not low <= widths[name] <= high:
-            raise invalid(name, f"a width must be between {low:g} and {high:g}")
     cutoff = inside.cutoff if "cutoff" in inside.model_fields_set else CUTOFF
     exact = cutoff is None or cutoff > _LARGEST_CUTOFF
     return KernelChoice(**widths), None if exact else cutoff

@@ -16,7 +16,7 @@ from graspdb.wire import (
 )
 from graspdb.wire.jobs import FailureNoted
 from graspdb.wire.states import JobState
-from graspdb_service.problems import ProblemError, conflict, found, invalid
+from graspdb_service.problems import ProblemError, conflict, found
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.simulation.jobs import JobRow
@@ -30,11 +30,9 @@ WORKER_NOTED_EVERY_S = 10.0
 
 
 def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
-    """Lease jobs to a worker and register it; 422 if it names no capability."""
+    """Lease jobs to a worker and register it."""
     settings = ctx.settings
     capabilities = sorted(set(request.capabilities))
-    if not capabilities:
-        raise invalid("capabilities", "name at least one, such as simulate")
     with ctx.database.read() as tx:
         exhausted = jobs.exhausted(tx, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
         age = jobs.worker_age(tx, request.worker)
