@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from graspdb.wire.base import MAX_METADATA_LENGTH
+
 
 class Settings(BaseSettings):
     """What a service process is told; every limit is answered by ``GET /info``."""
@@ -60,6 +62,11 @@ class Settings(BaseSettings):
     max_mesh_seconds: Annotated[float, Field(gt=0)] = 20.0
     max_mesh_memory_bytes: Annotated[int, Field(ge=2**28)] = 2 * 2**30
     max_batch_trials: Annotated[int, Field(ge=1)] = 1_000_000
+    max_object_protocols: Annotated[int, Field(ge=1, le=10_000)] = 1_000
+    max_object_provenances: Annotated[int, Field(ge=1, le=10_000)] = 5_000
+    """Combinations of gripper, source and protocol among an object's trials."""
+    max_metadata_bytes: Annotated[int, Field(ge=0, le=MAX_METADATA_LENGTH)] = MAX_METADATA_LENGTH
+    """Of one trial, batch or object, as JSON."""
     max_query_poses: Annotated[int, Field(ge=1)] = 1_000_000
     max_samples: Annotated[int, Field(ge=1)] = 1_000_000
     max_sweep_poses: Annotated[int, Field(ge=1)] = 100_000_000

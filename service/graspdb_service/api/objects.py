@@ -11,6 +11,7 @@ from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, na
 from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.usecases import copies, objects
+from graspdb_service.usecases.runtime.quotas import check_metadata
 
 router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 
@@ -18,6 +19,7 @@ router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 @router.post("/objects", status_code=201, response_model=ObjectInfo, **scope("admin"))
 def create_object(ctx: Ctx, request: ObjectCreate, sent: Creating) -> object:
     """Register an object; its mesh and its trials follow."""
+    check_metadata(ctx.settings, request.metadata)
     return sent.answered(objects.create(ctx.database, request, sent))
 
 
@@ -38,6 +40,7 @@ def get_object(ctx: Ctx, id: ObjectId, request: Request) -> Response:
 @router.patch("/objects/{id}", **scope("admin"))
 def change_object(ctx: Ctx, id: ObjectId, request: ObjectPatch) -> ObjectInfo:
     """Change properties: a field left out stays, an explicit null clears it."""
+    check_metadata(ctx.settings, request.metadata)
     return objects.change(ctx.database, id, request)
 
 

@@ -29,6 +29,7 @@ from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
 from graspdb_service.formats.trials import page_response, stream_response
 from graspdb_service.usecases import objects
+from graspdb_service.usecases.runtime.quotas import check_metadata
 from graspdb_service.usecases.trials import batches, corrections, listing, posting
 
 router = APIRouter(tags=["trials"], route_class=AdmittedRoute)
@@ -149,6 +150,7 @@ def correct_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: TrialPatch) -> Tria
 
     409 for a trial of a sweep.
     """
+    check_metadata(ctx.settings, request.metadata)
     return corrections.correct(ctx.database, id, seq, request)
 
 

@@ -46,6 +46,8 @@ BLOCK = 16_384
 
 Place = Callable[[int, str], str]
 """What a field of a trial is called in the request."""
+#: Answers, and combinations of gripper, source and protocol, of one request, whatever the settings allow.
+MOST_NAMES = 10_000
 
 
 @dataclass
@@ -116,25 +118,22 @@ def check_blocks(blocks: Iterable[Fields], defaults: TrialDefaults, place: Place
     422 naming the fields that are wrong in the first block that has any; 413 for more trials than ``limit``.
     """
     parts: list[TrialBatch] = []
+    numbers: dict[Provenance, int] = {}
+    answers: dict[str, int] = {}
+    columns = []
     count = 0
     for block in blocks:
         count += block.count
         refuse_too_many(count, limit)
-        parts.append(_check(block, defaults))
-    numbers: dict[Provenance, int] = {}
-    answers: dict[str, int] = {}
-    columns = []
-    for part in parts:
+        part = _check(block, defaults)
         own = [numbers.setdefault(item, len(numbers)) for item in part.provenances]
         # The last one stands for none, whose place is -1.
         tried = [*(answers.setdefault(name, len(answers)) for name in part.answers), -1]
-        columns.append(
-            replace(
-                part.columns,
-                provenance=np.array(own, dtype=np.int64)[part.columns.provenance],
-                answer=np.array(tried, dtype=np.int64)[part.columns.answer],
-            )
-        )
+        provenance = np.array(own, dtype=np.int64)[part.columns.provenance]
+        answer = np.array(tried, dtype=np.int64)[part.columns.answer]
+        _refuse_made_up_names(block, provenance, answer)
+        parts.append(part)
+        columns.append(replace(part.columns, provenance=provenance, answer=answer))
 
     def field_of_gripper(gripper: str) -> str:
         named = (part.field_of_gripper(gripper) for part in parts)
@@ -142,6 +141,24 @@ def check_blocks(blocks: Iterable[Fields], defaults: TrialDefaults, place: Place
 
     joined = TrialColumns.joined(columns)
     return TrialBatch(joined, list(numbers), defaults.metadata, field_of_gripper, place, list(answers))
+
+
+def _refuse_made_up_names(block: Fields, provenance: Ints, answer: Ints) -> None:
+    """422, before later blocks cost any time, for more names than an object may have."""
+    for what, field_name, places, told in (
+        ("provenances", "protocol", provenance, "combinations of gripper, source and protocol"),
+        ("answers", "answer", answer, "answers"),
+    ):
+        if places.max(initial=0) >= MOST_NAMES:
+            row = int(np.argmax(places >= MOST_NAMES))
+            raise ProblemError(
+                422,
+                f"too-many-{what}",
+                f"Trials of one request are of at most {MOST_NAMES:,} {told}, those of an object of fewer"
+                " (see /info): what differs from trial to trial belongs in their metadata",
+                errors=[(block.place(row, field_name), f"over the limit of {MOST_NAMES:,}")],
+                extra={"limit": MOST_NAMES},
+            )
 
 
 def blocks_of(

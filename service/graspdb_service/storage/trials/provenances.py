@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from sqlalchemy import and_, func, insert, select
 
@@ -11,22 +11,60 @@ from graspdb_service.storage.tables import provenances
 from graspdb_service.storage.tables import tallies as tallied
 from graspdb_service.trial_columns import Provenance, gripper_parts
 
+#: Combinations that are looked up one by one; of more all of the object's are read.
+_FEW = 8
+_ROWS = 500
+
 
 def ensure(tx: Tx, object_id: int, provenance: Provenance) -> int:
     """The id of this combination, made if it is new. Call it under the object's lock, its gripper one version
     that is held.
     """
+    known = _find(tx, object_id, provenance)
+    if known is not None:
+        return known
+    statement = insert(provenances).values(object_id=object_id, **_columns(provenance))
+    return int(tx.execute(statement.returning(provenances.c.id)).scalar_one())
+
+
+def _columns(provenance: Provenance) -> dict[str, str | int | None]:
     names: dict[str, str | int | None] = dict(provenance._asdict())
     if provenance.gripper is not None:
         names["gripper"], names["gripper_version"] = gripper_parts(provenance.gripper)
-    same = [provenances.c[name].is_not_distinct_from(value) for name, value in names.items()]
+    return names
+
+
+def _find(tx: Tx, object_id: int, provenance: Provenance) -> int | None:
+    same = [provenances.c[name].is_not_distinct_from(value) for name, value in _columns(provenance).items()]
     known = tx.execute(
         select(provenances.c.id).where(provenances.c.object_id == object_id, and_(*same)).limit(1)
     ).scalar()
-    if known is not None:
-        return int(known)
-    statement = insert(provenances).values(object_id=object_id, **names).returning(provenances.c.id)
-    return int(tx.execute(statement).scalar_one())
+    return None if known is None else int(known)
+
+
+def find(tx: Tx, object_id: int, items: Collection[Provenance]) -> dict[Provenance, int]:
+    """The ids of those of these combinations that there are."""
+    if len(items) > _FEW:
+        wanted = set(items)
+        return {item: number for number, item in of_object(tx, object_id).items() if item in wanted}
+    found = {item: _find(tx, object_id, item) for item in items}
+    return {item: number for item, number in found.items() if number is not None}
+
+
+def make(tx: Tx, object_id: int, items: Sequence[Provenance]) -> dict[Provenance, int]:
+    """Ids of new combinations. Call it under the object's lock, their grippers versions that are held."""
+    rows = [{"object_id": object_id, "gripper_version": None, **_columns(item)} for item in items]
+    # Many in one statement, but no more parameters than every database takes.
+    for start in range(0, len(rows), _ROWS):
+        tx.execute(insert(provenances).values(rows[start : start + _ROWS]))
+    return find(tx, object_id, items)
+
+
+def spread(tx: Tx, object_id: int) -> tuple[frozenset[str], int]:
+    """The protocols of an object's trials, and how many combinations they are of."""
+    query = select(provenances.c.protocol, func.count()).where(provenances.c.object_id == object_id)
+    counts = {name: int(n) for name, n in tx.execute(query.group_by(provenances.c.protocol))}
+    return frozenset(name for name in counts if name is not None), sum(counts.values())
 
 
 def of_object(tx: Tx, object_id: int) -> dict[int, Provenance]:

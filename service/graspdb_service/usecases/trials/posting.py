@@ -12,11 +12,13 @@ from graspdb.wire import BatchReceipt
 from graspdb_service.formats.json_pieces import Allowed
 from graspdb_service.formats.trials import parse
 from graspdb_service.problems import ProblemError
+from graspdb_service.settings import Settings
 from graspdb_service.storage import answers, grippers, objects
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.trials import batches, findings, provenances, rows
+from graspdb_service.storage.trials import batches, findings, rows
 from graspdb_service.trial_columns import Ints, Provenance, TrialBatch
 from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.runtime import quotas
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or, replayed
 from graspdb_service.usecases.runtime.runtime import Runtime
 from graspdb_service.usecases.trials.findings import inspection, words
@@ -55,6 +57,7 @@ def add(
     limits = ctx.settings
     allowed = Allowed(limits.max_json_values, limits.max_json_depth)
     batch = parse(sent.body, media, limit=limits.max_batch_trials, allowed=allowed)
+    quotas.check_batch(limits, batch)
     with ctx.database.read() as tx:
         known = require(tx, slug)
         profiles = inspection.profiles_of(tx, batch)
@@ -62,15 +65,15 @@ def add(
     if not accept_implausible:
         _refuse_implausible(batch, concerns)
     given.settle(batch.answers)
-    return replay_or(ctx.database, scope, meant, lambda tx: _store(tx, slug, batch, concerns))
+    return replay_or(ctx.database, scope, meant, lambda tx: _store(tx, ctx.settings, slug, batch, concerns))
 
 
-def _store(tx: Tx, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) -> Created:
+def _store(tx: Tx, settings: Settings, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) -> Created:
     row = require(tx, slug)
     named = _held_grippers(tx, batch)
     count = len(batch.columns)
     revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
-    ids = np.array([provenances.ensure(tx, row.id, item) for item in named])
+    ids = np.array(quotas.provenance_ids(tx, settings, row.id, batch, named))
     batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
     columns = replace(
         batch.columns, provenance=ids[batch.columns.provenance], answer=_answers(tx, row.id, batch)
@@ -153,7 +156,7 @@ def _held_grippers(tx: Tx, batch: TrialBatch) -> list[Provenance]:
     """The batch's provenances, each gripper as the version that it stands for; 422 for one there is not."""
     names = {item.gripper for item in batch.provenances if item.gripper is not None}
     held = grippers.held(tx, names)
-    unknown = sorted(names - held.keys())
+    unknown = sorted(names - held.keys())[: inspection.FIRST]
     if unknown:
         raise ProblemError(
             422,

@@ -27,6 +27,8 @@ _KEPT = 4_096
 _TOLD = 5
 UNSPECIFIED = "unspecified"
 """What the source of trials that name none is called."""
+#: Names that a message lists.
+_LISTED = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +176,7 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
     }
     ambiguous = [name for name, values in named.items() if len(values) > 1 and getattr(asked, name) is None]
     if ambiguous:
-        told = "; ".join(f"{name}: {', '.join(named[name])}" for name in ambiguous)
+        told = "; ".join(f"{name}: {_listed(named[name])}" for name in ambiguous)
         raise conflict(
             "ambiguous-selection",
             f"The trials are of several {' and '.join(name + 's' for name in ambiguous)}: name one ({told})",
@@ -205,6 +207,12 @@ def _weighing(candidates: dict[int, Provenance], asked: TrialSelection) -> dict[
         names = ", ".join(distinct(item.source for item in candidates.values()))
         raise invalid("source_weight", f"leaves no trial: all there are of {names}, and weigh nothing")
     return left
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first names, for a person; all of them stand beside, for programs."""
+    more = len(names) - _LISTED
+    return ", ".join(names[:_LISTED]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def of_provenances(
