@@ -187,6 +187,13 @@ def postgres_url(postgres_server_url: str, _postgres_template: str) -> Iterator[
         yield url
 
 
+@pytest.fixture(scope="module")
+def postgres_module_url(postgres_server_url: str, _postgres_template: str) -> Iterator[str]:
+    """As ``postgres_url``, for all tests of a module."""
+    with _postgres_database(postgres_server_url, _postgres_template) as url:
+        yield url
+
+
 @pytest.fixture(params=["sqlite", "postgres"])
 def database_url(request: pytest.FixtureRequest) -> str:
     """Each test twice: on SQLite and on PostgreSQL."""

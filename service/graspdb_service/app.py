@@ -288,7 +288,8 @@ def _database_problem(error: Exception) -> ProblemError:
 
 def problem_of_validation(errors: Any) -> ProblemError:
     """A 422 that names each field and never echoes the input, which may hold NaN or megabytes."""
-    listed = []
+    listed: list[tuple[str, str]] = []
+    of_type: list[tuple[str, str]] = []
     for item in list(errors)[:20]:
         if item["type"] == "json_invalid":
             listed.append(("body", f"not valid JSON: {item.get('ctx', {}).get('error', item['msg'])}"))
@@ -297,5 +298,9 @@ def problem_of_validation(errors: Any) -> ProblemError:
         # pydantic names the branch of a union it tried; that is no part of the user's document.
         place = [part for part in place if "[" not in part and not part[:1].isupper()]
         place = [part for part in place if part != "constrained-str"]
-        listed.append((".".join(place) or "body", str(item["msg"]).removeprefix("Value error, ")))
+        told = ".".join(place) or "body", str(item["msg"]).removeprefix("Value error, ")
+        (of_type if item["type"].endswith("_type") else listed).append(told)
+    # Of a union's branches the one that took the value says what is wrong with it, not those of other types.
+    fields = [f"{name}." for name, _ in listed]
+    listed += [told for told in of_type if not any(name.startswith(f"{told[0]}.") for name in fields)]
     return invalid_fields(list(dict.fromkeys(listed)))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 from fastapi import Request
 from pydantic import BaseModel
 
-from graspdb_service.problems import ProblemError
+from graspdb_service.problems import ProblemError, invalid
 
 Scope = Literal["public", "read", "trials:write", "jobs:work", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
@@ -55,8 +57,8 @@ def _schema(given: Any) -> dict[str, Any]:
     return schema
 
 
-def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], frozenset[str]]:
-    """The query parameters of every operation of an OpenAPI document, by method and path.
+def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, bool]]:
+    """The query parameters of every operation of an OpenAPI document, and whether each may be repeated.
 
     RuntimeError if an operation declares no scope: none may be open by oversight.
     """
@@ -65,18 +67,38 @@ def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], fr
         for method, operation in operations.items():
             if operation.get(SCOPE_FIELD) not in SCOPES:
                 raise RuntimeError(f"{method.upper()} {path} declares no scope")
-            names = [item["name"] for item in operation.get("parameters", ()) if item["in"] == "query"]
-            found[method.upper(), path] = frozenset(names)
+            found[method.upper(), path] = {
+                item["name"]: '"array"' in json.dumps(item["schema"])
+                for item in operation.get("parameters", ())
+                if item["in"] == "query"
+            }
     return found
 
 
 async def refuse_unknown_parameters(request: Request) -> None:
-    """422 for a query parameter that the route does not know: a typing error must not be ignored."""
+    """422 for a query parameter that the route does not know, or one of one value that stands twice.
+
+    A typing error must not be ignored. No name has a NUL in it, which no database takes: 404 in a path.
+    """
+    if "\0" in request.url.path or any("\0" in str(value) for value in request.path_params.values()):
+        raise ProblemError(404, "not-found", "There is nothing whose name has the NUL character in it")
     path = getattr(request.scope.get("route"), "path", None)
     known = request.app.state.parameters.get((request.method, path))
     if known is None or not request.query_params:
         return
-    unknown = sorted(set(request.query_params) - known)
+    given = Counter(name for name, _ in request.query_params.multi_items())
+    nul = [name for name, value in request.query_params.multi_items() if "\0" in value and name in known]
+    if nul:
+        raise invalid(nul[0], "text must not contain the NUL character")
+    unknown = [name[:80] for name in sorted(given.keys() - known)][:20]
+    twice = sorted(name for name, count in given.items() if count > 1 and not known.get(name, True))
+    if twice:
+        raise ProblemError(
+            422,
+            "repeated-parameter",
+            f"Query parameter {', '.join(twice)} stands there twice: which of its values is meant?",
+            errors=[(name, "given more than once") for name in twice],
+        )
     if unknown:
         allowed = ", ".join(sorted(known)) or "none"
         raise ProblemError(
