@@ -93,11 +93,11 @@ class TrialsIn(TrialDefaults):
 class TrialColumns(Request):
     """Trials as columns of equal length: position (N, 3), quaternion_xyzw (N, 4), outcome (N,), ..."""
 
-    position: Annotated[list[Position], MANY]
+    position: Annotated[list[Position], Field(min_length=1), MANY]
     """Origins of the tool frame in the object frame, one x, y, z a trial, metres."""
-    quaternion_xyzw: Annotated[list[Quaternion], MANY]
+    quaternion_xyzw: Annotated[list[Quaternion], Field(min_length=1), MANY]
     """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a trial."""
-    outcome: Annotated[list[OutcomeIn], MANY]
+    outcome: Annotated[list[OutcomeIn], Field(min_length=1), MANY]
     """What became of each, by name; true and false mean success and failure."""
     gripper: Annotated[list[GripperRef | None], MANY] | None = None
     """Id of the gripper of each, or one version of it; null if unknown."""
@@ -118,9 +118,9 @@ class TrialColumns(Request):
     """When each was tried; a time without a zone is UTC; null if unknown."""
     metadata: Annotated[list[Metadata | None], MANY] | None = None
     """Any JSON object of the user's of each; null for none."""
-    answer: list[Slug | None] | None = None
+    answer: Annotated[list[Slug | None], MANY] | None = None
     """Id or name of the answer that each tried; null for none."""
-    achieved_pose: list[Pose | None] | None = None
+    achieved_pose: Annotated[list[Pose | None], MANY] | None = None
     """Where the tool was after all in each, in the object frame: estimates take this pose; null if
     unknown."""
 
