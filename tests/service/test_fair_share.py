@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections import deque
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -139,7 +140,7 @@ def test_work_for_nobody_and_work_that_is_late_ends() -> None:
     assert caught.value.status == 499
     question.gone = False
     question.reached("computing poses", 3, 10)
-    with compute.within(1e-9), pytest.raises(ProblemError) as caught:
+    with compute.within(SimpleNamespace(timeout_s=1e-9)), pytest.raises(ProblemError) as caught:
         compute.run(breathe)
     assert (caught.value.status, caught.value.kind) == (503, "deadline")
     assert caught.value.extra["reached"] == {"step": "computing poses", "done": 3, "of": 10, "seconds": 1e-9}
