@@ -40,7 +40,14 @@ IN_A_FRAME = {
 
 NOT_IN_A_FRAME = {
     # Probabilities, counts and columns of other things that have the same names.
-    *("CalibrationBin.lower", "CalibrationBin.upper", "ConvergencePoint.grasps", "Verdict.grasps"),
+    *(
+        "PromiseBin.lower",
+        "PromiseBin.upper",
+        "CalibrationBin.lower",
+        "CalibrationBin.upper",
+        "ConvergencePoint.grasps",
+        "Verdict.grasps",
+    ),
     *("AnisotropyReport.grasps", "CheckedGrasps.grasps", "ProjectionReport.grasps", "SweepInfo.poses"),
     "ConvergenceCurve.points",
 }

@@ -63,7 +63,7 @@ def test_few_decide_nothing(sqlite_http: httpx.Client, thing: str) -> None:
 
 
 def test_promises_that_are_kept_and_such_that_are_not(sqlite_http: httpx.Client, thing: str) -> None:
-    trials = _tried(sqlite_http, thing, [i % 10 > 1 for i in range(24)])
+    trials = _tried(sqlite_http, thing, [i not in (3, 11) for i in range(24)])
     # Never tried.
     sqlite_http.post(f"/objects/{thing}/best-grasp", json={"count": 7})
     found = _report(sqlite_http, thing)

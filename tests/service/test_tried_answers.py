@@ -144,6 +144,21 @@ def test_an_answer_that_trials_name_stays_until_they_go(http: httpx.Client, thin
     assert http.delete(f"/answers/{id}").status_code == 204
 
 
+def test_a_copy_keeps_achieved_poses_and_leaves_answers_to_the_original(
+    http: httpx.Client, thing: str
+) -> None:
+    id = _answer(http, thing)
+    trial = {**HERE, "outcome": "success", "answer": id, "achieved_pose": THERE}
+    http.post(f"/objects/{thing}/trials", json=trial)
+    made = http.post(f"/objects/{thing}/copies", json={"id": "copy", "trials": True})
+    assert made.status_code == 201, made.text
+    batch = http.get("/objects/copy/batches").json()["items"][-1]["batch"]
+    (copied,) = _stored(http, "copy", batch)
+    assert (copied["achieved_pose"], copied["answer"]) == (THERE, None)
+    assert http.delete(f"/objects/copy/batches/{batch}").status_code == 204
+    assert http.get(f"/answers/{id}").json()["trials"] == 1
+
+
 def test_estimates_take_the_pose_that_was_achieved(
     http: httpx.Client, make_object: Callable[..., str], clusters: Callable[..., Poses]
 ) -> None:
@@ -168,9 +183,10 @@ def test_estimates_take_the_pose_that_was_achieved(
     assert found["success_probability"][0] == pytest.approx(expected["success_probability"][0])
     assert found["density"][0] > 10 * found["density"][1]
     # A tail that extends the density is read so, too.
-    more = {**HERE, "outcome": "success", "achieved_pose": {**HERE, "position": [-0.05, 0, 0.06]}}
-    http.post(f"/objects/{beside}/trials", json=more)
-    poses_ = [{**HERE, "position": [x, 0, 0.06]} for x in (-0.05, 0.0)]
-    now = http.post(f"/objects/{beside}/likelihood", json={"poses": poses_}).json()["density"]
-    assert now[0] > 2 * now[1]
-    assert np.isfinite(now).all()
+    far = {**HERE, "position": [-0.05, 0, 0.06]}
+    http.post(f"/objects/{there}/trials", json={**far, "outcome": "success"})
+    http.post(f"/objects/{beside}/trials", json={**HERE, "outcome": "success", "achieved_pose": far})
+    asked = {"poses": [far, HERE]}
+    expected, found = (http.post(f"/objects/{s}/likelihood", json=asked).json() for s in (there, beside))
+    assert found["density"] == pytest.approx(expected["density"])
+    assert found["density"][0] > found["density"][1]

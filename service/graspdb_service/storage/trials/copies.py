@@ -103,6 +103,8 @@ def copy_trials(tx: Tx, original: int, copy: int) -> None:
         tx, trials, of_trial, [trials.c.object_id == original],
         object_id=literal(copy), batch_id=copied.c.id,
         provenance_id=case(numbers, value=trials.c.provenance_id),
+        # What they tried were answers about the original.
+        answer_number=null(),
     )  # fmt: skip
     _insert(
         tx, trial_changes, trial_changes, [trial_changes.c.object_id == original], object_id=literal(copy)
