@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import logging
 import os
@@ -25,6 +24,7 @@ try:
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
     from graspdb_service.storage.database import CANNOT_OPEN, Database, UnsupportedDatabase, why
+    from graspdb_service.usecases.upkeep.doctor import is_loopback
 except ModuleNotFoundError as error:
     sys.exit(NEEDS.format(error.name))
 
@@ -44,7 +44,7 @@ def serve(
 ) -> None:
     """Serve the HTTP API. A SQLite database is created and migrated; PostgreSQL must be current."""
     settings = settings_from(host=host, port=port, database_url=database_url, auth=auth)
-    if settings.auth != "off" and not _is_loopback(settings.host):
+    if settings.auth != "off" and not is_loopback(settings.host):
         fail(
             f"Serving on {settings.host} without keys would open the database to the network."
             " Listen on 127.0.0.1, or say so explicitly: --auth off (GRASPDB_AUTH=off)."
@@ -100,7 +100,7 @@ def openapi() -> None:
         app.state.context.close()
 
 
-for command in (upkeep.backup, upkeep.restore):
+for command in (upkeep.backup, upkeep.restore, upkeep.doctor):
     cli.command()(command)
 
 
@@ -111,15 +111,6 @@ def _application(settings: Settings) -> FastAPI:
     except ModuleNotFoundError as error:
         fail(NEEDS.format(error.name))
     return create_app(settings)
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def main() -> None:

@@ -123,6 +123,8 @@ def world(tmp_path_factory: pytest.TempPathFactory, serve_module: Callable[..., 
     # One file without a journal beside it, which tests may copy.
     with closing(sqlite3.connect(folder / "served.sqlite")) as connection:
         connection.execute("VACUUM INTO ?", (str(folder / "graspdb.sqlite"),))
+    with closing(sqlite3.connect(folder / "graspdb.sqlite")) as connection:
+        connection.execute("PRAGMA journal_mode = WAL")
     return folder / "graspdb.sqlite"
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,8 +19,11 @@ from graspdb_service.storage.database import Database, UnsupportedDatabase
 from graspdb_service.storage.upkeep import backup as copies
 from graspdb_service.storage.upkeep.archive import ArchiveReader, DamagedArchive, Manifest
 from graspdb_service.storage.upkeep.layout import UncopiableValue
+from graspdb_service.usecases.upkeep import doctor as examination
+from graspdb_service.usecases.upkeep.doctor import Diagnosis
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print what was done as JSON.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_LEVELS = ("ok", "warning", "error")
 _FAILURES = (
     *(copies.NothingToCopy, copies.RefusedRestore, DamagedArchive, UncopiableValue),
     *(schema.StaleSchema, UnsupportedDatabase, OSError),
@@ -83,9 +88,47 @@ def restore(
         typer.echo(f"{done.continued} objects had changed since: their revisions go on after those changes'.")
 
 
+def doctor(
+    database_url: DatabaseUrl = None,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Count anew what does not agree with the rows; nothing else.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Look whether the database and the settings are in order, while the service goes on.
+
+    Ends with 0 where all is well, 1 with warnings, 2 with errors.
+    """
+    settings = settings_from(database_url=database_url)
+    told: list[Diagnosis] = []
+    mended: list[str] = []
+    with _database(database_url, code=2) as database:
+        copies.require_file(database)
+        if repair:
+            schema.check(database)
+            mended = examination.repair(database)
+        for diagnosis in examination.examine(database, settings, os.environ):
+            told.append(diagnosis)
+            if not as_json:
+                _show(diagnosis)
+    worst = max((_LEVELS.index(diagnosis.level) for diagnosis in told), default=0)
+    if as_json:
+        checks = [asdict(diagnosis) for diagnosis in told]
+        typer.echo(json.dumps({"level": _LEVELS[worst], "repaired": mended, "checks": checks}))
+    elif mended:
+        typer.echo(f"Counted anew: {', '.join(mended)}.")
+    raise SystemExit(worst)
+
+
+def _show(diagnosis: Diagnosis) -> None:
+    typer.echo(f"{diagnosis.level:<8} {diagnosis.check}: {diagnosis.found}")
+    if diagnosis.level != "ok":
+        typer.echo(f"         {diagnosis.meaning}\n         {diagnosis.remedy}")
+
+
 @contextmanager
-def _database(url: str | None) -> Iterator[Database]:
-    with _failures():
+def _database(url: str | None, code: int = 1) -> Iterator[Database]:
+    with _failures(code):
         database = Database(settings_from(database_url=url).database_url)
         try:
             yield database
@@ -94,14 +137,14 @@ def _database(url: str | None) -> Iterator[Database]:
 
 
 @contextmanager
-def _failures() -> Iterator[None]:
+def _failures(code: int = 1) -> Iterator[None]:
     """End with one line where a person has to do something."""
     try:
         yield
     except DBAPIError as error:
-        fail(f"The database does not answer or refuses: {' '.join(str(error.orig).split())}")
+        fail(f"The database does not answer or refuses: {' '.join(str(error.orig).split())}", code)
     except _FAILURES as error:
-        fail(str(error))
+        fail(str(error), code)
 
 
 def _progress(quiet: bool) -> Callable[[str, int], None]:
