@@ -51,6 +51,7 @@ from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database, is_full, why
 from graspdb_service.storage.objects import ObjectGone
+from graspdb_service.telemetry.requests import RequestLog
 from graspdb_service.usecases.grippers import seed
 
 log = logging.getLogger("graspdb")
@@ -112,6 +113,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         admission.open()
         await anyio.to_thread.run_sync(ctx.health.start)
         watching = asyncio.create_task(_cut_what_hangs(ctx))
+        ctx.upkeep.start()
         yield
         watching.cancel()
         ctx.close()
@@ -134,6 +136,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(Methods)
     app.add_middleware(Decoding, max_body_bytes=settings.max_body_bytes)
     app.add_middleware(RequestTrace)
+    app.add_middleware(RequestLog)
     return app
 
 

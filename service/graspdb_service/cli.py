@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import sys
 import tempfile
@@ -24,6 +23,7 @@ try:
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
     from graspdb_service.storage.database import CANNOT_OPEN, Database, UnsupportedDatabase, why
+    from graspdb_service.telemetry import logs, traces
     from graspdb_service.usecases.upkeep.doctor import is_loopback
 except ModuleNotFoundError as error:
     sys.exit(NEEDS.format(error.name))
@@ -40,10 +40,14 @@ def serve(
     port: Annotated[int | None, typer.Option(help="Port to listen on; 0 takes a free one.")] = None,
     database_url: DatabaseUrl = None,
     auth: Annotated[str | None, typer.Option(help="'off' serves without keys beyond loopback, too.")] = None,
-    log_level: Annotated[str, typer.Option(help="critical, error, warning, info or debug.")] = "info",
+    log_level: Annotated[
+        str | None, typer.Option(help="critical, error, warning, info (the default) or debug.")
+    ] = None,
+    log_format: Annotated[str | None, typer.Option(help="text (the default) or json.")] = None,
 ) -> None:
     """Serve the HTTP API. A SQLite database is created and migrated; PostgreSQL must be current."""
-    settings = settings_from(host=host, port=port, database_url=database_url, auth=auth)
+    given = {"log_level": log_level, "log_format": log_format}
+    settings = settings_from(host=host, port=port, database_url=database_url, auth=auth, **given)
     if settings.auth != "off" and not is_loopback(settings.host):
         fail(
             f"Serving on {settings.host} without keys would open the database to the network."
@@ -51,11 +55,12 @@ def serve(
         )
     # Before NumPy is imported: its BLAS would start a thread a core inside each compute thread.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    logs.configure(settings.log_format, settings.log_level)
+    traces.start()
     with _opening(settings):
         app = _application(settings)
     _warm_up(app)
-    connections.serve(app, settings, log_level)
+    connections.serve(app, settings)
 
 
 def _warm_up(app: Any) -> None:

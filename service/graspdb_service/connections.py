@@ -109,7 +109,7 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def serve(app: FastAPI, settings: Settings, log_level: str) -> None:
+def serve(app: FastAPI, settings: Settings) -> None:
     """Serve until a signal says to stop; then whoever is being answered has 10 s more."""
     config = uvicorn.Config(
         app,
@@ -118,7 +118,10 @@ def serve(app: FastAPI, settings: Settings, log_level: str) -> None:
         # h11 refuses headers over 64 KiB; httptools would collect them without end.
         http=protocol(settings),
         timeout_keep_alive=settings.max_idle_seconds,
-        log_level=log_level,
+        # Its lines go where ours do; that of a request is ours alone.
+        log_config=None,
+        log_level=settings.log_level,
+        access_log=False,
         timeout_graceful_shutdown=10,
     )
     server = _Server(config)

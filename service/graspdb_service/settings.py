@@ -5,10 +5,16 @@ from __future__ import annotations
 import os
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from graspdb.wire.base import MAX_METADATA_LENGTH
+
+LogLevel = Literal["critical", "error", "warning", "info", "debug"]
+
+
+def _in_small_letters(value: object) -> object:
+    return value.lower() if isinstance(value, str) else value
 
 
 class Settings(BaseSettings):
@@ -83,6 +89,20 @@ class Settings(BaseSettings):
     """With less free under a SQLite database the service says that it is not ready."""
     probe_seconds: Annotated[float, Field(gt=0)] = 3.0
     """How often the service looks whether its database can be used."""
+
+    log_format: Literal["text", "json"] = "text"
+    log_level: Annotated[LogLevel, BeforeValidator(_in_small_letters)] = "info"
+
+    keep_idempotency_days: Annotated[float, Field(gt=0)] = 30.0
+    """So long a request that creates something may be sent again under its Idempotency-Key."""
+    keep_audit_days: Annotated[float, Field(gt=0)] | None = None
+    """Entries of the audit older than this are deleted; unset, none is."""
+    keep_trials_days: Annotated[float, Field(gt=0)] | None = None
+    """Whole batches older than this are deleted; unset, none is but by somebody's request."""
+    keep_workers_days: Annotated[float, Field(gt=0)] = 90.0
+    """Workers not seen for so long are listed no more."""
+    upkeep_seconds: Annotated[float, Field(gt=0)] = 3_600.0
+    """How often what is kept no longer is deleted."""
 
     lease_s: Annotated[float, Field(gt=0)] = 60.0
     """How long a worker keeps a job without renewing."""

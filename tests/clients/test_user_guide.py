@@ -109,7 +109,7 @@ def test_the_python_blocks_run(own_service_url: str, tmp_path: Path, monkeypatch
         assert names["report"].recommended[0] > 0
 
 
-def test_the_shell_blocks_run(empty_postgres_url: str) -> None:
+def test_the_shell_blocks_run(empty_postgres_url: str, tmp_path: Path) -> None:
     found = blocks("bash")
     assert found
     for _, block in found:
@@ -117,6 +117,7 @@ def test_the_shell_blocks_run(empty_postgres_url: str) -> None:
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         done = subprocess.run(
             ["sh", "-ec", block.replace("postgresql://user@host/graspdb", empty_postgres_url)],
+            cwd=tmp_path,
             env={**os.environ, "PATH": path},
             capture_output=True,
             text=True,

@@ -20,6 +20,7 @@ from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.runtime.health import Health
 from graspdb_service.usecases.runtime.runs import Runs
 from graspdb_service.usecases.trials.selection import Selections
+from graspdb_service.usecases.upkeep.upkeep import Upkeep
 
 
 @dataclass(kw_only=True)
@@ -29,6 +30,7 @@ class Context(Asking):
     reports: Reports
     runs: Runs
     health: Health
+    upkeep: Upkeep
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
@@ -56,11 +58,13 @@ class Context(Asking):
             answers=AnswerKeeper(database, most=settings.max_answers),
             reports=reports,
             health=health,
+            upkeep=Upkeep(settings, database),
             runs=Runs(database, wait_s=settings.report_wait_s, kinds={fit.RUN: fits, **reports.run_kinds()}),
         )
 
     def close(self) -> None:
         self.answers.close()
         self.health.close()
+        self.upkeep.close()
         self.runs.close()
         self.database.dispose()

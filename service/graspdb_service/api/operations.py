@@ -9,6 +9,7 @@ from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from graspdb_service import __version__
+from graspdb_service.api.routing.gauges import Gauges
 from graspdb_service.api.routing.parameters import Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.settings import Settings
@@ -32,9 +33,10 @@ async def readyz(ctx: Ctx) -> dict[str, Any]:
 
 
 @router.get("/metrics", **scope("public"), response_class=Response)
-def metrics() -> Response:
+def metrics(ctx: Ctx) -> Response:
     """Prometheus metrics of this process."""
-    return Response(generate_latest(), media_type=CONTENT_TYPE_LATEST)
+    own = generate_latest(Gauges(ctx).registry)
+    return Response(generate_latest() + own, media_type=CONTENT_TYPE_LATEST)
 
 
 @router.get("/info", **scope("public"))
@@ -47,6 +49,10 @@ def info(ctx: Ctx) -> dict[str, Any]:
         "python": platform.python_version(),
         "database": ctx.database.url.get_backend_name(),
         "limits": {name: getattr(settings, name) for name in names},
+        "retention_days": {
+            name: getattr(settings, f"keep_{name}_days")
+            for name in ("idempotency", "audit", "trials", "workers")
+        },
         "lease_s": settings.lease_s,
         "chunk_poses": settings.chunk_poses,
     }

@@ -31,6 +31,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import GenericFunction
 
 from graspdb_service.storage.tables import UtcDateTime
+from graspdb_service.telemetry.record import timed
 
 T = TypeVar("T")
 Tx: TypeAlias = Connection
@@ -206,7 +207,7 @@ class Database:
     def read(self) -> Iterator[Tx]:
         """A read-only transaction: one snapshot of everything."""
         self._refuse_if_down()
-        with self._reader.begin() as tx, _drivers_errors(tx):
+        with timed("database"), self._reader.begin() as tx, _drivers_errors(tx):
             yield tx
 
     @contextmanager
@@ -216,7 +217,7 @@ class Database:
         CommitUnknown where the connection broke while it was committed.
         """
         self._refuse_if_down()
-        with self._writer.connect() as tx:
+        with timed("database"), self._writer.connect() as tx:
             transaction = tx.begin()
             with _drivers_errors(tx):
                 yield tx
@@ -264,6 +265,12 @@ class Database:
     def keep_file(self) -> None:
         """From now on a SQLite file that is missing is an error: a new one must not take its place."""
         self._may_create = False
+
+    def connections(self) -> tuple[int, int]:
+        """Connections in use, and those open for the next."""
+        # On PostgreSQL both engines are one.
+        pools: Any = {engine.pool for engine in (self._writer, self._reader)}
+        return sum(pool.checkedout() for pool in pools), sum(pool.checkedin() for pool in pools)
 
     def dispose(self) -> None:
         """Close every pooled connection."""

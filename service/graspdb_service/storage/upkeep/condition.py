@@ -16,7 +16,7 @@ from sqlalchemy.exc import DBAPIError
 from graspdb_service.storage.database import Database, Tx, unix_now
 from graspdb_service.storage.tables import UtcDateTime, assets, batches, idempotency_keys, metadata, objects
 
-#: Columns that say when the service did something, by its own clock.
+#: Columns that say when something was done, by the database's clock.
 _STAMPS = ("created_at", "updated_at", "changed_at", "started_at", "finished_at", "at")
 
 
@@ -122,7 +122,7 @@ def clock_offset_s(tx: Tx) -> float:
 
 
 def newest_stamp(tx: Tx) -> datetime | None:
-    """The latest time at which, by a service's clock, something in the database was done."""
+    """The latest time at which something in the database was done."""
     newest: datetime | None = None
     for table in metadata.sorted_tables:
         for column in table.columns:

@@ -31,6 +31,8 @@ class SingleFlightCache(Generic[K, V]):
         self._size = size
         self._lock = threading.Lock()
         self._slots: OrderedDict[K, _Slot[V]] = OrderedDict()
+        self.hits = 0
+        self.misses = 0
 
     def get(self, key: K, usable: Callable[[V], bool], make: Callable[[V | None], V]) -> V:
         """The value of ``key`` if ``usable``, else what ``make`` answers, given the value before (or None).
@@ -45,10 +47,12 @@ class SingleFlightCache(Generic[K, V]):
         try:
             value = slot.value
             if value is not None and usable(value):
+                self.hits += 1
                 return value
             with slot.lock:
                 value = slot.value
                 if value is None or not usable(value):
+                    self.misses += 1
                     value = make(value)
                     slot.value = value
             return value

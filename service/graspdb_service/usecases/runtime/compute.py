@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import busy
+from graspdb_service.telemetry.record import timed
 from graspdb_service.usecases.runtime.asked import Asked, asked
 from graspdb_service.usecases.runtime.fair_share import Claim, FairShare, NoRoom
 
@@ -103,6 +104,16 @@ class Compute:
         # One client has at most as many as there are; a short question of another finds one more.
         self._slots = FairShare(threads + 1, threads, _MOST_WAITING)
 
+    @property
+    def busy(self) -> int:
+        """Processors that compute."""
+        return self._slots.used
+
+    @property
+    def waiting(self) -> int:
+        """Computations that wait for a processor."""
+        return self._slots.waiting
+
     def run(self, work: Callable[[], T]) -> T:
         """Do ``work`` when it is this client's turn. Never call it within another or a transaction."""
         with self._turn():
@@ -122,8 +133,10 @@ class Compute:
         turn = _Turn(self._slots, asked())
         token = _TURN.set(turn)
         try:
-            turn.take()
-            yield
+            with timed("queue"):
+                turn.take()
+            with timed("compute"):
+                yield
         finally:
             turn.give()
             _TURN.reset(token)

@@ -91,6 +91,11 @@ class FairShare:
         """How much is held."""
         return self._used
 
+    @property
+    def waiting(self) -> int:
+        """How many claims wait."""
+        return self._waiting_count
+
     @asynccontextmanager
     async def held(self, client: str, seconds: float, amount: int = 1) -> AsyncIterator[None]:
         """Hold so much, waiting at most so long for it; NoRoom."""

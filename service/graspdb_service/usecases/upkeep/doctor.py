@@ -12,13 +12,12 @@ import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
-from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.database import Database, Tx, clock
 from graspdb_service.storage.upkeep import condition, counters
 from graspdb_service.storage.upkeep.backup import unhurried
 from graspdb_service.storage.upkeep.counters import Disagreement
@@ -245,7 +244,7 @@ def _clock(tx: Tx) -> Iterator[Diagnosis]:
     ahead = condition.clock_offset_s(tx)
     wrong = [f"the database's is {ahead:+.1f} s from this machine's"] if abs(ahead) > _CLOCK_S else []
     newest = condition.newest_stamp(tx) if schema.current(tx) == schema.history()[-1] else None
-    if newest is not None and (newest - datetime.now(UTC)).total_seconds() > _CLOCK_S:
+    if newest is not None and (newest - clock(tx)).total_seconds() > _CLOCK_S:
         wrong.append(f"something was done at {newest:%Y-%m-%d %H:%M:%S} UTC, which is still to come")
     yield _told(
         "clock",
