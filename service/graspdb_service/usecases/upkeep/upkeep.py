@@ -19,6 +19,7 @@ log = logging.getLogger("graspdb")
 
 _COUNT_SECONDS = 15.0
 _BATCHES = 100
+_END_SECONDS = 5.0
 
 _PURGED = Counter("graspdb_purged_total", "What retention has deleted.", ["kind"])
 _LAST = Gauge("graspdb_upkeep_last_success_timestamp_seconds", "When retention last went through.")
@@ -39,6 +40,9 @@ class Upkeep:
 
     def close(self) -> None:
         self._closed.set()
+        if self._thread.is_alive():
+            # What it does is soon done or fails; a transaction cut off here is rolled back.
+            self._thread.join(_END_SECONDS)
 
     def purge(self) -> dict[str, int]:
         """Delete what the settings keep no longer; how many of each."""
