@@ -20,7 +20,7 @@ from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database, Tx, clock
 from graspdb_service.storage.upkeep import condition, counters
 from graspdb_service.storage.upkeep.backup import unhurried
-from graspdb_service.storage.upkeep.counters import Disagreement
+from graspdb_service.storage.upkeep.counters import Disagreement, Survey
 
 Level = Literal["ok", "warning", "error"]
 
@@ -133,6 +133,10 @@ def _rows(tx: Tx) -> Iterator[Diagnosis]:
         "Delete the sweep's batch and sweep again, or restore a backup.",
         repairable=False,
     )
+    yield from _owners(tx, found)
+
+
+def _owners(tx: Tx, found: Survey) -> Iterator[Diagnosis]:
     lost = counters.rows_without_owners(tx, found)
     yield _told(
         "owners",
