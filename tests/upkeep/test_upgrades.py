@@ -130,5 +130,5 @@ def _goes_on(http: httpx.Client) -> None:
     reused = http.post("/objects/box/trials", json=sent, headers={"Idempotency-Key": "first-afternoon"})
     assert reused.json()["type"].endswith("idempotency-key-reused")
     for batch in batches:
-        assert http.delete(f"/objects/box/batches/{batch['id']}").status_code == 204
+        assert http.delete(f"/objects/box/batches/{batch['batch']}").status_code == 204
     assert http.get("/objects/box").json()["outcomes"] == {"success": 1}
