@@ -10,6 +10,7 @@ from graspdb_service.storage.upkeep.probe import Probe
 from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
+from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -53,6 +54,7 @@ class Context(Asking):
             compute=compute,
             densities=densities,
             scenes=scenes,
+            evidence=CollisionEvidence(scenes, compute),
             priors=Priors(compute, scenes),
             successes=Successes(database, compute, settings.max_density_cache_bytes),
             answers=AnswerKeeper(database, most=settings.max_answers),

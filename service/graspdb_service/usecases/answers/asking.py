@@ -99,7 +99,7 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     if before is not None:
         return before
     built, reach, calibration, columns = likelihoods.likelihood(ctx, slug, request, poses, request.include)
-    head = _head(built, built.kernel)
+    head = _head(ctx, built, built.kernel)
     if reach is not None:
         head["reach"] = reach.model_dump()
     if calibration is not None:
@@ -124,7 +124,7 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
         more = {"strategy": request.strategy, "criterion": criterion}
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
-    head = {**_head(drawn.built, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more}
+    head = {**_head(ctx, drawn.built, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more}
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
     asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo(), seed)
@@ -167,13 +167,13 @@ def _question(request: Selection) -> dict[str, Any]:
     }
 
 
-def _head(built: Built, kernel: KernelInfo) -> dict[str, Any]:
+def _head(ctx: Asking, built: Built, kernel: KernelInfo) -> dict[str, Any]:
     return {
         "revision": built.revision,
         "kernel": kernel.model_dump(),
         "estimator": EstimatorInfo().model_dump(),
         "selection": built.selection.model_dump(),
-        "warnings": list(built.selected.warnings),
+        "warnings": ctx.evidence.warnings(built),
     }
 
 

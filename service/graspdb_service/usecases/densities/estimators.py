@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from graspdb_service.usecases.densities.cache import Densities
+from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -17,5 +18,6 @@ class Estimators(Runtime):
 
     densities: Densities
     scenes: Scenes
+    evidence: CollisionEvidence
     priors: Priors
     successes: Successes

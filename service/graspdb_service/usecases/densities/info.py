@@ -17,7 +17,7 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
     density, selected = built.density, built.selected
     size = 0 if density is None else density.size
     effective = 0.0 if density is None else density.effective_sample_size
-    warnings = list(selected.warnings)
+    warnings = ctx.evidence.warnings(built)
     if size and effective < LOW_EFFECTIVE_SHARE * size:
         warnings.append(
             f"the weights are very uneven: {size} successes count like {effective:.0f};"

@@ -162,6 +162,11 @@ class Weighing:
         )
 
     @property
+    def simulated(self) -> Bools:
+        """Which of them a simulation found."""
+        return np.asarray(self.codes // _KINDS == SOURCE_NAMES.index("simulation"))
+
+    @property
     def swept(self) -> Bools:
         """Which of them a grid tried."""
         return np.asarray(self.codes % _KINDS == GRID)

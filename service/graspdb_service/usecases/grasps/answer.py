@@ -21,8 +21,8 @@ from graspdb.wire import (
 )
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
-from graspdb_service.usecases.densities.calibrations import of_simulation
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence.calibrations import of_simulation
 from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
 from graspdb_service.usecases.densities.support import reach_info, support_of
 from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
@@ -60,7 +60,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         "revision": built.revision,
         "estimator": EstimatorInfo(),
         "selection": built.selection,
-        "warnings": list(built.selected.warnings),
+        "warnings": ctx.evidence.warnings(built),
     }
     return BestGrasps.model_validate({**told, **answer}), built.selected
 
@@ -136,8 +136,9 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     free, widths, nearest, relative = ctx.compute.run(known)
     estimates = None
     if question.chances:
-        estimates = ctx.successes.estimate(question.model, poses, free)
-        ctx.successes.add_prior(estimates, question.model, poses, test, free)
+        believed = question.believed
+        estimates = ctx.successes.estimate(question.model, poses, None if believed is None else free)
+        ctx.successes.add_prior(estimates, question.model, poses, believed, free)
     reach = reach_info(question.model)
     grasps = []
     for i, item in enumerate(found):

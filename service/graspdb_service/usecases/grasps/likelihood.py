@@ -16,8 +16,8 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
-from graspdb_service.usecases.densities.calibrations import calibrated, of_simulation
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence.calibrations import calibrated, of_simulation
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.densities.support import reach_info, support_columns
 
@@ -74,17 +74,18 @@ def likelihood(
             if test is not None:
                 free = np.concatenate(ctx.compute.blocks(poses, partial(test.free, threads=threads)))
         if chances:
-            model = ctx.successes.model(built, collisions_known=free is not None)
+            believed = ctx.evidence.believed(built)
+            model = ctx.successes.model(built, collisions_known=believed is not None)
             if model is not None and source is not None:
-                model, calibration = calibrated(ctx, built, model, test, source)
+                model, calibration = calibrated(ctx, built, model, believed, source)
             reach = reach_info(model)
-            estimates = ctx.successes.estimate(model, poses, free)
+            estimates = ctx.successes.estimate(model, poses, None if believed is None else free)
             columns["success_probability"] = estimates.probability
             columns["interval"] = {"level": LEVEL, "low": estimates.low, "high": estimates.high}
             columns["effective_trials"] = estimates.effective_trials
             columns["support"] = support_columns(estimates)
-            if test is not None and asked("prior_success_probability"):
-                ctx.successes.add_prior(estimates, model, poses, test, free)
+            if believed is not None and asked("prior_success_probability"):
+                ctx.successes.add_prior(estimates, model, poses, believed, free)
                 columns["prior_success_probability"] = estimates.prior
         columns["collision_free"] = free
     known = {name: column for name, column in columns.items() if column is not None and asked(name)}

@@ -67,7 +67,7 @@ def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         if density is None:
             raise samples.no_successes(slug)
         test = ctx.scenes.test(built.selected)
-        model = ctx.successes.model(built, collisions_known=test is not None)
+        model = ctx.successes.model(built, collisions_known=ctx.evidence.believed(built) is not None)
         if model is None:
             raise conflict(
                 "no-attempts",

@@ -12,8 +12,8 @@ from graspdb_density.search.scored_poses import Admissible, distinct_from
 from graspdb_service.problems import conflict
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
-from graspdb_service.usecases.densities.calibrations import calibrated
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence.calibrations import calibrated
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import Model
 from graspdb_service.usecases.geometry.collision import CollisionTest, shape_of
@@ -32,8 +32,9 @@ FEW_ATTEMPTS = 500_000
 class Question:
     """A request about one density, everything looked up.
 
-    ``search`` and ``kernel`` are of the density of successes, or before any of the prior of the object's
-    edges; ``chances``: whether grasps are told with their success probability, by ``model`` if there is one.
+    ``test`` says what collides, ``believed`` the same where success probabilities may rest on it. ``search``
+    and ``kernel`` are of the density of successes, or before any of the prior of the object's edges;
+    ``chances``: whether grasps are told with their success probability, by ``model`` if there is one.
     """
 
     built: Built
@@ -41,6 +42,7 @@ class Question:
     kernel: KernelInfo
     limits: Constraints
     test: CollisionTest | None
+    believed: CollisionTest | None
     chances: bool
     model: Model | None
     bounds: Bounds
@@ -68,10 +70,7 @@ def question_of(
     if source is None or source.search is None:
         return None
     chances = _wants_chances(request, built)
-    model = ctx.successes.model(built, collisions_known=test is not None) if chances else None
-    calibration = None
-    if model is not None and request.calibrated_for is not None:
-        model, calibration = calibrated(ctx, built, model, test, request.calibrated_for)
+    believed, model, calibration = _chances(ctx, request, built) if chances else (None, None, None)
     by_success = _by_success(request, model)
     if (by_success or asks_chance(request)) and model is None:
         if built.search is None:
@@ -87,11 +86,11 @@ def question_of(
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if request.objective == "robust":
-            value = None if chance is None else success_score(chance.quick, test, threads)
+            value = None if chance is None else success_score(chance.quick, believed, threads)
             pull = None if chance is None else near.pull
             return objectives.by_mean(request, row, search, value, pull, threads)
         if chance is not None:
-            return objectives.by_success(search, chance, test, near.pull, threads)
+            return objectives.by_success(search, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)
 
     def complete() -> Question:
@@ -103,10 +102,32 @@ def question_of(
             engine = CandidateRanking(limits.candidates, by, separated)
         bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
         return Question(
-            built, search, kernel, limits, test, chances, model, bounds, engine, ranking, calibration
+            built,
+            search,
+            kernel,
+            limits,
+            test,
+            believed,
+            chances,
+            model,
+            bounds,
+            engine,
+            ranking,
+            calibration,
         )
 
     return ctx.compute.run(complete)
+
+
+def _chances(
+    ctx: Estimators, request: GraspConstraints, built: Built
+) -> tuple[CollisionTest | None, Model | None, CalibrationInfo | None]:
+    """What success probabilities rest on: geometry where it is believed, attempts, and how they are corrected."""
+    believed = ctx.evidence.believed(built)
+    model = ctx.successes.model(built, collisions_known=believed is not None)
+    if model is None or request.calibrated_for is None:
+        return believed, model, None
+    return believed, *calibrated(ctx, built, model, believed, request.calibrated_for)
 
 
 def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | None:

@@ -105,7 +105,7 @@ def _support(ctx: Estimators, built: Built, poses: se3.Poses) -> dict[str, Any] 
     """How far draws are from what was tried; None without attempts, and with too many to read at once."""
     if sum(built.selected.outcomes.values()) > FEW_ATTEMPTS:
         return None
-    known = ctx.scenes.test(built.selected) is not None
+    known = ctx.evidence.believed(built) is not None
     model = ctx.successes.model(built, collisions_known=known)
     return None if model is None else support_columns(ctx.successes.support(model, poses))
 

@@ -22,6 +22,7 @@ from graspdb_density.vicinity.displacement_bins import LEAST_SUCCESSES
 from graspdb_service.problems import too_few_trials
 from graspdb_service.trial_columns import Floats, Ints
 from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.evidence.collisions import Contradiction, contradiction
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
     LEVEL,
@@ -53,6 +54,8 @@ def calibration_report(
     inputs: ReportInputs, built: Built, options: SelectionQuery, progress: Progress
 ) -> CalibrationReport:
     test = inputs.scenes.test(built.selected)
+    against = None if test is None else contradiction(built, test, inputs.threads)
+    test = None if against is not None else test
     # Where geometry tells them apart, those that collided are only judged, and few of them.
     most = None if test is None else _KEPT_COLLIDED
     everything = attempts.read(inputs.database, built.selected, most_collided=most)
@@ -97,7 +100,7 @@ def calibration_report(
         auc_density=finite(area_under_curve(ranked, won, weights=weights)),
         bins=[as_model(CalibrationBin, item) for item in whole.bins],
         checked=checked,
-        warnings=_warnings(built.object_row.slug, geometry=test is not None, checked=checked is not None),
+        warnings=_warnings(built.object_row.slug, test, against, checked=checked is not None),
     )
     return report.model_copy(update={"text": _calibration_text(report)})
 
@@ -142,9 +145,13 @@ def _skill(item: Calibration) -> ReportRange:
     return interval(item.skill, item.skill_low, item.skill_high)
 
 
-def _warnings(slug: str, *, geometry: bool, checked: bool) -> list[str]:
+def _warnings(
+    slug: str, test: CollisionTest | None, against: Contradiction | None, *, checked: bool
+) -> list[str]:
     warnings = []
-    if not geometry:
+    if against is not None:
+        warnings.append(against.warning)
+    elif test is None:
         warnings.append(
             "mesh or gripper is not known: collisions count as ordinary failures, which costs much skill"
         )

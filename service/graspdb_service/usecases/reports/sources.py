@@ -28,7 +28,7 @@ from graspdb_density.success.source_map import (
 from graspdb_service.problems import too_few_trials
 from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
-from graspdb_service.usecases.densities.calibrations import learned, real_trials
+from graspdb_service.usecases.densities.evidence.calibrations import learned, real_trials
 from graspdb_service.usecases.densities.stored_kernel import isotropic_info
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.reports.common import (
