@@ -191,5 +191,8 @@ def test_a_correction_that_does_not_help_is_not_applied(simulated: httpx.Client,
     found = ok(simulated.get("/objects/thing/likelihood", params={**at, "calibrated_for": "robot"}))
     assert not found["calibration"]["applied"]
     assert "not corrected" in found["calibration"]["reason"]
+    assert any("not corrected" in warning for warning in found["warnings"])
+    best = ok(simulated.get("/objects/thing/best-grasp", params={"calibrated_for": "robot"}))
+    assert best["calibration"]["applied"] or any("not corrected" in text for text in best["warnings"])
     assert found["success_probability"] == pytest.approx(plain["success_probability"], abs=1e-6)
     assert found["interval"]["low"][0] < plain["interval"]["low"][0]

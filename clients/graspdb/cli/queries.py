@@ -102,7 +102,8 @@ def best_grasp(
             raise typer.Exit(1) from None
         raise
     if state.json:
-        names = ("status", "ranking", "revision", "kernel", "warnings", "answer", "newer_revision")
+        head = ("status", "ranking", "revision", "kernel", "selection", "calibration", "warnings")
+        names = (*head, "answer", "newer_revision")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())

@@ -27,6 +27,7 @@ from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.answers.references import answer_id
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence.calibrations import doubts
 from graspdb_service.usecases.grasps import answer, proposals, samples
 from graspdb_service.usecases.grasps import likelihood as likelihoods
 from graspdb_service.usecases.grasps.samples import Draw
@@ -104,6 +105,7 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
         head["reach"] = reach.model_dump()
     if calibration is not None:
         head["calibration"] = calibration.model_dump()
+        head["warnings"] += doubts(calibration)
     asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, EstimatorInfo())
     return _in_columns(ctx, asked, few, head, columns)
 

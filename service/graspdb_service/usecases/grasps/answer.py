@@ -22,7 +22,7 @@ from graspdb.wire import (
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.densities.evidence.calibrations import of_simulation
+from graspdb_service.usecases.densities.evidence.calibrations import doubts, of_simulation
 from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
 from graspdb_service.usecases.densities.support import reach_info, support_of
 from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
@@ -60,7 +60,10 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         "revision": built.revision,
         "estimator": EstimatorInfo(),
         "selection": built.selection,
-        "warnings": ctx.evidence.warnings(built),
+        "warnings": [
+            *ctx.evidence.warnings(built),
+            *doubts(None if question is None else question.calibration),
+        ],
     }
     return BestGrasps.model_validate({**told, **answer}), built.selected
 

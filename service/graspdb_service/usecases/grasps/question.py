@@ -122,7 +122,7 @@ def question_of(
 def _chances(
     ctx: Estimators, request: GraspConstraints, built: Built
 ) -> tuple[CollisionTest | None, Model | None, CalibrationInfo | None]:
-    """What success probabilities rest on: geometry where it is believed, attempts, and how they are corrected."""
+    """What success probabilities rest on: geometry where it is believed, attempts, and a correction."""
     believed = ctx.evidence.believed(built)
     model = ctx.successes.model(built, collisions_known=believed is not None)
     if model is None or request.calibrated_for is None:

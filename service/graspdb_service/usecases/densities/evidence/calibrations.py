@@ -99,6 +99,13 @@ def calibrated(
     return Model(whole, quick, model.reach), info
 
 
+def doubts(calibration: CalibrationInfo | None) -> list[str]:
+    """Warnings of probabilities that are not what was asked for, or that nothing shows to be worth much."""
+    if calibration is None or (calibration.applied and calibration.informative):
+        return []
+    return [f"success probabilities are {calibration.reason}"]
+
+
 def _reason(source: str, judged: Judged) -> str:
     told = {
         "better": f"corrected: {source} trials in left-out blocks of space are predicted better",
