@@ -101,20 +101,8 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
-        return Question(
-            built,
-            search,
-            kernel,
-            limits,
-            test,
-            believed,
-            chances,
-            model,
-            bounds,
-            engine,
-            ranking,
-            calibration,
-        )
+        found = built, search, kernel, limits, test, believed, chances, model, bounds
+        return Question(*found, engine, ranking, calibration)
 
     return ctx.compute.run(complete)
 
