@@ -49,8 +49,9 @@ format: install  ## Mend what the formatter and the linter can
 bench: install  ## Measure speed: a table with medians and ratios taken in one run
 	$(BIN)/python tests/benchmarks
 
-openapi: install  ## Write docs/openapi.json anew
+openapi: install  ## Write docs/openapi.json and docs/scopes.md anew
 	$(BIN)/graspdb-server openapi > docs/openapi.json
+	$(BIN)/graspdb-server scopes > docs/scopes.md
 
 PIP_COMPILE = $(BIN)/python -m piptools compile --quiet --generate-hashes --allow-unsafe --strip-extras \
   --no-emit-index-url --no-emit-find-links --no-emit-trusted-host

@@ -19,6 +19,8 @@ import anyio.to_thread
 from graspdb import wire
 from graspdb.client import Client
 from graspdb.reports import AllReports, Reports
+from graspdb.resources.access.audit import Audit
+from graspdb.resources.access.keys import Keys
 from graspdb.resources.answers import Answers
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
@@ -289,6 +291,23 @@ class AsyncKernels(Mirror[Kernels]):
     __aiter__ = list
 
 
+class AsyncKeys(Mirror[Keys]):
+    """:class:`graspdb.resources.access.Keys`."""
+
+    create = _awaited(Keys.create)
+    rotate = _awaited(Keys.rotate)
+    revoke = _awaited(Keys.revoke)
+    list = _iterated(Keys.list, _same)
+    __aiter__ = list
+
+
+class AsyncAudit(Mirror[Audit]):
+    """:class:`graspdb.resources.access.Audit`."""
+
+    list = _at_once(Audit.list, AsyncListing[wire.AuditEntry])
+    __aiter__ = _iterated(Audit.list, _same)
+
+
 class AsyncClient(Mirror[Client]):
     """:class:`graspdb.client.Client` for asynchronous programs; takes the same parameters."""
 
@@ -306,6 +325,8 @@ class AsyncClient(Mirror[Client]):
         self.kernels = AsyncKernels(self.sync.kernels)
         self.sweeps = AsyncSweeps(self.sync.sweeps)
         self.answers = AsyncAnswers(self.sync.answers)
+        self.keys = AsyncKeys(self.sync.keys)
+        self.audit = AsyncAudit(self.sync.audit)
         self.reports = AsyncAllReports(self.sync.reports)
 
     url = _Attribute[Client, str](lambda client: client.url)

@@ -8,6 +8,8 @@ from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.examples import example
 from graspdb.reports import AllReports
+from graspdb.resources.access.audit import Audit
+from graspdb.resources.access.keys import Keys
 from graspdb.resources.answers import Answers
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
@@ -43,6 +45,8 @@ class Client:
         self.answers = Answers(self._transport, "/answers")
         self.reports = AllReports(self._transport, "/reports")
         self.sweeps = Sweeps(self._transport, "/sweeps")
+        self.keys = Keys(self._transport, "/keys")
+        self.audit = Audit(self._transport, "/audit")
 
     @property
     def url(self) -> str:

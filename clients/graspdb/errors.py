@@ -35,12 +35,20 @@ class InvalidInput(GraspDBError):
     """400, 415 or 422: the request is wrong; ``fields`` says where."""
 
 
-class Unauthorized(GraspDBError):
-    """401: no valid API key."""
+class AuthenticationError(GraspDBError):
+    """401: no API key was sent, or one that is unknown, expired or revoked."""
 
 
-class Forbidden(GraspDBError):
-    """403: the key lacks the scope."""
+class PermissionDenied(GraspDBError):
+    """403: the key lacks a scope (``scopes`` names those of which one suffices), or is limited to others'
+    objects.
+    """
+
+    @property
+    def scopes(self) -> tuple[str, ...]:
+        """The scopes of which the request needs one; empty where it was refused for something else."""
+        extra = {} if self.problem is None else self.problem.model_extra or {}
+        return tuple(extra.get("required_scopes", ()))
 
 
 class NotFound(GraspDBError):
@@ -80,6 +88,10 @@ class TooManyRequests(GraspDBError):
     """429: the service is busy; try again later."""
 
 
+class RateLimited(TooManyRequests):
+    """429: the key asked too often, and went on after the pauses that the service named."""
+
+
 class ServiceError(GraspDBError):
     """5xx: the service failed."""
 
@@ -117,15 +129,19 @@ class SweepFailed(GraspDBError):
         self.failed_chunks = failed_chunks or []
 
 
+Unauthorized = AuthenticationError
+Forbidden = PermissionDenied
+
 _BY_TYPE: dict[str, type[GraspDBError]] = {
     "ambiguous-selection": AmbiguousSelection,
     "checks-needed": ChecksNeeded,
     "deadline": DeadlineExceeded,
     "lease-lost": LeaseLost,
+    "rate-limited": RateLimited,
 }
 _BY_STATUS: dict[int, type[GraspDBError]] = {
-    401: Unauthorized,
-    403: Forbidden,
+    401: AuthenticationError,
+    403: PermissionDenied,
     404: NotFound,
     409: Conflict,
     413: TooLarge,

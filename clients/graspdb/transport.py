@@ -7,9 +7,11 @@ idempotent, and every creating POST carries one Idempotency-Key through all its 
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 import random
+import re
 import time
 import uuid
 from collections.abc import Callable, Mapping
@@ -21,13 +23,14 @@ import httpx
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from graspdb.errors import Unreachable, error_for
+from graspdb.errors import GraspDBError, Unreachable, error_for
 from graspdb.wire import Problem
 
 __all__ = ["DEFAULT_URL", "Transport"]
 
 Model = TypeVar("Model", bound=BaseModel)
 DEFAULT_URL = "http://127.0.0.1:8000"
+_PROXY_VARIABLES = frozenset({"http_proxy", "https_proxy", "all_proxy", "no_proxy"})
 _RETRIED = frozenset({429, 502, 503, 504})
 
 
@@ -47,18 +50,10 @@ class Transport:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.url = (url or os.environ.get("GRASPDB_URL") or DEFAULT_URL).rstrip("/")
-        key = api_key or os.environ.get("GRASPDB_API_KEY")
-        headers = {"User-Agent": user_agent}
-        if key:
-            headers["Authorization"] = f"Bearer {key}"
+        headers = {"User-Agent": user_agent, **_authorization(api_key)}
         self._retries = retries
         self._sleep = sleep
-        self._make = partial(
-            httpx.Client,
-            base_url=self.url,
-            headers=headers,
-            timeout=httpx.Timeout(timeout_s, connect=10.0),
-        )
+        self._make = partial(_pool, self.url, headers, httpx.Timeout(timeout_s, connect=10.0))
         self._process, self._made = os.getpid(), self._make()
         self._inherited: httpx.Client | None = None
 
@@ -135,6 +130,42 @@ class Transport:
     def model(self, model: type[Model], method: str, path: str, **options: Any) -> Model:
         """:meth:`request`, and the answer as this model."""
         return model.model_validate_json(self.request(method, path, **options).content)
+
+
+def _authorization(api_key: str | None) -> dict[str, str]:
+    """The header that shows the key given, or ``$GRASPDB_API_KEY``; ValueError for what can't be a key."""
+    key = (api_key or os.environ.get("GRASPDB_API_KEY") or "").strip()
+    if not key:
+        return {}
+    if not re.fullmatch(r"[\x21-\x7e]+", key):
+        raise ValueError("an API key is printable ASCII without spaces: is api_key (GRASPDB_API_KEY) one?")
+    return {"Authorization": f"Bearer {key}"}
+
+
+def _pool(url: str, headers: dict[str, str], timeout: httpx.Timeout) -> httpx.Client:
+    """Connections to a service: straight to this machine's own, else as the environment's proxies say."""
+    host = httpx.URL(url).host
+    # A proxy has its own loopback: what it would reach there is not the service that is meant.
+    transport = httpx.HTTPTransport() if _is_loopback(host) else None
+    try:
+        return httpx.Client(base_url=url, headers=headers, timeout=timeout, transport=transport)
+    except (httpx.InvalidURL, ValueError, ImportError) as error:
+        names = [name for name in os.environ if name.lower() in _PROXY_VARIABLES]
+        if not names:
+            raise
+        raise GraspDBError(
+            f"a proxy variable ({', '.join(sorted(names))}) can't be used for {host}: {error}."
+            " Mend it, or unset it"
+        ) from error
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _plain(value: object) -> Any:

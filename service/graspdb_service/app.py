@@ -38,12 +38,16 @@ from graspdb_service.api import (
     sweeps,
     trials,
 )
+from graspdb_service.api.access import keys
+from graspdb_service.api.access.browsers import BrowserGuard
+from graspdb_service.api.access.guard import Door, refuse_unguarded
 from graspdb_service.api.context import Context
 from graspdb_service.api.questions import answers, queries
 from graspdb_service.api.routing.admission import Admission
 from graspdb_service.api.routing.document import document
 from graspdb_service.api.routing.encodings import Decoding
 from graspdb_service.api.routing.methods import METHODS, Methods, allowed
+from graspdb_service.api.routing.prefix import Prefix
 from graspdb_service.api.routing.scopes import declared_parameters, refuse_unknown_parameters
 from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid_fields
@@ -52,6 +56,7 @@ from graspdb_service.storage import schema
 from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database, is_full, why
 from graspdb_service.storage.objects import ObjectGone
 from graspdb_service.telemetry.requests import RequestLog
+from graspdb_service.usecases.access.rates import Rates
 from graspdb_service.usecases.grippers import seed
 
 log = logging.getLogger("graspdb")
@@ -81,6 +86,7 @@ ROUTERS = [
     reports.router,
     sweeps.router,
     jobs.router,
+    keys.router,
 ]
 
 
@@ -120,6 +126,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     app = FastAPI(
         **ABOUT,
+        root_path=settings.root_path.rstrip("/"),
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
@@ -128,13 +135,19 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.context = ctx
     app.state.admission = admission
     for router in ROUTERS:
+        refuse_unguarded(router.routes)
         app.include_router(router)
     app.openapi = openapi_document  # type: ignore[method-assign]
     app.state.parameters = declared_parameters(openapi_document())
     _add_docs(app)
     _add_problems(app)
+    rates = Rates(settings.max_requests_per_s, settings.max_request_burst)
+    app.state.door = Door(ctx.keys if settings.uses_keys else None, rates)
     app.add_middleware(Methods)
     app.add_middleware(Decoding, max_body_bytes=settings.max_body_bytes)
+    hosts = None if settings.uses_keys else (settings.host, *settings.allowed_hosts)
+    app.add_middleware(BrowserGuard, hosts=hosts, answer=problem_response)
+    app.add_middleware(Prefix)
     app.add_middleware(RequestTrace)
     app.add_middleware(RequestLog)
     return app
@@ -214,11 +227,12 @@ def _add_docs(app: FastAPI) -> None:
     @app.get("/docs", include_in_schema=False)
     def docs() -> HTMLResponse:
         return get_swagger_ui_html(
-            openapi_url="/openapi.json",
+            # Relative: right under whatever prefix a proxy serves the page.
+            openapi_url="openapi.json",
             title="GraspDB",
-            swagger_js_url="/docs/assets/swagger-ui-bundle.js",
-            swagger_css_url="/docs/assets/swagger-ui.css",
-            swagger_favicon_url="/docs/assets/favicon-32x32.png",
+            swagger_js_url="docs/assets/swagger-ui-bundle.js",
+            swagger_css_url="docs/assets/swagger-ui.css",
+            swagger_favicon_url="docs/assets/favicon-32x32.png",
         )
 
 

@@ -9,6 +9,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 NEEDS = "graspdb-server needs {}: pip install 'graspdb[service]'"
@@ -18,13 +19,13 @@ try:
 
     from graspdb.processes import LIFELINE_HELP, end_with_parent
     from graspdb_service import connections
-    from graspdb_service.commands import upkeep
+    from graspdb_service.commands import access, upkeep
+    from graspdb_service.commands.keys import keys
     from graspdb_service.commands.options import DatabaseUrl, fail, settings_from
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
     from graspdb_service.storage.database import CANNOT_OPEN, Database, UnsupportedDatabase, why
     from graspdb_service.telemetry import logs, traces
-    from graspdb_service.usecases.upkeep.doctor import is_loopback
 except ModuleNotFoundError as error:
     sys.exit(NEEDS.format(error.name))
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 cli = typer.Typer(add_completion=False, no_args_is_help=True, help="The GraspDB service.")
+cli.add_typer(keys, name="keys")
 
 
 @cli.command(epilog=LIFELINE_HELP)
@@ -39,26 +41,35 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on; 0 takes a free one.")] = None,
     database_url: DatabaseUrl = None,
-    auth: Annotated[str | None, typer.Option(help="'off' serves without keys beyond loopback, too.")] = None,
+    auth: Annotated[
+        str | None, typer.Option(help="keys, or off for everybody; off by default on loopback alone.")
+    ] = None,
+    root_path: Annotated[
+        str | None, typer.Option(help="Path under which a proxy serves this, such as /graspdb.")
+    ] = None,
+    ssl_certfile: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Speak TLS with this certificate.")
+    ] = None,
+    ssl_keyfile: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="The certificate's private key.")
+    ] = None,
     log_level: Annotated[
         str | None, typer.Option(help="critical, error, warning, info (the default) or debug.")
     ] = None,
     log_format: Annotated[str | None, typer.Option(help="text (the default) or json.")] = None,
 ) -> None:
     """Serve the HTTP API. A SQLite database is created and migrated; PostgreSQL must be current."""
-    given = {"log_level": log_level, "log_format": log_format}
-    settings = settings_from(host=host, port=port, database_url=database_url, auth=auth, **given)
-    if settings.auth != "off" and not is_loopback(settings.host):
-        fail(
-            f"Serving on {settings.host} without keys would open the database to the network."
-            " Listen on 127.0.0.1, or say so explicitly: --auth off (GRASPDB_AUTH=off)."
-        )
+    given = {"log_level": log_level, "log_format": log_format, "root_path": root_path}
+    files = {"ssl_certfile": ssl_certfile, "ssl_keyfile": ssl_keyfile}
+    settings = settings_from(host=host, port=port, database_url=database_url, auth=auth, **given, **files)
+    access.check_certificate(settings)
     # Before NumPy is imported: its BLAS would start a thread a core inside each compute thread.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logs.configure(settings.log_format, settings.log_level)
     traces.start()
     with _opening(settings):
         app = _application(settings)
+        access.check(settings, app.state.context.database)
     _warm_up(app)
     connections.serve(app, settings)
 
@@ -102,6 +113,17 @@ def openapi() -> None:
     with tempfile.TemporaryDirectory() as folder:
         app = _application(Settings(database_url=f"sqlite:///{folder}/empty.sqlite"))
         typer.echo(json.dumps(app.openapi(), indent=1, ensure_ascii=False))
+        app.state.context.close()
+
+
+@cli.command()
+def scopes() -> None:
+    """Print which scope each route takes; docs/scopes.md is this output."""
+    from graspdb_service.api.routing.document import scope_matrix  # extra: service
+
+    with tempfile.TemporaryDirectory() as folder:
+        app = _application(Settings(database_url=f"sqlite:///{folder}/empty.sqlite"))
+        typer.echo(scope_matrix(app.openapi()), nl=False)
         app.state.context.close()
 
 

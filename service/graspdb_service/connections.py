@@ -123,6 +123,8 @@ def serve(app: FastAPI, settings: Settings) -> None:
         log_level=settings.log_level,
         access_log=False,
         timeout_graceful_shutdown=10,
+        ssl_certfile=settings.ssl_certfile,
+        ssl_keyfile=settings.ssl_keyfile,
     )
     server = _Server(config)
     with suppress(KeyboardInterrupt):

@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from graspdb.wire.base import MAX_METADATA_LENGTH
+
+DEFAULT_PORT = 8000
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine's own, which no other reaches."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _port(value: Any) -> Any:
+    # A Kubernetes service or a docker link named graspdb sets GRASPDB_PORT=tcp://ADDRESS:PORT, not for us.
+    return DEFAULT_PORT if isinstance(value, str) and "://" in value else value
+
+
+def _listed(value: Any) -> Any:
+    return [item.strip() for item in value.split(",") if item.strip()] if isinstance(value, str) else value
+
 
 LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
@@ -25,13 +49,25 @@ class Settings(BaseSettings):
     database_url: str = "sqlite:///graspdb.sqlite"
     """``sqlite:///relative.sqlite``, ``sqlite:////absolute.sqlite`` or ``postgresql://user@host/name``."""
     host: str = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65_535)] = 8000
-    auth: Literal["off"] | None = None
-    """``off`` serves without keys on any address; unset, that is allowed on loopback only."""
+    port: Annotated[int, Field(ge=0, le=65_535), BeforeValidator(_port)] = DEFAULT_PORT
+    root_path: str = ""
+    """Path under which a proxy serves this, such as ``/graspdb``."""
+    auth: Literal["off", "keys"] | None = None
+    """``keys`` serves who has one, ``off`` everybody; unset, ``off`` on loopback and ``keys`` elsewhere."""
+    ssl_certfile: Path | None = None
+    """A certificate and its chain, in PEM: the service speaks TLS with it."""
+    ssl_keyfile: Path | None = None
+    """The certificate's private key, where it is not in the same file."""
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)] = ()
+    """Hosts that are served without keys beside loopback, comma-separated; ``*`` is any."""
 
     threads: Annotated[int, Field(ge=1, le=256)] = max(1, os.cpu_count() or 1)
     """Threads of the compute pool; BLAS threads stay at 1."""
 
+    max_requests_per_s: Annotated[float, Field(gt=0)] = 200.0
+    """Requests a second of a key, where the key has no limit of its own; each process counts for itself."""
+    max_request_burst: Annotated[int, Field(ge=1)] = 400
+    """Requests that a key may make at once."""
     max_body_bytes: Annotated[int, Field(ge=1_000)] = 256 * 2**20
     """A body of trials, poses, obstacles or a mesh; any other has at most ``max_small_body_bytes``."""
     max_small_body_bytes: Annotated[int, Field(ge=1_000)] = 2**20
@@ -113,3 +149,8 @@ class Settings(BaseSettings):
     """How long a request waits for a report before it is told where the report will be."""
     retry_after_s: Annotated[float, Field(gt=0)] = 2.0
     """How long an idle worker is told to wait before it asks for jobs again."""
+
+    @property
+    def uses_keys(self) -> bool:
+        """Whether callers need keys."""
+        return self.auth == "keys" or (self.auth is None and not is_loopback(self.host))

@@ -34,6 +34,8 @@ GLB = "model/gltf-binary"
 MAX_BACKOFF_S = 15.0
 IDLE_S = 2.0
 _CACHED_PARTS = 16
+#: For want of a key, or of a scope.
+_REFUSED = (errors.AuthenticationError, errors.PermissionDenied)
 
 
 class WorkerFailed(Exception):
@@ -209,7 +211,7 @@ class Worker:
             self._note_busy(True)
             try:
                 job, wait = self._claim(name, capabilities)
-            except (errors.Unauthorized, errors.Forbidden) as error:
+            except _REFUSED as error:
                 raise WorkerFailed(f"the service refuses this worker: {error}") from error
             except errors.InvalidInput as error:
                 raise WorkerFailed(f"the service does not understand this worker: {error}") from error
@@ -329,7 +331,12 @@ class Worker:
             try:
                 data = self.transport.request("GET", path, retries=0).content
                 break
-            except (errors.NotFound, errors.Unauthorized, errors.Forbidden, errors.InvalidInput) as error:
+            except (
+                errors.NotFound,
+                errors.AuthenticationError,
+                errors.PermissionDenied,
+                errors.InvalidInput,
+            ) as error:
                 raise ChunkFailed(f"can't fetch {path}: {error}") from error
             except errors.GraspDBError as error:
                 failures += 1
@@ -374,7 +381,12 @@ class Worker:
                 log.warning("job %s: %s not wanted: %s", lease.job, what, error)
                 self.tally.lost += 1
                 return False
-            except (errors.InvalidInput, errors.TooLarge, errors.Unauthorized, errors.Forbidden) as error:
+            except (
+                errors.InvalidInput,
+                errors.TooLarge,
+                errors.AuthenticationError,
+                errors.PermissionDenied,
+            ) as error:
                 log.error("job %s: the service refuses the %s: %s", lease.job, what, error)
                 self.tally.failures += 1
                 if what == "result":

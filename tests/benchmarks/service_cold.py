@@ -25,6 +25,7 @@ import numpy as np
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import se3
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.trials import batches, provenances, rows
 from graspdb_service.trial_columns import Provenance, TrialColumns
@@ -83,7 +84,8 @@ def write(folder: Path, total: int) -> None:
             assert row is not None
             revision, first = objects.advance(tx, row.id, rows=len(columns), append=True)
             columns.provenance[:] = provenances.ensure(tx, row.id, Provenance("pg70", None, None))
-            batch_id, _ = batches.create(tx, row.id, revision=revision)
+            batch_id, key = batches.create(tx, row.id, revision=revision)
+            audit.record(tx, "batch.create", object=SLUG, subject=key)
             rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first)
             last = first + len(columns) - 1
             batches.grow(tx, batch_id, first_seq=first, last_seq=last, inserted=len(columns), packed=0)

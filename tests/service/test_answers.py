@@ -16,6 +16,7 @@ from graspdb_service.api.context import Context
 from graspdb_service.settings import Settings
 from graspdb_service.storage import answers as stored
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database
 
 Poses = tuple[Any, Any]
@@ -237,6 +238,7 @@ def test_only_the_newest_are_kept_but_for_those_with_a_name(
     ctx = Context.create(Settings(database_url=database_url, max_answers=3), database)
     with database.write() as tx:
         objects.create(tx, "thing", {})
+        audit.record(tx, "object.create", object="thing")
         row = objects.find(tx, "thing")
         assert row is not None
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.trials import batches, provenances, rows
 from graspdb_service.trial_columns import Provenance, TrialColumns
@@ -140,7 +141,8 @@ def test_columns_are_read_as_they_were_stored(
         # Posted, and once more as a sweep's.
         for pose_index in (np.empty(0, dtype=np.int64), np.arange(400, dtype=np.int64) * 2**40):
             revision, first = objects.advance(tx, row.id, rows=400, append=True)
-            batch, _ = batches.create(tx, row.id, revision=revision)
+            batch, key = batches.create(tx, row.id, revision=revision)
+            audit.record(tx, "batch.create", object="mug", subject=key)
             columns = TrialColumns(
                 position,
                 quaternion,

@@ -21,6 +21,7 @@ from graspdb.wire import (
 )
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage import assets, objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import jobs as job_rows
 
@@ -34,6 +35,7 @@ def add_box(database: Database, slug: str) -> None:
     """An object ready for sweeps: a box that is its own convex part. The protocol never opens the files."""
     with database.write() as tx:
         objects.create(tx, slug, {"mass_kg": 0.3})
+        audit.record(tx, "object.create", object=slug)
         row = objects.find(tx, slug)
         assert row is not None
         sha256 = assets.put(tx, f"a box for {slug}".encode(), "model/stl")

@@ -16,6 +16,7 @@ from graspdb.wire.queries import TrialSelection
 from graspdb_density import se3
 from graspdb_density.bandwidth import mixture_fit
 from graspdb_service.api.context import Context
+from graspdb_service.principal import Actor
 from graspdb_service.settings import Settings
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database
@@ -127,10 +128,12 @@ def test_a_dead_processs_fit_is_taken_over(http: httpx.Client, database_url: str
     row = context.densities.selections.resolve("thing", TrialSelection()).row
     request = KernelCreate.model_validate(AUTO)
     with context.database.write() as tx:
-        report_runs.ask(tx, fit.run_key(row, "mine", request), id="mine", lease_id="gone")
+        report_runs.ask(tx, fit.run_key(row, "mine", request, Actor(key="robot")), id="mine", lease_id="gone")
         report_runs.release(tx, "mine", "gone")
     run = ended(http, "/report-runs/mine")
     assert run["state"] == "done"
     assert run["result"]["id"] == "mine"
     assert [item["id"] for item in http.get("/kernels").json()["items"]] == ["mine"]
+    # The process that computes it did not ask for it.
+    assert http.get("/audit?action=kernel.create").json()["items"][0]["key"] == "robot"
     context.close()

@@ -8,6 +8,7 @@ import httpx
 from sqlalchemy import text
 
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.schema import upgrade
 
@@ -183,6 +184,7 @@ def test_read_modify_writes_of_many_threads_lose_none(database_url: str) -> None
         upgrade(database)
     with database.write() as tx:
         objects.create(tx, "mug", {"mass_kg": 0.0})
+        audit.record(tx, "object.create", object="mug")
 
     def work(number: int) -> None:
         for _ in range(150):
@@ -192,6 +194,7 @@ def test_read_modify_writes_of_many_threads_lose_none(database_url: str) -> None
                 assert row.mass_kg is not None
                 objects.advance(tx, row.id, rows=number % 3, append=True)
                 objects.change(tx, row.id, {"mass_kg": row.mass_kg + 1.0})
+                audit.record(tx, "object.change", object="mug")
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(work, range(8)))

@@ -22,6 +22,7 @@ from sqlalchemy import text
 from graspdb.wire import OUTCOME_CODES, OUTCOMES
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database
 
 GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "margin_m": 0.0, "max_poses": 1_500}
@@ -123,6 +124,7 @@ class JobProtocol(RuleBasedStateMachine):
             like = objects.find(tx, template)
             assert like is not None
             objects.create(tx, slug, {"mass_kg": 0.3})
+            audit.record(tx, "object.create", object=slug)
             row = objects.find(tx, slug)
             assert row is not None
             objects.advance(tx, row.id, append=False)

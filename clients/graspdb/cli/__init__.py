@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 
 from graspdb import __version__
-from graspdb.cli import answers, kernels, objects, queries, reports, sweeps, trials
+from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
 from graspdb.cli.options import Commands
 from graspdb.cli.wording import in_commands
@@ -65,6 +65,8 @@ app.command("add-example")(objects.add_example)
 app.add_typer(objects.grippers, name="grippers")
 app.add_typer(trials.trials, name="trials")
 app.add_typer(trials.batches, name="batches")
+app.add_typer(access.keys, name="keys")
+app.command("audit")(access.audit)
 app.command("density")(queries.density)
 app.command("best-grasp")(queries.best_grasp)
 app.command("likelihood")(queries.likelihood)

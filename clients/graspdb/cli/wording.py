@@ -46,6 +46,7 @@ COMMANDS: Mapping[str, str] = {
     "GET /kernels": "kernels list",
     "POST /kernels": "kernels fit OBJECT",
     "GET /sweeps": "sweeps list",
+    "GET /keys": "keys list",
     "POST /sweeps/SWEEP/cancel": "sweeps cancel SWEEP",
     "POST /sweeps/SWEEP/retry": "sweeps retry SWEEP",
 }

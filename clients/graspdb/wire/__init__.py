@@ -7,6 +7,11 @@ not know.
 """
 
 from graspdb.wire import reports as reports
+from graspdb.wire.access.audit import AuditEntry as AuditEntry
+from graspdb.wire.access.keys import KeyCreate as KeyCreate
+from graspdb.wire.access.keys import KeyInfo as KeyInfo
+from graspdb.wire.access.keys import KeyMade as KeyMade
+from graspdb.wire.access.keys import KeyRotate as KeyRotate
 from graspdb.wire.base import OUTCOME_CODES as OUTCOME_CODES
 from graspdb.wire.base import OUTCOMES as OUTCOMES
 from graspdb.wire.base import SOURCES as SOURCES

@@ -147,6 +147,8 @@ class SweepInfo(Response):
     object: ObjectId
     batch: str
     """Id of the batch that its outcomes are stored in."""
+    key: str | None = None
+    """Name of the API key that asked for it; null where keys were off."""
     gripper: str
     """Id of the gripper that grasps."""
     gripper_version: OneGripperVersion = None

@@ -262,6 +262,8 @@ class BatchInfo(Response):
     """How many of its trials are withdrawn: they are in no count by outcome."""
     sweep: str | None = None
     """Id of the sweep that wrote it; null for posted trials."""
+    key: str | None = None
+    """Name of the API key that posted it, or asked for its sweep; null where keys were off."""
     metadata: StoredMetadata | None = None
     """What was posted with it as metadata of all; null where nothing was."""
     outcomes: OutcomeCounts = Field(default_factory=dict)

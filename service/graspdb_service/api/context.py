@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.upkeep.probe import Probe
+from graspdb_service.usecases.access.key_ring import KeyRing
 from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
@@ -32,6 +33,7 @@ class Context(Asking):
     runs: Runs
     health: Health
     upkeep: Upkeep
+    keys: KeyRing
 
     @classmethod
     def create(cls, settings: Settings, database: Database) -> Context:
@@ -59,6 +61,7 @@ class Context(Asking):
             successes=Successes(database, compute, settings.max_density_cache_bytes),
             answers=AnswerKeeper(database, most=settings.max_answers),
             reports=reports,
+            keys=KeyRing(database),
             health=health,
             upkeep=Upkeep(settings, database),
             runs=Runs(database, wait_s=settings.report_wait_s, kinds={fit.RUN: fits, **reports.run_kinds()}),
@@ -69,4 +72,5 @@ class Context(Asking):
         self.health.close()
         self.upkeep.close()
         self.runs.close()
+        self.keys.close()
         self.database.dispose()

@@ -15,7 +15,7 @@ from graspdb_service.usecases import grippers
 router = APIRouter(tags=["grippers"], route_class=AdmittedRoute)
 
 
-@router.post("/grippers", status_code=201, response_model=GripperInfo, **scope("admin"))
+@router.post("/grippers", status_code=201, response_model=GripperInfo, **scope("objects:write"))
 def create_gripper(ctx: Ctx, request: GripperCreate, sent: Creating) -> object:
     """Store a parallel-jaw gripper's profile."""
     return sent.answered(grippers.create(ctx.database, request, sent))
@@ -34,7 +34,7 @@ def get_gripper(ctx: Ctx, gripper: GripperId, request: Request) -> Response:
     return tagged_json(request, grippers.get(ctx.database, gripper))
 
 
-@router.put("/grippers/{gripper}", **scope("admin"))
+@router.put("/grippers/{gripper}", **scope("objects:write"))
 def update_gripper(ctx: Ctx, gripper: GripperId, request: GripperUpdate) -> GripperInfo:
     """Make a new version of a gripper, built-in ones too: its id stands for that from now on.
 
@@ -54,7 +54,7 @@ def list_gripper_versions(
     return Page(items=items, next=encode_cursor(after))
 
 
-@router.delete("/grippers/{gripper}", status_code=204, **scope("admin"))
+@router.delete("/grippers/{gripper}", status_code=204, **scope("objects:write"))
 def delete_gripper(ctx: Ctx, gripper: GripperId) -> None:
     """Delete a gripper that nothing uses, with all its versions, so that its id is free; 409 while trials,
     sweeps or kernels use one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 
 from graspdb.wire import (
     ClaimRequest,
@@ -37,25 +37,34 @@ ProgressText = Annotated[
 ]
 
 
+def _hidden(ctx: Ctx, id: JobId) -> None:
+    leases.refuse_hidden(ctx, id)
+
+
+_OWN = [Depends(_hidden)]
+
+
 @router.post("/jobs/claim", **scope("jobs:work"))
 def claim_jobs(ctx: Ctx, request: ClaimRequest) -> ClaimResponse:
     """Lease up to ``limit`` jobs that a worker with these capabilities can do, and register it."""
     return leases.claim(ctx, request)
 
 
-@router.put("/jobs/{id}/lease", **scope("jobs:work"))
+@router.put("/jobs/{id}/lease", dependencies=_OWN, **scope("jobs:work"))
 def renew_lease(ctx: Ctx, id: JobId, lease_id: LeaseId, progress: ProgressText = None) -> LeaseRenewed:
     """Keep a job; ``cancel`` says that it is no longer wanted. 409 ``lease-lost`` if another has it."""
     return leases.renew(ctx, id, lease_id, progress)
 
 
-@router.delete("/jobs/{id}/lease", status_code=204, **scope("jobs:work"))
+@router.delete("/jobs/{id}/lease", status_code=204, dependencies=_OWN, **scope("jobs:work"))
 def release_lease(ctx: Ctx, id: JobId, lease_id: LeaseId) -> None:
     """Give a job back unfinished, as a worker does that is told to stop; it counts as no attempt."""
     leases.release(ctx, id, lease_id)
 
 
-@router.put("/jobs/{id}/result", **scope("jobs:work", body=_RESULTS, work="uploads", large=True))
+@router.put(
+    "/jobs/{id}/result", dependencies=_OWN, **scope("jobs:work", body=_RESULTS, work="uploads", large=True)
+)
 def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: RawBody) -> ResultAccepted:
     """Store a chunk's outcomes, or an object's convex parts, and complete the job, in one transaction.
 
@@ -70,7 +79,7 @@ def put_result(ctx: Ctx, id: JobId, lease_id: LeaseId, request: Request, body: R
         raise unsupported(f"The result of a {error.kind} job is {wanted}") from None
 
 
-@router.put("/jobs/{id}/failure", **scope("jobs:work"))
+@router.put("/jobs/{id}/failure", dependencies=_OWN, **scope("jobs:work"))
 def put_failure(ctx: Ctx, id: JobId, lease_id: LeaseId, report: FailureReport) -> FailureNoted:
     """Report that an attempt failed: the job is queued again, or failed after its last attempt."""
     return leases.fail(ctx, id, lease_id, report)

@@ -25,7 +25,7 @@ router = APIRouter(tags=["kernels"], route_class=AdmittedRoute)
     status_code=201,
     response_model=StoredKernel,
     responses={202: {"model": ReportRun, "description": "Being fitted: Location says where it will be"}},
-    **scope("admin", work="queries"),
+    **scope("objects:write", work="queries"),
 )
 def create_kernel(ctx: Ctx, request: KernelCreate, sent: Creating) -> object:
     """Fit a kernel on an object's successes, or store one given by its components.
@@ -60,7 +60,7 @@ def get_kernel(ctx: Ctx, id: KernelId, request: Request) -> Response:
     return tagged_json(request, stored.get(ctx, id))
 
 
-@router.delete("/kernels/{id}", status_code=204, **scope("admin"))
+@router.delete("/kernels/{id}", status_code=204, **scope("objects:write"))
 def delete_kernel(ctx: Ctx, id: KernelId) -> None:
     """Delete a kernel; queries that name it are answered 404 from then on."""
     stored.remove(ctx, id)

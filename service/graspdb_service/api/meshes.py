@@ -22,7 +22,7 @@ MeshUnit = Annotated[
 _MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, BINARY)
 
 
-@router.put("/objects/{id}/mesh", **scope("admin", body=_MESH_BODY, work="meshes", large=True))
+@router.put("/objects/{id}/mesh", **scope("objects:write", body=_MESH_BODY, work="meshes", large=True))
 def put_mesh(ctx: Ctx, id: ObjectId, request: Request, body: RawBody, unit: MeshUnit = "m") -> MeshInfo:
     """Store the mesh: STL, OBJ, PLY or GLB as the raw body, said by Content-Type."""
     return meshes.put_mesh(ctx, id, body, media=one_of(request, *meshes.MEDIA_TYPES), unit=unit)
@@ -32,14 +32,16 @@ def put_mesh(ctx: Ctx, id: ObjectId, request: Request, body: RawBody, unit: Mesh
     "/objects/{id}/mesh",
     response_class=Response,
     responses={200: {"content": {media: {"schema": BINARY} for media in meshes.MEDIA_TYPES}}},
-    **scope("jobs:work"),
+    **scope("read", "jobs:work"),
 )
 def get_mesh(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     """The mesh's bytes as they came."""
     return _bytes(request, *meshes.get_mesh(ctx, id))
 
 
-@router.put("/objects/{id}/convex-parts", **scope("admin", body={GLB: BINARY}, work="meshes", large=True))
+@router.put(
+    "/objects/{id}/convex-parts", **scope("objects:write", body={GLB: BINARY}, work="meshes", large=True)
+)
 def put_convex_parts(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> PartsInfo:
     """Store the convex parts: a GLB in metres with one geometry a part, object frame."""
     one_of(request, GLB)
@@ -50,7 +52,7 @@ def put_convex_parts(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) ->
     "/objects/{id}/convex-parts",
     response_class=Response,
     responses={200: {"content": {GLB: {"schema": BINARY}}}},
-    **scope("jobs:work"),
+    **scope("read", "jobs:work"),
 )
 def get_convex_parts(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     """The convex parts' bytes."""

@@ -16,7 +16,7 @@ from graspdb_service.usecases.runtime.quotas import check_metadata
 router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 
 
-@router.post("/objects", status_code=201, response_model=ObjectInfo, **scope("admin"))
+@router.post("/objects", status_code=201, response_model=ObjectInfo, **scope("objects:write"))
 def create_object(ctx: Ctx, request: ObjectCreate, sent: Creating) -> object:
     """Register an object; its mesh and its trials follow."""
     check_metadata(ctx.settings, request.metadata)
@@ -37,14 +37,14 @@ def get_object(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     return tagged_json(request, info, tag=etag(row.id, row.revision))
 
 
-@router.patch("/objects/{id}", **scope("admin"))
+@router.patch("/objects/{id}", **scope("objects:write"))
 def change_object(ctx: Ctx, id: ObjectId, request: ObjectPatch) -> ObjectInfo:
     """Change properties: a field left out stays, an explicit null clears it."""
     check_metadata(ctx.settings, request.metadata)
     return objects.change(ctx.database, id, request)
 
 
-@router.post("/objects/{id}/copies", status_code=201, response_model=ObjectInfo, **scope("admin"))
+@router.post("/objects/{id}/copies", status_code=201, response_model=ObjectInfo, **scope("objects:write"))
 def copy_object(ctx: Ctx, id: ObjectId, request: CopyRequest, sent: Creating) -> object:
     """Copy an object with its mesh and convex parts, and its trials if asked: the copy takes one other mesh.
 
@@ -53,7 +53,7 @@ def copy_object(ctx: Ctx, id: ObjectId, request: CopyRequest, sent: Creating) ->
     return sent.answered(copies.create(ctx.database, id, request, sent))
 
 
-@router.delete("/objects/{id}", status_code=204, **scope("admin"))
+@router.delete("/objects/{id}", status_code=204, **scope("objects:write"))
 def delete_object(ctx: Ctx, id: ObjectId) -> None:
     """Delete an object, its trials, densities and sweeps; 409 while a sweep of it runs."""
     objects.remove(ctx.database, id)

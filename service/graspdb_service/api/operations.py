@@ -9,12 +9,13 @@ from fastapi import APIRouter, Response
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 
 from graspdb_service import __version__
+from graspdb_service.api.access.guard import GuardedRoute
 from graspdb_service.api.routing.gauges import Gauges
 from graspdb_service.api.routing.parameters import Ctx
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.settings import Settings
 
-router = APIRouter(tags=["operations"])
+router = APIRouter(tags=["operations"], route_class=GuardedRoute)
 
 
 @router.get("/livez", **scope("public"))

@@ -30,7 +30,7 @@ PosesLimit = Annotated[
     "/objects/{id}/sweeps",
     status_code=202,
     response_model=SweepInfo,
-    **scope("admin", body={JSON: SweepCreate}, work="uploads", large=True),
+    **scope("objects:write", body={JSON: SweepCreate}, work="uploads", large=True),
 )
 def create_sweep(ctx: Ctx, id: ObjectId, request: Request, sent: Creating) -> object:
     """Queue a simulation of many grasps: of a grid about the object (the default), of given poses, or of
@@ -69,13 +69,13 @@ def get_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     return sweeps.get(ctx.database, id)
 
 
-@router.post("/sweeps/{id}/cancel", **scope("admin"))
+@router.post("/sweeps/{id}/cancel", **scope("objects:write"))
 def cancel_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     """Stop a sweep; what is stored stays. A finished one is left as it is."""
     return sweeps.cancel(ctx.database, id)
 
 
-@router.post("/sweeps/{id}/retry", **scope("admin"))
+@router.post("/sweeps/{id}/retry", **scope("objects:write"))
 def retry_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     """Queue a sweep's failed and cancelled chunks again. 409 once its batch was deleted."""
     return sweeps.retry(ctx.database, id)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, NoReturn
 
 import typer
+from pydantic import ValidationError
 
 from graspdb_service.settings import Settings
 
@@ -17,8 +18,14 @@ def settings_from(**given: Any) -> Settings:
     """The settings of the environment, and above them the options that were given."""
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        fail("; ".join(f"{_variable(e['loc'])}: {e['msg']}, not {e['input']!r}" for e in error.errors()))
     except ValueError as error:
         fail(str(error))
+
+
+def _variable(place: tuple[int | str, ...]) -> str:
+    return f"GRASPDB_{str(place[0] if place else '').upper()}"
 
 
 def fail(message: str, code: int = 1) -> NoReturn:

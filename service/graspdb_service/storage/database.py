@@ -12,14 +12,19 @@ from typing import Any, TypeAlias, TypeVar
 from weakref import WeakSet
 
 from sqlalchemy import (
+    ColumnElement,
     Connection,
+    Delete,
     Double,
     Engine,
     Executable,
+    Insert,
     String,
     Table,
+    Update,
     create_engine,
     event,
+    func,
     make_url,
     select,
 )
@@ -49,6 +54,8 @@ class DatabaseDown(Exception):
 
 UNAVAILABLE = (OperationalError, PoolExhausted, DatabaseDown)
 """What a database raises that does not answer, is full, or has no connection free."""
+#: Where a connection notes which tables its transaction has changed.
+_CHANGED = "graspdb_changed"
 CANNOT_OPEN = (DBAPIError, PoolExhausted, OSError)
 """What opening a database raises that is not there, or is none."""
 
@@ -140,7 +147,11 @@ def insert_or(tx: Tx, table: Table) -> postgresql.Insert:
 def insert_new(tx: Tx, table: Table, **values: Any) -> bool:
     """Insert a row; False where one of the same key is there already."""
     statement = insert_or(tx, table).values(values).on_conflict_do_nothing()
-    return tx.execute(statement.returning(*table.primary_key)).first() is not None
+    before = set(tx.info.get(_CHANGED, ()))
+    inserted = tx.execute(statement.returning(*table.primary_key)).first() is not None
+    if not inserted and _CHANGED in tx.info:
+        tx.info[_CHANGED] = before
+    return inserted
 
 
 def first_as(tx: Tx, query: Executable, kind: Callable[..., T]) -> T | None:
@@ -152,6 +163,15 @@ def first_as(tx: Tx, query: Executable, kind: Callable[..., T]) -> T | None:
 def all_as(tx: Tx, query: Executable, kind: Callable[..., T]) -> list[T]:
     """The rows of a query as values whose fields have its columns' names."""
     return [kind(**row._mapping) for row in tx.execute(query)]
+
+
+def begins_with(text_: ColumnElement[str], prefix: str) -> ColumnElement[bool]:
+    """Whether a text begins so, letter for letter: SQLite's LIKE would not tell A from a."""
+    return func.substr(text_, 1, len(prefix)) == prefix
+
+
+class UnauditedChange(RuntimeError):
+    """A transaction changed what the audit is of and wrote no row of it: nothing was committed."""
 
 
 class UnsupportedDatabase(ValueError):
@@ -202,6 +222,7 @@ class Database:
             self._reader = self._writer.execution_options(
                 isolation_level="REPEATABLE READ", postgresql_readonly=True
             )
+        event.listen(self._writer, "after_execute", _note_change)
 
     @contextmanager
     def read(self) -> Iterator[Tx]:
@@ -214,13 +235,20 @@ class Database:
     def write(self) -> Iterator[Tx]:
         """A writing transaction, committed when the block ends and rolled back if it raises.
 
-        CommitUnknown where the connection broke while it was committed.
+        UnauditedChange where it changed an audited table and no row of the audit tells of it; CommitUnknown
+        where the connection broke while it was committed.
         """
         self._refuse_if_down()
         with timed("database"), self._writer.connect() as tx:
             transaction = tx.begin()
+            tx.info[_CHANGED] = set()
             with _drivers_errors(tx):
                 yield tx
+            changed = tx.info.pop(_CHANGED)
+            if changed and "audit" not in changed:
+                raise UnauditedChange(
+                    f"{', '.join(sorted(changed))} changed without a record: call storage.access.audit.record"
+                )
             try:
                 transaction.commit()
             except DBAPIError as error:
@@ -293,6 +321,20 @@ def _normalised(url: str) -> URL:
     raise UnsupportedDatabase(
         f"{backend} is not supported: use sqlite:///FILE or postgresql://USER@HOST/NAME"
     )
+
+
+def _note_change(
+    tx: Connection, statement: object, _several: object, _one: object, _options: object, result: Any
+) -> None:
+    """Note that a transaction changed a table of which every change is audited, or the audit itself."""
+    if not isinstance(statement, (Insert, Update, Delete)) or _CHANGED not in tx.info:
+        return
+    if not result.returns_rows and result.rowcount == 0:
+        return
+    table = statement.table
+    kind = statement.__visit_name__
+    if isinstance(table, Table) and (table.name == "audit" or kind in table.info.get("audited", ())):
+        tx.info[_CHANGED].add(table.name)
 
 
 def _sqlite_engine(url: URL, begin: str, *, pool_size: int, query_only: bool) -> Engine:

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import and_, delete, exists, or_, select, update
 
-from graspdb_service.storage.database import Tx, all_as, first_as, insert_new, utc_now
+from graspdb_service.storage.database import Tx, all_as, begins_with, first_as, insert_new, utc_now
 from graspdb_service.storage.simulation.jobs import OPEN
 from graspdb_service.storage.tables import batches, idempotency_keys, jobs, objects, sweeps, trials
 
@@ -54,9 +54,11 @@ def find(tx: Tx, slug: str, *, lock: bool = False) -> ObjectRow | None:
     return first_as(tx, query.with_for_update() if lock else query, ObjectRow)
 
 
-def page(tx: Tx, *, after: str, limit: int) -> list[ObjectRow]:
-    """Up to ``limit`` objects in the order of their slugs, from the one after ``after``."""
+def page(tx: Tx, *, after: str, limit: int, prefix: str = "") -> list[ObjectRow]:
+    """Up to ``limit`` objects whose slugs begin so, in the order of slugs, from the one after ``after``."""
     query = select(objects).where(objects.c.slug > after).order_by(objects.c.slug).limit(limit)
+    if prefix:
+        query = query.where(begins_with(objects.c.slug, prefix))
     return all_as(tx, query, ObjectRow)
 
 

@@ -43,6 +43,11 @@ metadata = MetaData(
     }
 )
 
+# What of a table may not be changed without a row of the audit in the same transaction (see Database.write).
+WHOLLY_AUDITED = {"audited": frozenset({"insert", "update", "delete"})}
+# Rows come and go by somebody's doing; what changes of them meanwhile follows from work that is under way.
+AUDITED_AS_A_WHOLE = {"audited": frozenset({"insert", "delete"})}
+
 # SQLite numbers rows only in a column declared INTEGER.
 BigId = BigInteger().with_variant(Integer(), "sqlite")
 
@@ -74,6 +79,7 @@ grippers = Table(
     Column("name", Text),
     Column("builtin", Boolean, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
+    info=WHOLLY_AUDITED,
 )
 
 # What a gripper was and is: the newest version is what its id alone stands for. Never changed once stored.
@@ -90,6 +96,7 @@ gripper_versions = Table(
     Column("created_at", UtcDateTime, nullable=False),
     UniqueConstraint("gripper", "version"),
     sqlite_autoincrement=True,
+    info=WHOLLY_AUDITED,
 )
 
 # Content-addressed: meshes and convex parts, stored once whoever uses them.
@@ -125,6 +132,7 @@ objects = Table(
     # Of a copy: what it was copied from, and whether its mesh may be, or was, changed in spite of its trials.
     Column("copied_from", JSON(none_as_null=True)),
     sqlite_autoincrement=True,
+    info=WHOLLY_AUDITED,
 )
 
 # Which gripper, source and protocol a trial had, once per combination instead of once per row.
@@ -169,9 +177,12 @@ sweeps = Table(
     Column("chunk_poses", Integer, nullable=False),
     Column("chunks", Integer, nullable=False),
     Column("cancelled", Boolean, nullable=False),
+    # Name of the key that asked for it, where one did.
+    Column("made_by", String(64)),
     Column("created_at", UtcDateTime, nullable=False),
     Column("started_at", UtcDateTime),
     Column("finished_at", UtcDateTime),
+    info=AUDITED_AS_A_WHOLE,
 )
 
 batches = Table(
@@ -188,8 +199,11 @@ batches = Table(
     Column("inserted", BigInteger, nullable=False),
     Column("packed", BigInteger, nullable=False),
     Column("metadata", JSON),
+    # Name of the key that posted it, where one did.
+    Column("made_by", String(64)),
     Column("created_at", UtcDateTime, nullable=False),
     sqlite_autoincrement=True,
+    info=AUDITED_AS_A_WHOLE,
 )
 
 trials = Table(
@@ -252,6 +266,7 @@ trial_changes = Table(
     Column("before", JSON, nullable=False),
     Column("reason", Text),
     Column("changed_at", UtcDateTime, nullable=False),
+    info=WHOLLY_AUDITED,
 )
 
 # What was doubtful about a batch's trials when they came. Who is numbered by `provenance_id` has no foreign
@@ -362,6 +377,7 @@ kernels = Table(
     # Null: for all versions of the gripper.
     Column("gripper_version", Integer),
     sqlite_autoincrement=True,
+    info=WHOLLY_AUDITED,
 )
 
 # Reports that are computed or have been: one row for an object, revision and set of parameters, leased to
@@ -440,4 +456,59 @@ idempotency_keys = Table(
     # Its batch was deleted: the same request again is no retry but a mistake.
     Column("revoked", Boolean, nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
+)
+
+# Who may ask. Rows stay when a key is revoked, so that the audit's ids go on meaning something.
+api_keys = Table(
+    "api_keys",
+    metadata,
+    Column("number", BigId, primary_key=True, autoincrement=True),
+    Column("id", String(12), nullable=False, unique=True),
+    Column("name", String(64), nullable=False),
+    # Of what is sent. It has 256 random bits: no guessing, so no need for a hash that makes guessing slow.
+    Column("sha256", String(64), nullable=False),
+    Column("previous_sha256", String(64)),
+    Column("previous_until", UtcDateTime),
+    Column("scopes", JSON, nullable=False),
+    Column("objects", String(64)),
+    Column("requests_per_s", Double),
+    Column("burst", Integer),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("created_by", String(64)),
+    Column("expires_at", UtcDateTime),
+    Column("revoked_at", UtcDateTime),
+    Index(
+        "uq_api_keys_name",
+        "name",
+        unique=True,
+        sqlite_where=text("revoked_at IS NULL"),
+        postgresql_where=text("revoked_at IS NULL"),
+    ),
+    sqlite_autoincrement=True,
+    info=WHOLLY_AUDITED,
+)
+
+# Written now and then in the background, apart from the keys, which nobody then waits for.
+key_uses = Table(
+    "key_uses",
+    metadata,
+    Column("key_id", ForeignKey("api_keys.id", ondelete="CASCADE"), primary_key=True),
+    Column("last_used_at", UtcDateTime, nullable=False),
+)
+
+# Who changed what. Names and no foreign keys: it outlives what it tells of.
+audit = Table(
+    "audit",
+    metadata,
+    Column("id", BigId, primary_key=True, autoincrement=True),
+    Column("at", UtcDateTime, nullable=False, index=True),
+    Column("action", String(40), nullable=False),
+    Column("key_id", String(12)),
+    Column("key", String(64)),
+    Column("object", String(64)),
+    Column("subject", String(64)),
+    Column("request_id", String(32)),
+    Index("ix_audit_object_id", "object", "id"),
+    Index("ix_audit_key_name_id", "key", "id"),
+    sqlite_autoincrement=True,
 )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from graspdb.wire import CopyRequest
+from graspdb_service import principal
 from graspdb_service.problems import conflict
 from graspdb_service.storage import grippers, objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.trials import copies, provenances
 from graspdb_service.usecases.objects import info, require
@@ -13,6 +15,7 @@ from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_o
 
 def create(database: Database, slug: str, request: CopyRequest, sent: Sent) -> Created:
     """Copy an object; 409 for an id that is taken, and of trials while a sweep is adding to them."""
+    principal.refuse_hidden(request.id)
 
     def make(tx: Tx) -> Created:
         row = require(tx, slug, lock=True)
@@ -27,6 +30,7 @@ def create(database: Database, slug: str, request: CopyRequest, sent: Sent) -> C
         copy = copies.create(tx, row, request.id, told, trials=request.trials)
         if copy is None:
             raise conflict("already-exists", f"There is an object {request.id!r} already: choose another id")
+        audit.record(tx, "object.copy", object=request.id, subject=slug)
         if request.trials:
             grippers.held(tx, copies.grippers_of(tx, row.id))
             copies.copy_trials(tx, row.id, copy)

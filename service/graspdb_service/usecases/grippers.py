@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from graspdb.wire import GripperCreate, GripperInfo, GripperProfile, GripperUpdate
 from graspdb_geometry.grippers import PANDA, PG70, GripperShape
+from graspdb_service import principal
 from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.trial_columns import gripper_parts
@@ -21,17 +23,20 @@ def seed(database: Database) -> None:
             return
     with database.write() as tx:
         for gripper, (name, profile) in sorted(BUILTIN.items()):
-            grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
+            if grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True):
+                audit.record(tx, "gripper.create", subject=gripper)
 
 
 def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
     """Store the user's gripper."""
+    principal.refuse_limited("Grippers")
     profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
     _check_shape(profile)
 
     def make(tx: Tx) -> Created:
         if not grippers.create(tx, request.id, request.name, profile.model_dump(mode="json")):
             raise conflict("already-exists", f"There is a gripper {request.id!r} already: choose another id")
+        audit.record(tx, "gripper.create", subject=request.id)
         return Created(
             _info(require(tx, request.id)).model_dump(mode="json"), location=f"/grippers/{request.id}"
         )
@@ -42,6 +47,7 @@ def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
 def update(database: Database, gripper: str, request: GripperUpdate) -> GripperInfo:
     """Store a profile as the gripper's newest version; the profile that it has already makes none."""
     _refuse_version(gripper, "PUT")
+    principal.refuse_limited("Grippers")
     if request.id not in (None, gripper):
         raise invalid("id", f"this is of gripper {gripper!r}: leave it out, or give the same one")
     profile = GripperProfile.model_validate(request.model_dump(exclude={"id", "name"}))
@@ -56,6 +62,8 @@ def update(database: Database, gripper: str, request: GripperUpdate) -> GripperI
             grippers.add_version(tx, gripper, row.version + 1, profile.model_dump(mode="json"), changed)
         if request.name is not None:
             grippers.rename(tx, gripper, request.name)
+        if changed or request.name is not None:
+            audit.record(tx, "gripper.change", subject=gripper)
         return _info(require(tx, gripper))
 
 
@@ -85,6 +93,7 @@ def page(database: Database, *, after: str, limit: int) -> tuple[list[GripperInf
 def remove(database: Database, gripper: str) -> None:
     """Delete a gripper; 409 while trials, sweeps or kernels use it, and for a built-in one."""
     _refuse_version(gripper, "DELETE")
+    principal.refuse_limited("Grippers")
     with database.write() as tx:
         grippers.lock(tx, gripper, deleting=True)
         if require(tx, gripper).builtin:
@@ -96,6 +105,7 @@ def remove(database: Database, gripper: str) -> None:
                 " gripper (POST /grippers)",
             )
         grippers.remove(tx, gripper)
+        audit.record(tx, "gripper.delete", subject=gripper)
 
 
 def require(tx: Tx, gripper: str) -> GripperRow:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, ObjectCreate, ObjectInfo, ObjectPatch
+from graspdb_service import principal
 from graspdb_service.problems import conflict, found
 from graspdb_service.storage import assets, objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
@@ -14,10 +16,12 @@ from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_o
 
 def create(database: Database, request: ObjectCreate, sent: Sent) -> Created:
     """Store a new object, without mesh and trials."""
+    principal.refuse_hidden(request.id)
 
     def make(tx: Tx) -> Created:
         if not objects.create(tx, request.id, request.model_dump(exclude={"id"})):
             raise conflict("already-exists", f"There is an object {request.id!r} already: choose another id")
+        audit.record(tx, "object.create", object=request.id)
         return Created(
             info(require(tx, request.id), {}).model_dump(mode="json"), location=f"/objects/{request.id}"
         )
@@ -26,7 +30,11 @@ def create(database: Database, request: ObjectCreate, sent: Sent) -> Created:
 
 
 def require(tx: Tx, slug: str, *, object_id: int | None = None, lock: bool = False) -> ObjectRow:
-    """The object of this slug (404), and of this internal id (409); ``lock`` holds it for the transaction."""
+    """The object of this slug (404), and of this internal id (409); ``lock`` holds it for the transaction.
+
+    403 where the key that asks is limited to others.
+    """
+    principal.refuse_hidden(slug)
     known = objects.find(tx, slug, lock=lock) if is_slug(slug) else None
     row = found(known, "object", slug, "GET /objects lists them, POST /objects makes one")
     if object_id is not None and row.id != object_id:
@@ -44,7 +52,7 @@ def get(database: Database, slug: str) -> tuple[ObjectRow, ObjectInfo]:
 def page(database: Database, *, after: str, limit: int) -> tuple[list[ObjectInfo], str | None]:
     """A page of objects by id, and where the next one starts."""
     with database.read() as tx:
-        rows = objects.page(tx, after=after, limit=limit + 1)
+        rows = objects.page(tx, after=after, limit=limit + 1, prefix=principal.object_prefix())
         counts = provenances.outcome_counts(tx, [row.id for row in rows])
     items = [info(row, counts[row.id]) for row in rows[:limit]]
     return items, items[-1].id if len(rows) > limit else None
@@ -59,6 +67,7 @@ def change(database: Database, slug: str, patch: ObjectPatch) -> ObjectInfo:
         if different:
             objects.advance(tx, row.id, append=False)
             objects.change(tx, row.id, different)
+            audit.record(tx, "object.change", object=slug)
             row = require(tx, slug)
         return info(row, provenances.outcome_counts(tx, [row.id])[row.id])
 
@@ -73,6 +82,7 @@ def remove(database: Database, slug: str) -> None:
                 f"A sweep of {slug!r} is running: cancel it (POST /sweeps/{{id}}/cancel) or wait for its end",
             )
         objects.remove(tx, row)
+        audit.record(tx, "object.delete", object=slug)
     with database.write() as tx:
         assets.drop_unused(tx, {h for h in (row.mesh_sha256, row.parts_sha256) if h})
 

@@ -9,8 +9,8 @@ from typing import Any, get_args
 
 import anyio.to_thread
 from fastapi import Request, Response
-from fastapi.routing import APIRoute
 
+from graspdb_service.api.access.guard import GuardedRoute
 from graspdb_service.api.routing.bodies import Bodies, Received, no_room
 from graspdb_service.api.routing.scopes import BODY_FIELD, PLACE_FIELD, SCOPE_FIELD, Work
 from graspdb_service.settings import Settings
@@ -70,7 +70,7 @@ def client_of(request: Request) -> str:
     return "" if request.client is None else request.client.host
 
 
-class AdmittedRoute(APIRoute):
+class AdmittedRoute(GuardedRoute):
     """A route whose requests pass admission; what it declares (see ``scope``) says how."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:

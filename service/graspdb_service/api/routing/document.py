@@ -10,11 +10,18 @@ from pydantic.json_schema import models_json_schema
 from starlette.routing import BaseRoute
 
 from graspdb.wire import Problem
-from graspdb_service.api.routing.scopes import BODY_MODELS
+from graspdb.wire.access.keys import SCOPES
+from graspdb_service.api.routing.scopes import ACCEPTED_FIELD, BODY_MODELS
 
 PROBLEM = {
     "description": "A problem (RFC 9457): `title` says what to do, `errors` name the fields",
     "content": {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}},
+}
+COLUMNS = ("public", *SCOPES)
+KEY = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "An API key (`graspdb-server keys create`, `POST /keys`), where the service takes keys",
 }
 
 
@@ -36,5 +43,29 @@ def document(routes: Sequence[BaseRoute], *, title: str, summary: str, version: 
             # Ours are problems, whatever the status; FastAPI's own 422 never leaves this service.
             responses.pop("422", None)
             responses["default"] = PROBLEM
+            accepted = operation.get(ACCEPTED_FIELD, [])
+            # Without keys, too, where the service is told so.
+            operation["security"] = [] if accepted == ["public"] else [{}, *({"key": [s]} for s in accepted)]
+    found["components"]["securitySchemes"] = {"key": KEY}
     found["components"]["schemas"] = dict(sorted(schemas.items()))
     return found
+
+
+def scope_matrix(found: dict[str, Any]) -> str:
+    """Which scope each route takes, as Markdown; of an OpenAPI document."""
+    lines = [
+        "# Which key may call which route",
+        "",
+        "A key with any of a route's scopes may call it; `admin` implies all, `public` needs none.",
+        "Made by `graspdb-server scopes`; see [security](security.md).",
+        "",
+        f"| route | {' | '.join(COLUMNS)} |",
+        "|---" * (1 + len(COLUMNS)) + "|",
+    ]
+    for path, operations in found["paths"].items():
+        for method, operation in operations.items():
+            accepted = operation[ACCEPTED_FIELD]
+            open_to = {*accepted, "admin"} if accepted != ["public"] else set(COLUMNS)
+            cells = ["yes" if column in open_to else "" for column in COLUMNS]
+            lines.append(f"| `{method.upper()} {path}` | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias
 
 from fastapi import Request
+from fastapi.routing import APIRoute
 from pydantic import BaseModel
 
+from graspdb.wire.access import keys
 from graspdb_service.problems import ProblemError, invalid
 
-Scope = Literal["public", "read", "trials:write", "jobs:work", "admin"]
-SCOPES: tuple[Scope, ...] = get_args(Scope)
+RouteScope: TypeAlias = keys.Scope | Literal["public"]
+SCOPES: frozenset[str] = frozenset(("public", *keys.SCOPES))
 SCOPE_FIELD = "x-required-scope"
+ACCEPTED_FIELD = "x-accepted-scopes"
 
 Work = Literal["queries", "reports", "uploads", "meshes", "writes", "reads"]
 PLACE_FIELD = "x-place"
@@ -27,16 +30,21 @@ BODY_MODELS: dict[str, type[BaseModel]] = {}
 
 
 def scope(
-    name: Scope, *, body: Mapping[str, Any] | None = None, work: Work | None = None, large: bool = False
+    name: RouteScope,
+    *others: RouteScope,
+    body: Mapping[str, Any] | None = None,
+    work: Work | None = None,
+    large: bool = False,
 ) -> dict[str, Any]:
-    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``, and what it may take.
+    """Declare a route's scope: ``@router.get("/objects", **scope("read"))``, of several one suffices; and
+    what it may take.
 
     ``body`` documents a body that the route reads itself (:data:`RawBody`): by media type a model, a tuple
     of models or a JSON schema. ``large`` bodies may have ``max_body_bytes``, others ``max_small_body_bytes``.
     ``work`` is the kind of place that a request takes: by default a read for GET, else a write; none for
     what is public.
     """
-    extra: dict[str, Any] = {SCOPE_FIELD: name}
+    extra: dict[str, Any] = {SCOPE_FIELD: name, ACCEPTED_FIELD: [name, *others]}
     if work is not None:
         extra[PLACE_FIELD] = f"max_{work}_at_once"
     if large:
@@ -55,6 +63,14 @@ def _schema(given: Any) -> dict[str, Any]:
         return {"$ref": f"#/components/schemas/{given.__name__}"}
     schema: dict[str, Any] = given
     return schema
+
+
+def accepted_scopes(route: APIRoute) -> tuple[str, ...]:
+    """The scopes of which a route asks for one; RuntimeError where it declares none that there is."""
+    declared = tuple((route.openapi_extra or {}).get(ACCEPTED_FIELD, ()))
+    if not declared or not SCOPES.issuperset(declared):
+        raise RuntimeError(f"{'/'.join(sorted(route.methods or ()))} {route.path} declares no scope")
+    return declared
 
 
 def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, bool]]:

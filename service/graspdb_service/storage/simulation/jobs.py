@@ -21,8 +21,8 @@ from sqlalchemy.sql.functions import GenericFunction
 
 from graspdb.wire import WorkerInfo
 from graspdb.wire.states import JobState
-from graspdb_service.storage.database import Tx, all_as, first_as, insert_or, unix_now
-from graspdb_service.storage.tables import jobs, workers
+from graspdb_service.storage.database import Tx, all_as, begins_with, first_as, insert_or, unix_now
+from graspdb_service.storage.tables import jobs, objects, workers
 
 OPEN = (JobState.WAITING, JobState.QUEUED, JobState.LEASED)
 """States of a job that is still to be done."""
@@ -116,26 +116,44 @@ def _ran_out(lease_s: float) -> ColumnElement[bool]:
     )
 
 
-def _claimable(capabilities: Sequence[str], lease_s: float, max_attempts: int) -> ColumnElement[bool]:
+def _claimable(
+    capabilities: Sequence[str], lease_s: float, max_attempts: int, prefix: str
+) -> ColumnElement[bool]:
     # The states are named once more so that both databases search the index on (state, capability).
     ran_out = and_(_ran_out(lease_s), jobs.c.attempts < max_attempts)
     return and_(
         jobs.c.state.in_([JobState.QUEUED, JobState.LEASED]),
         jobs.c.capability.in_(capabilities),
         or_(jobs.c.state == JobState.QUEUED, ran_out),
+        *(_of_objects(prefix) if prefix else ()),
     )
 
 
-def any_claimable(tx: Tx, capabilities: Sequence[str], *, lease_s: float, max_attempts: int) -> bool:
+def _of_objects(prefix: str) -> tuple[ColumnElement[bool]]:
+    """Whether a job is of an object whose slug begins so."""
+    own = select(objects.c.id).where(begins_with(objects.c.slug, prefix))
+    return (jobs.c.object_id.in_(own),)
+
+
+def any_claimable(
+    tx: Tx, capabilities: Sequence[str], *, lease_s: float, max_attempts: int, prefix: str
+) -> bool:
     """Whether a claim would get anything: lets an idle worker ask without a write lock."""
-    query = select(exists().where(_claimable(capabilities, lease_s, max_attempts)))
+    query = select(exists().where(_claimable(capabilities, lease_s, max_attempts, prefix)))
     return bool(tx.scalar(query))
 
 
 def claim(
-    tx: Tx, *, worker: str, capabilities: Sequence[str], limit: int, lease_s: float, max_attempts: int
+    tx: Tx,
+    *,
+    worker: str,
+    capabilities: Sequence[str],
+    limit: int,
+    lease_s: float,
+    max_attempts: int,
+    prefix: str = "",
 ) -> list[JobRow]:
-    """Lease up to ``limit`` jobs to a worker, first those that sort first.
+    """Lease up to ``limit`` jobs to a worker, first those that sort first, of objects whose slugs begin so.
 
     One statement on both databases: PostgreSQL skips what others are just claiming, on SQLite the
     transaction is alone (BEGIN IMMEDIATE). PostgreSQL never inlines a CTE that locks rows, so the limit
@@ -143,7 +161,7 @@ def claim(
     """
     chosen: Select[tuple[str]] = (
         select(jobs.c.id)
-        .where(_claimable(capabilities, lease_s, max_attempts))
+        .where(_claimable(capabilities, lease_s, max_attempts, prefix))
         .order_by(jobs.c.id)
         .limit(limit)
         .with_for_update(skip_locked=True)

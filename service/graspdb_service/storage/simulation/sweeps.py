@@ -13,7 +13,8 @@ from sqlalchemy import ColumnElement, Select, and_, exists, func, insert, not_, 
 
 from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import FailedChunk
-from graspdb_service.storage.database import Tx, all_as, first_as, unix_now, utc_now
+from graspdb_service import principal
+from graspdb_service.storage.database import Tx, all_as, begins_with, first_as, unix_now, utc_now
 from graspdb_service.storage.simulation.jobs import AFRESH, OPEN
 from graspdb_service.storage.tables import batches, jobs, objects, provenances, sweeps
 from graspdb_service.trial_columns import Floats
@@ -45,6 +46,7 @@ class SweepRow:
     chunk_poses: int
     chunks: int
     cancelled: bool
+    made_by: str | None
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -115,6 +117,7 @@ def create(
         "poses": None if poses is None else np.ascontiguousarray(poses, dtype="<f8").tobytes(),
         "chunks": len(job_ids),
         "cancelled": False,
+        "made_by": principal.actor().key,
         "created_at": utc_now(),
     }
     tx.execute(insert(sweeps).values(values))
@@ -177,10 +180,14 @@ def _in_state(state: str) -> ColumnElement[bool]:
 
 
 def listing(
-    tx: Tx, *, object_id: int | None, state: str | None, before: str | None, limit: int
+    tx: Tx, *, object_id: int | None, prefix: str, state: str | None, before: str | None, limit: int
 ) -> list[SweepRow]:
-    """Sweeps, the newest first; ``before`` is the id of the last one of the page before."""
+    """Sweeps of objects whose slugs begin so, the newest first; ``before`` is the id of the last one of the
+    page before.
+    """
     query = _query().order_by(sweeps.c.id.desc()).limit(limit)
+    if prefix:
+        query = query.where(begins_with(objects.c.slug, prefix))
     if object_id is not None:
         query = query.where(sweeps.c.object_id == object_id)
     if state is not None:
@@ -256,8 +263,8 @@ def note_finished(tx: Tx, sweep_id: str) -> None:
         )
 
 
-def cancel(tx: Tx, sweep_id: str) -> None:
-    """Cancel what is not finished; under the object's lock."""
+def cancel(tx: Tx, sweep_id: str) -> bool:
+    """Cancel what is not finished, under the object's lock; False where all is."""
     # The lease stays, so that its holder is told to stop rather than that the lease is lost.
     stopped = tx.execute(
         update(jobs)
@@ -267,10 +274,13 @@ def cancel(tx: Tx, sweep_id: str) -> None:
     if stopped.rowcount:
         ended = {"cancelled": True, "finished_at": utc_now()}
         tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(ended))
+    return bool(stopped.rowcount)
 
 
-def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> None:
-    """Queue failed and cancelled chunks again, with all their attempts; under the object's lock."""
+def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> bool:
+    """Queue failed and cancelled chunks again, with all their attempts, under the object's lock; False where
+    there are none.
+    """
     again = tx.execute(
         update(jobs)
         .where(jobs.c.sweep_id == sweep_id, jobs.c.state.in_([JobState.FAILED, JobState.CANCELLED]))
@@ -278,6 +288,7 @@ def retry(tx: Tx, sweep_id: str, *, waiting: bool = False) -> None:
     )
     if again.rowcount:
         tx.execute(update(sweeps).where(sweeps.c.id == sweep_id).values(cancelled=False, finished_at=None))
+    return bool(again.rowcount)
 
 
 def poses(tx: Tx, sweep_id: str, start: int, stop: int) -> Floats:

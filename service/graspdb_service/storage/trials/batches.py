@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Select, and_, case, delete, distinct, func, insert, or_, select, update
 
+from graspdb_service import principal
 from graspdb_service.storage import answers
 from graspdb_service.storage.database import Tx, all_as, first_as, utc_now
 from graspdb_service.storage.simulation import outcomes
@@ -40,6 +41,7 @@ class BatchRow:
     inserted: int
     packed: int
     metadata: dict[str, Any] | None
+    made_by: str | None
     created_at: datetime
     provenance_id: int | None
     purpose: str | None
@@ -65,6 +67,7 @@ def create(
             inserted=0,
             packed=0,
             metadata=metadata,
+            made_by=principal.actor().key,
             created_at=utc_now(),
         )
         .returning(batches.c.id)

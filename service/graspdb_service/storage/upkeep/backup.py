@@ -20,6 +20,7 @@ from sqlalchemy.exc import DBAPIError
 
 from graspdb_service import __version__
 from graspdb_service.storage import schema
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.tables import grippers, objects
 from graspdb_service.storage.upkeep import layout
@@ -336,6 +337,8 @@ def _continue_revisions(tx: Tx, seen: dict[int, tuple[int, int]]) -> int:
             }
             tx.execute(objects.update().where(objects.c.id == id).values(values))
             continued += 1
+    if continued:
+        audit.record(tx, "database.restore")
     return continued
 
 

@@ -8,8 +8,10 @@ from typing import Any
 import orjson
 
 from graspdb.wire import Answer, AnswerInfo
+from graspdb_service import principal
 from graspdb_service.problems import busy, conflict, found
 from graspdb_service.storage import answers
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.answers import AnswerRow
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.usecases.answers.asking import Asking, ask
@@ -55,9 +57,12 @@ def remove(ctx: Asking, reference: str) -> None:
     with ctx.database.write() as tx:
         if by_name:
             answers.drop_name(tx, reference)
+            audit.record(tx, "answer.delete", object=row.object, subject=reference)
             if answers.names(tx, [row.number]):
                 return
         removed = answers.remove(tx, row.number)
+        if removed and not by_name:
+            audit.record(tx, "answer.delete", object=row.object, subject=reference)
     if not removed and not by_name:
         raise conflict(
             "answer-in-use",
@@ -69,7 +74,10 @@ def remove(ctx: Asking, reference: str) -> None:
 
 
 def _find(ctx: Asking, reference: str) -> AnswerRow:
-    return found(ctx.answers.find(reference) if is_slug(reference) else None, "answer", reference, _UNKNOWN)
+    row = ctx.answers.find(reference) if is_slug(reference) else None
+    # Neither an id nor a name tells whose it is: one about a hidden object is answered as none.
+    seen = row is not None and principal.sees(row.object)
+    return found(row if seen else None, "answer", reference, _UNKNOWN)
 
 
 def _content(database: Database, row: AnswerRow) -> tuple[bytes, bytes]:

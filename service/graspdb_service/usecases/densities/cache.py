@@ -9,6 +9,7 @@ import numpy as np
 from graspdb.wire import KernelSpec, Selection
 from graspdb.wire.queries import TrialSelection
 from graspdb_density.kde.isotropic import CUTOFF
+from graspdb_service import principal
 from graspdb_service.problems import conflict, invalid_fields, not_found
 from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
@@ -98,6 +99,8 @@ class Densities:
         with self._database.read() as tx:
             newest = name == "anisotropic"
             found = kernels.newest(tx, row.id, selected.gripper) if newest else kernels.find(tx, name)
+            if found is not None and not principal.sees(stored_kernel.owner(found)):
+                found = None
             others = [] if found else kernels.page(tx, after=0, limit=20, object_id=row.id, gripper=None)
         names = ["isotropic", *(kernel.id for kernel in others)]
         if found is None and newest:

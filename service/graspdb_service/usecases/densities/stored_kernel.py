@@ -27,6 +27,12 @@ def load(row: KernelRow) -> AnisotropicKernel:
     )
 
 
+def owner(row: KernelRow) -> str | None:
+    """The id of the object that a kernel was fitted on; None where it was given."""
+    slug: str | None = row.provenance.get("object")
+    return slug
+
+
 def _all(row: KernelRow, name: str) -> Floats:
     """What all components have of this name."""
     return np.array([item[name] for item in row.components])

@@ -15,6 +15,7 @@ from graspdb_geometry.meshes import Inspection, Mesh, MeshError, Part
 from graspdb_service.formats.negotiation import GLB
 from graspdb_service.problems import ProblemError, conflict, not_found
 from graspdb_service.storage import assets, objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
@@ -64,6 +65,7 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
             # The parts were those of the mesh before.
             values |= {"parts_sha256": None, "parts_info": None}
         objects.change(tx, row.id, values)
+        audit.record(tx, "mesh.put", object=slug)
     _drop_unused(ctx, row)
     return info
 
@@ -91,6 +93,7 @@ def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
         _refuse_other_parts(tx, locked)
         objects.advance(tx, locked.id, append=False)
         store_parts(tx, locked, content, info)
+        audit.record(tx, "parts.put", object=slug)
     _drop_unused(ctx, locked)
     return info
 

@@ -29,8 +29,11 @@ from graspdb_density.bandwidth.mixture_fit import (
 )
 from graspdb_density.kde.bhattacharyya import DisplacementWindow, bhattacharyya
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_service.principal import Actor
 from graspdb_service.problems import invalid, too_few_trials
 from graspdb_service.storage import kernels
+from graspdb_service.storage.access import audit
+from graspdb_service.storage.database import Tx
 from graspdb_service.storage.kernels import KernelRow, NewKernel
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.report_runs import RunKey, RunRow
@@ -223,9 +226,10 @@ def info(row: KernelRow) -> StoredKernel:
     return StoredKernel.model_validate({**vars(stored_kernel.info_of(row)), **vars(row)})
 
 
-def run_key(row: ObjectRow, id: str, request: KernelCreate) -> RunKey:
+def run_key(row: ObjectRow, id: str, request: KernelCreate, by: Actor) -> RunKey:
     """Of the run that fits the kernel of this id: every request makes one of its own, nobody else's."""
-    document = {"report": RUN, "run": id, "request": request.model_dump(mode="json", exclude_unset=True)}
+    asked = request.model_dump(mode="json", exclude_unset=True)
+    document = {"report": RUN, "run": id, "request": asked, "by": by._asdict()}
     return RunKey(row.id, row.revision, RUN, hashlib.sha256(id.encode()).hexdigest(), document)
 
 
@@ -241,6 +245,13 @@ def run_kind(densities: Densities, features: Features, threads: int) -> RunKind:
             computed=lambda work: work(),
             progress=progress,
         )
-        return lambda tx: info(kernels.create(tx, run.id, kernel)).model_dump_json()
+
+        def store(tx: Tx) -> str:
+            # Whoever computes it, a key asked for it.
+            by = Actor(**run.parameters.get("by", {}))
+            audit.record(tx, "kernel.create", object=run.object, subject=run.id, by=by)
+            return info(kernels.create(tx, run.id, kernel)).model_dump_json()
+
+        return store
 
     return RunKind("fit", compute)

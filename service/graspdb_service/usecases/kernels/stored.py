@@ -20,13 +20,16 @@ from graspdb.wire.kernels import (
 )
 from graspdb.wire.states import RunState
 from graspdb_density import AnisotropicKernel
-from graspdb_service.problems import found, invalid, not_found
+from graspdb_service import principal
+from graspdb_service.problems import found, invalid
 from graspdb_service.storage import kernels
 from graspdb_service.storage import report_runs as report_run_rows
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.kernels import NewKernel
+from graspdb_service.storage.kernels import KernelRow, NewKernel
 from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases import grippers
+from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.kernels import axis_bandwidth_fit, fit
 from graspdb_service.usecases.objects import require
@@ -34,6 +37,7 @@ from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_o
 from graspdb_service.usecases.runtime.runs import Runs, model
 
 _SCOPE = "POST /kernels"
+_GIVEN = "Kernels given by their components"
 #: Axes that kernels of a kind may lie along, where not all.
 _ALIGNED = {"sampled": ("gripper",), "probability": ("gripper", "object")}
 #: Farther along an axis no displacement between grasps of one object reaches.
@@ -47,6 +51,10 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Cr
 
     404 for the object, 422 for components that make no kernel, 409 where trials or geometry don't suffice.
     """
+    if request.object is None:
+        principal.refuse_limited(_GIVEN)
+    else:
+        principal.refuse_hidden(request.object)
     if request.alignment not in _ALIGNED.get(request.kind, (request.alignment,)):
         ways = " or ".join(f"alignment={name}" for name in _ALIGNED[request.kind])
         raise invalid(
@@ -66,6 +74,7 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Cr
         if made.gripper is not None:
             grippers.hold(tx, made.gripper)
         row = kernels.create(tx, str(uuid.uuid4()), made)
+        audit.record(tx, "kernel.create", object=request.object, subject=row.id)
         return Created(fit.info(row).model_dump(mode="json"), location=f"/kernels/{row.id}")
 
     return replay_or(ctx.database, _SCOPE, sent, make)
@@ -74,8 +83,7 @@ def create(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> Cr
 def get(ctx: Estimators, id: str) -> StoredKernel:
     """One kernel."""
     with ctx.database.read() as tx:
-        row = kernels.find(tx, id)
-    return fit.info(found(row, "kernel", id, "GET /kernels lists those there are"))
+        return fit.info(_require(tx, id))
 
 
 def page(
@@ -85,17 +93,28 @@ def page(
     with ctx.database.read() as tx:
         object_id = None if object is None else require(tx, object).id
         rows = kernels.page(tx, after=after, limit=limit + 1, object_id=object_id, gripper=gripper)
-    items = [fit.info(row) for row in rows[:limit]]
+    # A key that sees some objects only gets short pages.
+    items = [fit.info(row) for row in rows[:limit] if principal.sees(stored_kernel.owner(row))]
     return items, rows[limit - 1].number if len(rows) > limit else None
 
 
 def remove(ctx: Estimators, id: str) -> None:
     """Delete a kernel; densities that were asked with it go on only for answers under way."""
     with ctx.database.write() as tx:
-        if not kernels.remove(tx, id):
-            raise not_found("kernel", id[:80], "GET /kernels lists those there are")
+        owner = stored_kernel.owner(_require(tx, id))
+        if owner is None:
+            principal.refuse_limited(_GIVEN)
+        if kernels.remove(tx, id):
+            audit.record(tx, "kernel.delete", object=owner, subject=id)
         # The run that fitted it has its id, and answers with it.
         report_run_rows.remove(tx, id)
+
+
+def _require(tx: Tx, id: str) -> KernelRow:
+    """The kernel, or a 404: its id does not tell whose it is."""
+    row = kernels.find(tx, id)
+    seen = row is not None and principal.sees(stored_kernel.owner(row))
+    return found(row if seen else None, "kernel", id, "GET /kernels lists those there are")
 
 
 def _given(ctx: Estimators, request: KernelCreate) -> NewKernel:
@@ -209,9 +228,10 @@ def _started(ctx: Estimators, runs: Runs, request: KernelCreate, sent: Sent) -> 
     row = ctx.densities.selections.resolve(request.object, fit.trials_of(request)).row
     lease = runs.place()
     id = str(uuid.uuid4())
+    asked_by = principal.actor()
 
     def make(tx: Tx) -> Created:
-        report_run_rows.ask(tx, fit.run_key(row, id, request), id=id, lease_id=lease)
+        report_run_rows.ask(tx, fit.run_key(row, id, request, asked_by), id=id, lease_id=lease)
         return Created({"id": id}, location=f"/report-runs/{id}", status=202)
 
     made = replay_or(ctx.database, _SCOPE, sent, make)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from graspdb.wire.reports import SummaryRate, SummaryReport, SummaryRow
+from graspdb_service import principal
 from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
@@ -34,7 +35,7 @@ def summary(database: Database) -> SummaryReport:
     after = ""
     while True:
         with database.read() as tx:
-            page = objects.page(tx, after=after, limit=_PAGE)
+            page = objects.page(tx, after=after, limit=_PAGE, prefix=principal.object_prefix())
             for item in page:
                 found = _rows(tx, item)
                 rows += found

@@ -21,6 +21,7 @@ from typing import Any
 from graspdb.wire.reports import ReportRun
 from graspdb.wire.states import RunState
 from graspdb_density.kde.weighted_sums import Progress
+from graspdb_service import principal
 from graspdb_service.problems import ProblemError, busy, conflict, found
 from graspdb_service.storage import report_runs
 from graspdb_service.storage.database import Database, Tx
@@ -131,6 +132,7 @@ class Runs:
 
     def cancel(self, id: str) -> RunRow:
         """End a run; one that has ended stays as it is."""
+        self._row(id)
         with self._database.write() as tx:
             report_runs.cancel(tx, id)
         run = self._row(id)
@@ -160,6 +162,8 @@ class Runs:
     def _row(self, id: str) -> RunRow:
         with self._database.read() as tx:
             run = report_runs.get(tx, id)
+        if run is not None and not principal.sees(run.object):
+            run = None
         return found(run, "report run", id, "runs of a past revision are deleted: ask for the report")
 
     def place(self) -> str:

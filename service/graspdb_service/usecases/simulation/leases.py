@@ -16,6 +16,7 @@ from graspdb.wire import (
 )
 from graspdb.wire.jobs import FailureNoted
 from graspdb.wire.states import JobState
+from graspdb_service import principal
 from graspdb_service.problems import ProblemError, conflict, found
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
@@ -31,13 +32,17 @@ WORKER_NOTED_EVERY_S = 10.0
 
 def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
     """Lease jobs to a worker and register it."""
-    settings = ctx.settings
+    settings, prefix = ctx.settings, principal.object_prefix()
     capabilities = sorted(set(request.capabilities))
     with ctx.database.read() as tx:
         exhausted = jobs.exhausted(tx, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
         age = jobs.worker_age(tx, request.worker)
         work = jobs.any_claimable(
-            tx, capabilities, lease_s=settings.lease_s, max_attempts=settings.max_attempts
+            tx,
+            capabilities,
+            lease_s=settings.lease_s,
+            max_attempts=settings.max_attempts,
+            prefix=prefix,
         )
     for job in exhausted:
         _expire(ctx, job)
@@ -51,6 +56,7 @@ def claim(ctx: Runtime, request: ClaimRequest) -> ClaimResponse:
             limit=request.limit,
             lease_s=settings.lease_s,
             max_attempts=settings.max_attempts,
+            prefix=prefix,
         )
         ids = sorted({job.sweep_id for job in claimed if job.sweep_id is not None})
         if ids:
@@ -155,6 +161,15 @@ def fail(ctx: Runtime, job_id: str, lease_id: str, report: FailureReport) -> Fai
     if state is None and not repeated:
         raise lost_lease(job)
     return FailureNoted(job=job_id, state=job.state, attempts=job.attempts)
+
+
+def refuse_hidden(ctx: Runtime, job_id: str) -> None:
+    """404 for a job of an object that who asks may not see."""
+    if principal.object_prefix():
+        with ctx.database.read() as tx:
+            job = require(jobs.find(tx, job_id), job_id)
+            source = decompositions.source(tx, job)
+        require(job if principal.sees(source) else None, job_id)
 
 
 def require(job: JobRow | None, job_id: str) -> JobRow:

@@ -19,6 +19,7 @@ from graspdb.wire import (
 )
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict, invalid
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx, clock
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import jobs, sweeps
@@ -127,6 +128,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
         if waiting:
             # Until there are parts, it repeats no other's poses.
             snapshot["repeat_key"] = sweep_id
+        audit.record(tx, "sweep.create", object=slug, subject=sweep_id)
         _, batch = batches.create(tx, locked.id, revision=locked.revision, sweep_id=sweep_id)
         sweeps.keep_snapshot(tx, sweep_id, {**snapshot, "batch": batch})
         info = sweep_info(tx, require_sweep(tx, sweep_id))

@@ -13,6 +13,7 @@ from graspdb.wire.states import JobState
 from graspdb_service.formats.sweep_outcomes import ChunkResult
 from graspdb_service.problems import busy, invalid
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.simulation import jobs, sweeps
 from graspdb_service.storage.simulation import outcomes as packed
@@ -115,6 +116,7 @@ def complete_parts(ctx: Runtime, job_id: str, lease_id: str, body: bytes) -> Res
             ):
                 raise _LostLease
             meshes.store_parts(tx, locked, body, info)
+            audit.record(tx, "job.result", object=row.slug, subject=job.id)
             jobs.credit_worker(tx, job.worker, 0)
     except (_LostLease, objects.ObjectGone):
         return _replayed(ctx, job_id, lease_id, sha256, "decompose")
@@ -267,5 +269,6 @@ def _store(
             packed=sum(chunk.packed.values()) if collects else len(chunk.outcomes),
             revision=revision if collects else None,
         )
+        audit.record(tx, "job.result", object=sweep.object, subject=job.id)
         jobs.credit_worker(tx, job.worker, job.stop - job.start)
     return accepted

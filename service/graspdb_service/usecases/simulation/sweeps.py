@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, SweepInfo
 from graspdb.wire.states import JobState, SweepState
+from graspdb_service import principal
 from graspdb_service.problems import conflict, found
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx, clock
 from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import Progress, SweepRow
@@ -16,6 +18,8 @@ from graspdb_service.usecases.objects import require
 def require_sweep(tx: Tx, sweep_id: str) -> SweepRow:
     """The sweep, or a 404."""
     row = sweeps.find(tx, sweep_id) if is_uuid(sweep_id) else None
+    # An id tells nothing of whose sweep it is: one of a hidden object is answered as none.
+    row = row if row is not None and principal.sees(row.object) else None
     return found(row, "sweep", sweep_id, "GET /sweeps lists them")
 
 
@@ -31,7 +35,10 @@ def listing(
     """A page of sweeps, the newest first, and the cursor of the next one."""
     with database.read() as tx:
         object_id = None if slug is None else require(tx, slug).id
-        rows = sweeps.listing(tx, object_id=object_id, state=state, before=cursor, limit=limit + 1)
+        prefix = principal.object_prefix()
+        rows = sweeps.listing(
+            tx, object_id=object_id, prefix=prefix, state=state, before=cursor, limit=limit + 1
+        )
         page = [sweep_info(tx, row) for row in rows[:limit]]
     return page, page[-1].id if len(rows) > limit else None
 
@@ -42,7 +49,8 @@ def cancel(database: Database, sweep_id: str) -> SweepInfo:
         row = require_sweep(tx, sweep_id)
     with database.write() as tx:
         sweeps.lock_object(tx, row.object_id)
-        sweeps.cancel(tx, sweep_id)
+        if sweeps.cancel(tx, sweep_id):
+            audit.record(tx, "sweep.cancel", object=row.object, subject=sweep_id)
         decompositions.drop_unwanted(tx, row.object_id)
         return sweep_info(tx, require_sweep(tx, sweep_id))
 
@@ -64,7 +72,8 @@ def retry(database: Database, sweep_id: str) -> SweepInfo:
             waiting = decompositions.again(
                 tx, require(tx, row.object), row, int(clock(tx).timestamp() * 1000)
             )
-        sweeps.retry(tx, sweep_id, waiting=waiting)
+        if sweeps.retry(tx, sweep_id, waiting=waiting):
+            audit.record(tx, "sweep.retry", object=row.object, subject=sweep_id)
         return sweep_info(tx, require_sweep(tx, sweep_id))
 
 
@@ -80,6 +89,7 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
         {
             **vars(row),
             "batch": row.snapshot["batch"],
+            "key": row.made_by,
             "grid": grid,
             "seed": (grid or row.request.get("sample") or {}).get("seed"),
             "state": state,

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from graspdb.wire import OUTCOMES, BatchInfo
 from graspdb_service.problems import busy, conflict, found
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import batches, findings, provenances
@@ -64,6 +65,7 @@ def remove(database: Database, slug: str, key: str) -> None:
             if left is not None:
                 left.hand_over(tx, batch)
             batches.remove(tx, batch)
+            audit.record(tx, "batch.delete", object=slug, subject=key)
             return
     raise busy("Sweeps over the same grid keep finishing chunks meanwhile; send it again")
 
@@ -89,6 +91,7 @@ def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInf
             "batch": batch.key,
             "object": row.slug,
             "sweep": batch.sweep_id,
+            "key": batch.made_by,
             "withdrawn": batches.withdrawn_count(tx, batch),
             "outcomes": {OUTCOMES[code]: number for code, number in sorted(outcomes.items()) if number},
             "grippers": distinct(item.gripper and gripper_parts(item.gripper)[0] for item in items),

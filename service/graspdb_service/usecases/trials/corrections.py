@@ -8,6 +8,7 @@ from graspdb.wire import OUTCOME_CODES, OUTCOMES, TrialInfo, TrialPatch
 from graspdb_service.formats.trial_json import documents
 from graspdb_service.problems import conflict, found
 from graspdb_service.storage import objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import changes, findings, provenances, rows
@@ -56,8 +57,12 @@ def correct(database: Database, slug: str, seq: int, patch: TrialPatch) -> Trial
                 before={name: _worded(name, getattr(before, name)) for name in sorted(different)},
                 reason=patch.reason,
             )
+            withdrawn = bool(after.withdrawn and not before.withdrawn)
+            audit.record(
+                tx, "trial.withdraw" if withdrawn else "trial.correct", object=slug, subject=str(seq)
+            )
             _count(tx, before, after)
-            if after.withdrawn and not before.withdrawn:
+            if withdrawn:
                 findings.drop_trial(tx, row.id, seq)
         return _read(tx, row, seq)
 

@@ -14,6 +14,7 @@ from graspdb_service.formats.trials import parse
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.storage import answers, grippers, objects
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.trials import batches, findings, rows
 from graspdb_service.trial_columns import Ints, Provenance, TrialBatch
@@ -75,6 +76,7 @@ def _store(tx: Tx, settings: Settings, slug: str, batch: TrialBatch, concerns: S
     revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
     ids = np.array(quotas.provenance_ids(tx, settings, row.id, batch, named))
     batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
+    audit.record(tx, "batch.create", object=slug, subject=batch_key)
     columns = replace(
         batch.columns, provenance=ids[batch.columns.provenance], answer=_answers(tx, row.id, batch)
     )

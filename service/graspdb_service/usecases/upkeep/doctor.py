@@ -6,7 +6,6 @@ Everything that the rows say is read in one snapshot, so that a service may go o
 from __future__ import annotations
 
 import difflib
-import ipaddress
 import os
 import shutil
 import stat
@@ -15,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from graspdb_service.settings import Settings
+from graspdb_service.settings import Settings, is_loopback
 from graspdb_service.storage import schema
+from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx, clock
 from graspdb_service.storage.upkeep import condition, counters
 from graspdb_service.storage.upkeep.backup import unhurried
@@ -90,6 +90,7 @@ def repair(database: Database) -> list[str]:
         with database.write() as tx:
             unhurried(tx)
             counters.recount(tx, object_id)
+            audit.record(tx, "database.repair", object=names[object_id])
     return sorted(names.values())
 
 
@@ -302,16 +303,6 @@ def _disk(database: Database, settings: Settings) -> Iterator[Diagnosis]:
 
 
 # --- settings -------------------------------------------------------------------------------------------
-
-
-def is_loopback(host: str) -> bool:
-    """Whether nobody but this machine can connect to an address."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _settings(settings: Settings) -> Diagnosis:

@@ -1,0 +1,1 @@
+"""Keys, and the audit of what was done with them."""
