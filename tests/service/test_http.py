@@ -122,25 +122,25 @@ def test_compressed_body_is_read(
     assert made.status_code == 200, made.text
 
 
-@pytest.mark.parametrize(
-    ("coding", "body", "status"),
-    [
-        ("br", b"x", 415),
-        ("zstd", b"x", 415),
-        ("gzip, gzip", gzip.compress(gzip.compress(b"{}")), 415),
-        ("gzip", b"{}", 400),
-        ("gzip", gzip.compress(b'{"trials": []}')[:-5], 400),
-        ("gzip", gzip.compress(b"{}") + b"more", 400),
-        ("deflate", zlib.compress(b"{}") * 2, 400),
-        ("gzip", gzip.compress(b"") * 12_000, 413),
-        ("gzip", gzip.compress(b" " * (LIMIT + 1)), 413),
-        ("gzip", gzip.compress(b" " * 300_000_000, 9), 413),
-        ("deflate", zlib.compress(b" " * 300_000_000), 413),
-        ("gzip", gzip.compress(b""), 422),
-        ("gzip", b"", 422),
-    ],
-    ids=lambda value: value[:10] if isinstance(value, bytes) else str(value),
-)
+#: Named by their number: what gzip writes holds the time, and every process must name a test alike.
+REFUSED = [
+    ("br", b"x", 415),
+    ("zstd", b"x", 415),
+    ("gzip, gzip", gzip.compress(gzip.compress(b"{}")), 415),
+    ("gzip", b"{}", 400),
+    ("gzip", gzip.compress(b'{"trials": []}')[:-5], 400),
+    ("gzip", gzip.compress(b"{}") + b"more", 400),
+    ("deflate", zlib.compress(b"{}") * 2, 400),
+    ("gzip", gzip.compress(b"") * 12_000, 413),
+    ("gzip", gzip.compress(b" " * (LIMIT + 1)), 413),
+    ("gzip", gzip.compress(b" " * 300_000_000, 9), 413),
+    ("deflate", zlib.compress(b" " * 300_000_000), 413),
+    ("gzip", gzip.compress(b""), 422),
+    ("gzip", b"", 422),
+]
+
+
+@pytest.mark.parametrize(("coding", "body", "status"), REFUSED, ids=range(len(REFUSED)))
 def test_compressed_body_that_is_refused(client: httpx.Client, coding: str, body: bytes, status: int) -> None:
     before = client.get("/objects/mug").json()["trials"]
     answer = _post(client, coding, body)
