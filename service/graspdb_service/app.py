@@ -96,21 +96,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     SQLite is created and migrated here; a PostgreSQL schema that is not current is refused (StaleSchema).
     """
     settings = settings or Settings()
-    database = Database(
-        settings.database_url,
-        pool_size=settings.max_database_connections,
-        statement_s=settings.max_statement_seconds,
-    )
-    try:
-        if database.is_sqlite:
-            schema.upgrade(database)
-        else:
-            schema.check(database)
-        seed(database)
-    except BaseException:
-        database.dispose()
-        raise
-    ctx = Context.create(settings, database)
+    ctx = Context.create(settings, _open_database(settings))
 
     admission = Admission(settings)
 
@@ -151,6 +137,25 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(RequestTrace)
     app.add_middleware(RequestLog)
     return app
+
+
+def _open_database(settings: Settings) -> Database:
+    """The database, its schema current, with the built-in grippers."""
+    database = Database(
+        settings.database_url,
+        pool_size=settings.max_database_connections,
+        statement_s=settings.max_statement_seconds,
+    )
+    try:
+        if database.is_sqlite:
+            schema.upgrade(database)
+        else:
+            schema.check(database)
+        seed(database)
+    except BaseException:
+        database.dispose()
+        raise
+    return database
 
 
 async def _cut_what_hangs(ctx: Context) -> None:
