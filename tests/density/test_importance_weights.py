@@ -13,10 +13,9 @@ from graspdb_density import effective_sample_size, importance_weights
 from graspdb_density.kde.importance_weights import pooled_density
 
 POSITIVE = st.lists(st.floats(1e-12, 1e12), min_size=1, max_size=30)
-EVEN = st.lists(st.floats(0.5, 1.5), min_size=1, max_size=30)
 
 
-@given(EVEN, st.floats(1e-6, 1e6))
+@given(POSITIVE, st.floats(1e-6, 1e6))
 def test_reciprocal_normalised_and_free_of_units(g: list[float], unit: float) -> None:
     w = importance_weights(g)
     assert w.sum() == pytest.approx(1.0)
@@ -28,29 +27,6 @@ def test_unknown_densities_take_the_mean_of_the_rest() -> None:
     w = importance_weights([1.0, None, 3.0, math.nan])  # type: ignore[list-item]
     assert w[1] == w[3] == pytest.approx((w[0] + w[2]) / 2.0)
     np.testing.assert_allclose(importance_weights([math.nan] * 4), 0.25)
-
-
-@given(POSITIVE.map(sorted), st.integers(10, 400))
-def test_no_weight_is_above_its_limit(strange: list[float], ordinary: int) -> None:
-    """Twice the square root of n (or ten) times the mean: a factor of two is left for rounding."""
-    g = np.array(strange + [1.0] * ordinary)
-    w = importance_weights(g)
-    limit = max(np.sqrt(len(g)), 10.0) / len(g)
-    assert w.sum() == pytest.approx(1.0)
-    assert w.max() <= 2 * limit * (1 + 1e-9)
-    assert (np.diff(w[: len(strange)]) <= 1e-12 * w.max()).all()  # the order stays
-
-
-def test_one_wrong_density_is_not_all_that_counts() -> None:
-    g = np.full(400, 3.0)
-    g[7] = 1e-300
-    w = importance_weights(g)
-    assert 0.04 < w[7] < 0.1
-    others = np.delete(w, 7)
-    np.testing.assert_allclose(others, others[0])
-    # Weights that differ by an order of magnitude are not touched.
-    honest = np.random.default_rng(0).uniform(0.1, 3.0, 500)
-    np.testing.assert_allclose(importance_weights(honest), (1 / honest) / (1 / honest).sum())
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.inf])

@@ -16,17 +16,13 @@ __all__ = [
 
 #: Below this share of the rows, an effective sample size deserves a warning.
 LOW_EFFECTIVE_SHARE = 0.1
-#: A weight is never cut below so many times their mean: of few trials one may well be worth ten.
-_LEAST_LIMIT = 10.0
 
 
 def importance_weights(proposal_density: ArrayLike) -> Floats:
     """Weights ``1 / g(x_i)``, summing to 1, of trials each drawn with its own proposal density.
 
     A trial without a proposal density takes the mean weight of those that have one; where none has, all are
-    equal. No weight is above about the square root of N times their mean (truncated importance sampling,
-    Ionides 2008), nor need it be below ten times: one trial whose proposal density is wrong by orders of
-    magnitude would otherwise be all that counts.
+    equal.
 
     Parameters
     ----------
@@ -46,37 +42,10 @@ def importance_weights(proposal_density: ArrayLike) -> Floats:
         raise ValueError("proposal densities must be positive and finite")
     weights = np.ones(len(g))
     if known.any():
-        values = np.maximum(values, _least_density(values))
         # Scaled by the smallest density first: reciprocals of tiny ones would overflow.
         weights[known] = values.min() / values
         weights[~known] = weights[known].mean()
     return np.asarray(weights / weights.sum(), dtype=np.float64)
-
-
-def _least_density(g: Floats) -> float:
-    """Densities (N,) below this count as this, so that no weight is above the limit.
-
-    The limit is that of the weights as they are then: most times (rest + k limit) / N, where the k heaviest
-    are at it and ``rest`` is what the others sum to. Rounded to a power of two, so that a further trial
-    seldom changes the weights of all.
-    """
-    n = len(g)
-    most = max(np.sqrt(n), _LEAST_LIMIT)
-    count = int(np.ceil(n / most)) - 1
-    if count < 1:
-        return 0.0
-    lowest = np.partition(g, count)
-    heaviest = np.sort(lowest[:count])
-    # In units of the heaviest weight; summed from the lightest, for the heaviest may drown all others.
-    weights = heaviest[0] / heaviest
-    lighter = (heaviest[0] / lowest[count:]).sum()
-    rest = lighter + np.cumsum(weights[::-1])[::-1]
-    limits = most * np.append(rest, lighter) / (n - most * np.arange(count + 1))
-    fits = np.append(weights, heaviest[0] / lowest[count]) <= limits
-    at_limit = int(np.argmax(fits))
-    if at_limit == 0:
-        return 0.0
-    return float(2.0 ** np.floor(np.log2(heaviest[0] / limits[at_limit])))
 
 
 def pooled_density(densities: ArrayLike, counts: ArrayLike) -> Floats:

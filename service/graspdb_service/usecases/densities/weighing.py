@@ -238,7 +238,7 @@ class Weighing:
         elif GRID in kinds:
             rule = "all equal: a grid tried its region equally densely everywhere"
         elif TOLD in kinds:
-            kind, rule = "own", "1 / g of each trial's own proposal density, at most sqrt(n) times their mean"
+            kind, rule = "own", "1 / g of each trial's own proposal density"
             if unknown:
                 rule += "; trials without a proposal density take the mean weight of the rest"
         return WeightsInfo(kind=kind, rule=rule, poses_tried=tried, without_proposal_density=unknown)
