@@ -83,6 +83,18 @@ def test_every_line_is_json_and_a_request_is_one_of_them(tmp_path: Path) -> None
     assert line["route"] == "/objects/{id}/best-grasp"
 
 
+def test_a_request_with_a_key_is_told_under_the_keys_name(tmp_path: Path, server: Callable[..., Any]) -> None:
+    keys = {"GRASPDB_AUTH": "keys", "GRASPDB_DATABASE_URL": f"sqlite:///{tmp_path}/g.sqlite"}
+    assert server("migrate", **keys).returncode == 0
+    made = json.loads(server("keys", "create", "robot-3", "--scopes", "read", "--json", **keys).stdout)
+    with started(tmp_path, GRASPDB_LOG_FORMAT="json", **keys) as (http, log):
+        assert http.get("/objects", headers={"Authorization": f"Bearer {made['key']}"}).status_code == 200
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    (told,) = (line for line in lines if line["logger"] == "graspdb.request")
+    assert (told["key"], told["key_id"]) == ("robot-3", made["id"])
+    assert made["key"] not in log.read_text()
+
+
 def logged(formatter: logging.Formatter, message: str, **fields: Any) -> str:
     try:
         raise ValueError(message)

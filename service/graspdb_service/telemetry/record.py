@@ -33,9 +33,8 @@ class RequestRecord:
     def names(self) -> dict[str, str]:
         """The request's id and, where there is one, its key's id and name."""
         found = {"request_id": str(self.state.get("request_id", ""))}
-        key = self.state.get("identity")
-        if key is not None:
-            found |= {"key_id": str(key.key_id), "key": str(key.name)}
+        if "key_id" in self.state:
+            found |= {"key_id": str(self.state["key_id"]), "key": str(self.state.get("key", ""))}
         return found
 
 

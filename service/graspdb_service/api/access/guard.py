@@ -53,6 +53,8 @@ class GuardedRoute(APIRoute):
         if who is not None:
             # What is shared fairly is shared between keys.
             state["key_id"] = who.key_id
+            # The log names it, too.
+            state["key"] = who.name
         with principal.asking(who, state.get("request_id")):
             if self.path.startswith("/objects/{id}"):
                 principal.refuse_hidden(scope["path_params"]["id"])
