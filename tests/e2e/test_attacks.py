@@ -98,7 +98,7 @@ def connect(server: RealServer, sent: bytes) -> socket.socket:
     return connection
 
 
-POST = b"POST /objects/mug/trials HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+POST = b"POST /objects/mug/trials HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
 
 def test_connections_are_not_kept_for_ever(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_connections_are_not_kept_for_ever(tmp_path: Path) -> None:
     patience = {"max_header_seconds": 1, "max_idle_seconds": 1, "max_body_seconds": 1, "max_connections": 60}
     with real_server(tmp_path, **patience) as server, httpx.Client(base_url=server.url, timeout=60) as http:
         http.post("/objects", json={"id": "mug"})
-        for sent in (b"", b"GET /livez HTTP/1.1\r\nX-A: ", b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n"):
+        for sent in (b"", b"GET /livez HTTP/1.1\r\nX-A: ", b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"):
             with connect(server, sent) as connection:
                 assert closed_within(connection, 30), sent
         with connect(server, POST + b"Content-Length: 1000\r\n\r\n{") as connection:
@@ -120,7 +120,7 @@ def test_connections_are_not_kept_for_ever(tmp_path: Path) -> None:
 
 
 def test_who_does_not_read_is_cut_off(tmp_path: Path) -> None:
-    ask = b"GET /objects/mug/trials HTTP/1.1\r\nHost: x\r\nAccept: application/x-ndjson\r\n\r\n"
+    ask = b"GET /objects/mug/trials HTTP/1.1\r\nHost: localhost\r\nAccept: application/x-ndjson\r\n\r\n"
     with real_server(tmp_path, max_reader_stall_seconds=1) as server:
         with httpx.Client(base_url=server.url, timeout=240) as http:
             http.post("/objects", json={"id": "mug"})
@@ -210,7 +210,7 @@ def test_time_runs_out_with_what_was_reached(crowded: RealServer) -> None:
 
 def test_who_hangs_up_is_not_computed_for(crowded: RealServer) -> None:
     body = json.dumps(NOISE).encode()
-    head = b"POST /objects/large/best-grasp HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+    head = b"POST /objects/large/best-grasp HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     for _ in range(20):
         with connect(crowded, head + b"Content-Length: %d\r\n\r\n" % len(body) + body):
             time.sleep(0.02)

@@ -30,11 +30,11 @@ def sweep_of(name: str, **options: Any) -> SweepRow:
     now = datetime(2026, 1, 1, tzinfo=UTC)
     poses = sweep_plan.pose_grid(plan).total
     return SweepRow(
-        id=name, object_id=1, provenance_id=7, gripper="pg70", protocol="wrench", fidelity="standard",
-        purpose="collect", plan="grid", request={},
+        id=name, object_id=1, provenance_id=7, gripper="pg70", gripper_version=1, protocol="wrench",
+        fidelity="standard", purpose="collect", plan="grid", request={},
         snapshot={"grid": plan.model_dump(), "repeat_key": "one grid"},
-        pose_count=poses, chunk_poses=100, chunks=1, cancelled=False, created_at=now, started_at=now,
-        finished_at=now, object="thing", batch_id=1, batch="b",
+        pose_count=poses, chunk_poses=100, chunks=1, cancelled=False, made_by=None,
+        created_at=now, started_at=now, finished_at=now, object="thing", batch_id=1, batch="b",
     )  # fmt: skip
 
 
@@ -64,8 +64,14 @@ def stored(*sweeps: tuple[SweepRow, int], rows: int = 0) -> Stored:
         proposal_density=np.full(rows, np.nan), provenance=np.full(rows, 7),
     )  # fmt: skip
     now = datetime.now(UTC)
-    thing = ObjectRow(1, "thing", None, None, None, None, None, 1, 0, rows, None, None, None, None, now, now)
-    selected = Selected(thing, "pg70", "wrench", None, None, {7: True}, {}, frozenset({7}))
+    nothing = [None] * 5
+    thing = ObjectRow(1, "thing", *nothing, 1, 0, rows, *nothing[:4], now, now, None)
+    selected = Selected(
+        row=thing, gripper="pg70", protocol="wrench", source=None, source_weight=None, profile=None,
+        provenances={7: True}, sources={7: "simulation"}, outcomes={},
+        by_source={"simulation": {}}, tried=frozenset({7}),
+        versions=(1,), stamp=None, warnings=(),
+    )  # fmt: skip
     return Stored(columns, turns, selected, (NO_ATTEMPT,))
 
 

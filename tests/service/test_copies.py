@@ -157,8 +157,10 @@ def test_a_copy_takes_another_mesh_once(
     }  # fmt: skip
     with pytest.raises(AssertionError, match="mesh-in-use"):
         put_box(http, "copy", (0.05, 0.05, 0.1))
-    (warning,) = http.get(f"{place}/density", params=selection).json()["warnings"]
+    # The second: grasps that held collide by the other mesh.
+    warning, contradiction = http.get(f"{place}/density", params=selection).json()["warnings"]
     assert "thing" in warning
+    assert "grasps that held" in contradiction
     asked = {**selection, "poses": [{"position": [0, 0, 0.05], "quaternion_xyzw": DOWN}]}
     for of, free in ((full, True), ("copy", False)):
         likely = http.post(f"/objects/{of}/likelihood", json=asked).json()

@@ -19,7 +19,9 @@ from graspdb_service.usecases.access import audit, keys
 
 router = APIRouter(tags=["access"], route_class=AdmittedRoute)
 
-KeyId = Annotated[str, Path(description="Id of the key, as making it answered it.")]
+KeyId = Annotated[
+    str, Path(description="Id of the key, as making it answered it.", json_schema_extra={"maxLength": 200})
+]
 
 
 def _in_utc(at: datetime) -> datetime:
