@@ -134,6 +134,8 @@ def invented(database: Database) -> list[str]:
                 reference = next(iter(column.foreign_keys), None)
                 if reference is not None:
                     row[column.name] = tx.scalar(select(reference.column).limit(1))
+                elif column.server_default is not None:
+                    continue  # a number that the database gives, and goes on from
                 elif column.name in allowed:
                     row[column.name] = allowed[column.name]
                 else:

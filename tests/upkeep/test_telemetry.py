@@ -128,7 +128,7 @@ def test_the_level_and_the_format_are_settings(server: Callable[..., Any]) -> No
     assert Settings(log_level="WARNING").log_level == "warning"
     refused = server("serve", GRASPDB_LOG_FORMAT="xml")
     assert refused.returncode == 1
-    assert "log_format" in refused.stderr
+    assert "GRASPDB_LOG_FORMAT" in refused.stderr
 
 
 # --- metrics --------------------------------------------------------------------------------------------

@@ -232,11 +232,11 @@ class Database:
             yield tx
 
     @contextmanager
-    def write(self) -> Iterator[Tx]:
+    def write(self, *, audited: bool = True) -> Iterator[Tx]:
         """A writing transaction, committed when the block ends and rolled back if it raises.
 
-        UnauditedChange where it changed an audited table and no row of the audit tells of it; CommitUnknown
-        where the connection broke while it was committed.
+        ``audited`` but for what the service brings itself. UnauditedChange where it changed an audited table
+        and no row of the audit tells of it; CommitUnknown where the connection broke while it was committed.
         """
         self._refuse_if_down()
         with timed("database"), self._writer.connect() as tx:
@@ -245,7 +245,7 @@ class Database:
             with _drivers_errors(tx):
                 yield tx
             changed = tx.info.pop(_CHANGED)
-            if changed and "audit" not in changed:
+            if audited and changed and "audit" not in changed:
                 raise UnauditedChange(
                     f"{', '.join(sorted(changed))} changed without a record: call storage.access.audit.record"
                 )

@@ -21,10 +21,9 @@ def seed(database: Database) -> None:
     with database.read() as tx:
         if grippers.builtin_ids(tx) >= BUILTIN.keys():
             return
-    with database.write() as tx:
+    with database.write(audited=False) as tx:
         for gripper, (name, profile) in sorted(BUILTIN.items()):
-            if grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True):
-                audit.record(tx, "gripper.create", subject=gripper)
+            grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
 
 
 def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
