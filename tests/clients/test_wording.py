@@ -39,7 +39,7 @@ REQUEST = re.compile(r"(GET|POST|PUT|DELETE|PATCH) /")
             "post them with --accept-implausible",
         ),
         ("by 0.001 (on the command line --unit mm)", "by 0.001 (--unit mm)"),
-        ("collision_free=false would do", "--no-collision-free would do"),
+        ("collision_free=false would do", "--any would do"),
         ("trials.1.quaternion_xyzw: norm 3", "trials.1.quaternion_xyzw: norm 3"),
         ("GET /somewhere/else is unknown", "GET /somewhere/else is unknown"),
     ],

@@ -56,6 +56,8 @@ _PARAMETERS = option_names(
     *(Constraints, SweepOptions, KernelOptions, ObjectProperties, TrialFilters, Upload),
     *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, PromisesOptions),
 ) | {"unit", "mesh"}
+#: Flags whose opposite has a name of its own.
+_OPPOSITES = {"collision_free": "any"}
 _CALL = re.compile(r"\b(GET|POST|PUT|DELETE|PATCH) (/[\w{}./-]*[\w}])(?:\?([\w=]+)(?:=\.\.\.|\.\.\.)?)?")
 _FOR_BOTH = re.compile(r"(\?\w+=\w+)? \(on the command line (--[^()]+)\)")
 _PARAMETER = re.compile(r"(?<![\w.\-])\??(?:\w+\([^()]*\)|([a-z_]+)=([\w.-]*)|([a-z]+(?:_[a-z]+)+))")
@@ -132,7 +134,7 @@ def _option(found: re.Match[str]) -> str:
     if name not in _PARAMETERS:
         return found[0]
     if found[2] in ("true", "false"):
-        return _flag(name if found[2] == "true" else f"no_{name}")
+        return _flag(name if found[2] == "true" else _OPPOSITES.get(name, f"no_{name}"))
     return f"{_flag(name)} {found[2]}" if found[2] else _flag(name)
 
 
