@@ -114,6 +114,8 @@ def fill(http: httpx.Client) -> None:
     answered(http.post("/kernels", json={"components": components}))
     last = answered(http.post("/objects/box/trials", json=trials(2)))
     answered(http.delete(f"/objects/box/batches/{last['batch']}"))
+    selected = {"gripper": "mine", "source": "robot", "collision_free": False, "name": "kept"}
+    answered(http.get("/objects/box/best-grasp", params=selected))
     answered(http.get("/objects/box/reports/bandwidth", params={"gripper": "mine", "source": "robot"}))
 
 
