@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graspdb_service.problems import ProblemError
+from graspdb_service.usecases.runtime import asked
 from graspdb_service.usecases.runtime.asked import Asked, begin
 from graspdb_service.usecases.runtime.compute import Compute, breathe
 from graspdb_service.usecases.runtime.fair_share import Claim, FairShare, NoRoom
@@ -20,9 +21,10 @@ from graspdb_service.usecases.runtime.fair_share import Claim, FairShare, NoRoom
 
 @pytest.fixture(autouse=True)
 def _own_question() -> Iterator[None]:
-    """Whose question a test works on is nothing to the next one."""
+    """Whose question a test works on, and by when, is nothing to the next one in this process."""
+    before = asked._ASKED.set(None)
     yield
-    begin(Asked(""))
+    asked._ASKED.reset(before)
 
 
 CLIENTS = st.sampled_from("abc")
