@@ -162,7 +162,8 @@ def test_metrics_tell_what_there_is(http: httpx.Client, eventually: Callable[...
     assert value["graspdb_compute_waiting"] == 0
     assert 'graspdb_jobs{kind="simulate",state="queued"}' in value
     assert value['graspdb_phase_seconds_count{phase="compute"}'] > 0
-    assert value['graspdb_database_connections{state="idle"}'] >= 1
+    # One of them may be in use just then.
+    assert sum(value[name] for name in value if name.startswith("graspdb_database_connections{")) >= 1
 
 
 def test_strange_requests_make_no_series(sqlite_http: httpx.Client) -> None:
