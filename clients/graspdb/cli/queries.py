@@ -103,7 +103,7 @@ def best_grasp(
         raise
     if state.json:
         head = ("status", "ranking", "revision", "kernel", "selection", "calibration", "warnings")
-        names = (*head, "answer", "newer_revision")
+        names = (*head, "answer", "newer_revision", "stale")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())

@@ -227,8 +227,9 @@ class Grasps(Sequence[Grasp]):
     would do.
     ``ranking`` says what they are ranked by, ``reach`` how far from an attempt success probabilities are
     told, ``selection`` whose trials count. ``answer`` is the id that the service keeps them under, None where
-    it does not; ``newer_revision`` the object's revision now, where a name keeps them of an older one. Where
-    they were simulated before they were answered (``verify=True``), those that held come first.
+    it does not; ``newer_revision`` the object's revision now, where a name keeps them of an older one;
+    ``stale``: the database did not answer, so they are from what the service had read before. Where they
+    were simulated before they were answered (``verify=True``), those that held come first.
     """
 
     def __init__(self, answer: wire.BestGrasps, reporter: Reporter | None = None) -> None:
@@ -243,6 +244,7 @@ class Grasps(Sequence[Grasp]):
         self.calibration = answer.calibration
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
+        self.stale = answer.stale
         self.nearest = (
             None if answer.nearest is None else Grasp.from_wire(answer.nearest, answer.answer, reporter)
         )
@@ -425,7 +427,8 @@ class LikelihoodArrays(Columns):
     zero; ``relative`` to the density's global maximum. ``success_probability`` and ``interval`` are NaN where
     ``support.enough`` is False; ``reach`` says how far from an attempt they are told, and why no farther.
     ``answer`` is the id that the service keeps them under, None where it does not; ``newer_revision`` the
-    object's revision now, where a name keeps them of an older one.
+    object's revision now, where a name keeps them of an older one; ``stale``: the database did not answer, so
+    they are from what the service had read before.
     ``selection`` says whose trials count, and each source's share of the density's weight.
     """
 
@@ -445,6 +448,7 @@ class LikelihoodArrays(Columns):
     warnings: Sequence[str] = ()
     answer: str | None = None
     newer_revision: int | None = None
+    stale: bool = False
     selection: wire.SelectionInfo | None = None
     calibration: wire.CalibrationInfo | None = None
 
@@ -475,6 +479,7 @@ class LikelihoodArrays(Columns):
             interval=interval,
             answer=answers[0].answer if len(answers) == 1 else None,
             newer_revision=answers[-1].newer_revision,
+            stale=any(a.stale for a in answers),
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
             **columns,
         )
@@ -549,7 +554,8 @@ class SampledPoses(PoseArrays):
     ``criterion`` says how proposals were drawn; None for plain samples. ``support`` says how far each is from
     what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial. ``selection``
     says whose trials count. ``answer`` is the id that the service keeps them under, None where it does not;
-    ``newer_revision`` the object's revision now, where a name keeps them of an older one.
+    ``newer_revision`` the object's revision now, where a name keeps them of an older one; ``stale``: the
+    database did not answer, so they are from what the service had read before.
     """
 
     proposal_density: Floats
@@ -561,6 +567,7 @@ class SampledPoses(PoseArrays):
     prior: bool = False
     answer: str | None = None
     newer_revision: int | None = None
+    stale: bool = False
     selection: wire.SelectionInfo | None = None
 
     @classmethod
@@ -578,6 +585,7 @@ class SampledPoses(PoseArrays):
             prior=answer.prior,
             answer=answer.answer,
             newer_revision=answer.newer_revision,
+            stale=answer.stale,
             selection=answer.selection,
         )
 

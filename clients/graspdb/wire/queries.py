@@ -137,6 +137,13 @@ AnswerId = Annotated[
         " written."
     ),
 ]
+Stale = Annotated[
+    bool,
+    Field(
+        description="Whether the database did not answer, so that this is from what the service had read"
+        " before, of this `revision`: what came since is not in it, and it is not kept."
+    ),
+]
 NewerRevision = Annotated[
     int | None,
     Field(
@@ -270,6 +277,7 @@ class DensityInfo(Response):
     findings: list[Finding] = Field(default_factory=list)
     """What was doubtful about the selected trials when they came, over all batches."""
     estimator: EstimatorField = None
+    stale: Stale = False
 
 
 class PoseColumns(Request):
@@ -377,6 +385,7 @@ class Likelihoods(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    stale: Stale = False
     calibration: CalibrationField = None
     selection: SelectionField = None
 
@@ -611,6 +620,7 @@ class BestGrasps(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    stale: Stale = False
     calibration: CalibrationField = None
     selection: SelectionField = None
 
@@ -646,6 +656,7 @@ class Samples(Response):
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None
     newer_revision: NewerRevision = None
+    stale: Stale = False
     selection: SelectionField = None
 
 

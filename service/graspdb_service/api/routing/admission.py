@@ -92,7 +92,7 @@ class AdmittedRoute(GuardedRoute):
                 admission.bodies.read(request, client, most) as received,
                 admission.place(place, client),
             ):
-                question = Asked(client)
+                question = Asked(client, may_be_stale=place == "max_queries_at_once")
                 begin(question)
                 return await _while_wanted(handle, received, question)
 

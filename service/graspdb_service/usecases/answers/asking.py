@@ -32,6 +32,7 @@ from graspdb_service.usecases.grasps import answer, proposals, samples
 from graspdb_service.usecases.grasps import likelihood as likelihoods
 from graspdb_service.usecases.grasps.samples import Draw
 from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.runtime.asked import outage, outage_warnings
 from graspdb_service.usecases.trials.selection import Selected
 
 #: Answers of more poses are not kept, nor larger ones.
@@ -175,7 +176,8 @@ def _head(ctx: Asking, built: Built, kernel: KernelInfo) -> dict[str, Any]:
         "kernel": kernel.model_dump(),
         "estimator": EstimatorInfo().model_dump(),
         "selection": built.selection.model_dump(),
-        "warnings": ctx.evidence.warnings(built),
+        "warnings": [*outage_warnings(built.revision), *ctx.evidence.warnings(built)],
+        "stale": outage() is not None,
     }
 
 
@@ -190,6 +192,9 @@ def _in_columns(
 
 def _kept(ctx: Asking, asked: _Asked, make: Callable[[str | None], bytes]) -> tuple[str | None, bytes]:
     """Keep the JSON that an answer makes of its id: the id, None where it is not kept, and the JSON."""
+    if outage() is not None:
+        # Nobody knows what it would be today, and nothing can be written.
+        return None, make(None)
     selected, question = asked.selected, orjson.dumps(asked.question, option=orjson.OPT_SORT_KEYS)
     row = selected.row
     id = answer_id(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +23,7 @@ from graspdb_service.usecases.densities import build, proposal_density, stored_k
 from graspdb_service.usecases.densities.build import Built, Fresh, KernelChoice
 from graspdb_service.usecases.densities.weighing import Weighing, codes_of, fetch_tried, mixes
 from graspdb_service.usecases.geometry.features import Features
+from graspdb_service.usecases.runtime.asked import or_kept
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected, Selections, as_of
@@ -27,6 +31,8 @@ from graspdb_service.usecases.trials.selection import Selected, Selections, as_o
 _WIDTHS = ("sigma_position_m", "sigma_rotation_deg")
 #: Beyond this many standard deviations a cut-off changes no answer: evaluated exactly instead.
 _LARGEST_CUTOFF = 10.0
+#: Stored kernels remembered for while the database does not answer.
+_KERNELS_KEPT = 256
 
 
 def kernel_of(request: Selection) -> tuple[KernelChoice, float | None]:
@@ -73,6 +79,8 @@ class Densities:
         self._features = features
         self.kept: SingleFlightCache[tuple[tuple[int, TrialSelection, int | None], KernelChoice], Built]
         self.kept = SingleFlightCache(max_bytes, lambda built: built.nbytes)
+        self._found: OrderedDict[tuple[int, str | None, str], KernelRow] = OrderedDict()
+        self._lock = threading.Lock()
 
     def get(self, selected: Selected, kernel: KernelChoice) -> Built:
         """The density of a selection, at least as new; refused as :meth:`stored`, and as the selection where
@@ -95,6 +103,20 @@ class Densities:
 
     def stored(self, selected: Selected, name: str) -> KernelRow:
         """The stored kernel with this id (404), or for ``anisotropic`` the newest of its gripper (409)."""
+        key = selected.row.id, selected.gripper, name
+        with self._lock:
+            known = self._found.get(key)
+        if known is not None and not principal.sees(stored_kernel.owner(known)):
+            known = None
+        found = or_kept(partial(self._find_stored, selected, name), known)
+        with self._lock:
+            self._found[key] = found
+            self._found.move_to_end(key)
+            while len(self._found) > _KERNELS_KEPT:
+                self._found.popitem(last=False)
+        return found
+
+    def _find_stored(self, selected: Selected, name: str) -> KernelRow:
         row = selected.row
         with self._database.read() as tx:
             newest = name == "anisotropic"

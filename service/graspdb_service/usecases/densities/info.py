@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from graspdb.wire import DensityInfo, EstimatorInfo, Selection
 from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.storage.trials import findings
+from graspdb_service.storage.trials.findings import FindingTotal
+from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.runtime.asked import or_kept, outage, outage_warnings
 from graspdb_service.usecases.trials.findings.words import of_selection
 from graspdb_service.usecases.trials.selection import Selected
 
@@ -17,14 +22,15 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
     density, selected = built.density, built.selected
     size = 0 if density is None else density.size
     effective = 0.0 if density is None else density.effective_sample_size
-    warnings = ctx.evidence.warnings(built)
+    doubtful: list[FindingTotal] = or_kept(partial(_findings, ctx, built), [])
+    warnings = [*outage_warnings(built.revision), *ctx.evidence.warnings(built)]
+    if outage() is not None:
+        warnings.append("what was doubtful about its trials (findings) can't be read now")
     if size and effective < LOW_EFFECTIVE_SHARE * size:
         warnings.append(
             f"the weights are very uneven: {size} successes count like {effective:.0f};"
             " check the proposal densities of the trials"
         )
-    with ctx.database.read() as tx:
-        doubtful = findings.totals(tx, built.object_row.id, list(selected.provenances))
     info = DensityInfo(
         object=slug,
         revision=built.revision,
@@ -43,5 +49,11 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
         warnings=warnings,
         findings=of_selection(doubtful),
         estimator=EstimatorInfo(),
+        stale=outage() is not None,
     )
     return info, selected
+
+
+def _findings(ctx: Estimators, built: Built) -> list[FindingTotal]:
+    with ctx.database.read() as tx:
+        return findings.totals(tx, built.object_row.id, list(built.selected.provenances))

@@ -29,6 +29,7 @@ from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
 from graspdb_service.usecases.grasps.search import ScoreSearch, closest
+from graspdb_service.usecases.runtime.asked import outage, outage_warnings
 from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
@@ -60,7 +61,9 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         "revision": built.revision,
         "estimator": EstimatorInfo(),
         "selection": built.selection,
+        "stale": outage() is not None,
         "warnings": [
+            *outage_warnings(built.revision),
             *ctx.evidence.warnings(built),
             *doubts(None if question is None else question.calibration),
         ],

@@ -1,13 +1,20 @@
-"""Whose question a thread works on, until when an answer is wanted, and whether anybody waits for it."""
+"""Whose question a thread works on, until when an answer is wanted, whether anybody waits for it, and whether
+what is kept will do while the database does not answer.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from graspdb_service.problems import ProblemError
+from graspdb_service.storage.database import UNAVAILABLE, why
+
+V = TypeVar("V")
 
 
 @dataclass(eq=False)
@@ -21,6 +28,10 @@ class Asked:
     """Time for the answer, from the request on; None without an end."""
     gone: bool = False
     """Whether the asker has hung up."""
+    may_be_stale: bool = False
+    """Whether an answer from what is kept will do while the database does not answer."""
+    outage: str | None = None
+    """What the database said where the answer is from what was kept."""
     step: str = "waiting for a processor"
     done: int = 0
     of: int | None = None
@@ -69,3 +80,34 @@ def end_all() -> None:
 def begin(question: Asked) -> None:
     """From here on, in this task and the threads it hands work to, that is what is worked on."""
     _ASKED.set(question)
+
+
+def or_kept(read: Callable[[], V], kept: V | None) -> V:
+    """What the database has; while it does not answer what is kept, where that will do, as is then noted.
+
+    Without, or where nothing is kept, the database's error.
+    """
+    try:
+        return read()
+    except UNAVAILABLE as error:
+        question = asked()
+        if kept is None or not question.may_be_stale:
+            raise
+        question.outage = why(error)
+        return kept
+
+
+def outage() -> str | None:
+    """What the database said, where this thread's question is answered from what was kept."""
+    return asked().outage
+
+
+def outage_warnings(revision: int) -> list[str]:
+    """What is to be said of an answer, of this revision, from what was kept."""
+    said = outage()
+    if said is None:
+        return []
+    return [
+        f"stale: the database does not answer ({said}), so this is from what the service had read before, of"
+        f" revision {revision}; what came since is not in it"
+    ]

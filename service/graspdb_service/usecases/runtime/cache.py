@@ -6,7 +6,10 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Generic, TypeVar
+
+from graspdb_service.usecases.runtime.asked import or_kept
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -38,7 +41,8 @@ class SingleFlightCache(Generic[K, V]):
         """The value of ``key`` if ``usable``, else what ``make`` answers, given the value before (or None).
 
         Of several callers one makes while the others wait; they then judge what it made for themselves.
-        If ``make`` raises, its caller gets the error and the next one tries anew.
+        If ``make`` raises, its caller gets the error and the next one tries anew; where that is for the
+        database, which does not answer, a question that it will do for gets the value before.
         """
         with self._lock:
             slot = self._slots.setdefault(key, _Slot())
@@ -53,7 +57,7 @@ class SingleFlightCache(Generic[K, V]):
                 value = slot.value
                 if value is None or not usable(value):
                     self.misses += 1
-                    value = make(value)
+                    value = or_kept(partial(make, value), value)
                     slot.value = value
             return value
         finally:

@@ -13,6 +13,7 @@ from graspdb.wire import OUTCOMES, SOURCES, GripperProfile
 from graspdb.wire.base import source_weights
 from graspdb.wire.grippers import SHAPE_FIELDS
 from graspdb.wire.queries import TrialSelection
+from graspdb_service import principal
 from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
@@ -21,6 +22,7 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import copies, provenances
 from graspdb_service.trial_columns import Bools, Floats, Ints, Provenance, gripper_parts, is_gripper
 from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.runtime.asked import or_kept
 
 _KEPT = 4_096
 #: Versions that a warning tells of.
@@ -118,15 +120,26 @@ class Selections:
         self._lock = threading.Lock()
 
     def resolve(self, slug: str, asked: TrialSelection) -> Selected:
-        """The object as it is now, and which of its trials a request is about (404, 409 where ambiguous)."""
-        with self._database.read() as tx:
-            row = require(tx, slug)
-            key = row.id, asked.gripper, asked.protocol, asked.source, asked.source_weight
-            with self._lock:
-                known = self._resolved.get(key)
-            if known is not None and _still_holds(tx, known, row):
-                return known
-            selected = resolve(tx, row, asked)
+        """The object as it is now, and which of its trials a request is about (404, 409 where ambiguous).
+
+        While the database does not answer, as it was when that was last asked.
+        """
+        principal.refuse_hidden(slug)
+        key = slug, asked.gripper, asked.protocol, asked.source, asked.source_weight
+        with self._lock:
+            known = self._resolved.get(key)
+            if known is not None:
+                self._resolved.move_to_end(key)
+
+        def read() -> Selected:
+            with self._database.read() as tx:
+                row = require(tx, slug)
+                holds = known is not None and known.row.id == row.id and _still_holds(tx, known, row)
+                return known if known is not None and holds else resolve(tx, row, asked)
+
+        selected = or_kept(read, known)
+        if selected is known:
+            return selected
         with self._lock:
             self._resolved[key] = selected
             self._resolved.move_to_end(key)
