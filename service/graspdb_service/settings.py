@@ -89,6 +89,9 @@ class Settings(BaseSettings):
 
     max_queries_at_once: Annotated[int, Field(ge=2)] = 24
     """Questions that are computed or wait for a processor; of one client three quarters, as of all below."""
+    max_long_questions_at_once: Annotated[int, Field(ge=2)] = 8
+    """Questions that go on after a quarter of a second's computing, the short ones apart; as many as
+    ``max_queries_at_once`` wait for one of these places."""
     max_reports_at_once: Annotated[int, Field(ge=2)] = 10
     max_uploads_at_once: Annotated[int, Field(ge=2)] = 6
     max_meshes_at_once: Annotated[int, Field(ge=2)] = 4

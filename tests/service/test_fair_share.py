@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections import deque
+import time
+from collections import Counter, deque
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -129,6 +130,43 @@ def test_a_long_computation_lets_another_clients_short_one_between() -> None:
     ended.set()
     for thread in threads:
         thread.join(10)
+        assert not thread.is_alive()
+
+
+def test_long_questions_leave_place_and_processor_to_their_own_askers_short_ones() -> None:
+    """Ten of them on one processor: two go on in turns, the others wait, and a short one gets between."""
+    compute = Compute(1, long=3, waiting_long=20)
+    done, left, steps = threading.Event(), [], Counter[int]()
+
+    def long(number: int) -> None:
+        question = Asked("greedy", give_place=lambda: left.append(number))
+        begin(question)
+
+        def work() -> None:
+            while not done.is_set():
+                steps[number] += 1
+                time.sleep(0.002)
+                breathe()
+
+        compute.run(work)
+        question.end()
+
+    threads = [threading.Thread(target=long, args=(number,), daemon=True) for number in range(10)]
+    for thread in threads:
+        thread.start()
+    end = time.monotonic() + 60
+    while len(left) < 10:
+        assert time.monotonic() < end, left
+        time.sleep(0.01)
+    before = Counter(steps)
+    begin(Asked("greedy"))
+    for _ in range(5):
+        compute.run(lambda: time.sleep(0.05))
+    went_on = [number for number in range(10) if steps[number] > before[number]]
+    assert len(went_on) <= 2
+    done.set()
+    for thread in threads:
+        thread.join(30)
         assert not thread.is_alive()
 
 

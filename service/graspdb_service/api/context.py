@@ -42,7 +42,12 @@ class Context(Asking):
         # From here on a file that is gone is no empty database, and what hangs is not waited for.
         database.keep_file()
         database.down = health.down
-        compute = Compute(settings.threads, settings.max_question_seconds)
+        compute = Compute(
+            settings.threads,
+            settings.max_question_seconds,
+            long=settings.max_long_questions_at_once,
+            waiting_long=settings.max_queries_at_once,
+        )
         features = Features(database, compute)
         densities = Densities(
             database, Selections(database), compute, features, settings.max_density_cache_bytes

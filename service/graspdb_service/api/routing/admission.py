@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from typing import Any, get_args
 
@@ -36,7 +37,9 @@ class Admission:
         self.settings = settings
         self.bodies = Bodies(settings)
         most = {work: int(getattr(settings, f"max_{work}_at_once")) for work in get_args(Work)}
-        self._threads = sum(most.values()) + _SPARE_THREADS
+        # Long questions keep their thread when they give their place to a short one.
+        long = settings.max_long_questions_at_once + settings.max_queries_at_once
+        self._threads = sum(most.values()) + long + _SPARE_THREADS
         self._places = {
             f"max_{work}_at_once": (work, FairShare(count, max(1, count * 3 // 4), settings.max_waiting))
             for work, count in most.items()
@@ -52,12 +55,14 @@ class Admission:
         return self.bodies.held_bytes < self.settings.max_small_body_bytes
 
     @contextlib.asynccontextmanager
-    async def place(self, field: str, client: str) -> AsyncIterator[None]:
-        """A place of a kind, in turns of clients; 429 where too many wait, 503 after waiting in vain."""
+    async def place(self, field: str, client: str) -> AsyncIterator[Callable[[], None]]:
+        """A place of a kind, in turns of clients, and what gives it back early; 429 where too many wait, 503
+        after waiting in vain.
+        """
         work, places = self._places[field]
         try:
-            async with places.held(client, self.settings.max_waiting_seconds):
-                yield
+            async with places.held(client, self.settings.max_waiting_seconds) as claim:
+                yield functools.partial(places.release, claim)
         except NoRoom as error:
             raise no_room(f"All places for {_IN_WORDS[work]} are taken", error) from None
 
@@ -90,11 +95,15 @@ class AdmittedRoute(GuardedRoute):
             most = int(getattr(admission.settings, limit))
             async with (
                 admission.bodies.read(request, client, most) as received,
-                admission.place(place, client),
+                admission.place(place, client) as give_place,
             ):
-                question = Asked(client, may_be_stale=place == "max_queries_at_once")
+                asks = place == "max_queries_at_once"
+                question = Asked(client, may_be_stale=asks, give_place=give_place if asks else None)
                 begin(question)
-                return await _while_wanted(handle, received, question)
+                try:
+                    return await _while_wanted(handle, received, question)
+                finally:
+                    question.end()
 
         return admitted
 

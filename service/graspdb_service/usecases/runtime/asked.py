@@ -30,11 +30,29 @@ class Asked:
     """Whether the asker has hung up."""
     may_be_stale: bool = False
     """Whether an answer from what is kept will do while the database does not answer."""
+    computed_s: float = 0.0
+    """How long it has had a processor."""
+    is_long: bool = False
+    """Whether that was so long that short questions of its asker's own must not wait for it."""
+    give_place: Callable[[], None] | None = None
+    """Gives back its place among short questions; None for what has none."""
+    at_end: list[Callable[[], None]] = field(default_factory=list)
+    """What is to be given back when it is answered."""
     outage: str | None = None
     """What the database said where the answer is from what was kept."""
     step: str = "waiting for a processor"
     done: int = 0
     of: int | None = None
+
+    @property
+    def lane(self) -> str:
+        """Among whose work it waits for a processor: that of its asker, the short apart from the long."""
+        return f"{self.client} long" if self.is_long else self.client
+
+    def end(self) -> None:
+        """It is answered: give back what it holds."""
+        for give_back in self.at_end:
+            give_back()
 
     def within(self, seconds: float | None, most: float) -> None:
         """Answer within this, or within what the service allows at ``most``."""

@@ -29,6 +29,8 @@ _BLOCK = 16_384
 _STEP = 2_048
 #: A computation keeps its processor so long before another client's that waits has its turn.
 _TURN_S = 0.02
+#: A question that has had a processor for so long leaves its place to short ones.
+_SHORT_S = 0.25
 _LOOK_S = 0.25
 _MOST_WAITING = 1_000
 
@@ -36,8 +38,8 @@ _MOST_WAITING = 1_000
 class _Turn:
     """A computation that has a processor."""
 
-    def __init__(self, slots: FairShare, question: Asked) -> None:
-        self._slots, self._question = slots, question
+    def __init__(self, slots: FairShare, long_questions: FairShare, question: Asked) -> None:
+        self._slots, self._long, self._question = slots, long_questions, question
         self._woken = threading.Event()
         self._thread = threading.get_ident()
         self._claim: Claim | None = None
@@ -47,7 +49,7 @@ class _Turn:
         self._question.check()
         self._woken.clear()
         try:
-            self._claim = claim = self._slots.claim(self._question.client, 1, self._woken.set)
+            self._claim = claim = self._slots.claim(self._question.lane, 1, self._woken.set)
         except NoRoom:
             raise busy("Too many questions wait for a processor: try again in a second", status=429) from None
         while not claim.held and not self._woken.wait(_LOOK_S):
@@ -57,16 +59,44 @@ class _Turn:
     def give(self) -> None:
         claim, self._claim = self._claim, None
         if claim is not None:
+            if claim.held:
+                self._question.computed_s += time.monotonic() - self._since
             self._slots.release(claim)
 
     def breathe(self) -> None:
         """End here where the answer is no longer wanted, and let another client that waits have its turn."""
         self._question.check()
-        if threading.get_ident() != self._thread or time.monotonic() - self._since < _TURN_S:
+        held = time.monotonic() - self._since
+        if threading.get_ident() != self._thread or held < _TURN_S:
             return
-        if self._slots.others_wait(self._question.client):
+        turns_long = not self._question.is_long and self._question.computed_s + held > _SHORT_S
+        if turns_long or self._slots.others_wait(self._question.lane):
             self.give()
+            if turns_long:
+                self._lengthen()
             self.take()
+
+    def _lengthen(self) -> None:
+        """Go on as a long question, when it is the turn of its asker's among those.
+
+        Whoever has many of them waits with these alone: places and processors of short ones are free.
+        """
+        question = self._question
+        question.is_long = True
+        if question.give_place is None:
+            return
+        woken = threading.Event()
+        try:
+            claim = self._long.claim(question.client, 1, woken.set)
+        except NoRoom:
+            raise busy("Too many long questions wait: try again in a second", status=429) from None
+        question.at_end.append(partial(self._long.release, claim))
+        question.give_place()
+        before = question.step, question.done, question.of
+        question.reached("waiting for other long questions")
+        while not claim.held and not woken.wait(_LOOK_S):
+            question.check()
+        question.reached(*before)
 
 
 _TURN: ContextVar[_Turn | None] = ContextVar("turn", default=None)
@@ -98,11 +128,14 @@ def breathing(work: Callable[[Poses], NDArray[A]], step: str) -> Callable[[Poses
 class Compute:
     """Computations on a bounded number of processors, clients in turn."""
 
-    def __init__(self, threads: int, max_question_seconds: float = math.inf) -> None:
+    def __init__(
+        self, threads: int, max_question_seconds: float = math.inf, *, long: int = 8, waiting_long: int = 24
+    ) -> None:
         self.threads = threads
         self._most_seconds = max_question_seconds
         # One client has at most as many as there are; a short question of another finds one more.
         self._slots = FairShare(threads + 1, threads, _MOST_WAITING)
+        self._long = FairShare(long, max(1, long * 3 // 4), waiting_long)
 
     @property
     def busy(self) -> int:
@@ -130,7 +163,7 @@ class Compute:
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
-        turn = _Turn(self._slots, asked())
+        turn = _Turn(self._slots, self._long, asked())
         token = _TURN.set(turn)
         try:
             with timed("queue"):

@@ -97,8 +97,8 @@ class FairShare:
         return self._waiting_count
 
     @asynccontextmanager
-    async def held(self, client: str, seconds: float, amount: int = 1) -> AsyncIterator[None]:
-        """Hold so much, waiting at most so long for it; NoRoom."""
+    async def held(self, client: str, seconds: float, amount: int = 1) -> AsyncIterator[Claim]:
+        """Hold so much, waiting at most so long for it; NoRoom. The claim may be released before the end."""
         loop = asyncio.get_running_loop()
         woken = asyncio.Event()
 
@@ -112,7 +112,7 @@ class FairShare:
                     await asyncio.wait_for(woken.wait(), seconds)
                 except TimeoutError:
                     raise NoRoom(waited=True) from None
-            yield
+            yield claim
         finally:
             self.release(claim)
 
