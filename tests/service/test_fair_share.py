@@ -86,7 +86,7 @@ def test_one_client_does_not_fill_the_queue() -> None:
     modest = room.claim("modest", 1, nothing)
     room.release(held)
     assert room.used == 1
-    assert not room.others_wait("modest") or not modest.held
+    assert not room.others_wait(modest) or not modest.held
 
 
 def test_waiting_ends() -> None:

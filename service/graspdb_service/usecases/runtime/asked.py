@@ -46,8 +46,8 @@ class Asked:
 
     @property
     def lane(self) -> str:
-        """Among whose work it waits for a processor: that of its asker, the short apart from the long."""
-        return f"{self.client} long" if self.is_long else self.client
+        """Among which of its asker's work it waits for a processor."""
+        return "long" if self.is_long else "short"
 
     def end(self) -> None:
         """It is answered: give back what it holds."""

@@ -49,7 +49,9 @@ class _Turn:
         self._question.check()
         self._woken.clear()
         try:
-            self._claim = claim = self._slots.claim(self._question.lane, 1, self._woken.set)
+            self._claim = claim = self._slots.claim(
+                self._question.client, 1, self._woken.set, self._question.lane
+            )
         except NoRoom:
             raise busy("Too many questions wait for a processor: try again in a second", status=429) from None
         while not claim.held and not self._woken.wait(_LOOK_S):
@@ -67,10 +69,10 @@ class _Turn:
         """End here where the answer is no longer wanted, and let another client that waits have its turn."""
         self._question.check()
         held = time.monotonic() - self._since
-        if threading.get_ident() != self._thread or held < _TURN_S:
+        if threading.get_ident() != self._thread or held < _TURN_S or self._claim is None:
             return
         turns_long = not self._question.is_long and self._question.computed_s + held > _SHORT_S
-        if turns_long or self._slots.others_wait(self._question.lane):
+        if turns_long or self._slots.others_wait(self._claim):
             self.give()
             if turns_long:
                 self._lengthen()

@@ -20,11 +20,12 @@ class NoRoom(Exception):
 
 @dataclass(eq=False)
 class Claim:
-    """So much for a client: held, or waited for until ``wake`` is called."""
+    """So much for a client, in a lane of its own: held, or waited for until ``wake`` is called."""
 
     client: str
     amount: int
     wake: Callable[[], None]
+    lane: str
     held: bool = False
 
 
@@ -32,8 +33,8 @@ class FairShare:
     """``total`` of something, of which one client has at most ``share`` at a time.
 
     Who finds none waits, at most ``most_waiting`` of them and three quarters of these of one client; what
-    becomes free goes to the waiting clients in turn, whoever of them asks most. May be used by threads and by
-    an event loop at once.
+    becomes free goes to the waiting clients in turn, whoever of them asks most, and so to the lanes of one's
+    own that wait. May be used by threads and by an event loop at once.
     """
 
     def __init__(self, total: int, share: int, most_waiting: int) -> None:
@@ -43,21 +44,21 @@ class FairShare:
         self._lock = threading.Lock()
         self._used = 0
         self._used_by: dict[str, int] = {}
-        # The client that was served longest ago comes first.
-        self._waiting: OrderedDict[str, deque[Claim]] = OrderedDict()
+        # By client and lane; what was served longest ago comes first.
+        self._waiting: OrderedDict[tuple[str, str], deque[Claim]] = OrderedDict()
         self._waiting_count = 0
 
-    def claim(self, client: str, amount: int, wake: Callable[[], None]) -> Claim:
+    def claim(self, client: str, amount: int, wake: Callable[[], None], lane: str = "") -> Claim:
         """A claim that is held already, or that waits; NoRoom where too many do."""
-        claim = Claim(client, amount, wake)
+        claim = Claim(client, amount, wake, lane)
         with self._lock:
-            queue = self._waiting.get(client)
+            queue = self._waiting.get((client, lane))
             if not queue and self._fits(claim):
                 self._grant(claim)
             elif self._waiting_count >= self._most_waiting or len(queue or ()) >= self._most_of_one:
                 raise NoRoom(waited=False)
             else:
-                self._waiting.setdefault(client, deque()).append(claim)
+                self._waiting.setdefault((client, lane), deque()).append(claim)
                 self._waiting_count += 1
         return claim
 
@@ -78,12 +79,14 @@ class FairShare:
         for other in served:
             other.wake()
 
-    def others_wait(self, client: str) -> bool:
-        """Whether another client would get what this one gives back."""
+    def others_wait(self, claim: Claim) -> bool:
+        """Whether another client, or another lane, would get what this claim gives back."""
         with self._lock:
             return any(
-                name != client and self._used_by.get(name, 0) + queue[0].amount <= self._share
-                for name, queue in self._waiting.items()
+                (client, lane) != (claim.client, claim.lane)
+                and self._used_by.get(client, 0) + queue[0].amount - claim.amount * (client == claim.client)
+                <= self._share
+                for (client, lane), queue in self._waiting.items()
             )
 
     @property
@@ -126,27 +129,28 @@ class FairShare:
         self._used_by[claim.client] = self._used_by.get(claim.client, 0) + claim.amount
 
     def _forget(self, claim: Claim) -> None:
-        queue = self._waiting.get(claim.client)
+        key = claim.client, claim.lane
+        queue = self._waiting.get(key)
         if queue and claim in queue:
             queue.remove(claim)
             self._waiting_count -= 1
             if not queue:
-                del self._waiting[claim.client]
+                del self._waiting[key]
 
     def _served(self) -> list[Claim]:
-        """Grant what fits, one a client and turn."""
+        """Grant what fits, one a lane and turn."""
         served: list[Claim] = []
         before = -1
         while before < len(served):
             before = len(served)
-            for client in list(self._waiting):
-                queue = self._waiting[client]
+            for key in list(self._waiting):
+                queue = self._waiting[key]
                 if self._fits(queue[0]):
                     claim = queue.popleft()
                     self._grant(claim)
                     served.append(claim)
                     self._waiting_count -= 1
-                    self._waiting.move_to_end(client)
+                    self._waiting.move_to_end(key)
                     if not queue:
-                        del self._waiting[client]
+                        del self._waiting[key]
         return served
