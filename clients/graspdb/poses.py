@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graspdb import wire
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 
 __all__ = [
@@ -46,6 +47,16 @@ class Poses(NamedTuple):
     def rows(self) -> Floats:
         """(N, 7) rows x y z qx qy qz qw."""
         return np.concatenate([self.position, self.quaternion_xyzw], axis=1)
+
+    def followed_by(self, fixed: wire.Pose) -> Poses:
+        """Each with a fixed pose on its right: what ``fixed`` is of, where these are its parent frame.
+
+        With ``gripper.profile.in_tool("flange")`` poses of the tool become those of the flange, and with its
+        :func:`graspdb.wire.frames.gripper_frames.inverse` go back.
+        """
+        moved = self.matrices @ matrices(fixed.position, fixed.quaternion_xyzw)
+        quaternion = quaternions_of(moved[:, :3, :3])
+        return Poses(moved[:, :3, 3].copy(), quaternion)
 
     def columns(self, part: slice = slice(None)) -> dict[str, Any]:
         """As requests take them, all or a part."""

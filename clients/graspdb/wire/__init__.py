@@ -25,11 +25,14 @@ from graspdb.wire.base import Request as Request
 from graspdb.wire.base import Response as Response
 from graspdb.wire.base import Slug as Slug
 from graspdb.wire.base import Source as Source
+from graspdb.wire.frames.conventions import CONVENTIONS as CONVENTIONS
+from graspdb.wire.frames.conventions import Convention as Convention
 from graspdb.wire.grippers import Finger as Finger
 from graspdb.wire.grippers import GripperCreate as GripperCreate
 from graspdb.wire.grippers import GripperInfo as GripperInfo
 from graspdb.wire.grippers import GripperProfile as GripperProfile
 from graspdb.wire.grippers import GripperUpdate as GripperUpdate
+from graspdb.wire.grippers import JointValues as JointValues
 from graspdb.wire.jobs import ClaimedJob as ClaimedJob
 from graspdb.wire.jobs import ClaimRequest as ClaimRequest
 from graspdb.wire.jobs import ClaimResponse as ClaimResponse

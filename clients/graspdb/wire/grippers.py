@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-import operator
 from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from graspdb.wire.base import Pose, Request, Response, Slug, Text
+from graspdb.wire.frames.conventions import Convention
+from graspdb.wire.frames.gripper_frames import BASE, MAX_FRAMES, TOOL, FrameName, completed, in_tool
 
 SHAPE_FIELDS = ("max_opening_m", "finger.", "tip_offset_m", "palm_size_m")
 """What the fields of a profile that make the gripper's shape begin with."""
@@ -26,6 +27,20 @@ class Finger(Request):
     """Edge along the tool's y axis, in which fingers close, metres."""
     length_m: Length
     """Edge along the tool's z axis, from the palm to the tip, metres."""
+
+
+JointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9._/-]{0,127}$")]
+"""The name of a joint as a robot's description has it."""
+JointValue = Annotated[float, Field(ge=-1_000.0, le=1_000.0)]
+
+
+class JointValues(Request):
+    """Where a joint of the gripper stands when the jaw is wide open and when it is closed."""
+
+    open: JointValue
+    """Value with the jaw at ``max_opening_m``: radians, or metres for one that slides."""
+    closed: JointValue
+    """Value with the fingers together: radians, or metres for one that slides."""
 
 
 class GripperProfile(Request):
@@ -53,16 +68,50 @@ class GripperProfile(Request):
     """Whether the fingers are alike, so that half a turn about the approach is the same grasp."""
     base_to_tool: Pose | None = None
     """Pose of the tool frame in the gripper's base frame, metres and a unit quaternion; null if unknown."""
+    frames: Annotated[dict[FrameName, Pose], Field(max_length=MAX_FRAMES)] = Field(default_factory=dict)
+    """Frames of the gripper by name, each its pose in the gripper's base frame: ``flange``, where the robot
+    ends, and any of your own. Answers have ``base``, the identity, and ``tool``, the same as
+    ``base_to_tool``, too; of the others poses can be taken and given once the tool is known. ``world`` and
+    ``object`` are no names of frames."""
+    joints: Annotated[dict[JointName, JointValues], Field(max_length=MAX_FRAMES)] = Field(
+        default_factory=dict
+    )
+    """The gripper's joints by name, as the robot's description has them, each with its value open and
+    closed."""
+
+    @field_validator("frames")
+    @classmethod
+    def _agreeing(cls, frames: dict[str, Pose], info: ValidationInfo) -> dict[str, Pose]:
+        return completed(frames, info.data.get("base_to_tool"))
+
+    @model_validator(mode="after")
+    def _completed(self) -> GripperProfile:
+        # What says the same stands in both places, whichever was given.
+        frames = completed(self.frames, self.base_to_tool)
+        object.__setattr__(self, "frames", frames)
+        object.__setattr__(self, "base_to_tool", frames.get(TOOL))
+        return self
+
+    def in_tool(self, frame: str, convention: Convention = "graspdb") -> Pose:
+        """Pose of a frame of the gripper, its axes renamed by a convention, in the tool frame.
+
+        NoSuchFrame; ToolUnknown where no other frame than the tool can be used.
+        """
+        return in_tool(self.frames, frame, convention)
 
     def differences(self, other: GripperProfile) -> list[str]:
         """Fields in which two profiles differ by more than rounding, as in ``finger.length_m``."""
-        fields = ((name, value) for name, value in self if name != "finger")
-        own = [("finger." + name, value) for name, value in self.finger] + list(fields)
-        return sorted(name for name, value in own if not _alike(value, other.value_of(name)))
+        own, others = self._values(), other._values()
+        return sorted(
+            name for name in own.keys() | others.keys() if not _alike(own.get(name), others.get(name))
+        )
 
-    def value_of(self, field: str) -> Any:
-        """The value of a field, as in ``finger.length_m``."""
-        return operator.attrgetter(field)(self)
+    def _values(self) -> dict[str, Any]:
+        """All that can differ, by names such as ``finger.length_m`` and ``frames.flange``."""
+        values = {name: value for name, value in self if name not in ("finger", "frames", "joints")}
+        values |= {f"finger.{name}": value for name, value in self.finger}
+        values |= {f"frames.{name}": pose for name, pose in self.frames.items() if name not in (BASE, TOOL)}
+        return values | {f"joints.{name}": (at.open, at.closed) for name, at in self.joints.items()}
 
 
 def _alike(one: Any, other: Any) -> bool:

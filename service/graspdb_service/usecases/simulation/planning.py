@@ -181,7 +181,8 @@ def _world(row: ObjectRow, profile: GripperProfile) -> _World:
         "parts_sha256": row.parts_sha256,
         "mass_kg": mass_kg,
         "friction": row.friction if row.friction is not None else profile.friction,
-        "gripper": profile.model_dump(mode="json"),
+        # What the gripper's frames and joints are called makes no other simulation.
+        "gripper": profile.model_dump(mode="json", exclude={"frames", "joints"}),
         "lower": lower.tolist(),
         "upper": upper.tolist(),
     }

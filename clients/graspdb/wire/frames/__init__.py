@@ -1,0 +1,1 @@
+"""Frames: those of a gripper by their names, and the axes that other projects give a gripper."""
