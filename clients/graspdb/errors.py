@@ -27,6 +27,11 @@ class GraspDBError(Exception):
         return [] if self.problem is None else self.problem.errors
 
 
+def add_note(error: BaseException, note: str) -> None:
+    """As ``error.add_note``, which Python 3.10 does not have: there only the command line shows notes."""
+    vars(error)["__notes__"] = [*getattr(error, "__notes__", ()), note]
+
+
 class Unreachable(GraspDBError):
     """No service answered at that address."""
 

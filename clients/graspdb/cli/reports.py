@@ -14,7 +14,7 @@ import typer
 from graspdb import wire
 from graspdb.cli.common import ERRORS, ObjectId, State, out, run_bar, show_rows, show_table
 from graspdb.cli.wording import in_commands
-from graspdb.errors import ChecksNeeded
+from graspdb.errors import ChecksNeeded, add_note
 from graspdb.figures import FILE_FORMATS
 from graspdb.figures.style import number, widths
 from graspdb.reports import (
@@ -104,7 +104,7 @@ def _computed(state: State, id: str, name: str, options: Options, simulate: bool
         calls = getattr(found.raw, "calls", [])
     except ChecksNeeded as error:
         if not simulate:
-            error.add_note(_simulation_told(id, name, len(error.calls)))
+            add_note(error, _simulation_told(id, name, len(error.calls)))
             raise
         calls = error.calls
     if not simulate or not calls:

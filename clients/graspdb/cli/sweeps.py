@@ -8,7 +8,7 @@ import typer
 
 from graspdb.cli.common import ERRORS, ObjectId, State, flat, out, out_csv
 from graspdb.cli.options import Commands
-from graspdb.errors import SweepFailed
+from graspdb.errors import SweepFailed, add_note
 from graspdb.resources.sweeps import Sweep, SweepOptions, convex_parts_told
 from graspdb.wire import SweepInfo
 
@@ -125,11 +125,11 @@ def _wait(state: State, found: Sweep, timeout: float | None) -> None:
     try:
         found.wait(progress=not state.json, timeout=timeout)
     except SweepFailed as error:
-        error.add_note(f"`graspdb sweeps retry {found.id}` queues its failed chunks again.")
+        add_note(error, f"`graspdb sweeps retry {found.id}` queues its failed chunks again.")
         raise
     except TimeoutError as error:
-        error.add_note(
-            f"`graspdb sweeps wait {found.id}` waits on; `graspdb sweeps cancel {found.id}` stops it."
+        add_note(
+            error, f"`graspdb sweeps wait {found.id}` waits on; `graspdb sweeps cancel {found.id}` stops it."
         )
         raise
 

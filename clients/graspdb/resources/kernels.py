@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Any
+
+from typing_extensions import Unpack
 
 from graspdb import wire
 from graspdb.options import Option

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+from enum import Enum
 from typing import Annotated
 
 from pydantic import GetPydanticSchema
 from pydantic_core import core_schema
 
 
-class JobState(StrEnum):
+class _State(str, Enum):
+    """A string, as ``StrEnum`` makes one, which Python 3.10 does not have."""
+
+    __str__ = str.__str__
+
+    def __format__(self, spec: str) -> str:
+        return format(self.value, spec)
+
+
+class JobState(_State):
     """A job, and with it its lease.
 
     ::
@@ -37,7 +46,7 @@ class JobState(StrEnum):
     CANCELLED = "cancelled"
 
 
-class SweepState(StrEnum):
+class SweepState(_State):
     """A sweep, as its chunks' jobs make it; only CANCELLED is somebody's decision.
 
     - new to QUEUED; to RUNNING: a worker claims the first of its chunks.
@@ -54,7 +63,7 @@ class SweepState(StrEnum):
     CANCELLED = "cancelled"
 
 
-class RunState(StrEnum):
+class RunState(_State):
     """A report's run, computed by the replica that holds its lease.
 
     - new to RUNNING: a report takes long; RUNNING to RUNNING: another replica takes a lease that ran out.
@@ -69,7 +78,7 @@ class RunState(StrEnum):
     CANCELLED = "cancelled"
 
 
-def _one_of(states: type[StrEnum]) -> GetPydanticSchema:
+def _one_of(states: type[_State]) -> GetPydanticSchema:
     """A field that holds one of the states, and names their values in the OpenAPI document."""
     values = core_schema.literal_schema([state.value for state in states])
     schema = core_schema.no_info_after_validator_function(states, values)

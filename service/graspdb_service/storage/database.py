@@ -7,7 +7,7 @@ import socket
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Any, TypeAlias, TypeVar
 from weakref import WeakSet
 
@@ -70,8 +70,14 @@ def is_full(error: Exception) -> bool:
     """Whether an error says that the database's disk is full."""
     cause = getattr(error, "orig", None)
     if isinstance(cause, sqlite3.Error):
-        return getattr(cause, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_FULL
+        # By SQLite's words, which are fixed: Python 3.10 has no codes of its errors.
+        return str(cause) == "database or disk is full"
     return getattr(cause, "sqlstate", None) == "53100"
+
+
+def is_locked(error: sqlite3.Error) -> bool:
+    """Whether SQLite says that somebody else holds the file, or a table of it."""
+    return str(error).endswith(" is locked")
 
 
 class unix_now(GenericFunction[float]):
@@ -111,7 +117,7 @@ def _postgres_utc_now(element: utc_now, compiler: Any, **_: Any) -> str:
 
 def clock(tx: Tx) -> datetime:
     """The time by the database's own clock, as a value to compare and to reckon with."""
-    return datetime.fromtimestamp(tx.execute(select(unix_now())).scalar_one(), UTC)
+    return datetime.fromtimestamp(tx.execute(select(unix_now())).scalar_one(), timezone.utc)
 
 
 class new_uuid(GenericFunction[str]):

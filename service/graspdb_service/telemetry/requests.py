@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from http import HTTPMethod
 from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -14,7 +13,7 @@ from graspdb_service.telemetry.record import RECORD, RequestRecord
 
 log = logging.getLogger("graspdb.request")
 
-_METHODS = frozenset(HTTPMethod)
+_METHODS = frozenset(("CONNECT", "DELETE", "GET", "HEAD", "OPTIONS", "PATCH", "POST", "PUT", "TRACE"))
 #: Asked every few seconds by supervisors: told only where something is wrong.
 _ROUTINE = ("/livez", "/readyz", "/metrics")
 _PATH_LETTERS = 200

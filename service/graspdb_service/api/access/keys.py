@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
@@ -26,7 +26,7 @@ KeyId = Annotated[
 
 def _in_utc(at: datetime) -> datetime:
     try:
-        return at.replace(tzinfo=UTC) if at.tzinfo is None else at.astimezone(UTC)
+        return at.replace(tzinfo=timezone.utc) if at.tzinfo is None else at.astimezone(timezone.utc)
     except OverflowError:
         raise ValueError("no time that there is in UTC") from None
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
+import anyio
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
@@ -65,11 +65,10 @@ class Bodies:
 
     async def _content(self, request: Request, most: int) -> bytearray:
         content = bytearray()
-        loop = asyncio.get_running_loop()
-        started = loop.time()
+        started = anyio.current_time()
         settings = self._settings
         try:
-            async with asyncio.timeout_at(started + min(_GRACE_S, settings.max_body_seconds)) as limit:
+            with anyio.fail_after(min(_GRACE_S, settings.max_body_seconds)) as limit:
                 while True:
                     message = await request.receive()
                     if message["type"] == "http.disconnect":
@@ -80,7 +79,7 @@ class Bodies:
                     if not message.get("more_body", False):
                         return content
                     enough = _GRACE_S + len(content) / max(settings.min_body_bytes_per_second, 1)
-                    limit.reschedule(started + min(enough, settings.max_body_seconds))
+                    limit.deadline = started + min(enough, settings.max_body_seconds)
         except TimeoutError:
             raise ProblemError(
                 408,

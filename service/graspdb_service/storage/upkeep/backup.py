@@ -12,7 +12,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 
 from sqlalchemy import MetaData, func, inspect, select, text
@@ -21,7 +21,7 @@ from sqlalchemy.exc import DBAPIError
 from graspdb_service import __version__
 from graspdb_service.storage import schema
 from graspdb_service.storage.access import audit
-from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.database import Database, Tx, is_locked
 from graspdb_service.storage.tables import grippers, objects
 from graspdb_service.storage.upkeep import layout
 from graspdb_service.storage.upkeep.archive import ArchiveReader, ArchiveWriter, DamagedArchive, Manifest
@@ -74,7 +74,7 @@ def back_up(database: Database, path: Path, progress: Progress) -> Manifest:
             schema=revision,
             graspdb=__version__,
             database=database.url.get_backend_name(),
-            created_at=datetime.now(UTC).isoformat(timespec="seconds"),
+            created_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         )
         reader = ArchiveReader(unfinished)
         try:
@@ -245,7 +245,7 @@ def _put_in_place(fresh: Path, path: Path) -> Path:
         raise RefusedRestore(
             f"{path} is in use: stop the service, which would go on answering from what it remembers"
         )
-    kept = path.with_name(f"{path.name}.replaced-{datetime.now(UTC):%Y%m%dT%H%M%S%f}")
+    kept = path.with_name(f"{path.name}.replaced-{datetime.now(timezone.utc):%Y%m%dT%H%M%S%f}")
     os.link(path, kept)
     for suffix in ("-wal", "-shm"):
         # Of a file too damaged to be closed in order: beside another file it would damage that one.
@@ -266,7 +266,7 @@ def _close_file(path: Path) -> bool:
             connection.execute("COMMIT")
             connection.execute("PRAGMA journal_mode = DELETE")
         except sqlite3.DatabaseError as error:
-            return error.sqlite_errorcode not in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+            return not is_locked(error)
     return True
 
 

@@ -13,7 +13,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import text
 from sqlalchemy.pool import NullPool
 
-from graspdb_service.storage.database import Database
+from graspdb_service.storage.database import Database, is_locked
 from graspdb_service.storage.schema import migrations_directory
 
 _BUSY_S = 0.5
@@ -94,7 +94,7 @@ def _unless_busy() -> Iterator[None]:
     try:
         yield
     except sqlite3.OperationalError as error:
-        if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:
+        if is_locked(error):
             raise _Busy from None
         raise
 

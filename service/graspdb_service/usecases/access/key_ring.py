@@ -114,7 +114,7 @@ class KeyRing:
                 return await asyncio.wait_for(
                     asyncio.shield(asyncio.wrap_future(reading)), timeout=_PATIENCE_S
                 )
-            except (*UNAVAILABLE, TimeoutError):
+            except (*UNAVAILABLE, asyncio.TimeoutError):
                 self._failed_at = time.monotonic()
         if held is not None and held.row is not None and age < _OUTAGE_S:
             return held

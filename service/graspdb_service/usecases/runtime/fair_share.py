@@ -113,7 +113,7 @@ class FairShare:
             if not claim.held:
                 try:
                     await asyncio.wait_for(woken.wait(), seconds)
-                except TimeoutError:
+                except asyncio.TimeoutError:
                     raise NoRoom(waited=True) from None
             yield claim
         finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Any
 
 from graspdb.wire import (
@@ -104,7 +104,7 @@ def _payload(tx: Tx, sweep: SweepRow, job: JobRow) -> SimulatePayload:
 
 
 def _time(seconds: float | None) -> datetime:
-    return datetime.fromtimestamp(seconds or 0.0, UTC)
+    return datetime.fromtimestamp(seconds or 0.0, timezone.utc)
 
 
 def _expire(ctx: Runtime, job: JobRow) -> None:
