@@ -25,6 +25,7 @@ from graspdb_geometry.mesh_reading.touching import is_closed
 UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 MEDIA_TYPES: tuple[str, ...] = tuple(READERS)
 
+MAX_SCALE = 1e6
 MAX_TRIANGLES = 1_000_000
 MAX_EXTENT_M = 10.0
 MIN_EXTENT_M = 1e-4
@@ -109,7 +110,14 @@ class MeshProperties:
     warnings: list[str]
 
 
-def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = MAX_TRIANGLES) -> Mesh:
+def load(
+    data: bytes,
+    media_type: str,
+    unit: str = "m",
+    scale: float = 1.0,
+    *,
+    max_triangles: int = MAX_TRIANGLES,
+) -> Mesh:
     """Read a mesh from memory and check it.
 
     Vertices at the same place are merged (STL repeats each of them), triangles that repeat a vertex are
@@ -126,6 +134,8 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
         One of :data:`MEDIA_TYPES`; parameters after a semicolon are ignored.
     unit : str
         One of :data:`UNITS`.
+    scale : float
+        Factor to the file's coordinates, beside its unit: above 0, :data:`MAX_SCALE` at most.
     max_triangles : int
         Refuse more.
 
@@ -140,6 +150,8 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
         raise MeshError("content_type", f"must be one of {', '.join(MEDIA_TYPES)}")
     if unit not in UNITS:
         raise MeshError("unit", f"must be one of {', '.join(UNITS)}")
+    if not 0.0 < scale <= MAX_SCALE:
+        raise MeshError("scale", f"must be above 0 and at most {MAX_SCALE:g}")
     if not data:
         raise MeshError("mesh", "the body is empty")
     try:
@@ -152,15 +164,15 @@ def load(data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = 
     for geometry in geometries:
         _check_values("mesh", geometry)
     offsets = np.cumsum([0] + [len(g.vertices) for g in geometries[:-1]])
-    vertices = np.concatenate([g.vertices for g in geometries]) * UNITS[unit]
+    vertices = np.concatenate([g.vertices for g in geometries]) * (UNITS[unit] * scale)
     faces = np.concatenate([g.faces + offset for g, offset in zip(geometries, offsets, strict=True)])
-    _check_size(vertices[np.unique(faces)], unit)
+    _check_size(vertices[np.unique(faces)], unit, scale)
     mesh = _canonical(vertices, faces)
     return _made_solid(replace(mesh, warnings=(*content.notes, *mesh.warnings)))
 
 
-def properties(mesh: Mesh, unit: str = "m") -> MeshProperties:
-    """Measure a mesh; ``unit`` is the one it was sent in and serves the warnings only."""
+def properties(mesh: Mesh, unit: str = "m", scale: float = 1.0) -> MeshProperties:
+    """Measure a mesh; ``unit`` and ``scale`` are what it was sent with and serve the warnings only."""
     lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     corners = mesh.vertices[mesh.faces]
     solid = mass_properties(corners)
@@ -179,9 +191,11 @@ def properties(mesh: Mesh, unit: str = "m") -> MeshProperties:
             "volume and inertia are unknown: mend the mesh where it was made (a boolean union of its bodies),"
             " or give the object's mass_kg and convex parts"
         )
-    if unit == "m" and largest > 1.0:
+    if scale != 1.0 and not 0.005 <= largest <= 1.0:
+        warnings.append(f"the largest extent is {largest:.3g} m: are unit={unit} and scale={scale:g} right?")
+    elif unit == "m" and largest > 1.0:
         warnings.append(f"the largest extent is {largest:.3g} m: if the file is in millimetres, send unit=mm")
-    if unit != "m" and largest < 0.005:
+    elif unit != "m" and largest < 0.005:
         warnings.append(
             f"the largest extent is {largest * 1000:.3g} mm: if the file is in metres, send unit=m"
         )
@@ -295,11 +309,16 @@ class Inspection:
 
 
 def inspect(
-    data: bytes, media_type: str, unit: str = "m", *, max_triangles: int = MAX_TRIANGLES
+    data: bytes,
+    media_type: str,
+    unit: str = "m",
+    scale: float = 1.0,
+    *,
+    max_triangles: int = MAX_TRIANGLES,
 ) -> Inspection:
     """Load and measure in this process; for content that is trusted."""
-    mesh = load(data, media_type, unit, max_triangles=max_triangles)
-    return Inspection(mesh, properties(mesh, unit), convex_bodies(mesh))
+    mesh = load(data, media_type, unit, scale, max_triangles=max_triangles)
+    return Inspection(mesh, properties(mesh, unit, scale), convex_bodies(mesh))
 
 
 def readable(media_type: str, unit: str) -> bool:
@@ -320,15 +339,19 @@ def _check_values(field: str, geometry: Geometry) -> None:
         raise MeshError(field, "a coordinate is not finite")
 
 
-def _check_size(used: FloatArray, unit: str) -> None:
+def _check_size(used: FloatArray, unit: str, scale: float) -> None:
     low, high = used.min(axis=0), used.max(axis=0)
     with np.errstate(over="ignore"):
         largest = float((high - low).max())
     if largest > MAX_EXTENT_M:
         hint = ": is the file in millimetres (unit=mm)?" if unit != "mm" else ""
+        if scale != 1.0:
+            hint = f": is scale={scale:g} right?"
         raise MeshError("mesh", f"its largest extent is {largest:.3g} m, more than {MAX_EXTENT_M:g} m{hint}")
     if largest < MIN_EXTENT_M:
         hint = ": is the file in metres (unit=m)?" if unit != "m" else ""
+        if scale != 1.0:
+            hint = f": is scale={scale:g} right?"
         raise MeshError("mesh", f"its largest extent is {largest:.3g} m, less than 0.1 mm{hint}")
     if max(abs(float(low.min())), abs(float(high.max()))) > MAX_COORDINATE_M:
         raise MeshError("mesh", f"it lies more than {MAX_COORDINATE_M:g} m from the origin")

@@ -15,13 +15,14 @@ from graspdb.examples import example
 from graspdb_geometry import meshes
 from graspdb_geometry.meshes import MeshError
 from graspdb_service.usecases.geometry.mesh_child import inspect_in_child
+from graspdb_service.usecases.geometry.mesh_form import MeshForm
 
 TRIANGLE = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
 def test_the_child_gives_the_same_answer() -> None:
     data = example("mug").stl()
-    here, there = meshes.inspect(data, "model/stl"), inspect_in_child(data, "model/stl")
+    here, there = meshes.inspect(data, "model/stl"), inspect_in_child(data, MeshForm("model/stl"))
     assert here.properties == there.properties
     np.testing.assert_array_equal(here.mesh.vertices, there.mesh.vertices)
     np.testing.assert_array_equal(here.mesh.faces, there.mesh.faces)
@@ -29,23 +30,23 @@ def test_the_child_gives_the_same_answer() -> None:
 
 def test_the_child_reports_refusals() -> None:
     with pytest.raises(MeshError, match="finite") as caught:
-        inspect_in_child(b"v nan 0 0\n" + TRIANGLE + b"f 1 2 3\n", "model/obj")
+        inspect_in_child(b"v nan 0 0\n" + TRIANGLE + b"f 1 2 3\n", MeshForm("model/obj"))
     assert caught.value.field == "mesh"
     with pytest.raises(MeshError) as caught:
-        inspect_in_child(b"x", "model/3mf")
+        inspect_in_child(b"x", MeshForm("model/3mf"))
     assert caught.value.field == "content_type"
 
 
 def test_the_childs_memory_is_bounded() -> None:
     lump = trimesh.creation.icosphere(subdivisions=6, radius=0.1)
     with pytest.raises(MeshError, match="memory"):
-        inspect_in_child(lump.export(file_type="stl"), "model/stl", memory_bytes=150 * 2**20)
+        inspect_in_child(lump.export(file_type="stl"), MeshForm("model/stl"), memory_bytes=150 * 2**20)
 
 
 def test_the_childs_time_is_bounded() -> None:
     lines = TRIANGLE + b"f 1 2 3\n" * 900_000
     with pytest.raises(MeshError, match=r"takes more than 0\.3 s"):
-        inspect_in_child(lines, "model/obj", seconds=0.3)
+        inspect_in_child(lines, MeshForm("model/obj"), seconds=0.3)
 
 
 def test_the_child_ends_with_a_killed_service(
@@ -53,7 +54,9 @@ def test_the_child_ends_with_a_killed_service(
 ) -> None:
     program = (
         "from graspdb_service.usecases.geometry.mesh_child import inspect_in_child\n"
-        f"inspect_in_child({TRIANGLE!r} + b'f 1 2 3\\n' * 4_000_000, 'model/obj', max_triangles=10**9)"
+        "from graspdb_service.usecases.geometry.mesh_form import MeshForm\n"
+        f"content = {TRIANGLE!r} + b'f 1 2 3\\n' * 4_000_000\n"
+        "inspect_in_child(content, MeshForm('model/obj'), max_triangles=10**9)"
     )
     service = subprocess.Popen([sys.executable, "-c", program])
     try:

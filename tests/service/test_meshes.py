@@ -63,7 +63,8 @@ def test_mesh_is_measured_and_read_back(box: httpx.Client) -> None:
     back = box.get("/objects/box/mesh")
     assert back.content == BOX
     assert back.headers["content-type"] == "model/stl"
-    assert back.headers["etag"] == f'"{info["sha256"]}"'
+    assert info["sha256"] in back.headers["etag"]
+    assert (back.headers["mesh-unit"], back.headers["mesh-scale"]) == ("m", "1.0")
     assert box.get("/objects/box/mesh", headers={"If-None-Match": back.headers["etag"]}).status_code == 304
 
 
@@ -73,6 +74,66 @@ def test_unit_scales_to_metres(box: httpx.Client) -> None:
     assert info["bounding_box"]["upper"] == pytest.approx([0.02, 0.03, 0.05])
     assert info["volume_m3"] == pytest.approx(0.04 * 0.06 * 0.1)
     assert info["unit"] == "mm"
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 0.037), ("m", 2.5), ("in", 1.0)])
+def test_a_scale_beside_the_unit(box: httpx.Client, unit: str, scale: float) -> None:
+    """Lengths grow with it, volumes with its cube, inertia at unit density with its fifth power."""
+    factor = meshes.UNITS[unit] * scale
+    size = np.array([0.04, 0.06, 0.1])
+    stl = _stl(_box(tuple(size / factor)))
+    info = box.put(f"/objects/box/mesh?unit={unit}&scale={scale}", content=stl, headers=STL).json()
+    assert info["bounding_box"]["upper"] == pytest.approx(size / 2, rel=1e-6)
+    volume = float(size.prod())
+    assert info["volume_m3"] == pytest.approx(volume, rel=1e-5)
+    expected = [volume * (size @ size - side**2) / 12 for side in size]
+    assert np.diag(info["inertia_m5"]) == pytest.approx(expected, rel=1e-5)
+    assert (info["unit"], info["scale"]) == (unit, scale)
+    back = box.get("/objects/box/mesh")
+    assert back.content == stl
+    assert (back.headers["mesh-unit"], float(back.headers["mesh-scale"])) == (unit, scale)
+    # Its own convex part is in metres, whatever the mesh's coordinates were.
+    (part,) = meshes.parts_from_glb(box.get("/objects/box/convex-parts").content)
+    assert np.abs(part[0]).max(axis=0) == pytest.approx(size / 2, abs=1e-6)
+
+
+def test_the_collision_test_is_of_the_scaled_mesh(box: httpx.Client) -> None:
+    """A gripper from above meets what is 40 mm high, not what the unscaled bytes would be."""
+    upright = {"quaternion_xyzw": "1,0,0,0", "gripper": "panda", "include": "collision_free"}
+
+    def free(slug: str, height: float) -> bool:
+        box.post(f"/objects/{slug}/trials", json={**GRASP, "gripper": "panda"})
+        asked = {**upright, "position": f"0,0,{height}"}
+        answer = box.get(f"/objects/{slug}/likelihood", params=asked)
+        assert answer.status_code == 200, answer.text
+        return bool(answer.json()["collision_free"][0])
+
+    # Wider than any jaw, so that fingers come down on its top; of what has a cavity the surface is tested.
+    plate, slit = _box((0.2, 0.2, 0.04)), _box((0.01, 0.01, 0.001))
+    for slug, parts in (("plate", [plate]), ("hollow", [plate, (slit[0], slit[1][:, ::-1])])):
+        box.post("/objects", json={"id": slug})
+        grown = [(vertices / 0.5, faces) for vertices, faces in parts]
+        put = box.put(f"/objects/{slug}/mesh?scale=0.5", content=_stl(*grown), headers=STL)
+        assert put.status_code == 200, put.text
+        assert free(slug, 0.03)
+        assert not free(slug, 0.015)
+
+
+def test_another_scale_is_another_mesh(box: httpx.Client) -> None:
+    first = box.put("/objects/box/mesh?scale=1", content=BOX, headers=STL)
+    tag = box.get("/objects/box/mesh").headers["etag"]
+    again = box.put("/objects/box/mesh", content=BOX, headers=STL)
+    assert again.json() == first.json()
+    assert box.get("/objects/box").json()["revision"] == 1
+    assert box.put("/objects/box/mesh?scale=2", content=BOX, headers=STL).json()["scale"] == 2.0
+    assert box.get("/objects/box/mesh", headers={"If-None-Match": tag}).status_code == 200
+    box.post("/objects/box/trials", json=GRASP)
+    refused = box.put("/objects/box/mesh?scale=1", content=BOX, headers=STL)
+    assert refused.json()["type"] == "urn:graspdb:problem:mesh-in-use"
+    for wrong in ("0", "-1", "nan", "inf", "1e7", "x"):
+        refused = box.put(f"/objects/box/mesh?scale={wrong}", content=BOX, headers=STL)
+        assert refused.status_code == 422, wrong
+        assert refused.json()["errors"][0]["field"] == "scale"
 
 
 def test_convex_mesh_is_its_own_part(box: httpx.Client) -> None:

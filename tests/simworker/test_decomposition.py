@@ -75,7 +75,8 @@ def test_an_angle_is_split_the_same_every_time() -> None:
     assert "left, at most 120 s" in notes[0]
     assert "mm off" in notes[-1]
     assert "% volume" in notes[-1]
-    assert supervisor.decompose(PAYLOAD, angle_stl(), limits=LIMITS) == first
+    scaled = PAYLOAD.model_copy(update={"unit": "m", "scale": 0.001})
+    assert supervisor.decompose(scaled, angle_stl(), limits=LIMITS) == first
 
 
 def test_too_little_time_is_said_with_the_way_out() -> None:

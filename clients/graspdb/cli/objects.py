@@ -22,6 +22,7 @@ ProfileFile = Annotated[
     Path, typer.Argument(help="JSON file with the profile, as `grippers show` prints it.", show_default=False)
 ]
 Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
+Scale = Annotated[float, typer.Option(help="Factor to the mesh's coordinates, beside their unit.")]
 
 
 @objects.command("list")
@@ -55,12 +56,15 @@ def create_object(
     properties: ObjectProperties,
     mesh: Annotated[Path | None, typer.Option(help="Mesh file: .stl, .obj, .ply or .glb.")] = None,
     unit: Unit = "m",
+    scale: Scale = 1.0,
     convex_parts: Annotated[
         Path | None, typer.Option(help="GLB with one convex geometry a part, metres.")
     ] = None,
 ) -> None:
     """Create an object, with its mesh if given."""
-    item = state.db.objects.create(id, mesh=mesh, unit=unit, convex_parts=convex_parts, **properties)
+    item = state.db.objects.create(
+        id, mesh=mesh, unit=unit, scale=scale, convex_parts=convex_parts, **properties
+    )
     state.show(item.info, item.summary())
 
 
@@ -77,10 +81,11 @@ def set_mesh(
     id: ObjectId,
     mesh: Annotated[Path, typer.Argument(help="Mesh file.", show_default=False)],
     unit: Unit = "m",
+    scale: Scale = 1.0,
 ) -> None:
     """Upload an object's mesh."""
     item = state.db.objects.get(id)
-    info = item.upload_mesh(mesh, unit=unit)
+    info = item.upload_mesh(mesh, unit=unit, scale=scale)
     state.show(info, item.summary())
 
 

@@ -55,7 +55,7 @@ COMMANDS: Mapping[str, str] = {
 _PARAMETERS = option_names(
     *(Constraints, SweepOptions, KernelOptions, ObjectProperties, TrialFilters, Upload),
     *(ConvergenceOptions, AnisotropyOptions, ProjectionOptions, KernelSimilarityOptions, PromisesOptions),
-) | {"unit", "mesh"}
+) | {"unit", "scale", "mesh"}
 #: Flags whose opposite has a name of its own.
 _OPPOSITES = {"collision_free": "any"}
 _CALL = re.compile(r"\b(GET|POST|PUT|DELETE|PATCH) (/[\w{}./-]*[\w}])(?:\?([\w=]+)(?:=\.\.\.|\.\.\.)?)?")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
+from typing_extensions import Unpack
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
@@ -75,17 +76,20 @@ class GraspObject(GraspQueries):
 
     # Mesh and convex parts
 
-    def upload_mesh(self, mesh: MeshLike, *, unit: str = "m", media_type: str | None = None) -> wire.MeshInfo:
+    def upload_mesh(
+        self, mesh: MeshLike, *, unit: str = "m", scale: float = 1.0, media_type: str | None = None
+    ) -> wire.MeshInfo:
         """Store the object's mesh: a file (.stl, .obj, .ply, .glb), its bytes, or a trimesh object.
 
-        Its coordinates are in ``unit``: ``m``, ``mm``, ``cm`` or ``in``. ``media_type`` is needed for bytes
+        Its coordinates are in ``unit``: ``m``, ``mm``, ``cm`` or ``in``; ``scale`` multiplies them beside
+        that, as data sets have it that scale one mesh to several objects. ``media_type`` is needed for bytes
         whose format they do not tell themselves.
         """
         content, kind = read_mesh(mesh, media_type)
-        return self._upload(wire.MeshInfo, "mesh", content, kind, params={"unit": unit})
+        return self._upload(wire.MeshInfo, "mesh", content, kind, params={"unit": unit, "scale": scale})
 
     def download_mesh(self) -> bytes:
-        """The mesh as it was uploaded."""
+        """The mesh as it was uploaded, in the unit and scale that ``info.mesh`` tells."""
         return self._transport.request("GET", f"{self._path}/mesh").content
 
     def upload_convex_parts(self, parts: MeshLike | Sequence[Any]) -> wire.PartsInfo:
@@ -178,14 +182,16 @@ class Objects(Resource):
         *,
         mesh: MeshLike | None = None,
         unit: str = "m",
+        scale: float = 1.0,
         media_type: str | None = None,
         convex_parts: MeshLike | Sequence[Any] | None = None,
         **properties: Unpack[ObjectProperties],
     ) -> GraspObject:
         """Create an object, with its mesh and convex parts if given: all of it or nothing.
 
-        ``id`` is a slug; ``mesh``, ``unit`` and ``media_type`` as in :meth:`GraspObject.upload_mesh`,
-        ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`, the rest :class:`ObjectProperties`.
+        ``id`` is a slug; ``mesh``, ``unit``, ``scale`` and ``media_type`` as in
+        :meth:`GraspObject.upload_mesh`, ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`, the
+        rest :class:`ObjectProperties`.
         """
         fields = known_keywords(ObjectProperties, properties, "create")
         request = validate(wire.ObjectCreate, {"id": id, **fields})
@@ -194,7 +200,7 @@ class Objects(Resource):
         created = GraspObject(self._transport, info)
         try:
             if loaded is not None:
-                created.upload_mesh(loaded[0], unit=unit, media_type=loaded[1])
+                created.upload_mesh(loaded[0], unit=unit, scale=scale, media_type=loaded[1])
             if convex_parts is not None:
                 created.upload_convex_parts(convex_parts)
         except (GraspDBError, OSError, ValueError, TypeError, ImportError):

@@ -104,6 +104,8 @@ class DecomposePayload(Response):
     """Format of the mesh as a media type."""
     unit: str = "m"
     """Unit of the mesh's coordinates: m, mm, cm or in."""
+    scale: float = 1.0
+    """Factor to the mesh's coordinates beside their unit, without a unit."""
     max_parts: int = 1024
     """How many parts there may be at most."""
 

@@ -74,6 +74,8 @@ class MeshInfo(Response):
     """Format of the file as a media type."""
     unit: str
     """Unit that the file's coordinates are in: m, mm, cm or in."""
+    scale: float = 1.0
+    """Factor to the file's coordinates beside its unit: ``mm`` and 2 make 2 mm of a 1; without a unit."""
     bytes: int
     """Size of the file in bytes."""
     vertices: int

@@ -7,36 +7,60 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Request, Response
 
 from graspdb.wire import MeshInfo, PartsInfo
+from graspdb_geometry.meshes import MAX_SCALE
 from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import not_modified
 from graspdb_service.api.routing.parameters import Ctx, ObjectId, RawBody
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import BINARY, GLB, one_of
 from graspdb_service.usecases.geometry import meshes
+from graspdb_service.usecases.geometry.mesh_form import MeshForm
 
 router = APIRouter(tags=["objects"], route_class=AdmittedRoute)
 
 MeshUnit = Annotated[
     Literal["m", "mm", "cm", "in"], Query(description="Unit of the mesh's coordinates; kept in metres.")
 ]
+MeshScale = Annotated[
+    float,
+    Query(
+        gt=0,
+        le=MAX_SCALE,
+        description="Factor to the mesh's coordinates beside their unit, such as ACRONYM's `object/scale`.",
+    ),
+]
 _MESH_BODY = dict.fromkeys(meshes.MEDIA_TYPES, BINARY)
 
 
 @router.put("/objects/{id}/mesh", **scope("objects:write", body=_MESH_BODY, work="meshes", large=True))
-def put_mesh(ctx: Ctx, id: ObjectId, request: Request, body: RawBody, unit: MeshUnit = "m") -> MeshInfo:
+def put_mesh(
+    ctx: Ctx, id: ObjectId, request: Request, body: RawBody, unit: MeshUnit = "m", scale: MeshScale = 1.0
+) -> MeshInfo:
     """Store the mesh: STL, OBJ, PLY or GLB as the raw body, said by Content-Type."""
-    return meshes.put_mesh(ctx, id, body, media=one_of(request, *meshes.MEDIA_TYPES), unit=unit)
+    form = MeshForm(one_of(request, *meshes.MEDIA_TYPES), unit, scale)
+    return meshes.put_mesh(ctx, id, body, form=form)
 
 
 @router.get(
     "/objects/{id}/mesh",
     response_class=Response,
-    responses={200: {"content": {media: {"schema": BINARY} for media in meshes.MEDIA_TYPES}}},
+    responses={
+        200: {
+            "content": {media: {"schema": BINARY} for media in meshes.MEDIA_TYPES},
+            "headers": {
+                "Mesh-Unit": {"schema": {"type": "string"}, "description": "Unit of its coordinates."},
+                "Mesh-Scale": {"schema": {"type": "number"}, "description": "Factor to them beside it."},
+            },
+        }
+    },
     **scope("read", "jobs:work"),
 )
 def get_mesh(ctx: Ctx, id: ObjectId, request: Request) -> Response:
-    """The mesh's bytes as they came."""
-    return _bytes(request, *meshes.get_mesh(ctx, id))
+    """The mesh's bytes as they came, with unit and scale in headers: together they are metres."""
+    content, form, sha256 = meshes.get_mesh(ctx, id)
+    tag = f'"{sha256}-{form.unit}-{form.scale!r}"'
+    headers = {"ETag": tag, "Mesh-Unit": form.unit, "Mesh-Scale": repr(form.scale)}
+    return not_modified(request, tag) or Response(content, media_type=form.media_type, headers=headers)
 
 
 @router.put(
@@ -56,9 +80,6 @@ def put_convex_parts(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) ->
 )
 def get_convex_parts(ctx: Ctx, id: ObjectId, request: Request) -> Response:
     """The convex parts' bytes."""
-    return _bytes(request, *meshes.get_parts(ctx, id))
-
-
-def _bytes(request: Request, content: bytes, media: str, sha256: str) -> Response:
+    content, media, sha256 = meshes.get_parts(ctx, id)
     tag = f'"{sha256}"'
     return not_modified(request, tag) or Response(content, media_type=media, headers={"ETag": tag})

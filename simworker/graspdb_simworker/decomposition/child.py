@@ -62,7 +62,7 @@ def _serve(order: dict[str, Any], content: bytes, sink: int) -> None:
     limits = convexity.CuttingLimits(order["max_parts"], order["seconds"], order["seed"])
     try:
         convexity.decompose(
-            convexity.read(content, order["media_type"], order["unit"]),
+            convexity.read(content, order["media_type"], order["unit"], order["scale"]),
             limits,
             tell=lambda note: channel.send(sink, channel.NOTE, note.encode()),
             give=lambda found: channel.send(sink, channel.RESULT, found.glb),

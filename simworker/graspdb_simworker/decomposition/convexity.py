@@ -80,10 +80,10 @@ class CuttingLimits:
     seed: int
 
 
-def read(content: bytes, media_type: str, unit: str) -> Mesh:
+def read(content: bytes, media_type: str, unit: str, scale: float) -> Mesh:
     """The mesh as the service reads it, repaired as there, or Undecomposable."""
     try:
-        return meshes.load(content, media_type, unit)
+        return meshes.load(content, media_type, unit, scale)
     except MeshError as error:
         raise Undecomposable(error.message) from None
 

@@ -76,6 +76,7 @@ def decompose(
     order = {
         "media_type": payload.media_type,
         "unit": payload.unit,
+        "scale": payload.scale,
         "max_parts": payload.max_parts,
         "seed": SEED,
         "seconds": limits.seconds,

@@ -21,6 +21,7 @@ from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.densities.build import KernelChoice
 from graspdb_service.usecases.geometry.collision import CollisionTest, Scenes
+from graspdb_service.usecases.geometry.mesh_form import form_of
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected
@@ -84,8 +85,8 @@ class Priors:
                 f" {1e3 * selected.profile.max_opening_m:.0f} mm, as far as the jaw opens: name a wider"
                 " gripper",
             )
-        unit = None if row.mesh_info is None else row.mesh_info["unit"]
-        key = (row.mesh_sha256, unit, row.parts_sha256, selected.profile.model_dump_json(), kernel)
+        form = None if row.mesh_info is None else form_of(row)
+        key = (row.mesh_sha256, form, row.parts_sha256, selected.profile.model_dump_json(), kernel)
         symmetric = selected.jaw_symmetric
 
         def make(_: _Made | None) -> _Made:

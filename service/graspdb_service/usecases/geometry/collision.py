@@ -19,6 +19,7 @@ from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.geometry.features import Features
+from graspdb_service.usecases.geometry.mesh_form import MeshForm, form_of
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected
@@ -76,7 +77,7 @@ class Scenes:
         self._database = database
         self._compute = compute
         self.features = features
-        self._cache: SingleFlightCache[tuple[str, str], _Prepared] = SingleFlightCache(
+        self._cache: SingleFlightCache[tuple[str, MeshForm | str], _Prepared] = SingleFlightCache(
             _MAX_BYTES, lambda p: p.nbytes
         )
 
@@ -120,18 +121,19 @@ class Scenes:
         info = row.mesh_info
         if row.mesh_sha256 is None or info is None:
             return None
+        form = form_of(row)
 
-        def own(content: bytes, media_type: str) -> Solid:
-            # Checked in a child process when it came; what is stored is trusted.
-            mesh = meshes.load(content, media_type, info["unit"])
+        def own(content: bytes, _: str) -> Solid:
+            mesh = form.read(content)
             if info["convex"]:
                 return Scene([(mesh.vertices, mesh.faces)])
             return Surface(mesh.vertices, mesh.faces, watertight=info["watertight"])
 
-        # The same file in another unit is another object.
-        return self._prepared(row.mesh_sha256, info["unit"], own)
+        return self._prepared(row.mesh_sha256, form, own)
 
-    def _prepared(self, sha256: str, reading: str, prepare: Callable[[bytes, str], Solid]) -> Solid:
+    def _prepared(
+        self, sha256: str, reading: MeshForm | str, prepare: Callable[[bytes, str], Solid]
+    ) -> Solid:
         def make(_: _Prepared | None) -> _Prepared:
             with self._database.read() as tx:
                 found = assets.get(tx, sha256)

@@ -161,5 +161,6 @@ def payload(tx: Tx, job: JobRow) -> DecomposePayload | None:
         mesh_sha256=mesh.sha256,
         media_type=mesh.media_type,
         unit=mesh.unit,
+        scale=mesh.scale,
         max_parts=meshes.MAX_PARTS,
     )

@@ -18,6 +18,7 @@ from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.usecases.geometry.mesh_form import MeshForm, form_of
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected
@@ -30,7 +31,7 @@ Axes = Floats | FramesOf | None
 
 _MAX_BYTES = 32 * 2**20
 #: Hash of the geometry, how it is read, the jaw's opening (0: ridges only), whether with opposed points.
-_Key = tuple[str, str, float, bool]
+_Key = tuple[str, MeshForm | str, float, bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +110,10 @@ class Features:
         info = row.mesh_info
         closed = info is not None and bool(info["watertight"])
         if info is not None and row.mesh_sha256 is not None and (closed or row.parts_sha256 is None):
-            unit, sha256 = str(info["unit"]), row.mesh_sha256
+            form, sha256 = form_of(row), row.mesh_sha256
 
-            def read(content: bytes, media_type: str) -> _Prepared:
-                mesh = meshes.load(content, media_type, unit)
+            def read(content: bytes, _: str) -> _Prepared:
+                mesh = form.read(content)
                 ridges = ridges_of_mesh(mesh.vertices, mesh.faces)
                 if not opening_m:
                     return _Prepared(ridges)
@@ -125,7 +126,7 @@ class Features:
                 corners = mesh.vertices[mesh.faces]
                 return _Prepared(ridges, pairs, opposed_points(corners, solid, opening_m=opening_m))
 
-            return self._read((sha256, unit, opening_m, points), read)
+            return self._read((sha256, form, opening_m, points), read)
         if row.parts_sha256 is None:
             raise conflict(
                 "mesh-missing",

@@ -20,6 +20,7 @@ import numpy as np
 from graspdb.processes import ChildProcess, end_with_parent
 from graspdb_geometry import meshes
 from graspdb_geometry.meshes import Inspection, Mesh, MeshError, MeshProperties
+from graspdb_service.usecases.geometry.mesh_form import MeshForm
 
 # One thread in the numeric libraries: each would reserve address space of its own.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -27,8 +28,7 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THR
 
 def inspect_in_child(
     data: bytes,
-    media_type: str,
-    unit: str = "m",
+    form: MeshForm,
     *,
     as_parts: bool = False,
     max_triangles: int = meshes.MAX_TRIANGLES,
@@ -42,12 +42,11 @@ def inspect_in_child(
     exceeds a limit or dies.
     """
     # Cheap refusals need no child.
-    if not meshes.readable(media_type, unit) or not data:
-        meshes.load(data, media_type, unit, max_triangles=max_triangles)
+    if not meshes.readable(form.media_type, form.unit) or not data:
+        form.read(data)
     order = {
         "as_parts": as_parts,
-        "media_type": media_type,
-        "unit": unit,
+        **form._asdict(),
         "max_triangles": max_triangles,
         "memory_bytes": memory_bytes,
         "seconds": seconds,
@@ -89,7 +88,7 @@ def main() -> int:
     try:
         data = sys.stdin.buffer.read()
         inspection = meshes.inspect(
-            data, order["media_type"], order["unit"], max_triangles=order["max_triangles"]
+            data, order["media_type"], order["unit"], order["scale"], max_triangles=order["max_triangles"]
         )
         if order["as_parts"]:
             inspection = replace(inspection, parts=meshes.parts_from_glb(data))

@@ -21,6 +21,7 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.geometry.mesh_child import inspect_in_child
+from graspdb_service.usecases.geometry.mesh_form import MeshForm, form_of
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
 
@@ -34,7 +35,7 @@ _SAME_SHARE = 1e-4
 _SAME_VOLUME = 1e-3
 
 
-def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) -> MeshInfo:
+def put_mesh(ctx: Runtime, slug: str, content: bytes, *, form: MeshForm) -> MeshInfo:
     """Check and store an object's mesh; one whose bodies are all convex brings its own convex parts.
 
     413 and 422 for what can't be used; 409 for another mesh once trials or sweeps exist.
@@ -42,19 +43,19 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, media: str, unit: str) 
     sha256 = hashlib.sha256(content).hexdigest()
     with ctx.database.read() as tx:
         row = require(tx, slug)
-        if _is_stored(row, sha256, media, unit):
+        if _is_stored(row, sha256, form):
             return MeshInfo.model_validate(row.mesh_info)
         _refuse_another_mesh(tx, row)
-    inspection = _inspect(ctx, content, media, unit)
-    info = _mesh_info(inspection, sha256, media, unit, len(content))
+    inspection = _inspect(ctx, content, form)
+    info = _mesh_info(inspection, sha256, form, len(content))
     own = meshes.parts_to_glb(inspection.parts) if inspection.parts else None
     with ctx.database.write() as tx:
         row = require(tx, slug, lock=True)
-        if _is_stored(row, sha256, media, unit):
+        if _is_stored(row, sha256, form):
             return MeshInfo.model_validate(row.mesh_info)
         _refuse_another_mesh(tx, row)
         objects.advance(tx, row.id, append=False)
-        assets.put(tx, content, media)
+        assets.put(tx, content, form.media_type)
         values: dict[str, Any] = {"mesh_sha256": sha256, "mesh_info": info.model_dump(mode="json")}
         if _is_used(tx, row):
             values["copied_from"] = {**(row.copied_from or {}), "takes_mesh": False, "other_mesh": True}
@@ -100,7 +101,7 @@ def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
 
 def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
     """Check convex parts, wherever they come from, and measure them against their object's mesh."""
-    parts = _inspect(ctx, content, GLB, "m", field="parts").parts
+    parts = _inspect(ctx, content, MeshForm(GLB), field="parts").parts
     mesh = None if row.mesh_info is None else MeshInfo.model_validate(row.mesh_info)
     info = _parts_info(content, parts, mesh)
     if mesh is None:
@@ -111,7 +112,7 @@ def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
         raise conflict(
             "object-changed", f"The mesh of {row.slug!r} was changed at the same moment: try again"
         )
-    own = meshes.load(found[0], mesh.media_type, mesh.unit)
+    own = form_of(row).read(found[0])
     apart, volume = ctx.compute.run(lambda: (deviation(own, parts).largest_m, united_volume(parts)))
     longest = max(np.subtract(mesh.bounding_box.upper, mesh.bounding_box.lower))
     added = 0.0 if mesh.volume_m3 is None else volume / mesh.volume_m3 - 1.0
@@ -130,15 +131,15 @@ def store_parts(tx: Tx, row: ObjectRow, content: bytes, info: PartsInfo) -> None
     decompositions.settle(tx, replace(row, **values))
 
 
-def get_mesh(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
-    """The mesh as it came: bytes, media type, SHA-256."""
+def get_mesh(ctx: Runtime, slug: str) -> tuple[bytes, MeshForm, str]:
+    """The mesh as it came: bytes, how they are read, SHA-256."""
     with ctx.database.read() as tx:
         row = require(tx, slug)
         found = None if row.mesh_sha256 is None else assets.get(tx, row.mesh_sha256)
     if found is None or row.mesh_info is None or row.mesh_sha256 is None:
         raise not_found("mesh of object", slug, f"PUT /objects/{slug}/mesh stores one")
     # By the object, for the same bytes may have come for another one under another media type.
-    return found[0], str(row.mesh_info["media_type"]), row.mesh_sha256
+    return found[0], form_of(row), row.mesh_sha256
 
 
 def get_parts(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
@@ -151,7 +152,7 @@ def get_parts(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
     return found[0], GLB, row.parts_sha256
 
 
-def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str = "mesh") -> Inspection:
+def _inspect(ctx: Runtime, content: bytes, form: MeshForm, *, field: str = "mesh") -> Inspection:
     limit = ctx.settings.max_mesh_bytes
     if len(content) > limit:
         raise ProblemError(
@@ -165,8 +166,7 @@ def _inspect(ctx: Runtime, content: bytes, media: str, unit: str, *, field: str 
         with ctx.mesh_children:
             return inspect_in_child(
                 content,
-                media,
-                unit,
+                form,
                 as_parts=field == "parts",
                 memory_bytes=ctx.settings.max_mesh_memory_bytes,
                 seconds=ctx.settings.max_mesh_seconds,
@@ -183,11 +183,8 @@ def _refused(error: MeshError) -> ProblemError:
     )
 
 
-def _is_stored(row: ObjectRow, sha256: str, media: str, unit: str) -> bool:
-    info = row.mesh_info
-    return (
-        row.mesh_sha256 == sha256 and info is not None and (info["media_type"], info["unit"]) == (media, unit)
-    )
+def _is_stored(row: ObjectRow, sha256: str, form: MeshForm) -> bool:
+    return row.mesh_sha256 == sha256 and row.mesh_info is not None and form_of(row) == form
 
 
 def _refuse_another_mesh(tx: Tx, row: ObjectRow) -> None:
@@ -222,13 +219,14 @@ def _refuse_other_parts(tx: Tx, row: ObjectRow) -> None:
         )
 
 
-def _mesh_info(inspection: Inspection, sha256: str, media: str, unit: str, size: int) -> MeshInfo:
+def _mesh_info(inspection: Inspection, sha256: str, form: MeshForm, size: int) -> MeshInfo:
     measured = inspection.properties
     return MeshInfo.model_validate(
         {
             "sha256": sha256,
-            "media_type": media,
-            "unit": unit,
+            "media_type": form.media_type,
+            "unit": form.unit,
+            "scale": form.scale,
             "bytes": size,
             "vertices": len(inspection.mesh.vertices),
             "faces": len(inspection.mesh.faces),

@@ -19,6 +19,7 @@ from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.geometry.mesh_form import form_of
 from graspdb_service.usecases.reports.common import LEVEL, ReportInputs, head, interval
 
 #: Normals by the names of planes: towards the viewer, so that the first letter runs to the right.
@@ -186,8 +187,7 @@ def _corners(database: Database, row: ObjectRow) -> list[Floats]:
         return []
     if row.parts_sha256 is not None:
         return [np.asarray(part[0], dtype=np.float64) for part in meshes.parts_from_glb(found[0])]
-    assert row.mesh_info is not None
-    return [np.asarray(meshes.load(*found, row.mesh_info["unit"]).vertices, dtype=np.float64)]
+    return [np.asarray(form_of(row).read(found[0]).vertices, dtype=np.float64)]
 
 
 def _text(report: ProjectionReport, found: Marginal) -> str:

@@ -10,6 +10,7 @@ from graspdb_geometry.meshes import UNITS
 from graspdb_service.problems import ProblemError, invalid
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.geometry.collision import shape_of
+from graspdb_service.usecases.geometry.mesh_form import form_of
 from graspdb_service.usecases.trials import sweep_plan
 
 #: An object's longest side in openings of the gripper, beyond which its unit is wrong or its gripper.
@@ -105,14 +106,16 @@ def check_size(row: ObjectRow, longest_m: float, profile: GripperProfile) -> Non
 
 def _unit_hint(row: ObjectRow, longest_m: float, profile: GripperProfile) -> str:
     """Which unit would make an object of usual size of it."""
-    sent = str((row.mesh_info or {}).get("unit", "m"))
+    form = None if row.mesh_info is None else form_of(row)
+    sent, scale = ("m", 1.0) if form is None else (form.unit, form.scale)
     low, high = (share * profile.max_opening_m for share in _USUAL_SIZE_IN_OPENINGS)
     sizes = {unit: longest_m / UNITS[sent] * metres for unit, metres in UNITS.items() if unit != sent}
     fitting = [f"{size:.3g} m with unit={unit}" for unit, size in sizes.items() if low <= size <= high]
+    scaled = "" if scale == 1.0 else f" and scale={scale:g}"
     if not fitting:
-        return f"It was sent with unit={sent}, and no other fits: scale it, or take another gripper"
+        return f"It was sent with unit={sent}{scaled}, and no other fits: scale it, or take another gripper"
     return (
-        f"It was sent with unit={sent}; it would be {' or '.join(fitting)}:"
+        f"It was sent with unit={sent}{scaled}; it would be {' or '.join(fitting)}:"
         f" PUT /objects/{row.slug}/mesh?unit=... again, or take another gripper"
     )
 
