@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.wire.trials import BatchDefaults
 from graspdb_density.se3 import Poses
 
 Floats = NDArray[np.float64]
@@ -56,6 +57,8 @@ class TrialColumns:
     ascending, ``batch`` internal, ``withdrawn`` (n,) whether it counts no more. ``answer`` is which answer
     was tried, -1 for none: its place in a list that comes with the columns, once stored its number.
     ``achieved`` (n, 7) is where the tool was after all, position and quaternion, NaN where that is unknown.
+    ``qualities`` (n, k) are named scores, NaN for none; the names come with the columns, of stored ones with
+    the batch, whose first name is in column 0.
     """
 
     position: Floats
@@ -74,6 +77,7 @@ class TrialColumns:
     batch: Ints = field(default_factory=_ints)
     answer: Ints = field(default_factory=_ints)
     achieved: Floats = field(default_factory=_floats)
+    qualities: Floats = field(default_factory=_floats)
     withdrawn: NDArray[np.bool_] = field(default_factory=_flags)
 
     def __len__(self) -> int:
@@ -140,12 +144,15 @@ def is_gripper(name: str, asked: str) -> bool:
     return name == asked or ("@" not in asked and gripper_parts(name)[0] == asked)
 
 
-class BatchOrigin(NamedTuple):
-    """The batch that trials came in: its key, the sweep that wrote it, and the metadata beside it."""
+class BatchFacts(NamedTuple):
+    """What trials have from their batch: its key, the sweep that wrote it, the metadata beside it, and what
+    the columns of ``qualities`` are called.
+    """
 
     key: str
     sweep: str | None
     metadata: dict[str, Any] | None
+    qualities: Sequence[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,22 +160,25 @@ class TrialBatch:
     """Checked trials of one request, ready to store.
 
     ``field_of_gripper`` names the field that a gripper came in, ``field_of`` that of a trial's place and
-    name, for what only the database can tell. ``answers`` are ids or names of those that trials tried.
+    name, for what only the database can tell. ``shared`` stood once for all, ``answers`` are ids or names of
+    those that trials tried, ``qualities`` names of the columns of scores.
     """
 
     columns: TrialColumns
     provenances: Sequence[Provenance]
-    metadata: dict[str, Any] | None
+    shared: BatchDefaults
     field_of_gripper: Callable[[str], str]
     field_of: Callable[[int, str], str]
     answers: Sequence[str] = ()
+    qualities: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class TrialPage:
-    """Stored trials with what their internal ids stand for."""
+    """Stored trials with what their internal ids stand for, and names of all qualities of their object."""
 
     columns: TrialColumns
     provenances: Mapping[int, Provenance]
-    batches: Mapping[int, BatchOrigin]
+    batches: Mapping[int, BatchFacts]
     answers: Mapping[int, str]
+    qualities: Sequence[str]

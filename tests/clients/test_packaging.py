@@ -131,6 +131,31 @@ graspdb.cli.main()
 """
 
 
+def test_importing_the_sdk_imports_nothing_heavy() -> None:
+    """A robot's program starts as fast as it can: what only some calls need is imported by these."""
+    heavy = (
+        "scipy",
+        "pandas",
+        "matplotlib",
+        "trimesh",
+        "pyarrow",
+        "numba",
+        "fastapi",
+        "sqlalchemy",
+        "h5py",
+        "yaml",
+    )
+    program = (
+        f"import sys; from graspdb import Client; print([name for name in {heavy} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    needed = ("numpy", "pydantic", "httpx", "rich")
+    program = f"import sys; import graspdb; print([name for name in {needed} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_the_bare_install_is_sdk_and_command_line(wheel: Path, tmp_path: Path) -> None:
     bare = _requirements(wheel)
     assert {"httpx", "numpy", "pydantic", "rich", "typer"} <= bare

@@ -73,6 +73,15 @@ def test_wrong_properties_are_named_before_anything_is_sent(db: Client, fresh_id
         db.objects.get("../grippers")
 
 
+def test_a_mesh_is_scaled_beside_its_unit(db: Client, fresh_id: str) -> None:
+    made = db.objects.create(fresh_id, mesh=_box((-1, -1, -1), (1, 1, 1)), unit="cm", scale=2.5)
+    assert made.info.mesh is not None
+    assert (made.info.mesh.unit, made.info.mesh.scale) == ("cm", 2.5)
+    assert made.info.mesh.bounding_box.upper == pytest.approx((0.025, 0.025, 0.025))
+    info = made.upload_mesh(_box((-1, -1, -1), (1, 1, 1)), scale=0.04)
+    assert info.volume_m3 == pytest.approx(0.08**3, rel=1e-5)
+
+
 @pytest.mark.parametrize("form", ["file", "bytes", "mesh", "scene"])
 def test_a_mesh_comes_as_file_bytes_or_trimesh(db: Client, fresh_id: str, form: str, tmp_path: Path) -> None:
     box = _box((-20, -30, -50), (20, 30, 50))

@@ -87,6 +87,7 @@ def test_the_python_blocks_run(own_service_url: str, tmp_path: Path, monkeypatch
             "positions": position,
             "quaternions": quaternion,
             "held": [True, False] * 25,
+            "slips": np.linspace(0.0, 0.02, 50),
             "T_world_mug": np.array([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]),
             "robot": robot,
         }

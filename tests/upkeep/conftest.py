@@ -58,6 +58,7 @@ def trials(count: int = 300) -> dict[str, Any]:
         if number % 7 == 0:
             trial |= {
                 "quality": rng.random(),
+                "qualities": {"flex": float(number % 2), "motion": rng.random()},
                 "width_m": 0.04,
                 "proposal_density": 1e3 * rng.random(),
                 "measured_at": f"2026-03-01T12:{number % 60:02d}:00.000001Z",
@@ -65,7 +66,8 @@ def trials(count: int = 300) -> dict[str, Any]:
                 "pose_covariance": (np.eye(6) * 1e-6).tolist(),
             }
         listed.append(trial)
-    return {"trials": listed, "gripper": "mine", "source": "robot"}
+    told = {"licence": "CC-BY-4.0", "citation": "Doe 2020", "origin": {"file": "box.csv"}}
+    return {"trials": listed, "gripper": "mine", "source": "robot", **told}
 
 
 def simulate(payload: dict[str, Any]) -> dict[str, Any]:

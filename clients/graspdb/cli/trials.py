@@ -35,6 +35,8 @@ def add_trials(
     answer: Annotated[
         str | None, typer.Option(help="Id or name of the answer that trials tried which name none.")
     ] = None,
+    licence: Annotated[str | None, typer.Option(help="Licence of the data, as CC-BY-NC-4.0.")] = None,
+    citation: Annotated[str | None, typer.Option(help="What to cite for the data.")] = None,
     unit: Annotated[str, typer.Option(help="What the file's positions are in: m, cm, mm or in.")] = "m",
     quaternion_order: Annotated[
         str, typer.Option(help="The order of the file's quaternions: xyzw, or wxyz whatever their names say.")
@@ -43,8 +45,8 @@ def add_trials(
     """Store the trials of a file, and say what looks doubtful about them.
 
     CSV has the columns x,y,z,qx,qy,qz,qw,outcome and optionally gripper, source, protocol,
-    proposal_density, quality, width_m, measured_at, answer, and achieved_x to achieved_qw for where the tool
-    was after all.
+    proposal_density, quality, width_m, measured_at, answer, achieved_x to achieved_qw for where the tool was
+    after all, and qualities.NAME for any number of named scores.
     """
     records, shared = read_trials(file)
     try:
@@ -52,6 +54,7 @@ def add_trials(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     given = {"gripper": gripper, "source": source, "protocol": protocol, "answer": answer}
+    given |= {"licence": licence, "citation": citation}
     shared |= {name: value for name, value in given.items() if value is not None}
     upload["progress"] = not state.json and len(records) > 1_000
     with warnings.catch_warnings():
@@ -131,10 +134,14 @@ def _show_trial(state: State, found: TrialInfo) -> None:
 
 
 @batches.command("list")
-def list_batches(state: State, id: ObjectId) -> None:
+def list_batches(
+    state: State,
+    id: ObjectId,
+    licence: Annotated[str | None, typer.Option(help="Only batches under this licence.")] = None,
+) -> None:
     """List an object's batches."""
     state.show_list(
-        list(state.db.objects.get(id).batches),
+        list(state.db.objects.get(id).batches.list(licence=licence)),
         {
             "batch": lambda b: b.batch,
             "revision": lambda b: b.revision,
@@ -145,6 +152,7 @@ def list_batches(state: State, id: ObjectId) -> None:
             "source": lambda b: ", ".join(b.sources),
             "protocol": lambda b: ", ".join(b.protocols),
             "outcomes": lambda b: ", ".join(f"{number:,} {name}" for name, number in b.outcomes.items()),
+            "licence": lambda b: b.licence,
             "sweep": lambda b: b.sweep,
             "doubtful": lambda b: ", ".join(finding.code for finding in b.findings),
             "created": lambda b: f"{b.created_at:%Y-%m-%d %H:%M}",

@@ -2,9 +2,10 @@
 
 CSV has a header line. A pose is ``x,y,z,qx,qy,qz,qw``; a trial adds ``outcome`` and, where wanted,
 ``gripper``, ``source``, ``protocol``, ``proposal_density``, ``quality``, ``width_m``, ``measured_at``,
-``answer``, and the pose that was achieved as ``achieved_x`` to ``achieved_qw``; an empty cell is a value not
-given. JSON is what the HTTP interface takes: one trial, a list of trials,
-``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values shared by all beside them.
+``answer``, the pose that was achieved as ``achieved_x`` to ``achieved_qw``, and named scores as
+``qualities.NAME``; an empty cell is a value not given. JSON is what the HTTP interface takes: one trial, a
+list of trials, ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values shared by all
+beside them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from graspdb.poses import POSE_COLUMNS, as_poses
 _TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at", "answer"})
 _ACHIEVED_COLUMNS = tuple(f"achieved_{name}" for name in POSE_COLUMNS)
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
-
+_QUALITIES = "qualities."
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres per unit that positions in a file may be in."""
@@ -185,6 +186,9 @@ def _text(path: str) -> str:
 
 
 def _rows(path: str, columns: Any) -> list[dict[str, Any]]:
+    if isinstance(columns, dict) and isinstance(columns.get("qualities"), dict):
+        scores = {f"{_QUALITIES}{name}": values for name, values in columns["qualities"].items()}
+        columns = {name: values for name, values in columns.items() if name != "qualities"} | scores
     if not isinstance(columns, dict) or not all(
         isinstance(c, list) for c in columns.values() if c is not None
     ):
@@ -195,8 +199,18 @@ def _rows(path: str, columns: Any) -> list[dict[str, Any]]:
         raise FileProblem(f"{path}: the columns differ in length: {lengths}")
     count = next(iter(lengths.values()), 0)
     return [
-        {name: values[i] for name, values in given.items() if values[i] is not None} for i in range(count)
+        _gathered({name: values[i] for name, values in given.items() if values[i] is not None})
+        for i in range(count)
     ]
+
+
+def _gathered(row: dict[str, Any]) -> dict[str, Any]:
+    """A row of columns as a trial, whose ``qualities.NAME`` are one mapping."""
+    scores = {name.removeprefix(_QUALITIES): x for name, x in row.items() if name.startswith(_QUALITIES)}
+    if not scores:
+        return row
+    others = {name: value for name, value in row.items() if not name.startswith(_QUALITIES)}
+    return {**others, "qualities": scores}
 
 
 def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
@@ -207,7 +221,8 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
         wanted = {*POSE_COLUMNS, "outcome"} if trials else set(POSE_COLUMNS)
         if missing := sorted(wanted - names):
             raise FileProblem(f"{path} needs a header line with {','.join(POSE_COLUMNS)}; it lacks {missing}")
-        if trials and (unknown := sorted(names - wanted - known)):
+        scores = [name for name in reader.fieldnames or () if name.startswith(_QUALITIES)]
+        if trials and (unknown := sorted(names - wanted - known - set(scores))):
             raise FileProblem(f"{path} has unknown columns {unknown}")
         records = []
         for row in reader:
@@ -221,6 +236,8 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
                     text = row[name].strip()
                     if text:
                         record[name] = _number(where, name, text) if name in _NUMBER_COLUMNS else text
+                record |= {name: _number(where, name, row[name]) for name in scores if row[name].strip()}
+                record = _gathered(record)
                 record["outcome"] = _outcome(record.get("outcome"))
                 cells = [(row.get(name) or "").strip() for name in _ACHIEVED_COLUMNS]
                 if any(cells):

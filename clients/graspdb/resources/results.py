@@ -614,6 +614,15 @@ class TrialArrays(TriedPoses):
         table = np.array(rows, dtype=np.float64).reshape(-1, 7)
         return Poses(table[:, :3], table[:, 3:])
 
+    @property
+    def qualities(self) -> dict[str, Floats]:
+        """Scores by name, (N,) each, NaN where a trial has none."""
+        names = dict.fromkeys(name for trial in self.trials for name in trial.qualities or ())
+        return {
+            name: np.array([(trial.qualities or {}).get(name, np.nan) for trial in self.trials])
+            for name in names
+        }
+
     @classmethod
     def of(cls, trials: Sequence[wire.TrialOut]) -> TrialArrays:
         """The columns of these trials."""
@@ -630,6 +639,7 @@ class TrialArrays(TriedPoses):
         names += ["proposal_density", "measured_at", "revision", "withdrawn", "answer"]
         columns = {"seq": self.seq, **pose_columns(self), "outcome": self.outcome}
         columns |= {f"achieved_{name}": x for name, x in pose_columns(self.achieved).items()}
+        columns |= {f"qualities.{name}": x for name, x in self.qualities.items()}
         return columns | {name: [getattr(t, name) for t in self.trials] for name in names}
 
     def __repr__(self) -> str:

@@ -7,16 +7,17 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import Annotated, Any, TypedDict, Unpack
+from datetime import datetime, timezone
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from typing_extensions import Unpack
 
 from graspdb import wire
-from graspdb.errors import GraspDBError
+from graspdb.errors import GraspDBError, add_note
 from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses, first_masked, listed, numbers
 from graspdb.resources.pages import Listing, Resource, segment
@@ -79,14 +80,15 @@ class Upload(TypedDict, total=False):
 
 
 class TrialFilters(TrialSelection, total=False):
-    """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch``, ``since_revision`` and
-    ``withdrawn``.
+    """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch``, ``since_revision``,
+    ``withdrawn`` and ``licence``.
     """
 
     outcome: Annotated[str | None, Option("Only this outcome.")]
     batch: Annotated[str | None, Option("Only this batch.")]
     since_revision: Annotated[int | None, Option("Only what came or was changed after this revision.")]
     withdrawn: Annotated[bool | None, Option("Only withdrawn trials, or none of them; else all, marked.")]
+    licence: Annotated[str | None, Option("Only what came in batches under this licence.")]
 
 
 class TrialListing(Listing[wire.TrialOut]):
@@ -115,12 +117,16 @@ class Trials(Resource):
         protocol: str | None = None,
         proposal_density: ArrayLike | None = None,
         quality: ArrayLike | None = None,
+        qualities: Mapping[str, ArrayLike] | None = None,
         width_m: ArrayLike | None = None,
         pose_covariance: ArrayLike | None = None,
         measured_at: datetime | Sequence[datetime | None] | ArrayLike | None = None,
         metadata: Mapping[str, Any] | Sequence[Mapping[str, Any] | None] | None = None,
         answer: str | Sequence[str | None] | None = None,
         achieved_poses: ArrayLike | Any | None = None,
+        licence: str | None = None,
+        citation: str | None = None,
+        origin: Mapping[str, str] | wire.Origin | None = None,
         **upload: Unpack[Upload],
     ) -> Receipt:
         """Store grasp trials; how they are sent: :class:`Upload`. ValueError if shapes or poses are wrong.
@@ -134,23 +140,32 @@ class Trials(Resource):
         - ``gripper``, ``source``, ``protocol``: of the whole upload.
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
         - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
+        - ``qualities``: scores by name, each as ``quality``, at most 32; the first stands for ``quality``,
+          too, where that is unknown.
         - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, tool frame.
         - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial; NumPy's times are UTC.
         - ``answer``: id or name of the answer that was tried, one for all or one a trial: ``best.answer``.
         - ``achieved_poses``: where the tool was after all, as ``poses``, which are then what was commanded;
           in a list None where it is unknown. Estimates take the achieved pose where there is one.
+        - ``licence`` (best by its SPDX name), ``citation``, ``origin`` (``file``, ``format``, ``sha256``): of
+          the whole upload, kept with its batches.
         """
         given = as_poses(poses)
         count = len(given.position)
         columns = {**given.columns(), "outcome": _outcomes(outcomes, count)}
         given_numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
         columns |= {name: numbers(name, x, count) for name, x in given_numbers.items() if x is not None}
+        scores = {name: numbers(f"qualities[{name!r}]", x, count) for name, x in (qualities or {}).items()}
         if pose_covariance is not None:
             covariances = np.asarray(pose_covariance, dtype=np.float64)
             columns["pose_covariance"] = listed("pose_covariance", covariances, count, (6, 6))
         if measured_at is not None:
             columns["measured_at"] = _times(measured_at, count)
         shared: dict[str, Any] = {"gripper": gripper, "source": source, "protocol": protocol}
+        shared |= {"licence": licence, "citation": citation}
+        if origin is not None:
+            told = wire.Origin.model_validate(origin)
+            shared["origin"] = told.model_dump(exclude_none=True)
         if isinstance(metadata, Mapping):
             shared["metadata"] = dict(metadata)
         elif metadata is not None:
@@ -163,7 +178,10 @@ class Trials(Resource):
             columns["achieved_pose"] = _achieved(achieved_poses, count)
 
         def part(start: int, stop: int) -> dict[str, Any]:
-            return {"columns": {name: values[start:stop] for name, values in columns.items()}}
+            own: dict[str, Any] = {name: values[start:stop] for name, values in columns.items()}
+            if scores:
+                own["qualities"] = {name: values[start:stop] for name, values in scores.items()}
+            return {"columns": own}
 
         return self._send(part, shared, count, upload)
 
@@ -181,7 +199,8 @@ class Trials(Resource):
         """Store trials given as mappings with the fields of the HTTP interface; sent as :meth:`add` does.
 
         ``shared`` stands once for all that do not say it themselves: ``gripper``, ``source``, ``protocol``,
-        ``proposal_density``, ``metadata``, ``answer``.
+        ``proposal_density``, ``metadata``, ``answer``; and ``licence``, ``citation``, ``origin`` of the
+        batches.
         """
         trials = [dict(record) for record in records]
         if not trials:
@@ -228,10 +247,11 @@ class Trials(Resource):
                     findings += [_from_row(finding, start) for finding in receipt.findings]
                 except GraspDBError as error:
                     if start:
-                        error.add_note(
+                        add_note(
+                            error,
                             f"This was the request with trials {start} to {stop - 1}: indices above count"
                             f" from {start}. The {start} trials before are stored, in batches"
-                            f" {', '.join(r.batch for r in receipts)}."
+                            f" {', '.join(r.batch for r in receipts)}.",
                         )
                     raise
                 report(stop, count)
@@ -290,9 +310,10 @@ class Trials(Resource):
 class Batches(Resource):
     """``mug.batches``: what arrived together and can be deleted together."""
 
-    def list(self) -> Listing[wire.BatchInfo]:
-        """All batches, read page by page."""
-        return Listing(self._transport, self._path, wire.BatchInfo)
+    def list(self, *, licence: str | None = None) -> Listing[wire.BatchInfo]:
+        """All batches, or those under a licence, read page by page."""
+        params = {} if licence is None else {"licence": licence}
+        return Listing(self._transport, self._path, wire.BatchInfo, params)
 
     def __iter__(self) -> Iterator[wire.BatchInfo]:
         return iter(self.list())
@@ -315,7 +336,7 @@ def _times(times: Any, count: int) -> list[str | None]:
     """Times as text, a value a trial; NumPy's and pandas' too, whose missing ones are None."""
     if getattr(getattr(times, "dtype", None), "kind", None) == "M":
         utc = listed("measured_at", np.asarray(times, dtype="datetime64[us]"), count)
-        return [None if time is None else time.replace(tzinfo=UTC).isoformat() for time in utc]
+        return [None if time is None else time.replace(tzinfo=timezone.utc).isoformat() for time in utc]
     each = _each("measured_at", times, datetime, count)
     # A missing time of pandas is one that differs from itself.
     return [None if time is None or time != time else time.isoformat() for time in each]

@@ -102,6 +102,7 @@ from graspdb.wire.sweeps import SweepOutcomes as SweepOutcomes
 from graspdb.wire.trials import BatchInfo as BatchInfo
 from graspdb.wire.trials import BatchReceipt as BatchReceipt
 from graspdb.wire.trials import Finding as Finding
+from graspdb.wire.trials import Origin as Origin
 from graspdb.wire.trials import TrialChange as TrialChange
 from graspdb.wire.trials import TrialColumns as TrialColumns
 from graspdb.wire.trials import TrialIn as TrialIn

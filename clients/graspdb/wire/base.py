@@ -150,10 +150,17 @@ Slug = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """An identifier that stands in a URL: letters, digits, ``.``, ``_``, ``-``; at most 64 characters."""
 GripperRef = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}(@[1-9][0-9]{0,8})?$")]
 """A gripper's id, or one version of it, as in ``panda@1``."""
-Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: _no_nul(s))]
+Text = Annotated[str, Field(max_length=4_000), AfterValidator(lambda s: no_nul(s))]
 Metadata = Annotated[dict[str, Any], Field(max_length=1_000), AfterValidator(lambda value: _storable(value))]
 """Any JSON object of the user's: finite numbers, whole ones within 64 bits; at most 1,000 names, 32 levels
 and 65,536 characters."""
+MAX_QUALITIES = 32
+"""Most names of qualities among the trials of one batch."""
+Quality = Annotated[float, Field(ge=-1e9, le=1e9)]
+QualityName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,63}$")]
+"""Names a quality: letters, digits, ``.``, ``_``, ``/``, ``-``; at most 64 characters."""
+Licence = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(lambda s: no_nul(s))]
+"""A licence's name, best as SPDX has it: ``CC-BY-NC-4.0``."""
 StoredMetadata = dict[str, Any]
 """A user's JSON object as it was stored, whatever the limits are now."""
 
@@ -262,7 +269,8 @@ ToolRotations = Annotated[
 ]
 
 
-def _no_nul(text: str) -> str:
+def no_nul(text: str) -> str:
+    """The text, or ValueError for what no database stores."""
     if "\x00" in text:
         raise ValueError("text must not contain the NUL character")
     try:
@@ -309,7 +317,7 @@ def _storable(value: dict[str, Any]) -> dict[str, Any]:
         raise ValueError("a whole number of metadata fits in 64 bits: send a longer one as text")
     if _NUL.search(text):
         raise ValueError("text must not contain the NUL character")
-    _no_nul(text)
+    no_nul(text)
     return value
 
 

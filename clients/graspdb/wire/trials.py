@@ -5,11 +5,13 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from graspdb.wire.base import (
     MANY,
+    MAX_QUALITIES,
     GripperRef,
+    Licence,
     Metadata,
     ObjectId,
     OneGripperVersion,
@@ -17,6 +19,8 @@ from graspdb.wire.base import (
     OutcomeCounts,
     Pose,
     Position,
+    Quality,
+    QualityName,
     Quaternion,
     Request,
     Response,
@@ -27,6 +31,7 @@ from graspdb.wire.base import (
     Text,
     ToolPosition,
     ToolRotation,
+    no_nul,
 )
 
 
@@ -39,11 +44,21 @@ def _outcome_of_bool(value: Any) -> Any:
 OutcomeIn = Annotated[Outcome, BeforeValidator(_outcome_of_bool)]
 """An outcome's name; true and false mean success and failure."""
 ProposalDensity = Annotated[float, Field(ge=1e-30, le=1e15)]
-Quality = Annotated[float, Field(ge=-1e9, le=1e9)]
 Width = Annotated[float, Field(ge=0, le=10)]
 _Covariance = Annotated[float, Field(ge=-1e6, le=1e6)]
 Row6 = tuple[_Covariance, _Covariance, _Covariance, _Covariance, _Covariance, _Covariance]
 Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
+
+
+class Origin(Request):
+    """What a batch was read from."""
+
+    file: Annotated[str, Field(min_length=1, max_length=255), AfterValidator(no_nul)] | None = None
+    """Name of the file, without its folder; null for none."""
+    format: Slug | None = None
+    """The file's format, such as ``acronym``; null if unknown."""
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """SHA-256 of the file's bytes, in hexadecimal; null if unknown."""
 
 
 class TrialDefaults(Request):
@@ -64,13 +79,27 @@ class TrialDefaults(Request):
     """Id or name of the answer that was tried, one about this object; null for none."""
 
 
+class BatchDefaults(TrialDefaults):
+    """What stands once for a batch: what its trials may say themselves, and where they come from."""
+
+    licence: Licence | None = None
+    """Under which licence the trials may be used, best by its SPDX name, such as ``CC-BY-NC-4.0``; null if
+    unknown."""
+    citation: Text | None = None
+    """What to cite for the trials; null for nothing."""
+    origin: Origin | None = None
+    """What the trials were read from; null if unknown."""
+
+
 class TrialIn(Pose, TrialDefaults):
     """One attempt."""
 
     outcome: OutcomeIn
     """What became of it, by name; true and false mean success and failure."""
     quality: Quality | None = None
-    """Any score of the user's, without a unit; null for none."""
+    """Any score of the user's, without a unit; null for the batch's first of ``qualities``, or none."""
+    qualities: Annotated[dict[QualityName, Quality | None], Field(max_length=MAX_QUALITIES)] | None = None
+    """Scores by name, without a unit; all trials of a batch have at most 32 names together; null for none."""
     width_m: Width | None = None
     """Distance between the fingers at the end, metres; null if unknown."""
     pose_covariance: Matrix6 | None = None
@@ -83,7 +112,7 @@ class TrialIn(Pose, TrialDefaults):
     estimates take this one; null if unknown."""
 
 
-class TrialsIn(TrialDefaults):
+class TrialsIn(BatchDefaults):
     """Trials in a list, and what holds for all of them."""
 
     trials: Annotated[list[TrialIn], Field(min_length=1), MANY]
@@ -108,7 +137,13 @@ class TrialColumns(Request):
     proposal_density: Annotated[list[ProposalDensity | None], MANY] | None = None
     """Density that each pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: Annotated[list[Quality | None], MANY] | None = None
-    """Any score of each, without a unit; null for none."""
+    """Any score of each, without a unit; null for the first of ``qualities``, or none."""
+    qualities: (
+        Annotated[dict[QualityName, Annotated[list[Quality | None], MANY]], Field(max_length=MAX_QUALITIES)]
+        | None
+    ) = None
+    """Scores by name, a list with one value a trial each; the first name's also stand for ``quality`` where
+    that is null; null for none."""
     width_m: Annotated[list[Width | None], MANY] | None = None
     """Distance between the fingers at the end of each, metres; null if unknown."""
     pose_covariance: Annotated[list[Matrix6 | None], MANY] | None = None
@@ -125,7 +160,7 @@ class TrialColumns(Request):
     unknown."""
 
 
-class TrialColumnsIn(TrialDefaults):
+class TrialColumnsIn(BatchDefaults):
     """Trials in columns, and what holds for all of them."""
 
     columns: TrialColumns
@@ -161,7 +196,10 @@ class TrialOut(Response):
     proposal_density: float | None = None
     """Density that the pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: float | None = None
-    """Any score of the user's, of a sweep the protocol's margin, without a unit; null for none."""
+    """Any score of the user's, of a sweep the protocol's margin, without a unit; where only ``qualities``
+    were given, the first that the batch named; null for none."""
+    qualities: dict[str, float] | None = None
+    """Scores by name, without a unit; null for none."""
     width_m: float | None = None
     """Distance between the fingers at the end, metres; null if unknown."""
     pose_covariance: list[list[float]] | None = None
@@ -266,6 +304,14 @@ class BatchInfo(Response):
     """Name of the API key that posted it, or asked for its sweep; null where keys were off."""
     metadata: StoredMetadata | None = None
     """What was posted with it as metadata of all; null where nothing was."""
+    licence: str | None = None
+    """Under which licence its trials may be used; null if unknown."""
+    citation: str | None = None
+    """What to cite for its trials; null for nothing."""
+    origin: Origin | None = None
+    """What its trials were read from; null if unknown."""
+    qualities: list[str] = Field(default_factory=list)
+    """Names of the qualities that its trials have, in the order in which they were given."""
     outcomes: OutcomeCounts = Field(default_factory=dict)
     grippers: list[str] = Field(default_factory=list)
     """Ids of the grippers that its trials name."""

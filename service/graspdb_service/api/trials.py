@@ -24,7 +24,14 @@ from graspdb.wire.trials import TrialColumnsIn
 from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
-from graspdb_service.api.routing.parameters import BatchId, Creating, Ctx, ObjectId
+from graspdb_service.api.routing.parameters import (
+    BatchId,
+    Creating,
+    Ctx,
+    ObjectId,
+    ToldOfBatch,
+    UnderLicence,
+)
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, NDJSON, accepted, media_type
 from graspdb_service.formats.trials import page_response, stream_response
@@ -54,6 +61,7 @@ def add_trials(
     id: ObjectId,
     request: Request,
     sent: Creating,
+    told: ToldOfBatch,
     accept_implausible: Annotated[
         bool, Query(description="Store trials, too, that lie too far from the object to be grasps of it.")
     ] = False,
@@ -64,7 +72,9 @@ def add_trials(
     object than ten times its size and the gripper's together are refused (`implausible-poses`).
     """
     media = media_type(request)
-    made = posting.add(ctx, id, ctx.scenes, ctx.answers, sent, media, accept_implausible=accept_implausible)
+    made = posting.add(
+        ctx, id, ctx.scenes, ctx.answers, sent, media, accept_implausible=accept_implausible, told=told
+    )
     return sent.answered(made)
 
 
@@ -101,6 +111,7 @@ def list_trials(
     withdrawn: Annotated[
         bool | None, Query(description="Only withdrawn trials, or none; both, marked, if not given.")
     ] = None,
+    licence: UnderLicence = None,
     limit: Annotated[
         int | None,
         Query(ge=1, le=1_000, description="At most this many; 100, or all as lines or Arrow, if not given."),
@@ -109,7 +120,9 @@ def list_trials(
 ) -> Response:
     """Trial rows in commit order; as JSON a page, as lines (`Accept: application/x-ndjson`) or an Arrow
     stream (`Accept: application/vnd.apache.arrow.stream`) all of them."""
-    chosen = listing.TrialFilter(outcome, source, gripper, protocol, batch, since_revision, withdrawn)
+    chosen = listing.TrialFilter(
+        outcome, source, gripper, protocol, batch, since_revision, withdrawn, licence
+    )
     kind = accepted(request, JSON, NDJSON, ARROW)
     after = number_cursor(cursor)
     row, _ = objects.get(ctx.database, id)
@@ -156,11 +169,17 @@ def correct_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: TrialPatch) -> Tria
 
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))
 def list_batches(
-    ctx: Ctx, id: ObjectId, request: Request, limit: Limit = 100, cursor: Cursor = None
+    ctx: Ctx,
+    id: ObjectId,
+    request: Request,
+    licence: UnderLicence = None,
+    limit: Limit = 100,
+    cursor: Cursor = None,
 ) -> Response:
     """An object's batches in the order of their making."""
-    items, after = batches.page(ctx.database, id, after=number_cursor(cursor), limit=limit)
-    return tagged_json(request, Page[BatchInfo](items=items, next=encode_cursor(after)))
+    first = number_cursor(cursor)
+    items, last = batches.page(ctx.database, id, after=first, limit=limit, licence=licence)
+    return tagged_json(request, Page[BatchInfo](items=items, next=encode_cursor(last)))
 
 
 @router.get("/objects/{id}/batches/{batch}", response_model=BatchInfo, **scope("read"))

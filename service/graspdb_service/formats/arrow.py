@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import io
 import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -47,10 +48,13 @@ def library() -> Any:
 class Table:
     """The columns of a stream from a request, called ``prefix`` and their name in errors.
 
-    415 without pyarrow; 422 for what is no stream, or for other than these columns.
+    ``family`` names a struct of columns, or the part before the dot of any number of them. 415 without
+    pyarrow; 422 for what is no stream, or for other than these columns.
     """
 
-    def __init__(self, body: bytes, columns: Iterable[str], *, prefix: str = "columns") -> None:
+    def __init__(
+        self, body: bytes, columns: Iterable[str], *, prefix: str = "columns", family: str | None = None
+    ) -> None:
         self._prefix = prefix
         try:
             pa = library()
@@ -71,12 +75,15 @@ class Table:
             struct.error,
         ) as error:
             raise invalid("body", f"not a valid Arrow IPC stream: {str(error)[:200]}") from None
-        self._pa, self._table = pa, table
+        self._pa, self._table = pa, table if family is None else _spread(pa, table, family)
         self.count: int = table.num_rows
-        self.names: list[str] = list(table.column_names)
-        known = set(columns)
-        wrong = [name for name in self.names if name not in known]
-        wrong += [name for name in known if self.names.count(name) > 1]
+        self.names: list[str] = list(self._table.column_names)
+        known = set(columns) - {family}
+        wrong = [
+            name
+            for name, number in Counter(self.names).items()
+            if number > 1 or (name not in known and not (family and name.startswith(f"{family}.")))
+        ]
         if wrong:
             told = f"unknown or repeated; there are {', '.join(sorted(known))}"
             raise invalid_fields(
@@ -222,6 +229,19 @@ class Table:
 
     def _wrong(self, name: str, message: str) -> ProblemError:
         return invalid(f"{self._prefix}.{name}", message)
+
+
+def _spread(pa: Any, table: Any, family: str) -> Any:
+    """The table with the fields of a struct as columns ``family.field``."""
+    if family not in table.column_names or table.column_names.count(family) > 1:
+        return table
+    place = table.column_names.index(family)
+    kind = table.schema.types[place]
+    if not pa.types.is_struct(kind):
+        return table
+    for field, values in zip(kind, table.column(place).flatten(), strict=True):
+        table = table.append_column(f"{family}.{field.name}", values)
+    return table.remove_column(place)
 
 
 def _numpy(column: Any) -> NDArray[Any]:

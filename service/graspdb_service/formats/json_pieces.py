@@ -89,7 +89,7 @@ def loads(
     allowed: Allowed | None = None,
     flaws: list[str] | None = None,
 ) -> Any:
-    """As ``orjson.loads``, but for :class:`LongArray` where an object of depth 1 or 2 holds a long array.
+    """As ``orjson.loads``, but for :class:`LongArray` where an object of depth 1 to 3 holds a long array.
 
     What is wrong within a long array is raised when it is iterated. 422 ``body-not-in-pieces`` for a document
     of which more than ``whole`` bytes would have to be parsed at once; 422 for more values or nesting than is
@@ -125,7 +125,7 @@ def loads(
     def put_back(value: Any, depth: int) -> Any:
         if isinstance(value, str):
             return arrays.get(value, value)
-        if isinstance(value, dict) and depth < 2:
+        if isinstance(value, dict) and depth < 3:
             return {name: put_back(item, depth + 1) for name, item in value.items()}
         return value
 
@@ -169,7 +169,7 @@ def _check_whole(size: int, whole: int, why: str) -> None:
 def _scan(
     text: NDArray[np.uint8], long: int, piece: int, spans: NDArray[np.int64], cuts: NDArray[np.int64]
 ) -> tuple[int, int, int, int]:
-    """Find the long arrays of an object (depth 1 or 2) and commas between their items, a piece apart.
+    """Find the long arrays of an object (depth 1 to 3) and commas between their items, a piece apart.
 
     Returns the numbers of both; -1 where the document does not balance, is no object or has too many. Then
     the number of values, at least, and the greatest depth.
@@ -219,7 +219,7 @@ def _scan(
             if inside == depth and depth > 0:
                 if c == _CLOSE_OBJECT:
                     return -1, 0, values, deepest
-                if 1 < depth <= 3 and i - start >= long:
+                if 1 < depth <= 4 and i - start >= long:
                     if found == len(spans):
                         return -1, 0, values, deepest
                     spans[found, 0], spans[found, 1], spans[found, 2] = start, i, items

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import orjson
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES
+from graspdb.wire.base import MAX_QUALITIES
 from graspdb_service.formats import arrow
 from graspdb_service.formats.trial_fields import (
     NAMES,
+    QUALITIES,
     SCALARS,
     Faults,
     blocks_of,
@@ -23,7 +26,7 @@ from graspdb_service.formats.trial_fields import (
 )
 from graspdb_service.formats.trial_json import columns_of
 from graspdb_service.problems import invalid
-from graspdb_service.trial_columns import Provenance, TrialBatch, TrialPage
+from graspdb_service.trial_columns import Floats, Provenance, TrialBatch, TrialPage
 
 
 def parse(body: bytes, *, limit: int) -> TrialBatch:
@@ -31,10 +34,11 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
 
     Columns have the names of a trial's fields; ``outcome`` is text (or a dictionary of it) or boolean,
     ``measured_at`` a timestamp (UTC where it names no zone) or text, ``metadata`` a struct or JSON text,
-    ``pose_covariance`` lists of lists or of 36 numbers, ``achieved_pose`` a struct. What holds for the whole
+    ``pose_covariance`` lists of lists or of 36 numbers, ``achieved_pose`` a struct, ``qualities`` a struct of
+    numbers or a column ``qualities.NAME`` each. What holds for the whole
     batch stands as JSON in the schema's metadata, key ``graspdb``.
     """
-    table = arrow.Table(body, NAMES)
+    table = arrow.Table(body, NAMES, family="qualities")
     if not table.count:
         raise invalid("columns.position", "at least one trial")
     refuse_too_many(table.count, limit)
@@ -43,7 +47,10 @@ def parse(body: bytes, *, limit: int) -> TrialBatch:
         "quaternion_xyzw": table.vectors("quaternion_xyzw", 4),
         "outcome": _outcomes(table),
     }
-    for name in SCALARS:
+    scores = [name for name in table.names if name.startswith(QUALITIES)]
+    if len(scores) > MAX_QUALITIES:
+        raise invalid("columns.qualities", f"numbers of at most {MAX_QUALITIES} names")
+    for name in (*SCALARS, *scores):
         values = table.scalars(name)
         if values is not None:
             lists[name] = values
@@ -108,11 +115,18 @@ def _document(value: Any) -> Any:
 
 
 def stream(pages: Iterable[TrialPage], told: dict[str, Any] | None = None) -> Iterator[bytes]:
-    """Stored trials as an Arrow IPC stream; what else is ``told`` stands in its schema's metadata."""
-    return arrow.stream(_schema(told), (_record_batch(page) for page in pages if len(page.columns)))
+    """Stored trials of one object as an Arrow IPC stream, of one page at least; what else is ``told`` stands
+    in its schema's metadata.
+    """
+    rest = iter(pages)
+    first = next(rest)
+    schema = _schema(first.qualities, told)
+    return arrow.stream(
+        schema, (_record_batch(page, schema) for page in chain([first], rest) if len(page.columns))
+    )
 
 
-def _schema(told: dict[str, Any] | None = None) -> Any:
+def _schema(qualities: Sequence[str], told: dict[str, Any] | None) -> Any:
     """The columns of stored trials, as ``GET /objects/{id}/trials`` has them."""
     pa = arrow.library()
     achieved = [("position", arrow.vector_type(3)), ("quaternion_xyzw", arrow.vector_type(4))]
@@ -137,13 +151,14 @@ def _schema(told: dict[str, Any] | None = None) -> Any:
             ("answer", pa.string()),
             ("achieved_pose", pa.struct(achieved)),
             ("withdrawn", pa.bool_()),
+            *((f"{QUALITIES}{name}", pa.float64()) for name in qualities),
         ],
         told,
     )
 
 
-def _record_batch(page: TrialPage) -> Any:
-    pa, schema, columns = arrow.library(), _schema(), dict[str, Any](columns_of(page))
+def _record_batch(page: TrialPage, schema: Any) -> Any:
+    pa, columns = arrow.library(), dict[str, Any](columns_of(page))
     texts = [None if value is None else orjson.dumps(value).decode() for value in columns["metadata"]]
     columns |= {
         "position": arrow.vectors(columns["position"], 3),
@@ -153,8 +168,21 @@ def _record_batch(page: TrialPage) -> Any:
         "metadata": texts,
         "pose_index": pa.array(columns["pose_index"], mask=columns["pose_index"] < 0),
     }
+    columns |= {f"{QUALITIES}{name}": arrow.numbers(x) for name, x in _scores(page).items()}
     filled = [
         column if isinstance(column, pa.Array) else pa.array(column, schema.field(name).type)
         for name, column in columns.items()
     ]
     return pa.record_batch(filled, schema=schema)
+
+
+def _scores(page: TrialPage) -> dict[str, Floats]:
+    """Each quality of the object's trials as a column (n,), NaN for none."""
+    columns = page.columns
+    scores = {name: np.full(len(columns), np.nan) for name in page.qualities}
+    if len(columns.qualities):
+        for number in np.unique(columns.batch).tolist():
+            rows = columns.batch == number
+            for place, name in enumerate(page.batches[number].qualities):
+                scores[name][rows] = columns.qualities[rows, place]
+    return scores

@@ -7,9 +7,9 @@ where that fails does a loop look for the places to name.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,19 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, SOURCES
-from graspdb.wire.base import Metadata, expand_matrix
-from graspdb.wire.trials import TrialDefaults
+from graspdb.wire.base import MAX_QUALITIES, Metadata, QualityName, expand_matrix
+from graspdb.wire.trials import BatchDefaults, TrialDefaults
 from graspdb_service.formats.poses import near, no_vectors, unit, vectors
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, TrialColumns, json_text
 
-DEFAULTS = frozenset(TrialDefaults.model_fields)
+DEFAULTS = frozenset(BatchDefaults.model_fields)
 REQUIRED = ("position", "quaternion_xyzw", "outcome")
 SCALARS = ("proposal_density", "quality", "width_m")
-_OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at", "achieved_pose")
-NAMES = frozenset(REQUIRED) | frozenset(_OPTIONAL) | DEFAULTS
+_OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at", "achieved_pose", "qualities")
+NAMES = frozenset(REQUIRED) | frozenset(_OPTIONAL) | frozenset(TrialDefaults.model_fields)
+#: What a column of one quality is called, with its name after it.
+QUALITIES = "qualities."
 _SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _GRIPPER = re.compile(_SLUG.pattern + r"(@[1-9][0-9]{0,8})?")
 _GRIPPER_RULE = "a gripper's id, or one version of it, as in panda@1"
@@ -38,6 +40,7 @@ _NAME_RULES = {
     "protocol": (_SLUG, _SLUG_RULE),
     "answer": (_SLUG, _SLUG_RULE),
 }
+_QUALITY_NAME: TypeAdapter[str] = TypeAdapter(QualityName)
 _METADATA: TypeAdapter[Any] = TypeAdapter(Metadata)
 _TIME: TypeAdapter[datetime] = TypeAdapter(datetime)
 _MOST_ERRORS = 20
@@ -100,26 +103,27 @@ def refuse_too_many(count: int, limit: int) -> None:
         )
 
 
-def defaults_of(beside: Mapping[str, Any], faults: Faults, form: str) -> TrialDefaults:
+def defaults_of(beside: Mapping[str, Any], faults: Faults, form: str) -> BatchDefaults:
     """What stands once for the whole batch, beside its ``form``: ``columns`` or ``trials``."""
     for name in sorted(set(beside) - DEFAULTS):
         faults.add(name[:80], f"unknown field beside {form}")
     try:
-        return TrialDefaults.model_validate({name: beside[name] for name in DEFAULTS & set(beside)})
+        return BatchDefaults.model_validate({name: beside[name] for name in DEFAULTS & set(beside)})
     except ValidationError as error:
         for item in error.errors(include_input=False, include_context=False):
             faults.add(".".join(map(str, item["loc"])), item["msg"].removeprefix("Value error, "))
-    return TrialDefaults()
+    return BatchDefaults()
 
 
-def check_blocks(blocks: Iterable[Fields], defaults: TrialDefaults, place: Place, limit: int) -> TrialBatch:
+def check_blocks(blocks: Iterable[Fields], defaults: BatchDefaults, place: Place, limit: int) -> TrialBatch:
     """Checked trials, block by block, so that no more of them than of one block are Python's at a time.
 
     422 naming the fields that are wrong in the first block that has any; 413 for more trials than ``limit``.
     """
-    parts: list[TrialBatch] = []
+    fields_of_gripper: list[Callable[[str], str]] = []
     numbers: dict[Provenance, int] = {}
     answers: dict[str, int] = {}
+    names: dict[str, int] = {}
     columns = []
     count = 0
     for block in blocks:
@@ -132,15 +136,56 @@ def check_blocks(blocks: Iterable[Fields], defaults: TrialDefaults, place: Place
         provenance = np.array(own, dtype=np.int64)[part.columns.provenance]
         answer = np.array(tried, dtype=np.int64)[part.columns.answer]
         _refuse_made_up_names(block, provenance, answer)
-        parts.append(part)
-        columns.append(replace(part.columns, provenance=provenance, answer=answer))
+        for name in part.qualities:
+            names.setdefault(name, len(names))
+        _refuse_many_qualities(names, block)
+        fields_of_gripper.append(part.field_of_gripper)
+        columns.append(
+            replace(
+                part.columns,
+                provenance=provenance,
+                answer=answer,
+                qualities=_widened(part.columns.qualities, part.qualities, names),
+            )
+        )
 
     def field_of_gripper(gripper: str) -> str:
-        named = (part.field_of_gripper(gripper) for part in parts)
+        named = (field_of(gripper) for field_of in fields_of_gripper)
         return next((name for name in named if name != "gripper"), "gripper")
 
+    width = len(names)
+    columns = [replace(part, qualities=_padded(part.qualities, width)) for part in columns]
     joined = TrialColumns.joined(columns)
-    return TrialBatch(joined, list(numbers), defaults.metadata, field_of_gripper, place, list(answers))
+    return TrialBatch(joined, list(numbers), defaults, field_of_gripper, place, list(answers), list(names))
+
+
+def _widened(scores: Floats, own: Sequence[str], names: Mapping[str, int]) -> Floats:
+    """Scores of a block (n, k) under ``own`` names as columns of all the ``names`` so far."""
+    if not own:
+        return scores
+    table = np.full((len(scores), len(names)), np.nan)
+    table[:, [names[name] for name in own]] = scores
+    return table
+
+
+def _padded(scores: Floats, width: int) -> Floats:
+    """Scores with columns for the names that later blocks brought."""
+    if not len(scores) or scores.shape[1] == width:
+        return scores
+    more = np.full((len(scores), width - scores.shape[1]), np.nan)
+    return np.concatenate([scores, more], axis=1)
+
+
+def _refuse_many_qualities(names: Collection[str], block: Fields) -> None:
+    if len(names) > MAX_QUALITIES:
+        raise ProblemError(
+            422,
+            "too-many-qualities",
+            f"Trials of one request have at most {MAX_QUALITIES} names of qualities together: what differs"
+            " from trial to trial belongs in their metadata",
+            errors=[(block.place(0, "qualities"), f"over the limit of {MAX_QUALITIES}")],
+            extra={"limit": MAX_QUALITIES},
+        )
 
 
 def _refuse_made_up_names(block: Fields, provenance: Ints, answer: Ints) -> None:
@@ -181,7 +226,7 @@ def sliced(values: Sequence[Any] | NDArray[Any]) -> Iterator[Sequence[Any] | NDA
     return (values[start : start + BLOCK] for start in range(0, len(values), BLOCK))
 
 
-def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
+def _check(fields: Fields, defaults: BatchDefaults) -> TrialBatch:
     """Checked trials, or 422 naming the fields that are wrong, those found before included."""
     position, quaternion = _vectors(fields, "position", 3), _vectors(fields, "quaternion_xyzw", 4)
     refuse = fields.fault
@@ -197,6 +242,7 @@ def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         metadata=_each(fields, "metadata", _metadata),
         achieved=_achieved(fields),
     )
+    scores, qualities = _qualities(fields)
     answers, answer = _answers(fields, defaults)
     provenances, provenance = _provenances(fields, defaults)
     fields.faults.raise_if_any()
@@ -205,12 +251,15 @@ def _check(fields: Fields, defaults: TrialDefaults) -> TrialBatch:
         proposal = proposal if len(proposal) else np.full(fields.count, np.nan)
         proposal = np.where(np.isnan(proposal), defaults.proposal_density, proposal)
     return TrialBatch(
-        replace(columns, provenance=provenance, proposal_density=proposal, answer=answer),
+        replace(
+            columns, provenance=provenance, proposal_density=proposal, answer=answer, qualities=qualities
+        ),
         provenances,
-        defaults.metadata,
+        defaults,
         _fields_of_grippers(fields),
         fields.place,
         answers,
+        scores,
     )
 
 
@@ -346,6 +395,45 @@ def _achieved(fields: Fields) -> Floats:
     return table
 
 
+def _qualities(fields: Fields) -> tuple[list[str], Floats]:
+    """Names of scores in the order in which they come, and the scores (n, k), NaN for none."""
+    lists = {name: x for name, x in fields.lists.items() if name.startswith(QUALITIES)}
+    rows = fields.lists.get("qualities", ())
+    if not set(map(type, rows)) <= {type(None)}:
+        lists |= _quality_lists(fields, rows)
+    names = [name.removeprefix(QUALITIES) for name in lists]
+    for name in names:
+        try:
+            _QUALITY_NAME.validate_python(name)
+        except ValidationError:
+            told = "letters, digits, '.', '_', '/', '-'; at most 64 characters, the first a letter or digit"
+            fields.fault("qualities", 0, f"{name[:80]!r} is no name of a quality: {told}")
+    scored = replace(fields, lists=lists)
+    columns = [_scalars(scored, name, -1e9, 1e9) for name in lists]
+    fields.faults.raise_if_any()
+    given = [place for place, column in enumerate(columns) if not np.isnan(column).all()]
+    if not given:
+        return [], np.empty(0)
+    return [names[place] for place in given], np.stack([columns[place] for place in given], axis=1)
+
+
+def _quality_lists(fields: Fields, rows: Iterable[Any]) -> dict[str, list[Any]]:
+    """Scores that come as one object a trial, as one list a name."""
+    lists: dict[str, list[Any]] = {}
+    for row, scores in enumerate(rows):
+        if scores is None:
+            continue
+        if not isinstance(scores, dict):
+            fields.fault("qualities", row, "an object of numbers by name")
+            continue
+        for name, value in scores.items():
+            if f"{QUALITIES}{name}" not in lists:
+                _refuse_many_qualities([*lists, name], fields)
+                lists[f"{QUALITIES}{name}"] = [None] * fields.count
+            lists[f"{QUALITIES}{name}"][row] = value
+    return lists
+
+
 def _fields_of_grippers(fields: Fields) -> Callable[[str], str]:
     """The field that each gripper is named in first; nothing else of the request is kept for it."""
     first: dict[Any, str] = {}
@@ -378,7 +466,7 @@ def _time(value: Any) -> datetime:
     time = _TIME.validate_python(value)
     if not 1900 <= time.year <= 2500:
         raise ValueError("a time between the years 1900 and 2500")
-    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+    return time.replace(tzinfo=timezone.utc) if time.tzinfo is None else time.astimezone(timezone.utc)
 
 
 def _metadata(value: Any) -> str:

@@ -10,12 +10,13 @@ import orjson
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES
-from graspdb.wire.base import expand_matrix
-from graspdb.wire.trials import TrialDefaults
+from graspdb.wire.base import MAX_QUALITIES, expand_matrix
+from graspdb.wire.trials import BatchDefaults
 from graspdb_service.formats.json_pieces import WHOLE, Allowed, LongArray, lenient, loads
 from graspdb_service.formats.trial_fields import (
     BLOCK,
     NAMES,
+    QUALITIES,
     REQUIRED,
     SCALARS,
     Faults,
@@ -48,7 +49,7 @@ def _parsed(document: Any, flaws: Sequence[str], limit: int) -> TrialBatch:
         raise invalid("body", flaws[0] if flaws else told)
     faults = Faults()
     if "columns" not in document and "trials" not in document:
-        return check_blocks([_from_rows([document], faults, _of_one)], TrialDefaults(), _of_one, limit)
+        return check_blocks([_from_rows([document], faults, _of_one)], BatchDefaults(), _of_one, limit)
     form = "columns" if "columns" in document else "trials"
     given = document.pop(form)
     defaults = defaults_of(document, faults, form)
@@ -71,7 +72,7 @@ def _of_trials(row: int, name: str) -> str:
 
 def parse_lines(body: bytes, *, limit: int) -> TrialBatch:
     """As :func:`parse`, for one trial a line."""
-    return check_blocks(_from_lines(body), TrialDefaults(), _of_trials, limit)
+    return check_blocks(_from_lines(body), BatchDefaults(), _of_trials, limit)
 
 
 def _from_lines(body: bytes) -> Iterator[Fields]:
@@ -133,10 +134,11 @@ def _from_columns(columns: Any, faults: Faults, limit: int) -> Iterator[Fields]:
     if not isinstance(columns, dict):
         faults.add("columns", "an object of lists, one a field")
         faults.raise_if_any()
-    for name in sorted(set(columns) - NAMES):
+    columns = _with_qualities(columns, faults)
+    for name in sorted(name for name in columns if name not in NAMES and not name.startswith(QUALITIES)):
         faults.add(f"columns.{name[:80]}", f"unknown column; there are {', '.join(sorted(NAMES))}")
     lists: dict[str, list[Any] | LongArray] = {}
-    for name in sorted(set(columns) & NAMES):
+    for name in columns:
         if isinstance(columns[name], list | LongArray):
             lists[name] = columns[name]
         elif columns[name] is not None or name in REQUIRED:
@@ -154,6 +156,22 @@ def _from_columns(columns: Any, faults: Faults, limit: int) -> Iterator[Fields]:
         faults.add("columns.position", "at least one trial")
     faults.raise_if_any()
     return blocks_of({name: _in_blocks(values) for name, values in lists.items()}, _of_columns, faults)
+
+
+def _with_qualities(columns: dict[str, Any], faults: Faults) -> dict[str, Any]:
+    """Columns with those of qualities beside the others, as ``qualities.NAME``."""
+    for name in columns:
+        if name.startswith(QUALITIES):
+            faults.add(f"columns.{name[:80]}", "unknown column: qualities are an object of lists by name")
+    faults.raise_if_any()
+    scores = columns.get("qualities")
+    if scores is None:
+        return {name: values for name, values in columns.items() if name != "qualities"}
+    if not isinstance(scores, dict) or len(scores) > MAX_QUALITIES:
+        faults.add("columns.qualities", f"an object of lists by name, at most {MAX_QUALITIES}")
+        faults.raise_if_any()
+    others = {name: values for name, values in columns.items() if name != "qualities"}
+    return others | {f"{QUALITIES}{name}": values for name, values in scores.items()}
 
 
 def _in_blocks(values: list[Any] | LongArray) -> Iterator[list[Any]]:
@@ -271,7 +289,20 @@ def documents(page: TrialPage) -> list[dict[str, Any]]:
     values["pose_index"] = [None if index < 0 else index for index in values["pose_index"]]
     for name in SCALARS:
         values[name] = [None if value != value else value for value in values[name]]
+    values["qualities"] = _scores(page)
     return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
+
+
+def _scores(page: TrialPage) -> list[dict[str, float] | None]:
+    """The named scores of each trial, None where it has none."""
+    columns = page.columns
+    if not len(columns.qualities):
+        return [None] * len(columns)
+    scored: list[dict[str, float] | None] = []
+    for number, row in zip(columns.batch.tolist(), columns.qualities.tolist(), strict=True):
+        known = {n: x for n, x in zip(page.batches[number].qualities, row, strict=False) if x == x}
+        scored.append(known or None)
+    return scored
 
 
 def _pose(row: list[float]) -> dict[str, list[float]] | None:

@@ -39,6 +39,7 @@ class ObjectRow:
     created_at: datetime
     updated_at: datetime
     copied_from: dict[str, Any] | None
+    quality_names: list[str] | None
 
 
 def create(tx: Tx, slug: str, properties: Mapping[str, Any]) -> bool:

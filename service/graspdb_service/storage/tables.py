@@ -7,7 +7,7 @@ numbers are therefore in commit order on both databases, which auto-increment id
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Any
 
 from sqlalchemy import (
@@ -62,14 +62,14 @@ class UtcDateTime(TypeDecorator[datetime]):
         if value is None:
             return None
         if value.tzinfo is None:
-            value = value.replace(tzinfo=UTC)
-        value = value.astimezone(UTC)
+            value = value.replace(tzinfo=timezone.utc)
+        value = value.astimezone(timezone.utc)
         return value.replace(tzinfo=None) if dialect.name == "sqlite" else value
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
         if value is None:
             return None
-        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+        return value.replace(tzinfo=timezone.utc) if value.tzinfo is None else value.astimezone(timezone.utc)
 
 
 grippers = Table(
@@ -131,6 +131,8 @@ objects = Table(
     Column("updated_at", UtcDateTime, nullable=False),
     # Of a copy: what it was copied from, and whether its mesh may be, or was, changed in spite of its trials.
     Column("copied_from", JSON(none_as_null=True)),
+    # Names of the qualities that its trials have, or had: they leave with the object only.
+    Column("quality_names", JSON(none_as_null=True)),
     sqlite_autoincrement=True,
     info=WHOLLY_AUDITED,
 )
@@ -202,6 +204,12 @@ batches = Table(
     # Name of the key that posted it, where one did.
     Column("made_by", String(64)),
     Column("created_at", UtcDateTime, nullable=False),
+    # Whose the data is and what it was read from, as told.
+    Column("licence", String(100)),
+    Column("citation", Text),
+    Column("origin", JSON(none_as_null=True)),
+    # [name, float type] of each quality, in the order in which its trials' `qualities` have them.
+    Column("quality_layout", JSON(none_as_null=True)),
     sqlite_autoincrement=True,
     info=AUDITED_AS_A_WHOLE,
 )
@@ -237,6 +245,8 @@ trials = Table(
     Column("answer_number", BigInteger),
     # Where the tool was after all, where that is known: all of it or nothing.
     *(Column(f"achieved_{name}", Double) for name in ("px", "py", "pz", "qx", "qy", "qz", "qw")),
+    # Its named scores, packed as its batch says; names would take more room than the numbers.
+    Column("qualities", LargeBinary),
     # Few trials name an answer: found without reading the rest.
     Index(
         "ix_trials_of_answers",

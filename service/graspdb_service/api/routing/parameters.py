@@ -6,9 +6,12 @@ import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from fastapi import Depends, Header, Path, Request, Response
+from fastapi import Depends, Header, Path, Query, Request, Response
 from pydantic import WithJsonSchema
 
+from graspdb.wire import Slug
+from graspdb.wire.base import Licence
+from graspdb.wire.trials import BatchDefaults, Origin
 from graspdb_service.api.context import Context
 from graspdb_service.problems import invalid
 from graspdb_service.usecases.runtime.idempotency import Created, Sent
@@ -79,3 +82,40 @@ async def _creation(response: Response, body: RawBody, key: Annotated[str | None
 
 
 Creating = Annotated[Creation, Depends(_creation)]
+
+
+UnderLicence = Annotated[
+    str | None,
+    Query(max_length=100, description="Only what came in batches under this licence; by default all."),
+]
+
+
+async def _told_of_batch(
+    licence: Annotated[
+        Licence | None,
+        Query(description="Licence of the batch, for bodies that have no place for it; null if unknown."),
+    ] = None,
+    citation: Annotated[
+        str | None, Query(max_length=4_000, description="What to cite for the batch; null for nothing.")
+    ] = None,
+    origin_file: Annotated[
+        str | None,
+        Query(min_length=1, max_length=255, description="Name of the file that was read; null for none."),
+    ] = None,
+    origin_format: Annotated[
+        Slug | None, Query(description="Format of that file, such as `acronym`; null if unknown.")
+    ] = None,
+    origin_sha256: Annotated[
+        str | None,
+        Query(pattern="^[0-9a-f]{64}$", description="SHA-256 of that file in hexadecimal; null if unknown."),
+    ] = None,
+) -> BatchDefaults:
+    parts = {"file": origin_file, "format": origin_format, "sha256": origin_sha256}
+    read_from = {name: value for name, value in parts.items() if value is not None}
+    origin = Origin(**read_from) if read_from else None
+    told: dict[str, Any] = {"licence": licence, "citation": citation, "origin": origin}
+    return BatchDefaults.model_construct(**{name: value for name, value in told.items() if value is not None})
+
+
+ToldOfBatch = Annotated[BatchDefaults, Depends(_told_of_batch)]
+"""What the address of a request with trials says of the batch that they make."""

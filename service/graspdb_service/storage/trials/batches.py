@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Select, and_, case, delete, distinct, func, insert, or_, select, update
 
+from graspdb.wire.trials import BatchDefaults
 from graspdb_service import principal
 from graspdb_service.storage import answers
 from graspdb_service.storage.database import Tx, all_as, first_as, utc_now
@@ -24,7 +25,8 @@ from graspdb_service.storage.tables import (
     trials,
 )
 from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import BatchOrigin
+from graspdb_service.storage.trials.qualities import Layout, names_of
+from graspdb_service.trial_columns import BatchFacts
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,10 @@ class BatchRow:
     metadata: dict[str, Any] | None
     made_by: str | None
     created_at: datetime
+    licence: str | None
+    citation: str | None
+    origin: dict[str, Any] | None
+    quality_layout: Layout | None
     provenance_id: int | None
     purpose: str | None
 
@@ -53,9 +59,11 @@ def create(
     *,
     revision: int,
     sweep_id: str | None = None,
-    metadata: dict[str, Any] | None = None,
+    shared: BatchDefaults | None = None,
+    quality_layout: Layout | None = None,
 ) -> tuple[int, str]:
     """An empty batch: its internal id and its key."""
+    told = BatchDefaults() if shared is None else shared
     key = str(uuid.uuid4())
     statement = (
         insert(batches)
@@ -66,7 +74,11 @@ def create(
             revision=revision,
             inserted=0,
             packed=0,
-            metadata=metadata,
+            metadata=told.metadata,
+            licence=told.licence,
+            citation=told.citation,
+            origin=None if told.origin is None else told.origin.model_dump(exclude_none=True) or None,
+            quality_layout=quality_layout,
             made_by=principal.actor().key,
             created_at=utc_now(),
         )
@@ -106,17 +118,30 @@ def of_sweep(tx: Tx, sweep_id: str) -> BatchRow | None:
     return first_as(tx, _query().where(batches.c.sweep_id == sweep_id), BatchRow)
 
 
-def page(tx: Tx, object_id: int, *, after: int, limit: int) -> list[BatchRow]:
-    """Up to ``limit`` batches in the order of their making, from the one after the internal id ``after``."""
+def page(tx: Tx, object_id: int, *, after: int, limit: int, licence: str | None = None) -> list[BatchRow]:
+    """Up to ``limit`` batches, all or those under a licence, in the order of their making, from the one after
+    the internal id ``after``.
+    """
     query = _query().where(batches.c.object_id == object_id, batches.c.id > after)
+    if licence is not None:
+        query = query.where(batches.c.licence == licence)
     return all_as(tx, query.order_by(batches.c.id).limit(limit), BatchRow)
 
 
-def origins(tx: Tx, ids: Iterable[int]) -> dict[int, BatchOrigin]:
+def under(tx: Tx, object_id: int, licence: str) -> list[int]:
+    """Internal ids of an object's batches under a licence."""
+    query = select(batches.c.id).where(batches.c.object_id == object_id, batches.c.licence == licence)
+    return [int(number) for number in tx.scalars(query)]
+
+
+def facts(tx: Tx, ids: Iterable[int]) -> dict[int, BatchFacts]:
     """Batches by internal id, as their trials name them."""
-    query = select(batches.c.id, batches.c.key, batches.c.sweep_id, batches.c.metadata)
-    rows = tx.execute(query.where(batches.c.id.in_(sorted(set(ids)))))
-    return {int(number): BatchOrigin(*origin) for number, *origin in rows}
+    columns = (batches.c[name] for name in ("id", "key", "sweep_id", "metadata", "quality_layout"))
+    rows = tx.execute(select(*columns).where(batches.c.id.in_(sorted(set(ids)))))
+    return {
+        int(number): BatchFacts(key, sweep, told, names_of(layout))
+        for number, key, sweep, told, layout in rows
+    }
 
 
 def keys(tx: Tx, ids: Collection[int]) -> dict[int, str]:

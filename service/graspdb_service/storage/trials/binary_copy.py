@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,12 @@ _INTEGERS = (
     "measured_at",
     "answer_number",
 )
-_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
+_EPOCH = datetime(2000, 1, 1, tzinfo=timezone.utc)
 
 
-def _kind(name: str) -> str:
+def _kind(name: str, values: Any = None) -> Any:
+    if name == "qualities":
+        return values.dtype
     return ">i8" if name in _INTEGERS else ">i2" if name == "outcome" else ">f8"
 
 
@@ -43,9 +45,9 @@ def encode(
     documents: Sequence[Sequence[Any]],
 ) -> bytes:
     """``count`` rows of the columns ``values``, null where ``nulls`` says so, and of JSON ``documents``."""
-    layout: list[tuple[str, str]] = [("fields", ">i2")]
-    for name in values:
-        layout += [(f"{name}_bytes", ">i4"), (name, _kind(name))]
+    layout: list[tuple[str, Any]] = [("fields", ">i2")]
+    for name, value in values.items():
+        layout += [(f"{name}_bytes", ">i4"), (name, _kind(name, value))]
     dtype = np.dtype(layout)
     table = np.zeros(count, dtype=dtype)
     table["fields"] = len(values) + len(documents)
@@ -93,5 +95,5 @@ def microseconds(value: datetime | None) -> int:
     """A time as PostgreSQL counts it, from 2000 on; 0 for None."""
     if value is None:
         return 0
-    since = value.astimezone(UTC) - _EPOCH
+    since = value.astimezone(timezone.utc) - _EPOCH
     return (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds

@@ -67,6 +67,7 @@ def create(tx: Tx, row: ObjectRow, slug: str, copied_from: Mapping[str, Any], *,
     now = utc_now()
     numbers = {name: getattr(row, name) if trials else 0 for name in ("revision", "epoch", "last_seq")}
     values = {name: getattr(row, name) for name in (*_OWN, "parts_info")}
+    values["quality_names"] = row.quality_names if trials else None
     statement = insert(objects).values(
         slug=slug, **values, **numbers, copied_from=dict(copied_from), created_at=now, updated_at=now
     )

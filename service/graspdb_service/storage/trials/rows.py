@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import closing
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from itertools import chain
 from typing import Any, cast
 
@@ -18,7 +18,8 @@ from sqlalchemy import bindparam, update
 
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.tables import trials
-from graspdb_service.storage.trials import binary_copy, provenances
+from graspdb_service.storage.trials import binary_copy, provenances, qualities
+from graspdb_service.storage.trials.qualities import Layout
 from graspdb_service.trial_columns import Ints, TrialColumns, json_text
 
 SUCCESS = 1
@@ -31,15 +32,26 @@ _DOCUMENTS = ("pose_covariance", "metadata")
 
 
 def insert(
-    tx: Tx, object_id: int, batch_id: int, columns: TrialColumns, *, revision: int, first_seq: int
+    tx: Tx,
+    object_id: int,
+    batch_id: int,
+    columns: TrialColumns,
+    *,
+    revision: int,
+    first_seq: int,
+    layout: Layout | None = None,
 ) -> None:
-    """Store trials under the sequence numbers that ``objects.advance`` reserved, and count them."""
+    """Store trials under the sequence numbers that ``objects.advance`` reserved, and count them; their
+    qualities as the batch's ``layout`` says.
+    """
     if len(columns) == 0:
         return
     shared = {"object_id": object_id, "revision": revision, "batch_id": batch_id}
     store = _insert_tuples if tx.dialect.name == "sqlite" else _copy_in
     for start in range(0, len(columns), COPY_ROWS):
-        store(tx, shared, columns[start : start + COPY_ROWS], first_seq + start)
+        block = columns[start : start + COPY_ROWS]
+        scores = None if layout is None else qualities.packed(block, layout)
+        store(tx, shared, block, first_seq + start, scores)
     # As one number: rows of two would be sorted by Python's comparisons.
     kinds, counts = np.unique(columns.provenance * 256 + columns.outcome, return_counts=True)
     for kind, number in zip(kinds.tolist(), counts.tolist(), strict=True):
@@ -60,7 +72,9 @@ def _numbers(columns: TrialColumns, first_seq: int) -> dict[str, NDArray[Any]]:
     return {name: values for name, values in found.items() if not np.isnan(values).all()}
 
 
-def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
+def _insert_tuples(
+    tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int, scores: NDArray[Any] | None
+) -> None:
     # What all rows share stands in the statement, and what none has is left out: binding is half the time.
     lists: dict[str, list[Any]] = {}
     for name, values in _numbers(columns, first_seq).items():
@@ -74,6 +88,11 @@ def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_
         items, convert = getattr(columns, name), converters.get(name, json_text)
         if items:
             lists[name] = [None if item is None else convert(item) for item in items]
+    if scores is not None:
+        cells = scores.tolist()
+        for row in np.flatnonzero(np.isnan(columns.qualities).all(axis=1)):
+            cells[row] = None
+        lists["qualities"] = cells
     names = ", ".join([*shared, *lists])
     places = ", ".join([str(int(value)) for value in shared.values()] + ["?"] * len(lists))
     rows = zip(*lists.values(), strict=True)
@@ -83,10 +102,12 @@ def _insert_tuples(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_
 
 
 def _sqlite_time(value: datetime) -> str:
-    return value.astimezone(UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
+    return value.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S.%f")
 
 
-def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int) -> None:
+def _copy_in(
+    tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: int, scores: NDArray[Any] | None
+) -> None:
     values: dict[str, Any] = {**shared, **_numbers(columns, first_seq)}
     maybe = (*_OPTIONAL, "answer_number", *_ACHIEVED)
     nulls = {name: np.isnan(values[name]) for name in maybe if name in values}
@@ -96,6 +117,9 @@ def _copy_in(tx: Tx, shared: dict[str, int], columns: TrialColumns, first_seq: i
     if times:
         nulls["measured_at"] = np.array([time is None for time in times])
         values["measured_at"] = np.array([binary_copy.microseconds(time) for time in times], dtype=np.int64)
+    if scores is not None:
+        nulls["qualities"] = np.isnan(columns.qualities).all(axis=1)
+        values["qualities"] = scores
     documents = {name: getattr(columns, name) for name in _DOCUMENTS if getattr(columns, name)}
     content = binary_copy.encode(len(columns), values, nulls, list(documents.values()))
     names = ", ".join([*values, *documents])
@@ -229,7 +253,7 @@ def _fetch(tx: Tx, query: str) -> list[Any]:
 _ALL = (
     "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, "proposal_density", "quality",
     "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS, "withdrawn IS NOT NULL",
-    "coalesce(answer_number, -1)", *_ACHIEVED,
+    "coalesce(answer_number, -1)", *_ACHIEVED, "qualities",
 )  # fmt: skip
 
 
@@ -243,7 +267,7 @@ def page(
     up_to_seq: int | None = None,
     outcome: int | None = None,
     provenance_ids: Sequence[int] | None = None,
-    batch_id: int | None = None,
+    batch_ids: Collection[int] | None = None,
     since_revision: int | None = None,
     withdrawn: bool | None = None,
     answered: bool = False,
@@ -258,11 +282,12 @@ def page(
         ("seq <=", up_to_seq),
         # Said literally, as the partial index has it.
         ("outcome =", outcome),
-        ("batch_id =", batch_id),
         ("revision >", since_revision),
     ):
         if value is not None:
             where.append(f"{condition} {int(value)}")
+    if batch_ids is not None:
+        where.append(f"batch_id IN ({', '.join(str(int(number)) for number in batch_ids) or 'NULL'})")
     if withdrawn is not None:
         where.append(f"withdrawn IS {'NOT NULL' if withdrawn else 'NULL'}")
     if answered:
@@ -276,6 +301,7 @@ def page(
     integers = [np.array(cells[i], dtype=np.int64) for i in (0, 1, 2, 3, 15)]
     # None becomes NaN.
     numbers = [np.array(cells[i], dtype=np.float64) for i in range(5, 15)]
+    scores = qualities.unpacked(tx, cells[2], cells[28])
     return TrialColumns(
         seq=integers[0],
         revision=integers[1],
@@ -285,7 +311,8 @@ def page(
         position=np.stack(numbers[:3], axis=1),
         quaternion_xyzw=np.stack(numbers[3:7], axis=1),
         proposal_density=numbers[7],
-        quality=numbers[8],
+        # A batch's first name stands in where only named ones were given.
+        quality=np.where(np.isnan(numbers[8]), scores[:, 0], numbers[8]) if len(scores) else numbers[8],
         width_m=numbers[9],
         pose_index=integers[4],
         measured_at=[_time(value) for value in cells[16]],
@@ -294,14 +321,15 @@ def page(
         withdrawn=np.array(cells[19], dtype=np.bool_),
         answer=np.array(cells[20], dtype=np.int64),
         achieved=np.array(cells[21:28], dtype=np.float64).T.reshape(-1, 7),
+        qualities=scores,
     )
 
 
 def _time(value: Any) -> datetime | None:
     """PostgreSQL's driver makes times of them, SQLite keeps text."""
     if isinstance(value, str):
-        return datetime.fromisoformat(value).replace(tzinfo=UTC)
-    return None if value is None else cast("datetime", value).astimezone(UTC)
+        return datetime.fromisoformat(value).replace(tzinfo=timezone.utc)
+    return None if value is None else cast("datetime", value).astimezone(timezone.utc)
 
 
 def _document(value: Any) -> Any:

@@ -1,4 +1,5 @@
-"""How much of what users make up an object may have: protocols, their combinations, metadata."""
+"""How much of what users make up an object may have: protocols, their combinations, names of qualities,
+metadata."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from graspdb.wire.base import MAX_METADATA_LENGTH
 from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.trials import provenances
+from graspdb_service.storage.trials import provenances, qualities
 from graspdb_service.trial_columns import Provenance, TrialBatch
 
 
@@ -26,9 +27,10 @@ def check_metadata(settings: Settings, metadata: Any, field: str = "metadata") -
 
 def check_batch(settings: Settings, batch: TrialBatch) -> None:
     """Refuse, before anything is asked of the database, what no object may have."""
-    check_metadata(settings, batch.metadata)
+    check_metadata(settings, batch.shared.metadata)
     for row, metadata in enumerate(batch.columns.metadata):
         check_metadata(settings, metadata, batch.field_of(row, "metadata"))
+    _check_qualities(settings, batch, batch.qualities, 0)
     _check(settings, batch, dict(enumerate(batch.provenances)), frozenset(), 0)
 
 
@@ -47,6 +49,32 @@ def provenance_ids(
         _check(settings, batch, new, *provenances.spread(tx, object_id))
         known |= provenances.make(tx, object_id, list(new.values()))
     return [known[item] for item in named]
+
+
+def keep_quality_names(tx: Tx, settings: Settings, object_id: int, batch: TrialBatch) -> None:
+    """Note the names of a batch's qualities as its object's; 422 where these would be too many.
+
+    Call it under the object's lock.
+    """
+    if not batch.qualities:
+        return
+    known = qualities.names(tx, object_id)
+    new = [name for name in batch.qualities if name not in known]
+    if new:
+        _check_qualities(settings, batch, new, len(known))
+        qualities.keep_names(tx, object_id, [*known, *new])
+
+
+def _check_qualities(settings: Settings, batch: TrialBatch, new: Sequence[str], known: int) -> None:
+    limit = settings.max_object_qualities
+    if new and known + len(new) > limit:
+        name = new[max(0, limit - known)]
+        row = int(np.argmax(~np.isnan(batch.columns.qualities[:, list(batch.qualities).index(name)])))
+        title = (
+            f"An object's trials have at most {limit:,} names of qualities (max_object_qualities in /info):"
+            " what differs from trial to trial belongs in their metadata"
+        )
+        raise _too_much("too-many-qualities", title, limit, batch.field_of(row, f"qualities.{name}"))
 
 
 def _check(

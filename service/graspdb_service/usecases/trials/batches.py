@@ -13,6 +13,7 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import batches, findings, provenances
 from graspdb_service.storage.trials.batches import BatchRow
+from graspdb_service.storage.trials.qualities import names_of
 from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
@@ -31,11 +32,15 @@ def get(database: Database, slug: str, key: str) -> BatchInfo:
         return _infos(tx, row, [_require(tx, row.id, key)])[0]
 
 
-def page(database: Database, slug: str, *, after: int, limit: int) -> tuple[list[BatchInfo], int | None]:
-    """A page of batches in the order of their making, and where the next one starts."""
+def page(
+    database: Database, slug: str, *, after: int, limit: int, licence: str | None = None
+) -> tuple[list[BatchInfo], int | None]:
+    """A page of batches, all or those under a licence, in the order of their making, and where the next one
+    starts.
+    """
     with database.read() as tx:
         row = require(tx, slug)
-        rows = batches.page(tx, row.id, after=after, limit=limit + 1)
+        rows = batches.page(tx, row.id, after=after, limit=limit + 1, licence=licence)
         items = _infos(tx, row, rows[:limit])
     return items, rows[limit - 1].id if len(rows) > limit else None
 
@@ -98,6 +103,7 @@ def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInf
             "gripper_versions": distinct(item.gripper for item in items),
             "sources": distinct(item.source for item in items),
             "protocols": distinct(item.protocol for item in items),
+            "qualities": names_of(batch.quality_layout),
             "findings": words.of_batch(stored.get(batch.id, []), batch.inserted, keys),
         }
         infos.append(BatchInfo.model_validate({**vars(batch), **told}))

@@ -100,6 +100,6 @@ def _read(tx: Tx, row: ObjectRow, seq: int) -> TrialInfo:
     _require(tx, row, seq)
     columns = rows.page(tx, row.id, after_seq=seq - 1, up_to_seq=seq, limit=1)
     names = provenances.of_object(tx, row.id)
-    page = page_of(tx, columns, names)
+    page = page_of(tx, row, columns, names)
     history = [change._asdict() for change in changes.of_trial(tx, row.id, seq)]
     return TrialInfo.model_validate({**documents(page)[0], "history": history})

@@ -30,6 +30,7 @@ class TrialFilter:
     batch: str | None = None
     since_revision: int | None = None
     withdrawn: bool | None = None
+    licence: str | None = None
 
 
 def page(
@@ -60,10 +61,11 @@ def pages(database: Database, slug: str, chosen: TrialFilter, *, after: int) -> 
     return read(after)
 
 
-def page_of(tx: Tx, columns: TrialColumns, names: Mapping[int, Provenance]) -> TrialPage:
-    """Stored trials with their batches and answers."""
+def page_of(tx: Tx, row: ObjectRow, columns: TrialColumns, names: Mapping[int, Provenance]) -> TrialPage:
+    """Stored trials of an object with their batches and answers."""
     tried = {number for number in columns.answer.tolist() if number >= 0}
-    return TrialPage(columns, names, batches.origins(tx, columns.batch.tolist()), answers.ids(tx, tried))
+    facts = batches.facts(tx, columns.batch.tolist())
+    return TrialPage(columns, names, facts, answers.ids(tx, tried), row.quality_names or ())
 
 
 def _read(
@@ -77,13 +79,14 @@ def _read(
         if chosen.gripper is None or (name.gripper is not None and is_gripper(name.gripper, chosen.gripper))
         if chosen.source in (None, name.source) and chosen.protocol in (None, name.protocol)
     ]
-    batch_id = None
+    batch_ids = None if chosen.licence is None else batches.under(tx, row.id, chosen.licence)
     if chosen.batch is not None:
         batch = batches.find(tx, row.id, chosen.batch) if is_uuid(chosen.batch) else None
         if batch is None or batch.first_seq is None or batch.last_seq is None:
             limit = 0
         else:
-            batch_id, after = batch.id, max(after, batch.first_seq - 1)
+            after = max(after, batch.first_seq - 1)
+            batch_ids = [batch.id] if batch_ids is None or batch.id in batch_ids else []
             up_to = batch.last_seq if up_to is None else min(up_to, batch.last_seq)
     columns = rows.page(
         tx,
@@ -93,8 +96,8 @@ def _read(
         up_to_seq=up_to,
         outcome=None if chosen.outcome is None else OUTCOME_CODES[chosen.outcome],
         provenance_ids=passing if any(wanted) else None,
-        batch_id=batch_id,
+        batch_ids=batch_ids,
         since_revision=chosen.since_revision,
         withdrawn=chosen.withdrawn,
     )
-    return page_of(tx, columns, names)
+    return page_of(tx, row, columns, names)

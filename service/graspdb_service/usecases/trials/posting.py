@@ -9,14 +9,15 @@ from typing import Protocol
 import numpy as np
 
 from graspdb.wire import BatchReceipt
+from graspdb.wire.trials import BatchDefaults
 from graspdb_service.formats.json_pieces import Allowed
 from graspdb_service.formats.trials import parse
-from graspdb_service.problems import ProblemError
+from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.settings import Settings
 from graspdb_service.storage import answers, grippers, objects
 from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.trials import batches, findings, rows
+from graspdb_service.storage.trials import batches, findings, qualities, rows
 from graspdb_service.trial_columns import Ints, Provenance, TrialBatch
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime import quotas
@@ -42,13 +43,16 @@ def add(
     media: str,
     *,
     accept_implausible: bool,
+    told: BatchDefaults,
 ) -> Created:
     """Store the trials of one request as a batch, and say what is doubtful about them.
 
-    422 ``implausible-poses`` for trials that can't be of the object, unless they are accepted.
+    ``told`` is what the request's address says of the batch. 422 ``implausible-poses`` for trials that can't
+    be of the object, unless they are accepted.
     """
     scope = f"POST /objects/{slug}/trials"
-    meant = Sent(sent.key, sent.body, media.encode() + b"\n")
+    beside = told.model_dump_json(exclude_none=True).encode() if told.model_fields_set else b""
+    meant = Sent(sent.key, sent.body, media.encode() + b"\n" + beside)
     with ctx.database.read() as tx:
         require(tx, slug)
     # What was stored once is answered so again, whatever is known of the object by now.
@@ -57,7 +61,7 @@ def add(
         return earlier
     limits = ctx.settings
     allowed = Allowed(limits.max_json_values, limits.max_json_depth)
-    batch = parse(sent.body, media, limit=limits.max_batch_trials, allowed=allowed)
+    batch = _with_told(parse(sent.body, media, limit=limits.max_batch_trials, allowed=allowed), told)
     quotas.check_batch(limits, batch)
     with ctx.database.read() as tx:
         known = require(tx, slug)
@@ -69,18 +73,31 @@ def add(
     return replay_or(ctx.database, scope, meant, lambda tx: _store(tx, ctx.settings, slug, batch, concerns))
 
 
+def _with_told(batch: TrialBatch, told: BatchDefaults) -> TrialBatch:
+    """A batch with what the address says of it; 422 where the body says it, too."""
+    given = {name: getattr(told, name) for name in told.model_fields_set}
+    twice = [name for name, value in given.items() if value is not None and getattr(batch.shared, name)]
+    if twice:
+        raise invalid_fields([(name, "stands in the body and in the query: say it once") for name in twice])
+    return replace(batch, shared=batch.shared.model_copy(update=given))
+
+
 def _store(tx: Tx, settings: Settings, slug: str, batch: TrialBatch, concerns: Sequence[Concern]) -> Created:
     row = require(tx, slug)
     named = _held_grippers(tx, batch)
     count = len(batch.columns)
     revision, first_seq = objects.advance(tx, row.id, rows=count, append=True)
     ids = np.array(quotas.provenance_ids(tx, settings, row.id, batch, named))
-    batch_id, batch_key = batches.create(tx, row.id, revision=revision, metadata=batch.metadata)
+    quotas.keep_quality_names(tx, settings, row.id, batch)
+    layout = qualities.layout_of(batch.qualities, batch.columns.qualities)
+    batch_id, batch_key = batches.create(
+        tx, row.id, revision=revision, shared=batch.shared, quality_layout=layout
+    )
     audit.record(tx, "batch.create", object=slug, subject=batch_key)
     columns = replace(
         batch.columns, provenance=ids[batch.columns.provenance], answer=_answers(tx, row.id, batch)
     )
-    rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first_seq)
+    rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first_seq, layout=layout)
     last_seq = first_seq + count - 1
     batches.grow(tx, batch_id, first_seq=first_seq, last_seq=last_seq, inserted=count, packed=0)
     told = [concern.stored(ids) for concern in concerns]

@@ -6,6 +6,9 @@ them, however many there are; of a batch of no more than `MOST` rows every one i
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,11 +23,12 @@ _STEP = 1e-8
 _Words = NDArray[np.uint64]
 
 
-def fingerprints(columns: TrialColumns, object_id: int) -> tuple[Ints, Ints]:
+def fingerprints(columns: TrialColumns, object_id: int, qualities: Sequence[str]) -> tuple[Ints, Ints]:
     """Ascending places of the rows that are compared, and a digest of each.
 
-    Rows have one digest where pose (to :data:`_STEP`), achieved pose, outcome, width, quality and time agree,
-    whatever gripper, source or protocol they name: who forgot those and posts again posts the same rows.
+    Rows have one digest where pose (to :data:`_STEP`), achieved pose, outcome, width, quality, named
+    ``qualities`` and time agree, whatever gripper, source or protocol they name: who forgot those and posts
+    again posts the same rows.
     """
     words = np.full(len(columns), object_id, dtype=np.uint64)
     quaternions = columns.quaternion_xyzw
@@ -38,8 +42,11 @@ def fingerprints(columns: TrialColumns, object_id: int) -> tuple[Ints, Ints]:
     if len(rows) > MOST:
         rows = np.sort(np.argpartition(words, MOST)[:MOST])
     kept = words[rows]
-    for salt, name in enumerate(("width_m", "quality"), start=1):
-        values = getattr(columns, name)
+    scores = [(1, columns.width_m), (2, columns.quality)]
+    # In one order, however the request had them.
+    named = sorted((name, place) for place, name in enumerate(qualities))
+    scores += [(zlib.crc32(name.encode()) + 3, columns.qualities[:, place]) for name, place in named]
+    for salt, values in scores:
         if len(values):
             numbers = np.ascontiguousarray(values[rows])
             known = _mixed(kept ^ numbers.view(np.uint64) ^ np.uint64(salt))

@@ -93,7 +93,7 @@ def inspect(
 
 def repeats(tx: Tx, object_id: int, batch_id: int, batch: TrialBatch, ids: Ints) -> list[FindingRow]:
     """Rows that stand twice in the batch, or in earlier ones; remembers those of this one."""
-    rows, digests = fingerprints(batch.columns, object_id)
+    rows, digests = fingerprints(batch.columns, object_id, batch.qualities)
     distinct, first = np.unique(digests, return_index=True)
     again = np.setdiff1d(rows, rows[first])
     seen = findings.seen_in(tx, distinct)
