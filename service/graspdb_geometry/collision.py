@@ -175,6 +175,22 @@ class Scene:
         _, travel = self.classify(poses, shape, threads)
         return np.asarray(shape.max_opening_m - travel.sum(axis=1), dtype=np.float64)
 
+    def extents(self, poses: PoseArrays, box: tuple[FloatArray, FloatArray], threads: int = 1) -> FloatArray:
+        """Least and greatest y of the object within a box of the tool frame (half extents, centre), metres,
+        (n, 2); NaN where it is outside.
+        """
+        p, q = checked(poses)
+        half, centre = box
+        column = np.stack([*(_NOWHERE for _ in range(3)), np.stack([centre, half])])
+        codes = np.empty(len(p), dtype=np.uint8)
+        extents = np.empty((len(p), 2))
+
+        def run(block: slice) -> None:
+            convex.classify(p[block], q[block], column, self._model, True, codes[block], extents[block])
+
+        _in_blocks(run, len(p), threads)
+        return extents
+
 
 class Surface:
     """An object as triangles, for queries before it has convex parts; immutable, thread-safe.
@@ -243,17 +259,24 @@ class Surface:
 
     def widths(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> FloatArray:
         """As :meth:`Scene.widths`."""
+        centre, half = _gripper_boxes(shape, None, 0.0)[3]
+        extents = self.extents(poses, (half, centre), threads)
+        width: FloatArray = extents[:, 1] - extents[:, 0]
+        width[self.collides(poses, shape, threads=threads)] = np.nan
+        return width
+
+    def extents(self, poses: PoseArrays, box: tuple[FloatArray, FloatArray], threads: int = 1) -> FloatArray:
+        """As :meth:`Scene.extents`, of the surface alone."""
         p, q = checked(poses)
-        column = np.ascontiguousarray(_gripper_boxes(shape, None, 0.0)[3])
+        half, centre = box
+        column = np.ascontiguousarray(np.stack([centre, half]))
         extents = np.empty((len(p), 2))
 
         def run(block: slice) -> None:
             surface_extents(p[block], q[block], column, self._tree, extents[block])
 
         _in_blocks(run, len(p), threads)
-        width: FloatArray = extents[:, 1] - extents[:, 0]
-        width[self.collides(poses, shape, threads=threads)] = np.nan
-        return width
+        return extents
 
     def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether points (n, 3) lie in the solid; in the union, where several closed pieces overlap."""

@@ -60,7 +60,7 @@ ServiceUrl = Annotated[
         envvar="GRASPDB_URL", help="Take object and gripper from this service; --url '' means the examples."
     ),
 ]
-GripperName = Annotated[str, typer.Option(help="A gripper of the service; without --url pg70 or panda.")]
+GripperName = Annotated[str, typer.Option(help="A gripper of the service; without --url a built-in one.")]
 ApiKey = Annotated[
     str | None, typer.Option(envvar="GRASPDB_API_KEY", help="With the scope jobs:work, to run; else read.")
 ]

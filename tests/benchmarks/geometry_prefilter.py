@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_geometry import collision, grids, grippers
+from graspdb_geometry import collision, grids
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
 
 def measure(name: str, poses: int, repetitions: int, threads: int) -> dict[str, Any]:
@@ -34,16 +35,16 @@ def measure(name: str, poses: int, repetitions: int, threads: int) -> dict[str, 
     vertices, faces = thing.triangles
     surface = collision.Surface(vertices, faces, watertight=True)
     # Compile, or load from the cache, before the clock starts.
-    codes, _ = scene.classify(ToolPoses(positions[:64], quaternions[:64]), grippers.PG70)
-    surface.collides(ToolPoses(positions[:64], quaternions[:64]), grippers.PG70)
+    codes, _ = scene.classify(ToolPoses(positions[:64], quaternions[:64]), PG70)
+    surface.collides(ToolPoses(positions[:64], quaternions[:64]), PG70)
     rates, wall_rates, surface_rates = [], [], []
     for _ in range(repetitions):
         started, wall = time.process_time(), time.perf_counter()
-        codes, _ = scene.classify(ToolPoses(positions, quaternions), grippers.PG70, threads)
+        codes, _ = scene.classify(ToolPoses(positions, quaternions), PG70, threads)
         rates.append(len(codes) / (time.process_time() - started))
         wall_rates.append(len(codes) / (time.perf_counter() - wall))
         started = time.process_time()
-        surface.collides(ToolPoses(positions, quaternions), grippers.PG70, threads=threads)
+        surface.collides(ToolPoses(positions, quaternions), PG70, threads=threads)
         surface_rates.append(len(codes) / (time.process_time() - started))
     shares = np.bincount(codes, minlength=3) / len(codes)
     return {

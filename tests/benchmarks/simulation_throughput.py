@@ -14,7 +14,8 @@ import time
 import numpy as np
 
 from graspdb.examples import EXAMPLES, example
-from graspdb.wire import Finger, GridPlan, GripperProfile, SimulatePayload
+from graspdb.wire import GridPlan, SimulatePayload
+from graspdb.wire.presets.grippers import PRESETS
 from graspdb_geometry import collision
 from graspdb_simworker.process.local import LocalRunner
 from graspdb_simworker.simulation import chunks
@@ -23,12 +24,7 @@ from graspdb_simworker.simulation.force_test import weakest_force
 CHUNK = 10_000
 ROUNDS = 5
 TARGETS = {"cone": 10_000, "elongated-d": 20_000, "screwdriver": 2_000, "mug": 7_000}
-PG70 = GripperProfile(
-    max_opening_m=0.070,
-    finger=Finger(width_m=0.020, thickness_m=0.015, length_m=0.070),
-    tip_offset_m=0.023,
-    palm_size_m=(0.080, 0.112, 0.092),
-)
+PG70 = PRESETS["pg70"].profile
 
 
 def payload(name: str, start: int, stop: int) -> SimulatePayload:

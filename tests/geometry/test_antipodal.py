@@ -14,8 +14,8 @@ from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.features.antipodal import opposed_points
 from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_geometry.features.ridges import parts_solid
-from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
 
 def of(mesh: trimesh.Trimesh, opening: float = 0.07) -> JawPairs:

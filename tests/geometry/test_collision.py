@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from graspdb.examples import EXAMPLES, example
 from graspdb_geometry import collision, grids, grippers
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
-PG70 = grippers.PG70
 SEEDS = st.integers(0, 2**32 - 1)
 #: Overlaps within this of zero may be called either way by the two methods.
 CLOSE = 1e-6

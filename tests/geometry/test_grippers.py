@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from graspdb_geometry import grippers
+from known_jaws import PANDA, PG70, SHAPES
 
 
 def test_pg70_boxes() -> None:
-    half, centres = grippers.PG70.boxes()
+    half, centres = PG70.boxes()
     low, high = centres - half, centres + half
     np.testing.assert_allclose(half * 2, [[0.02, 0.015, 0.07], [0.02, 0.015, 0.07], [0.08, 0.112, 0.092]])
     assert low[grippers.FINGER_PLUS, 1] == pytest.approx(0.035)
@@ -22,13 +23,13 @@ def test_pg70_boxes() -> None:
 
 
 def test_pandas_base_is_103_4_mm_behind_the_pads_centre() -> None:
-    half, centres = grippers.PANDA.boxes()
+    half, centres = PANDA.boxes()
     assert (centres - half)[grippers.PALM, 2] == pytest.approx(-0.1034)
 
 
-@pytest.mark.parametrize("name", ["pg70", "panda"])
+@pytest.mark.parametrize("name", sorted(SHAPES))
 def test_column_fills_the_gap_between_the_fingers(name: str) -> None:
-    shape = grippers.GRIPPER_SHAPES[name]
+    shape = SHAPES[name]
     for opening in (None, 0.0, 0.03):
         half, centres = shape.boxes(opening)
         column_half, column_centre = shape.column(opening)

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from graspdb_geometry import collision, grippers
+from graspdb_geometry import collision
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
-PG70 = grippers.PG70
 HERE = [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]
 
 

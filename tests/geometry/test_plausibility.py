@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from graspdb_geometry.collision import Scene, Surface, box_part
-from graspdb_geometry.grippers import PANDA, GripperShape
+from graspdb_geometry.grippers import GripperShape
 from graspdb_geometry.plausibility import Doubt, Target, doubts
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PANDA
 
 SIZE = np.array([0.04, 0.06, 0.1])
 BOX = box_part(SIZE / 2, (0, 0, 0), (0, 0, 0, 1))

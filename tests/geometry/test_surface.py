@@ -12,11 +12,10 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES, example
-from graspdb_geometry import collision, grids, grippers
+from graspdb_geometry import collision, grids
 from graspdb_geometry._compiled import surface as compiled
 from graspdb_geometry.poses import ToolPoses
-
-PG70 = grippers.PG70
+from known_jaws import PG70
 
 
 def triangle_depth(corners: np.ndarray, box: np.ndarray) -> float:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from graspdb_geometry.collision import Scene, Surface, box_part
-from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
 BOX = box_part([0.01, 0.02, 0.05], [0, 0, 0], [0, 0, 0, 1])
 

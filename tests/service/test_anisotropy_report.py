@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from graspdb_density import se3
 from graspdb_geometry.collision import Scene
-from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
 Floats = NDArray[np.float64]
 Post = Callable[..., dict[str, Any]]

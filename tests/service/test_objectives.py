@@ -27,7 +27,6 @@ from graspdb_density.se3 import Poses
 from graspdb_density.search.mode_search import MeanShiftSearch, ModeSearch
 from graspdb_density.search.scored_poses import Score
 from graspdb_geometry.collision import Scene
-from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
 from graspdb_service.api.context import Context
 from graspdb_service.app import create_app
@@ -37,6 +36,7 @@ from graspdb_service.usecases.densities import success_models
 from graspdb_service.usecases.grasps import question
 from graspdb_service.usecases.grasps.admissible import NearSuccesses
 from graspdb_service.usecases.grasps.answer import best_grasps
+from known_jaws import PG70
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

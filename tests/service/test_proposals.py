@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from graspdb_density import GraspDensity, IsotropicKernel, SuccessModel, se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, box_part
-from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.proposals import uncertain
+from known_jaws import PG70
 
 Floats = NDArray[np.float64]
 Pair = tuple[Floats, Floats]

@@ -221,7 +221,7 @@ def test_collisions_known_and_aligned_with_the_object(
     rng = np.random.default_rng(0)
     p = rng.uniform(-1.0, 1.0, (3_000, 3)) * [0.05, 0.06, 0.08]
     q = se3.random_quaternions(3_000, rng)
-    from graspdb_geometry.grippers import PG70
+    from known_jaws import PG70
 
     hit = scene.collides(ToolPoses(p, q), PG70)
     won = ~hit & (np.abs(p[:, 1]) < 0.02)

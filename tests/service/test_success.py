@@ -16,8 +16,8 @@ from graspdb.wire import OUTCOME_CODES, OUTCOMES
 from graspdb_density import IsotropicKernel, se3
 from graspdb_geometry.collision import Scene
 from graspdb_geometry.grids import PoseGrid
-from graspdb_geometry.grippers import PG70
 from graspdb_geometry.poses import ToolPoses
+from known_jaws import PG70
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -11,20 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.examples import ExampleObject, example
-from graspdb.wire import Finger, GridPlan, GripperProfile, PosePlan, SimulatePayload
+from graspdb.wire import GridPlan, PosePlan, SimulatePayload
+from graspdb.wire.presets.grippers import PRESETS
+from graspdb_geometry.grippers import shape_of
 from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.simulation import chunks
 
-PG70 = GripperProfile(
-    max_opening_m=0.070,
-    finger=Finger(width_m=0.020, thickness_m=0.015, length_m=0.070),
-    tip_offset_m=0.023,
-    palm_size_m=(0.080, 0.112, 0.092),
-    finger_mass_kg=0.1,
-    max_speed_m_s=0.06,
-    force_n=40.0,
-    friction=0.4,
-)
+PG70 = PRESETS["pg70"].profile
 Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
 HALF = math.sqrt(0.5)
 RIM = ((0.0, 0.028, 0.035), (1.0, 0.0, 0.0, 0.0))
@@ -120,9 +113,7 @@ def physical_poses() -> Callable[[str, int], list[tuple[Any, Any]]]:
 
         thing = example(name)
         _, positions, quaternions = chunks.poses_of(plan(thing, stop=40_000))
-        codes, _ = collision.Scene(thing.parts).classify(
-            ToolPoses(positions, quaternions), chunks.shape_of(PG70)
-        )
+        codes, _ = collision.Scene(thing.parts).classify(ToolPoses(positions, quaternions), shape_of(PG70))
         rows = np.flatnonzero(codes == collision.CONTACT)
         assert len(rows) >= count
         rows = rows[np.linspace(0, len(rows) - 1, count).astype(int)]

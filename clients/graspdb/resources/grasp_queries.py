@@ -183,6 +183,7 @@ class GraspQueries(Resource):
         *,
         strategy: str = "density",
         seed: int | None = None,
+        pre_opening_m: float | str | None = None,
         name: str | None = None,
         timeout_s: float | None = None,
         **selection: Unpack[Selection],
@@ -191,10 +192,13 @@ class GraspQueries(Resource):
 
         ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges``
         needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on opposed surfaces,
-        edges or points; some of what it draws collides. ``name`` keeps the answer, as for :meth:`samples`.
+        edges or points; some of what it draws collides. Either starts from poses at which the gripper is
+        free, as far open as ``pre_opening_m`` says (see :class:`Constraints`). ``name`` keeps the answer, as
+        for :meth:`samples`.
         """
         fields = known_keywords(Selection, selection, "proposals")
-        fields |= {"count": count, "seed": seed, "strategy": strategy, "name": name, "timeout_s": timeout_s}
+        fields |= {"count": count, "seed": seed, "strategy": strategy, "pre_opening_m": pre_opening_m}
+        fields |= {"name": name, "timeout_s": timeout_s}
         request = validate(wire.ProposalsRequest, fields)
         answer = self._transport.model(wire.Proposals, "POST", f"{self._path}/proposals", body=request)
         return SampledPoses.from_wire(answer)

@@ -82,6 +82,7 @@ class Grasp:
     - ``candidate``: its place among the candidates that were given.
     - ``simulated``: outcome of the grasp simulated anew at the fine step, where that was asked for.
     - ``width_m``: opening of the jaw once both fingers touch the object, metres.
+    - ``opening_m``: opening to command before the approach, at which collisions were tested, metres.
     - ``nearest_trials``: ``seq`` of the trials nearest to it.
     - ``active_constraints``: those that hold it where it is.
     - ``answer``: id of the answer that it is of, for the trial that tries it; None where it is not kept.
@@ -100,6 +101,7 @@ class Grasp:
     prior_success_probability: float | None = None
     collision_free: bool | None = None
     width_m: float | None = None
+    opening_m: float | None = None
     nearest_trials: tuple[int, ...] = ()
     active_constraints: tuple[str, ...] = ()
     score: float | None = None
@@ -202,6 +204,8 @@ class Grasp:
             rows["simulated"] = self.simulated
         if self.width_m is not None:
             rows["width [m]"] = f"{self.width_m:.4f}"
+        if self.opening_m is not None:
+            rows["opening to command [m]"] = f"{self.opening_m:.4f}"
         if self.active_constraints:
             rows["held by"] = ", ".join(self.active_constraints)
         if self.answer is not None:
@@ -320,7 +324,14 @@ class Grasps(Sequence[Grasp]):
         if worlds is not None:
             columns |= {f"world_{name}": x for name, x in pose_columns(as_poses(worlds)).items()}
         names = ["score", "density", "log_density", "relative", "success_probability", "effective_trials"]
-        names += ["prior_success_probability", "collision_free", "width_m", "candidate", "simulated"]
+        names += [
+            "prior_success_probability",
+            "collision_free",
+            "width_m",
+            "opening_m",
+            "candidate",
+            "simulated",
+        ]
         columns |= {name: [getattr(grasp, name) for grasp in self] for name in names}
         for end in ("low", "high"):
             columns[end] = [g.interval and getattr(g.interval, end) for g in self]
@@ -429,7 +440,8 @@ class LikelihoodArrays(Columns):
     ``answer`` is the id that the service keeps them under, None where it does not; ``newer_revision`` the
     object's revision now, where a name keeps them of an older one; ``stale``: the database did not answer, so
     they are from what the service had read before.
-    ``selection`` says whose trials count, and each source's share of the density's weight.
+    ``selection`` says whose trials count, and each source's share of the density's weight. ``opening_m`` is
+    the opening to command, at which collisions were tested, where ``pre_opening_m`` asked for it, metres.
     """
 
     revision: int
@@ -441,6 +453,7 @@ class LikelihoodArrays(Columns):
     interval: IntervalArrays | None = None
     effective_trials: Floats | None = None
     collision_free: NDArray[np.bool_] | None = None
+    opening_m: Floats | None = None
     support: SupportArrays | None = None
     prior_success_probability: Floats | None = None
     reach: wire.ReachInfo | None = None
@@ -455,7 +468,7 @@ class LikelihoodArrays(Columns):
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
         """From the answers to consecutive parts of the poses."""
-        free = _joined(answers, "collision_free")
+        free, openings = _joined(answers, "collision_free"), _joined(answers, "opening_m")
         # NumPy makes NaN of nulls; the log of an exact zero is another null.
         joined = {name: _joined(answers, name) for name in _COLUMNS}
         columns = {name: None if x is None else np.array(x, dtype=float) for name, x in joined.items()}
@@ -481,11 +494,14 @@ class LikelihoodArrays(Columns):
             newer_revision=answers[-1].newer_revision,
             stale=any(a.stale for a in answers),
             collision_free=None if free is None or None in free else np.array(free, dtype=np.bool_),
+            opening_m=None if openings is None else np.array(openings, dtype=float),
             **columns,
         )
 
     def _columns(self) -> dict[str, Any]:
-        names = [name for name in (*_COLUMNS, "collision_free") if getattr(self, name) is not None]
+        names = [
+            name for name in (*_COLUMNS, "collision_free", "opening_m") if getattr(self, name) is not None
+        ]
         columns = {name: getattr(self, name) for name in names}
         if self.interval is not None:
             columns |= {"low": self.interval.low, "high": self.interval.high}

@@ -59,12 +59,22 @@ CalibratedFor = Annotated[
 ]
 
 
+PreOpening = Annotated[
+    float | str | None,
+    Option("How far open the jaw comes: metres, or auto, what each grasp needs and 5 mm beside a finger."),
+]
+
+
 class LikelihoodSelection(Selection, total=False):
     """A :class:`Selection`, and ``calibrated_for``: the source of real trials (``robot``, ``human``,
     ``import``) that success probabilities of simulated trials, which are then selected, are corrected for.
+
+    ``pre_opening_m``: how far open the jaw comes, as in :class:`Constraints`; ``opening_m`` of the answer
+    tells it.
     """
 
     calibrated_for: CalibratedFor
+    pre_opening_m: PreOpening
 
 
 class Constraints(Selection, total=False):
@@ -85,6 +95,9 @@ class Constraints(Selection, total=False):
     - ``obstacles``: ``boxes`` (each ``size_m`` and a pose), ``points`` (K, 3) and their ``point_radius_m``:
       what the open gripper must not touch either.
     - ``pregrasp_distance_m``: the straight approach is free from this far back.
+    - ``pre_opening_m``: how far open the jaw comes to a grasp, metres, or ``auto``: as far as what is between
+      the fingers needs, and 5 mm beside either of them, though the wide-open jaw may collide. Collisions are
+      tested so, and ``grasp.opening_m`` is what to command; by default wide open.
     - ``max_width_m``: how far apart the fingers are at most, once both touch the object.
     - ``min_success_probability``, ``min_effective_trials``: how likely a grasp is at least, and from how many
       effective trials; one too far from every attempt for a success probability fails either.
@@ -129,6 +142,7 @@ class Constraints(Selection, total=False):
     ]
     obstacles: wire.Obstacles | Mapping[str, Any] | None
     pregrasp_distance_m: Annotated[float | None, Option("The straight approach is free from this far back.")]
+    pre_opening_m: PreOpening
     max_width_m: Annotated[float | None, Option("Fingers at most this far apart.")]
     min_success_probability: Annotated[float | None, Option("At least so likely to succeed.")]
     min_effective_trials: Annotated[float | None, Option("... from at least so many effective trials.")]

@@ -33,6 +33,7 @@ from graspdb.wire.grippers import GripperInfo as GripperInfo
 from graspdb.wire.grippers import GripperProfile as GripperProfile
 from graspdb.wire.grippers import GripperUpdate as GripperUpdate
 from graspdb.wire.grippers import JointValues as JointValues
+from graspdb.wire.grippers import TipOffset as TipOffset
 from graspdb.wire.jobs import ClaimedJob as ClaimedJob
 from graspdb.wire.jobs import ClaimRequest as ClaimRequest
 from graspdb.wire.jobs import ClaimResponse as ClaimResponse

@@ -12,8 +12,11 @@ from graspdb.wire.base import Pose, Request, Response, Slug, Text
 from graspdb.wire.frames.conventions import Convention
 from graspdb.wire.frames.gripper_frames import BASE, MAX_FRAMES, TOOL, FrameName, completed, in_tool
 
-SHAPE_FIELDS = ("max_opening_m", "finger.", "tip_offset_m", "palm_size_m")
+SHAPE_FIELDS = ("max_opening_m", "finger.", "tip_offset", "palm_size_m")
 """What the fields of a profile that make the gripper's shape begin with."""
+
+MAX_TIP_OFFSETS = 64
+"""Most openings at which a profile says where its tips are."""
 
 Length = Annotated[float, Field(ge=1e-4, le=2.0)]
 
@@ -43,6 +46,15 @@ class JointValues(Request):
     """Value with the fingers together: radians, or metres for one that slides."""
 
 
+class TipOffset(Request):
+    """Where the fingertips are at one opening, of fingers whose tips move on arcs."""
+
+    opening_m: Annotated[float, Field(ge=0, le=2.0)]
+    """Distance between the fingers' inner faces, metres; below ``max_opening_m``."""
+    tip_offset_m: Annotated[float, Field(ge=0, le=2.0)]
+    """Distance from the tool's origin to the fingertips along the tool's z axis at that opening, metres."""
+
+
 class GripperProfile(Request):
     """A parallel-jaw gripper. Tool frame: origin midway between the fingers, z approach, y closing."""
 
@@ -51,7 +63,12 @@ class GripperProfile(Request):
     finger: Finger
     """The box that each of the two fingers is."""
     tip_offset_m: Annotated[float, Field(ge=0, le=2.0)] = 0.0
-    """Distance from the tool's origin to the fingertips along the tool's z axis, metres."""
+    """Distance from the tool's origin to the fingertips along the tool's z axis, metres; of the wide-open jaw
+    where ``tip_offsets`` says that it changes."""
+    tip_offsets: Annotated[list[TipOffset], Field(max_length=MAX_TIP_OFFSETS)] = Field(default_factory=list)
+    """Where the tips move on arcs: how far ahead they are at smaller openings, ascending, linear in between
+    and up to ``tip_offset_m`` at ``max_opening_m``; a finger's box begins at the palm throughout. By default
+    none: the fingers move straight."""
     palm_size_m: tuple[Length, Length, Length]
     """Edges of the box right behind the fingers along x, y, z of the tool frame, metres."""
     finger_mass_kg: Annotated[float, Field(gt=0, le=100)] = 0.1
@@ -78,6 +95,10 @@ class GripperProfile(Request):
     )
     """The gripper's joints by name, as the robot's description has them, each with its value open and
     closed."""
+    source: Text | None = None
+    """Where these values are from, such as a data sheet or a URDF; null if nobody said."""
+    unverified: Annotated[list[Text], Field(max_length=100)] = Field(default_factory=list)
+    """Which of them nobody has verified, a field and why each; by default none is named."""
 
     @field_validator("frames")
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from datetime import datetime
 from typing import Annotated, Any, Literal
@@ -327,6 +328,7 @@ class LikelihoodRequest(Selection):
     poses: Annotated[list[Pose], Field(min_length=1), MANY] | PoseColumns
     """Poses of the tool frame in the object frame, in a list or in columns; 1 to 1,000,000."""
     include: IncludedColumns = None
+    pre_opening_m: PreOpeningField = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
     timeout_s: TimeoutS = None
@@ -376,6 +378,9 @@ class Likelihoods(Response):
     """How many attempts the success probability rests on, weighted by nearness; null if not asked for."""
     collision_free: list[bool | None] | None = None
     """Whether the open gripper clears the object; null until mesh and gripper are known."""
+    opening_m: list[float] | None = None
+    """Opening to command at each pose, metres, at which collisions were tested; null without
+    ``pre_opening_m``, and where mesh or gripper are not known."""
     support: SupportColumns | None = None
     """How far every pose is from what was tried; null if not asked for."""
     prior_success_probability: list[float | None] | None = None
@@ -407,6 +412,39 @@ def _object_pose(value: Any) -> Any:
 ObjectPose = Annotated[Vector7, BeforeValidator(_object_pose)]
 """The object frame in the world frame: x, y, z, qx, qy, qz, qw (a pose's object is accepted too)."""
 
+
+def _pre_opening(value: Any) -> Any:
+    """An opening or ``auto``, of a query string, too: one message says what it may be."""
+    if value is None or value == "auto":
+        return value
+    try:
+        opening = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        opening = math.nan
+    if not 1e-4 <= opening <= 2.0:
+        raise ValueError("an opening from 0.0001 to 2, in metres, or auto")
+    return opening
+
+
+PreOpening = Annotated[float, Field(ge=1e-4, le=2.0)] | Literal["auto"] | None
+"""How far open a jaw is when it comes to a grasp: metres, ``auto``, or None for wide open."""
+PreOpeningField = Annotated[
+    PreOpening,
+    BeforeValidator(_pre_opening),
+    Field(
+        description="How far open the jaw comes to a grasp, metres: collisions are tested at that opening; or"
+        " `auto`: each grasp as far open as what is between the fingers needs, and 5 mm beside either of"
+        " them; where the wide-open jaw collides, at the least opening at which it does not. By default wide"
+        " open."
+    ),
+]
+OpeningM = Annotated[
+    float | None,
+    Field(
+        description="Opening to command before the approach, metres: the one that collisions were tested at;"
+        " null where no gripper is known, and without collision test for `auto`."
+    ),
+]
 
 Objective = Literal["density", "success_probability", "robust"]
 Averaged = Literal["density", "success_probability"]
@@ -490,6 +528,7 @@ class GraspConstraints(Selection):
     pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far back along the approach the open gripper's straight way must be free, metres; by default not at
     all."""
+    pre_opening_m: PreOpeningField = None
     max_width_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far the fingers may be apart once both touch the object, metres; by default as far as the jaw
     opens."""
@@ -572,6 +611,7 @@ class Grasp(Response):
     width_m: float | None = None
     """Distance between the fingers once both touch the object, metres; null where geometry or gripper are
     unknown or nothing is between the fingers."""
+    opening_m: OpeningM = None
     nearest_trials: list[int] = Field(default_factory=list)
     """The trials nearest to it, by their ``seq``."""
     active_constraints: list[str] = Field(default_factory=list)
@@ -669,6 +709,7 @@ class ProposalsRequest(SamplesRequest):
     strategy: Strategy = "density"
     """``density``: where successes lie; ``uncertainty``: where one more trial teaches most; ``edges``: where
     the jaw can close on opposed surfaces or edges, before anything is known."""
+    pre_opening_m: PreOpeningField = None
 
 
 class Proposals(Samples):
@@ -700,6 +741,7 @@ class LikelihoodQuery(SelectionQuery):
     quaternion_xyzw: Quaternion
     """Rotation of the tool frame in the object frame: a unit quaternion x,y,z,w."""
     include: Annotated[IncludedColumns, BeforeValidator(_listed)] = None
+    pre_opening_m: PreOpeningField = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
     timeout_s: TimeoutS = None
@@ -716,6 +758,7 @@ class LikelihoodOptions(Selection):
     """A likelihood request without its poses, which are read as arrays."""
 
     include: IncludedColumns = None
+    pre_opening_m: PreOpeningField = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
     timeout_s: TimeoutS = None

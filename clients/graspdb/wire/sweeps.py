@@ -20,6 +20,7 @@ from graspdb.wire.base import (
     Slug,
     ToolPositions,
     ToolRotations,
+    Warnings,
 )
 from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
@@ -187,6 +188,7 @@ class SweepInfo(Response):
     """Seconds it will take by that rate; null where the rate is."""
     failed_chunks: list[FailedChunk] = Field(default_factory=list)
     """Chunks that failed for good, and why."""
+    warnings: Warnings = Field(default_factory=list)
     created_at: datetime
     """When it was planned, UTC."""
     started_at: datetime | None = None

@@ -52,7 +52,7 @@ class Target:
         """How far from the tool origin the closing fingers may meet something."""
         if self.shape is None:
             return UNKNOWN_REACH_M
-        half, centre = self.shape.column()
+        half, centre = self.shape.swept()
         return float(np.linalg.norm(np.abs(centre) + half))
 
     @property

@@ -85,13 +85,15 @@ def collides(poses: ToolPoses, solid: Scene | Surface, shape: GripperShape) -> B
 
 def encloses(poses: ToolPoses, solid: Scene | Surface, shape: GripperShape) -> BoolArray:
     """Whether something is between the open fingers, or within the tolerance of it, (n,)."""
-    # A gripper whose closed fingers fill the room between the open ones of the other.
+    # A gripper whose closed fingers fill the room between the open ones of the other, as far ahead as
+    # the tips ever are.
+    ahead = shape.farthest_tip_m - shape.tip_offset_m
     filling = GripperShape(
         max_opening_m=shape.max_opening_m,
         finger_width_m=min(shape.finger_width_m + 2 * TOLERANCE_M, _LARGEST_M),
         finger_thickness_m=max(shape.max_opening_m / 2, _SMALLEST_M),
-        finger_length_m=min(shape.finger_length_m + 2 * TOLERANCE_M, _LARGEST_M),
-        tip_offset_m=shape.tip_offset_m + TOLERANCE_M,
+        finger_length_m=min(shape.finger_length_m + ahead + 2 * TOLERANCE_M, _LARGEST_M),
+        tip_offset_m=shape.farthest_tip_m + TOLERANCE_M,
         palm_size_m=(_SMALLEST_M, _SMALLEST_M, _SMALLEST_M),
     )
     return solid.collides(poses, filling, opening_m=0.0)

@@ -114,9 +114,16 @@ def held(tx: Tx, names: Iterable[str]) -> Mapping[str, str]:
     return {name: row.versioned for name, row in found.items() if row is not None}
 
 
-def builtin_ids(tx: Tx) -> set[str]:
-    """The grippers that GraspDB brought along, as far as they are stored."""
-    return set(tx.scalars(select(grippers.c.id).where(grippers.c.builtin.is_(True))))
+def first_versions(tx: Tx, ids: Collection[str]) -> dict[str, GripperRow]:
+    """The first versions of those of these grippers that are stored."""
+    query = _query().where(grippers.c.id.in_(sorted(ids)), gripper_versions.c.version == 1)
+    return {row.id: row for row in all_as(tx, query, GripperRow)}
+
+
+def complete(tx: Tx, gripper: str, profile: dict[str, Any]) -> None:
+    """Store what a gripper's first version lacks; nothing that a grasp depends on may change by it."""
+    which = (gripper_versions.c.gripper == gripper, gripper_versions.c.version == 1)
+    tx.execute(update(gripper_versions).where(*which).values(profile=profile))
 
 
 def page(tx: Tx, *, after: str, limit: int) -> list[GripperRow]:

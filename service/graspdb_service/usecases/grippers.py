@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from graspdb.wire import GripperCreate, GripperInfo, GripperProfile, GripperUpdate
-from graspdb_geometry.grippers import PANDA, PG70, GripperShape
+from graspdb.wire.presets.grippers import PRESETS
+from graspdb_geometry.grippers import shape_of
 from graspdb_service import principal
 from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import grippers
@@ -11,19 +12,44 @@ from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
 from graspdb_service.trial_columns import gripper_parts
-from graspdb_service.usecases.geometry.collision import shape_of
 from graspdb_service.usecases.identifiers import is_gripper_name
 from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_or
 
+#: What a profile says beside what grasps depend on.
+_SAID = {"source", "unverified", "frames", "joints"}
+
 
 def seed(database: Database) -> None:
-    """Store the built-in grippers where they are missing; several replicas may do so at once."""
+    """Store the built-in grippers where they are missing, and what they say of themselves where an older
+    version stored them without; several replicas may do so at once. One of the user's own that has the id of
+    a built-in one stays as it is.
+    """
     with database.read() as tx:
-        if grippers.builtin_ids(tx) >= BUILTIN.keys():
-            return
+        first = grippers.first_versions(tx, PRESETS)
+    wanted = {
+        gripper: preset.profile.model_dump(mode="json")
+        for gripper, preset in sorted(PRESETS.items())
+        if gripper not in first or _said_less(first[gripper], preset.profile)
+    }
+    if not wanted:
+        return
     with database.write(audited=False) as tx:
-        for gripper, (name, profile) in sorted(BUILTIN.items()):
-            grippers.create(tx, gripper, name, profile.model_dump(mode="json"), builtin=True)
+        for gripper, profile in wanted.items():
+            if gripper in first:
+                grippers.complete(tx, gripper, profile)
+            else:
+                grippers.create(tx, gripper, PRESETS[gripper].name, profile, builtin=True)
+
+
+def _said_less(row: GripperRow, preset: GripperProfile) -> bool:
+    """Whether a built-in gripper's first version, which no user changes, has the preset's values without all
+    that is said of them.
+    """
+    if not row.builtin:
+        return False
+    stored = GripperProfile.model_validate(row.profile)
+    values, same = (GripperProfile.model_validate(p.model_dump(exclude=_SAID)) for p in (stored, preset))
+    return bool(stored.differences(preset)) and not values.differences(same)
 
 
 def create(database: Database, request: GripperCreate, sent: Sent) -> Created:
@@ -152,44 +178,3 @@ def _check_shape(profile: GripperProfile) -> None:
 
 def _info(row: GripperRow) -> GripperInfo:
     return GripperInfo.model_validate({**vars(row), "changed": row.changed or []})
-
-
-def _profile(shape: GripperShape, base_offset_m: float, **facts: float) -> GripperProfile:
-    return GripperProfile.model_validate(
-        {
-            "max_opening_m": shape.max_opening_m,
-            "finger": {
-                "width_m": shape.finger_width_m,
-                "thickness_m": shape.finger_thickness_m,
-                "length_m": shape.finger_length_m,
-            },
-            "tip_offset_m": shape.tip_offset_m,
-            "palm_size_m": shape.palm_size_m,
-            "base_to_tool": {"position": [0, 0, base_offset_m], "quaternion_xyzw": [0, 0, 0, 1]},
-            "symmetric": True,
-            **facts,
-        }
-    )
-
-
-BUILTIN: dict[str, tuple[str, GripperProfile]] = {
-    # RobWork's public device files: 60 mm/s and 40 N, 0.1 kg a finger, plastic on plastic; the hardware
-    # driver's acceleration limit is 39 mm/s^2.
-    "pg70": (
-        "Schunk PG70",
-        _profile(
-            PG70,
-            0.140,
-            finger_mass_kg=0.1,
-            max_speed_m_s=0.06,
-            max_acceleration_m_s2=0.039,
-            force_n=40.0,
-            friction=0.4,
-        ),
-    ),
-    # Franka's hand: 50 mm/s and 70 N continuous by its data sheet; the tool 103.4 mm from the hand's frame.
-    "panda": (
-        "Franka Panda hand",
-        _profile(PANDA, 0.1034, finger_mass_kg=0.015, max_speed_m_s=0.05, force_n=70.0, friction=0.4),
-    ),
-}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import collision
+from graspdb_geometry.grippers import shape_of
 from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.inspection.stored_outcomes import StoredOutcomes
 from graspdb_simworker.simulation import chunks
@@ -75,7 +76,7 @@ class Agreement:
 def enough_poses(payload: SimulatePayload, parts: Sequence[Part], count: int) -> SimulatePayload:
     """The payload with so many random poses of its grid that about three times ``count`` meet physics."""
     assert payload.grid is not None
-    scene, shape = collision.Scene(parts), chunks.shape_of(payload.gripper)
+    scene, shape = collision.Scene(parts), shape_of(payload.gripper)
     poses = 20_000
     while True:
         grid = payload.grid.model_copy(update={"max_poses": poses})

@@ -9,17 +9,11 @@ import numpy as np
 
 from graspdb.examples import example
 from graspdb.transport import Transport
-from graspdb.wire import Finger, GridPlan, GridSpec, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
+from graspdb.wire import GridPlan, GridSpec, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
+from graspdb.wire.presets.grippers import PRESETS
 from graspdb.wire.sweeps import Protocol
 from graspdb_geometry import meshes
-from graspdb_geometry.grippers import GRIPPER_SHAPES
 from graspdb_simworker.simulation.bodies import Part
-
-_DRIVES: dict[str, dict[str, float]] = {
-    "pg70": {"finger_mass_kg": 0.1, "max_speed_m_s": 0.06, "force_n": 40.0, "friction": 0.4},
-    "panda": {"finger_mass_kg": 0.015, "max_speed_m_s": 0.05, "force_n": 70.0, "friction": 0.4},
-}
-"""What closes the grippers that can be had without a service: as every service has them built in."""
 
 
 def load(
@@ -81,17 +75,7 @@ def load(
 
 
 def _built_in(gripper: str) -> GripperProfile:
-    shape = GRIPPER_SHAPES.get(gripper)
-    if shape is None:
-        raise ValueError(f"no gripper {gripper!r} without a service; there are {', '.join(GRIPPER_SHAPES)}")
-    return GripperProfile(
-        max_opening_m=shape.max_opening_m,
-        finger=Finger(
-            width_m=shape.finger_width_m,
-            thickness_m=shape.finger_thickness_m,
-            length_m=shape.finger_length_m,
-        ),
-        tip_offset_m=shape.tip_offset_m,
-        palm_size_m=shape.palm_size_m,
-        **_DRIVES[gripper],
-    )
+    preset = PRESETS.get(gripper)
+    if preset is None:
+        raise ValueError(f"no gripper {gripper!r} without a service; there are {', '.join(PRESETS)}")
+    return preset.profile

@@ -31,7 +31,7 @@ the Panda's fingers of 15 g not one grasp of 1.6 kg held, where at the fine step
 of 100 g the same third. Once a jaw has stalled, its fingers' inertia has no part in what holds."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Gripper(GripperShape):
     """A parallel jaw as the physics sees it.
 

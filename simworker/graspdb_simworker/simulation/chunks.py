@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from graspdb.wire import GridPlan, GripperProfile, ResultRows, SimulatePayload, SimulateResult
 from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
-from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.grippers import shape_of
 from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.simulation.bodies import MIN_FINGER_SHARE, Gripper, Part, closing_force
 from graspdb_simworker.simulation.force_test import compile_force_test
@@ -92,18 +92,6 @@ def prepare(
         film_every_s=film_every_s,
     )
     return Workpiece(collision.Scene(parts), world, gripper)
-
-
-def shape_of(profile: GripperProfile) -> GripperShape:
-    """The boxes of a gripper profile."""
-    return GripperShape(
-        max_opening_m=profile.max_opening_m,
-        finger_width_m=profile.finger.width_m,
-        finger_thickness_m=profile.finger.thickness_m,
-        finger_length_m=profile.finger.length_m,
-        tip_offset_m=profile.tip_offset_m,
-        palm_size_m=profile.palm_size_m,
-    )
 
 
 def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:

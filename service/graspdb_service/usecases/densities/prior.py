@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graspdb.wire import KernelInfo
+from graspdb.wire.queries import PreOpening
 from graspdb_density import GraspDensity, IsotropicKernel, ModeSearch, se3
 from graspdb_geometry.features.jaw_pairs import JawPairs
 from graspdb_service.problems import ProblemError, conflict
@@ -65,8 +66,9 @@ class Priors:
         self._cache: SingleFlightCache[tuple[object, ...], _Made]
         self._cache = SingleFlightCache(_MAX_BYTES, lambda made: made.nbytes)
 
-    def get(self, selected: Selected, choice: KernelChoice) -> Prior:
-        """The prior of an object for a gripper; ``choice`` may name other widths than 10 mm and 15 degrees.
+    def get(self, selected: Selected, choice: KernelChoice, pre_opening_m: PreOpening = None) -> Prior:
+        """The prior of an object for a gripper; ``choice`` may name other widths than 10 mm and 15 degrees,
+        the jaw comes wide open or as far as ``pre_opening_m`` says.
 
         409 ``mesh-missing`` without geometry, ``gripper-unknown`` where none is named, ``no-surface-pairs``
         where the jaw finds nothing to close on, ``edges-unreachable`` where it can't come near.
@@ -76,7 +78,7 @@ class Priors:
         kernel = IsotropicKernel(metres, math.radians(degrees))
         row = selected.row
         opposed = self._scenes.features.opposed(selected)
-        test = self._scenes.require(selected)
+        test = self._scenes.require(selected, pre_opening_m)
         assert selected.profile is not None
         if not opposed:
             raise conflict(
@@ -86,7 +88,8 @@ class Priors:
                 " gripper",
             )
         form = None if row.mesh_info is None else form_of(row)
-        key = (row.mesh_sha256, form, row.parts_sha256, selected.profile.model_dump_json(), kernel)
+        jaw = (selected.profile.model_dump_json(), pre_opening_m)
+        key = (row.mesh_sha256, form, row.parts_sha256, *jaw, kernel)
         symmetric = selected.jaw_symmetric
 
         def make(_: _Made | None) -> _Made:
@@ -109,10 +112,12 @@ class Priors:
             KernelInfo(kind="isotropic", sigma_position_m=metres, sigma_rotation_deg=degrees, rule=rule),
         )
 
-    def known(self, selected: Selected, choice: KernelChoice) -> Prior | None:
+    def known(
+        self, selected: Selected, choice: KernelChoice, pre_opening_m: PreOpening = None
+    ) -> Prior | None:
         """As :meth:`get`, None where there is none or it can't be known."""
         try:
-            return self.get(selected, choice)
+            return self.get(selected, choice, pre_opening_m)
         except ProblemError as problem:
             if problem.status != 409:
                 raise

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import GripperProfile
+from graspdb.wire.queries import PreOpening
 from graspdb_density.se3 import Poses
-from graspdb_geometry import meshes
+from graspdb_geometry import meshes, openings
 from graspdb_geometry.collision import Scene, Surface
-from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.grippers import GripperShape, shape_of
+from graspdb_geometry.openings import Values
 from graspdb_geometry.plausibility import Target
-from graspdb_service.problems import conflict
+from graspdb_geometry.poses import PoseArrays
+from graspdb_service.problems import ProblemError, conflict, invalid
 from graspdb_service.storage import assets
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
@@ -32,6 +35,8 @@ Solid = Scene | Surface
 _MAX_BYTES = 256 * 2**20
 #: Hulls, planes, edges and trees take about this many times the bytes of the file.
 _GROWTH = 10
+#: How much wider than it needs the jaw is with ``auto``: half of that beside either finger.
+CLEARANCE_M = 0.01
 #: What reaches less far between the fingers is grazed: no gripper is placed more exactly.
 _GRAZED_M = 1e-3
 
@@ -44,30 +49,72 @@ class _Prepared:
 
 @dataclass(frozen=True, eq=False)
 class CollisionTest:
-    """The open gripper of one profile against one object."""
+    """The gripper of one profile against one object, wide open or as far as ``pre_opening_m`` says.
+
+    ``pre_opening_m`` is an opening in metres, ``auto`` for each pose's own, or None for wide open.
+    """
 
     solid: Solid
     shape: GripperShape
+    pre_opening_m: PreOpening = None
+
+    def preshaped(self, pre_opening_m: PreOpening) -> CollisionTest:
+        """The same with the jaw as far open as that."""
+        return self if pre_opening_m is None else replace(self, pre_opening_m=pre_opening_m)
+
+    def openings(self, poses: Poses, threads: int = 1) -> Floats:
+        """How far open the jaw is at each pose (n,), metres: the opening to command.
+
+        With ``auto`` that is what :func:`graspdb_geometry.openings.needed` says and :data:`CLEARANCE_M`; wide
+        open where nothing is needed.
+        """
+        if self.pre_opening_m == "auto":
+            needed = openings.needed(self.solid, poses, self.shape, threads)
+            return openings.commanded(needed, CLEARANCE_M, self.shape)
+        opening = self.shape.max_opening_m if self.pre_opening_m is None else self.pre_opening_m
+        return np.full(len(poses), opening)
 
     def free(self, poses: Poses, threads: int = 1) -> NDArray[np.bool_]:
         """Which poses (n,) the open gripper can take without overlapping the object."""
-        return ~self.solid.collides(poses, self.shape, threads=threads)
+        return self.free_on_the_way(poses, 0.0, threads)
 
     def free_on_the_way(self, poses: Poses, distance_m: float, threads: int = 1) -> NDArray[np.bool_]:
         """As :meth:`free`, all along the straight approach that starts this far back."""
-        return ~self.solid.collides(poses, self.shape, threads=threads, retreat_m=distance_m)
+
+        def tested(shape: GripperShape, some: PoseArrays) -> NDArray[np.bool_]:
+            return ~self.solid.collides(some, shape, threads=threads, retreat_m=distance_m)
+
+        return self.with_jaw(poses, tested, threads)
 
     def holds(self, poses: Poses, threads: int = 1) -> NDArray[np.bool_]:
         """Which poses the open gripper can take with something between its fingers."""
-        return self.solid.holds(poses, self.shape, threads=threads)
+        return self.with_jaw(
+            poses, lambda shape, some: openings.holds(self.solid, some, shape, threads), threads
+        )
 
     def widths(self, poses: Poses, threads: int = 1) -> Floats:
         """The jaw's opening (n,) once both fingers touch the object; NaN where it collides or misses, or only
         grazes the object with the rim of its pads.
         """
-        widths = np.array(self.solid.widths(poses, self.shape, threads=threads))
-        widths[~self.solid.holds(poses, self.shape.slimmer(_GRAZED_M), threads=threads)] = np.nan
-        return widths
+
+        def tested(shape: GripperShape, some: PoseArrays) -> Floats:
+            widths = np.array(openings.widths(self.solid, some, shape, threads))
+            widths[~openings.holds(self.solid, some, shape.slimmer(_GRAZED_M), threads)] = np.nan
+            return widths
+
+        return self.with_jaw(poses, tested, threads)
+
+    def with_jaw(
+        self,
+        poses: Poses,
+        tested: Callable[[GripperShape, PoseArrays], Values],
+        threads: int = 1,
+    ) -> Values:
+        """What a test of some poses tells of each (n,), with the jaw as far open as it is there."""
+        if self.pre_opening_m == "auto":
+            return openings.at_each(self.openings(poses, threads), poses, self.shape, tested)
+        shape = self.shape if self.pre_opening_m is None else self.shape.at(self.pre_opening_m)
+        return tested(shape, poses)
 
 
 class Scenes:
@@ -81,24 +128,29 @@ class Scenes:
             _MAX_BYTES, lambda p: p.nbytes
         )
 
-    def test(self, selected: Selected) -> CollisionTest | None:
-        """The collision test of a selection; None where geometry or gripper is not known."""
+    def test(self, selected: Selected, pre_opening_m: PreOpening = None) -> CollisionTest | None:
+        """The collision test of a selection; None where geometry or gripper is not known.
+
+        With a pre-opening 422 where the jaw opens less, 409 ``gripper-unknown``, and as :meth:`require` where
+        it depends on geometry.
+        """
+        if pre_opening_m is not None:
+            _check_pre_opening(selected, pre_opening_m)
         if selected.profile is None:
             return None
         solid = self._solid(selected.row)
-        return None if solid is None else CollisionTest(solid, shape_of(selected.profile))
+        if solid is None:
+            if pre_opening_m == "auto":
+                raise _unknown(selected)
+            return None
+        return CollisionTest(solid, shape_of(selected.profile), pre_opening_m)
 
-    def require(self, selected: Selected) -> CollisionTest:
+    def require(self, selected: Selected, pre_opening_m: PreOpening = None) -> CollisionTest:
         """As :meth:`test`, or 409 saying what is missing and how to give it."""
-        test, row = self.test(selected), selected.row
-        if test is not None:
-            return test
-        reasons = []
-        if row.mesh_sha256 is None and row.parts_sha256 is None:
-            reasons.append(f"the object has no mesh (PUT /objects/{row.slug}/mesh)")
-        if selected.profile is None:
-            reasons.append("no trial names its gripper (name one: gripper=)")
-        raise conflict("collision-unknown", "Collisions can't be tested: " + "; ".join(reasons))
+        test = self.test(selected, pre_opening_m)
+        if test is None:
+            raise _unknown(selected)
+        return test
 
     def target(self, row: ObjectRow, profile: GripperProfile | None) -> Target | None:
         """The object for posted trials to be looked at against; None without mesh and parts. Its geometry is
@@ -144,13 +196,20 @@ class Scenes:
         return self._cache.get((sha256, reading), lambda _: True, make).solid
 
 
-def shape_of(profile: GripperProfile) -> GripperShape:
-    """The boxes that the collision test needs of a gripper."""
-    return GripperShape(
-        max_opening_m=profile.max_opening_m,
-        finger_width_m=profile.finger.width_m,
-        finger_thickness_m=profile.finger.thickness_m,
-        finger_length_m=profile.finger.length_m,
-        tip_offset_m=profile.tip_offset_m,
-        palm_size_m=profile.palm_size_m,
-    )
+def _check_pre_opening(selected: Selected, pre_opening_m: PreOpening) -> None:
+    profile = selected.profile
+    if profile is None:
+        raise conflict("gripper-unknown", "A pre-opening is of a jaw: name the gripper (gripper=)")
+    if isinstance(pre_opening_m, float) and pre_opening_m > profile.max_opening_m:
+        told = f"is {pre_opening_m:g}, and {selected.gripper} opens {profile.max_opening_m:g} m at most"
+        raise invalid("pre_opening_m", told)
+
+
+def _unknown(selected: Selected) -> ProblemError:
+    """409 saying what is missing for a collision test, and how to give it."""
+    row, reasons = selected.row, []
+    if row.mesh_sha256 is None and row.parts_sha256 is None:
+        reasons.append(f"the object has no mesh (PUT /objects/{row.slug}/mesh)")
+    if selected.profile is None:
+        reasons.append("no trial names its gripper (name one: gripper=)")
+    return conflict("collision-unknown", "Collisions can't be tested: " + "; ".join(reasons))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,8 +12,11 @@ from graspdb_density import GraspDensity, se3
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Admissible
 from graspdb_geometry.grippers import GripperShape
+from graspdb_geometry.openings import STEP_M, at_each
+from graspdb_geometry.poses import PoseArrays
 from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.densities.success_models import Model
+from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.constraints import Constraints
 from graspdb_service.usecases.runtime.compute import breathing
 
@@ -38,14 +42,32 @@ def all_of(checks: Sequence[Admissible]) -> Admissible | None:
     return breathing(admissible, "testing poses")
 
 
-def clear_of(limits: Constraints, shape: GripperShape, distance: float, threads: int) -> Admissible:
-    """Whether the gripper touches no obstacle, all along an approach of this length."""
+def clear_of(
+    limits: Constraints, jaw: GripperShape, test: CollisionTest | None, distance: float, threads: int
+) -> Admissible:
+    """Whether the gripper touches no obstacle, all along an approach of this length.
+
+    It is as far open as a collision test has it, or as ``jaw`` where there is none. Tips that move on arcs
+    come closer while it closes, and must be clear of obstacles, too, once they touch the object.
+    """
+
+    def free(shape: GripperShape, poses: PoseArrays, retreat_m: float = 0.0) -> Bools:
+        hit = np.zeros(len(np.asarray(poses.positions)), dtype=np.bool_)
+        for solid in limits.obstacles:
+            hit |= solid.collides(poses, shape, threads=threads, retreat_m=retreat_m)
+        return ~hit
 
     def clear(poses: Poses) -> Bools:
-        hit = np.zeros(len(poses), dtype=np.bool_)
-        for solid in limits.obstacles:
-            hit |= solid.collides(poses, shape, threads=threads, retreat_m=distance)
-        return ~hit
+        if test is None:
+            return free(jaw, poses, distance)
+        clear = test.with_jaw(poses, partial(free, retreat_m=distance), threads)
+        rows = np.flatnonzero(clear)
+        if jaw.tip_offsets and rows.size:
+            widths = test.widths(poses[rows], threads)
+            closed = np.floor(widths / STEP_M) * STEP_M
+            rows, closed = rows[~np.isnan(widths)], closed[~np.isnan(widths)]
+            clear[rows] = at_each(closed, poses[rows], jaw, free)
+        return clear
 
     return clear
 

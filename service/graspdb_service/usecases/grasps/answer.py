@@ -127,9 +127,12 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     )
     logs = np.array([item.log_density for item in found])
 
-    def known() -> tuple[Any, Any, list[list[int]], Any]:
-        """Whether they are free, how wide the jaw is, the sequence numbers of the nearest successes."""
+    def known() -> tuple[Any, Any, Any, list[list[int]], Any]:
+        """Whether they are free, how far open the jaw comes and is on the object, the sequence numbers of the
+        nearest successes.
+        """
         free = None if test is None else test.free(poses, threads=threads)
+        openings = question.openings(poses, threads)
         widths = None if test is None else test.widths(poses, threads=threads)
         nearest: list[list[int]] = [[] for _ in found]
         if not question.prior:
@@ -137,9 +140,9 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
                 question.search.centres.nearest_rows(poses[i], _NEAREST_TRIALS) for i in range(len(poses))
             )
             nearest = [built.seq[row].tolist() for row in rows]
-        return free, widths, nearest, question.search.relative(logs, threads)
+        return free, openings, widths, nearest, question.search.relative(logs, threads)
 
-    free, widths, nearest, relative = ctx.compute.run(known)
+    free, openings, widths, nearest, relative = ctx.compute.run(known)
     estimates = None
     if question.chances:
         believed = question.believed
@@ -164,6 +167,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
                     "prior": question.prior,
                     "candidate": _place(limits, item),
                     "width_m": None if widths is None or math.isnan(widths[i]) else float(widths[i]),
+                    "opening_m": None if openings is None else float(openings[i]),
                     "nearest_trials": nearest[i],
                     "active_constraints": limits.named(item.active_constraints),
                 }

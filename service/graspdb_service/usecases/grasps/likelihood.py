@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graspdb.wire import CalibrationInfo, ReachInfo, Selection
-from graspdb.wire.queries import LikelihoodColumn
+from graspdb.wire.queries import LikelihoodColumn, PreOpening
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
@@ -44,11 +44,11 @@ def likelihood(
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
     is minus infinity where the density is exactly zero; NaN stands for not known.
     """
-    count = len(poses)
-    _refuse_many(ctx, count)
+    _refuse_many(ctx, len(poses))
     _, cutoff = kernel_of(request)
     request = of_simulation(request)
     source: str | None = getattr(request, "calibrated_for", None)
+    pre_opening_m: PreOpening = getattr(request, "pre_opening_m", None)
     calibration = None
 
     def asked(*names: str) -> bool:
@@ -60,21 +60,15 @@ def likelihood(
         free = test = reach = None
         threads = ctx.compute.threads
         if asked("density", "log_density", "relative"):
-            search, relative = built.search, np.zeros(count)
-            logs = np.full(count, -np.inf)
-            if search is not None:
-                logs = log_density(ctx, search.density, poses, cutoff)
-                if asked("relative"):
-                    relative = ctx.compute.run(partial(search.relative, logs, threads))
-            density = np.exp(logs) if asked("density") else None
-            columns |= {"density": density, "log_density": logs, "relative": relative}
+            columns |= _densities(ctx, built, poses, cutoff, relative=asked("relative"))
         chances = asked(*CHANCES)
         if chances or asked("collision_free"):
-            test = ctx.scenes.test(built.selected)
+            test = ctx.scenes.test(built.selected, pre_opening_m)
             if test is not None:
                 free = np.concatenate(ctx.compute.blocks(poses, partial(test.free, threads=threads)))
         if chances:
             believed = ctx.evidence.believed(built)
+            believed = None if believed is None else believed.preshaped(pre_opening_m)
             model = ctx.successes.model(built, collisions_known=believed is not None)
             if model is not None and source is not None:
                 model, calibration = calibrated(ctx, built, model, believed, source)
@@ -88,8 +82,23 @@ def likelihood(
                 ctx.successes.add_prior(estimates, model, poses, believed, free)
                 columns["prior_success_probability"] = estimates.prior
         columns["collision_free"] = free
-    known = {name: column for name, column in columns.items() if column is not None and asked(name)}
+        known = {name: column for name, column in columns.items() if column is not None and asked(name)}
+        if test is not None and pre_opening_m is not None:
+            blocks = ctx.compute.blocks(poses, partial(test.openings, threads=threads))
+            known["opening_m"] = np.concatenate(blocks)
     return built, reach, calibration, known
+
+
+def _densities(
+    ctx: Estimators, built: Built, poses: Poses, cutoff: float | None, *, relative: bool
+) -> dict[str, Floats]:
+    """Columns of the density of successes at poses (n,), the relative one where it is asked for."""
+    search, ranks, logs = built.search, np.zeros(len(poses)), np.full(len(poses), -np.inf)
+    if search is not None:
+        logs = log_density(ctx, search.density, poses, cutoff)
+        if relative:
+            ranks = ctx.compute.run(partial(search.relative, logs, ctx.compute.threads))
+    return {"density": np.exp(logs), "log_density": logs, "relative": ranks}
 
 
 def _refuse_many(ctx: Estimators, count: int) -> None:

@@ -66,7 +66,7 @@ def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         density = built.density
         if density is None:
             raise samples.no_successes(slug)
-        test = ctx.scenes.test(built.selected)
+        test = ctx.scenes.test(built.selected, request.pre_opening_m)
         model = ctx.successes.model(built, collisions_known=ctx.evidence.believed(built) is not None)
         if model is None:
             raise conflict(
@@ -91,7 +91,7 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         raise invalid("kernel", "strategy=edges takes the isotropic kernel: leave it out, or give its widths")
     with ctx.compute.within(request):
         selected = ctx.densities.selections.resolve(slug, request)
-        prior = ctx.priors.get(selected, choice)
+        prior = ctx.priors.get(selected, choice, request.pre_opening_m)
         built = ctx.densities.get(selected, KernelChoice())
         return samples.drawn_from(
             ctx, prior.density, built, prior.kernel, request.count, request.seed, prior=True

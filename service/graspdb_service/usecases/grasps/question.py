@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from graspdb.wire import CalibrationInfo, GraspConstraints, KernelInfo, Ranking
+from graspdb.wire.queries import PreOpening
 from graspdb_density import ModeSearch, Separation
+from graspdb_density.se3 import Poses
 from graspdb_density.search.mode_search import DISTINCT
 from graspdb_density.search.scored_poses import Admissible, distinct_from
+from graspdb_geometry.grippers import shape_of
 from graspdb_service.problems import conflict
+from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.evidence.calibrations import calibrated
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.success_models import Model
-from graspdb_service.usecases.geometry.collision import CollisionTest, shape_of
+from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import objectives
 from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of, likely_enough
 from graspdb_service.usecases.grasps.constraints import Constraints
@@ -49,10 +55,20 @@ class Question:
     engine: Engine
     ranking: Ranking
     calibration: CalibrationInfo | None
+    pre_opening_m: PreOpening
 
     @property
     def prior(self) -> bool:
         return self.built.search is None
+
+    def openings(self, poses: Poses, threads: int) -> Floats | None:
+        """How far open the jaw comes to poses (n,), metres; None where no gripper is known."""
+        if self.test is not None:
+            return self.test.openings(poses, threads)
+        profile, asked = self.built.selected.profile, self.pre_opening_m
+        if profile is None:
+            return None
+        return np.full(len(poses), asked if isinstance(asked, float) else profile.max_opening_m)
 
 
 def question_of(
@@ -64,7 +80,7 @@ def question_of(
     source = _prior(ctx, request, built) if built.search is None else built
     row, selected = built.object_row, built.selected
     needed = request.collision_free or request.pregrasp_distance_m is not None or request.max_width_m
-    test = (ctx.scenes.require if needed else ctx.scenes.test)(selected)
+    test = (ctx.scenes.require if needed else ctx.scenes.test)(selected, request.pre_opening_m)
     if limits.obstacles and selected.profile is None:
         raise conflict("gripper-unknown", "Obstacles need the gripper's shape: name one (gripper=)")
     if source is None or source.search is None:
@@ -102,7 +118,7 @@ def question_of(
             engine = CandidateRanking(limits.candidates, by, separated)
         bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
         found = built, search, kernel, limits, test, believed, chances, model, bounds
-        return Question(*found, engine, ranking, calibration)
+        return Question(*found, engine, ranking, calibration, request.pre_opening_m)
 
     return ctx.compute.run(complete)
 
@@ -112,6 +128,7 @@ def _chances(
 ) -> tuple[CollisionTest | None, Model | None, CalibrationInfo | None]:
     """What success probabilities rest on: geometry where it is believed, attempts, and a correction."""
     believed = ctx.evidence.believed(built)
+    believed = None if believed is None else believed.preshaped(request.pre_opening_m)
     model = ctx.successes.model(built, collisions_known=believed is not None)
     if model is None or request.calibrated_for is None:
         return believed, model, None
@@ -124,7 +141,7 @@ def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | 
     if request.prior is False or choice.stored is not None:
         return None
     get = ctx.priors.get if request.prior else ctx.priors.known
-    return get(built.selected, choice)
+    return get(built.selected, choice, request.pre_opening_m)
 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:
@@ -180,7 +197,10 @@ def _bounds(
         checks.append(lambda poses: test.free_on_the_way(poses, distance, threads))
     profile = built.selected.profile
     if limits.obstacles and profile is not None:
-        checks.append(clear_of(limits, shape_of(profile), distance, threads))
+        jaw = shape_of(profile)
+        if test is None and isinstance(request.pre_opening_m, float):
+            jaw = jaw.at(request.pre_opening_m)
+        checks.append(clear_of(limits, jaw, test, distance, threads))
     wide = request.max_width_m
     if wide is not None and test is not None:
         checks.append(lambda poses: test.widths(poses, threads) <= wide)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from graspdb.wire.presets.grippers import PRESETS
 from graspdb_density import (
     GraspDensity,
     IsotropicKernel,
@@ -25,7 +26,7 @@ from graspdb_density import (
 from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, Surface
-from graspdb_geometry.grippers import PG70
+from graspdb_geometry.grippers import shape_of
 from graspdb_service.trial_columns import Bools
 from graspdb_service.usecases.runtime.compute import Compute
 
@@ -75,12 +76,13 @@ def _exercise() -> None:
     corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]) * 0.02
     faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7]])
     scene = Scene([(corners, faces)])
-    Surface(corners, faces, watertight=False).collides(poses, PG70)
+    jaw = shape_of(PRESETS["pg70"].profile)
+    Surface(corners, faces, watertight=False).collides(poses, jaw)
     kernel = IsotropicKernel(0.015, math.radians(15.0))
     region = Region([[0.0, 0.0, 1.0, 0.0]], approach=(0.0, 0.0, 1.0), approach_angle=1.0)
 
     def free(asked: Poses) -> Bools:
-        return ~scene.collides(asked, PG70)
+        return ~scene.collides(asked, jaw)
 
     choose_widths(Rows.of(poses))
     success = rng.random(300) < 0.5

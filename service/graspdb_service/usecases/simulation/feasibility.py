@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from graspdb.wire import GridPlan, GripperProfile
+from graspdb_geometry.grippers import shape_of
 from graspdb_geometry.meshes import UNITS
 from graspdb_service.problems import ProblemError, invalid
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.usecases.geometry.collision import shape_of
 from graspdb_service.usecases.geometry.mesh_form import form_of
 from graspdb_service.usecases.trials import sweep_plan
 
@@ -33,6 +34,19 @@ def check_gripper(profile: GripperProfile) -> None:
     reason = next(_troubles(profile), None)
     if reason is not None:
         raise invalid("gripper", reason, "This gripper can't be simulated")
+
+
+def warnings(gripper: str, profile: Mapping[str, Any]) -> list[str]:
+    """What of a gripper, by its profile as JSON, the physics leaves out."""
+    known = profile.get("tip_offsets")
+    if not known:
+        return []
+    ahead = max(abs(tip["tip_offset_m"] - profile["tip_offset_m"]) for tip in known)
+    return [
+        f"the fingertips of {gripper} move on arcs, by up to {1e3 * ahead:.0f} mm towards the object as they"
+        " close; the simulation closes them straight, as far ahead as wide open: what happens at the tips may"
+        " differ"
+    ]
 
 
 def _troubles(profile: GripperProfile) -> Iterator[str]:

@@ -181,14 +181,21 @@ def _world(row: ObjectRow, profile: GripperProfile) -> _World:
         "parts_sha256": row.parts_sha256,
         "mass_kg": mass_kg,
         "friction": row.friction if row.friction is not None else profile.friction,
-        # What the gripper's frames and joints are called makes no other simulation.
-        "gripper": profile.model_dump(mode="json", exclude={"frames", "joints"}),
+        "gripper": _simulated(profile),
         "lower": lower.tolist(),
         "upper": upper.tolist(),
     }
     if snapshot["mass_kg"] is None:
         snapshot["density_kg_m3"] = row.density_kg_m3
     return _World(row, snapshot, profile)
+
+
+def _simulated(profile: GripperProfile) -> dict[str, Any]:
+    """A profile without what no simulation depends on: two sweeps of one grid then stay two of one grid, and
+    a worker of an older version knows all fields.
+    """
+    told = profile.model_dump(mode="json", exclude={"frames", "joints", "source", "unverified"})
+    return told if told["tip_offsets"] else {k: v for k, v in told.items() if k != "tip_offsets"}
 
 
 def _mass(row: ObjectRow) -> float | None:

@@ -13,6 +13,7 @@ from graspdb_service.storage.simulation.sweeps import Progress, SweepRow
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.simulation import feasibility
 
 
 def require_sweep(tx: Tx, sweep_id: str) -> SweepRow:
@@ -103,6 +104,7 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
             "rate_poses_s": rate,
             "time_left_s": left / rate if rate and state == SweepState.RUNNING else None,
             "failed_chunks": done.failed,
+            "warnings": feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
         }
     )
 
