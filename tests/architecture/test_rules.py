@@ -45,6 +45,7 @@ OPTIONAL = {
     "pybullet",
     "pybullet_utils",
     "trimesh",
+    "yourdfpy",
 }
 
 

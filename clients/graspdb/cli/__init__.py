@@ -15,6 +15,7 @@ from rich.markup import escape
 from graspdb import __version__
 from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
+from graspdb.cli.grippers import making
 from graspdb.cli.options import Commands
 from graspdb.cli.wording import in_commands
 from graspdb.demo import demo
@@ -62,6 +63,8 @@ def settings(
 
 app.add_typer(objects.objects, name="objects")
 app.command("add-example")(objects.add_example)
+objects.grippers.command("from-urdf")(making.from_urdf)
+objects.grippers.command("explain")(making.explain)
 app.add_typer(objects.grippers, name="grippers")
 app.add_typer(trials.trials, name="trials")
 app.add_typer(trials.batches, name="batches")

@@ -173,7 +173,7 @@ def show_gripper(state: State, id: GripperId) -> None:
     state.show(found, json.dumps({**name, **profile}, indent=2, ensure_ascii=False))
 
 
-def _profile(file: Path) -> dict[str, Any]:
+def profile_in(file: Path) -> dict[str, Any]:
     """A profile and its name, as `grippers show` prints them."""
     given = json.loads(file.read_text(encoding="utf-8"))
     if not isinstance(given, dict):
@@ -190,7 +190,7 @@ def create_gripper(
     name: Annotated[str | None, typer.Option(help="A name for people.")] = None,
 ) -> None:
     """Create a gripper profile from a JSON file."""
-    fields = {**_profile(file), **({"name": name} if name else {}), "id": id}
+    fields = {**profile_in(file), **({"name": name} if name else {}), "id": id}
     created = state.db.grippers.create(**fields)
     state.show(created, f"Gripper {created.id} is created.")
 
@@ -203,7 +203,7 @@ def update_gripper(
     name: Annotated[str | None, typer.Option(help="Another name for people.")] = None,
 ) -> None:
     """Make a new version of a gripper profile from a JSON file; what was tried keeps its version."""
-    fields = {**_profile(file), "id": id, **({"name": name} if name else {})}
+    fields = {**profile_in(file), "id": id, **({"name": name} if name else {})}
     updated = state.db.grippers.update(fields.pop("id"), **fields)
     changed = f": {', '.join(updated.changed)} changed" if updated.changed else ""
     state.show(updated, f"{updated.id} stands for {updated.id}@{updated.version} now{changed}.")

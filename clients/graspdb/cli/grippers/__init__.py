@@ -1,0 +1,1 @@
+"""Commands that make gripper profiles, and explain them."""
