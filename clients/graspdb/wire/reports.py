@@ -142,10 +142,10 @@ class ConvergenceOptions(SelectionQuery):
 class ConvergenceReport(Report):
     """Have we tried enough? N counts successes; twins by the jaw's symmetry are not counted."""
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "Have we tried enough? Similarity and held-out likelihood against the number of successes."
     )
-    options: ClassVar = ConvergenceOptions
+    options: ClassVar[type[Request]] = ConvergenceOptions
     report: Literal["convergence"] = "convergence"
     """Name of the report, as in its path."""
     level: IntervalLevel
@@ -315,10 +315,10 @@ class AnisotropyOptions(SelectionQuery):
 class AnisotropyReport(Report):
     """What a success tells about its vicinity, by displacement in the frame of ``alignment``."""
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "How far off may the gripper be? Success by displacement from successes, tolerances by axis."
     )
-    options: ClassVar = AnisotropyOptions
+    options: ClassVar[type[Request]] = AnisotropyOptions
     report: Literal["anisotropy"] = "anisotropy"
     """Name of the report, as in its path."""
     method: Method
@@ -402,10 +402,10 @@ class CheckedGrasps(Response):
 class CalibrationReport(Report):
     """Whether ``success_probability`` can be believed, on outcomes it has not seen (blocks left out)."""
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "Can success probabilities be believed? Judged on outcomes of blocks of space left out."
     )
-    options: ClassVar = SelectionQuery
+    options: ClassVar[type[Request]] = SelectionQuery
     report: Literal["calibration"] = "calibration"
     """Name of the report, as in its path."""
     level: IntervalLevel
@@ -504,10 +504,10 @@ class ProjectionOptions(SelectionQuery):
 class ProjectionReport(Report):
     """The density on a plane, depth and rotation integrated out; of grasps that point one way, or of all."""
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "Where do grasps succeed? The density on a plane, of all grasps or of those that point one way."
     )
-    options: ClassVar = ProjectionOptions
+    options: ClassVar[type[Request]] = ProjectionOptions
     report: Literal["projection"] = "projection"
     """Name of the report, as in its path."""
     level: IntervalLevel
@@ -594,10 +594,10 @@ class BandwidthReport(Report):
     """Which widths the kernel should have: those left-out blocks are likeliest under. How often draws
     succeed."""
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "How wide should the kernel be? By left-out blocks, and by draws that were simulated as checks."
     )
-    options: ClassVar = TrialSelection
+    options: ClassVar[type[Request]] = TrialSelection
     report: Literal["bandwidth"] = "bandwidth"
     """Name of the report, as in its path."""
     level: IntervalLevel
@@ -651,10 +651,10 @@ class KernelSimilarityReport(Report):
     It has a meaning only with its window and with the width of the components.
     """
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "How many samples, or Gaussians, does a kernel need to be like its statistics? (figure 13)"
     )
-    options: ClassVar = KernelSimilarityOptions
+    options: ClassVar[type[Request]] = KernelSimilarityOptions
     report: Literal["kernel-similarity"] = "kernel-similarity"
     """Name of the report, as in its path."""
     level: IntervalLevel
@@ -802,10 +802,10 @@ ReportOptions = TrialSelection | SourcesOptions
 class SourcesReport(Report):
     """Does simulation tell what real trials find?"""
 
-    question: ClassVar = (
+    question: ClassVar[str] = (
         "Does simulation tell what robots find? Predictions at real poses, and how alike densities are."
     )
-    options: ClassVar = SourcesOptions
+    options: ClassVar[type[Request]] = SourcesOptions
     report: Literal["sources"] = "sources"
     """Name of the report, as in its path."""
     level: IntervalLevel

@@ -24,6 +24,12 @@ from graspdb_service.usecases.geometry.mesh_form import MeshForm
 
 # One thread in the numeric libraries: each would reserve address space of its own.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+#: Modules are not looked for in the working folder, for which Python 3.10 has no option.
+_COMMAND = (
+    [sys.executable, "-P", "-m", __name__]
+    if sys.version_info >= (3, 11)
+    else [sys.executable, "-c", f"import sys; del sys.path[0]; from {__name__} import main; sys.exit(main())"]
+)
 
 
 def inspect_in_child(
@@ -53,7 +59,7 @@ def inspect_in_child(
     }
     pipe = subprocess.PIPE
     with ChildProcess(
-        [sys.executable, "-P", "-m", __name__],
+        _COMMAND,
         env=os.environ | _ONE_THREAD,
         stdin=pipe,
         stdout=pipe,
