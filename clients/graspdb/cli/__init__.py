@@ -15,6 +15,7 @@ from rich.markup import escape
 from graspdb import __version__
 from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
+from graspdb.cli.exchange import bundle
 from graspdb.cli.grippers import making
 from graspdb.cli.options import Commands
 from graspdb.cli.wording import in_commands
@@ -82,6 +83,7 @@ app.command("sweep")(sweeps.sweep)
 app.add_typer(sweeps.sweeps, name="sweeps")
 app.command("workers")(sweeps.workers)
 app.command("info")(sweeps.info)
+app.command("bundle")(bundle.bundle)
 app.command("demo")(demo)
 
 

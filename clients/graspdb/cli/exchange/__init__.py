@@ -1,0 +1,1 @@
+"""Commands that exchange files with other programs and other databases."""
