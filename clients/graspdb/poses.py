@@ -7,6 +7,7 @@ named before anything is sent.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +23,8 @@ __all__ = [
     "as_vector7",
     "first_masked",
     "matrices",
+    "pose_documents",
+    "pose_frame",
     "quaternions_of",
     "vector",
 ]
@@ -117,6 +120,23 @@ def as_poses(poses: ArrayLike | Any) -> Poses:
     return Poses(position, quaternion)
 
 
+def pose_frame(poses: Any, frame: str | None, convention: str | None) -> dict[str, str]:
+    """What poses are of, as requests take it: as is said, else as a grasp or samples say it themselves.
+
+    ValueError where they say otherwise, or each otherwise.
+    """
+    each = list(poses) if isinstance(poses, (list, tuple)) and len(poses) else [poses]
+    found: dict[str, str] = {}
+    for name, said, default in (("frame", frame, "tool"), ("convention", convention, "graspdb")):
+        own = {value for item in each if isinstance(value := getattr(item, name, None), str)}
+        if len(own) > 1 or (own and said is not None and own != {said}):
+            raise ValueError(f"{name}: these poses are of {' and '.join(sorted(own))}; asked was {said}")
+        value = said or next(iter(own), default)
+        if value != default:
+            found[name] = value
+    return found
+
+
 def _numbers_of(poses: Any) -> Any:
     """What a table's named columns or a rigid transform hold; anything else as it is."""
     if hasattr(poses, "as_matrix"):
@@ -165,6 +185,20 @@ def as_vector7(pose: ArrayLike | Any) -> tuple[float, ...]:
     if len(rows) != 1:
         raise ValueError(f"expected one pose, got {len(rows)}")
     return tuple(rows[0].tolist())
+
+
+def pose_documents(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Poses by name as requests take them: given as such, or as (4, 4) or ``x y z qx qy qz qw``."""
+    documents: dict[str, Any] = {}
+    for name, pose in named.items():
+        if isinstance(pose, Mapping):
+            documents[name] = dict(pose)
+        elif isinstance(pose, wire.Pose):
+            documents[name] = pose.model_dump(mode="json")
+        else:
+            x, y, z, *quaternion = as_vector7(pose)
+            documents[name] = {"position": [x, y, z], "quaternion_xyzw": quaternion}
+    return documents
 
 
 def vector(name: str, values: ArrayLike, of: str) -> list[float]:

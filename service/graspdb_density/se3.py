@@ -23,6 +23,7 @@ __all__ = [
     "JAW_TURN",
     "Floats",
     "Poses",
+    "adjoint",
     "angle_between",
     "canonical",
     "compose",
@@ -261,6 +262,16 @@ def inverse(poses: Poses) -> Poses:
     """The inverse rigid motions."""
     back = conjugate(poses.quaternions_xyzw)
     return Poses(-rotate(back, poses.positions), back)
+
+
+def adjoint(pose: Poses) -> Floats:
+    """The 6x6 matrix that takes a small motion along and about the axes of a frame, translation first, to the
+    same along and about those of its parent, where the frame has this one pose, (3,) and (4,).
+    """
+    rotation = to_matrix(pose.quaternions_xyzw)
+    x, y, z = pose.positions
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[rotation, cross @ rotation], [np.zeros((3, 3)), rotation]])
 
 
 def random_quaternions(count: int, rng: np.random.Generator) -> Floats:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from graspdb import wire
-from graspdb.poses import as_poses, matrices
+from graspdb import Client, wire
+from graspdb.errors import InvalidInput
+from graspdb.poses import as_poses, matrices, quaternions_of
+from graspdb.resources.objects import GraspObject
 from graspdb.wire.frames import gripper_frames
 from graspdb.wire.frames.conventions import axes_in_graspdb, to_graspdb
 from graspdb.wire.frames.gripper_frames import NoSuchFrame, ToolUnknown
@@ -113,3 +119,129 @@ def test_profiles_differ_in_frames_and_joints_by_name() -> None:
     other = _profile(frames={"camera": TOOL}, joints={"left": {"open": 0.05, "closed": 0}})
     named = ["base_to_tool", "frames.camera", "frames.flange", "joints.left"]
     assert one.differences(other) == other.differences(one) == named
+
+
+# -- through the SDK and the command line
+
+
+@pytest.fixture
+def mine(db: Client, fresh_id: str) -> wire.GripperInfo:
+    """A gripper whose flange is turned and whose camera is elsewhere."""
+    flange = np.eye(4)
+    flange[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    frames = {"flange": flange, "camera": [0.05, 0.02, 0.03, 0.5, 0.5, -0.5, 0.5]}
+    return db.grippers.create(f"g-{fresh_id}", base_to_tool=TOOL, frames=frames, **SHAPE)
+
+
+@pytest.fixture
+def grasped(
+    db: Client, fresh_id: str, mine: wire.GripperInfo, clusters: Callable[..., NDArray[np.float64]]
+) -> GraspObject:
+    item = db.objects.create(fresh_id, frames={"tracker": [0, 0.1, 0, 0, 0, 1, 0]})
+    above = clusters([([0.0, 0.0, 0.06], [1.0, 0.0, 0.0, 0.0])], 150)
+    item.trials.add(above, True, gripper=mine.id, source="robot")
+    item.trials.add(above[:20], False, gripper=mine.id, source="robot")
+    return item.refresh()
+
+
+def _fixed(
+    gripper: wire.GripperInfo, frame: str, convention: wire.Convention = "graspdb"
+) -> NDArray[np.float64]:
+    return _matrix(gripper.profile.in_tool(frame, convention))
+
+
+def test_a_grasp_knows_what_it_is_of_and_goes_back_so(
+    db: Client, mine: wire.GripperInfo, grasped: GraspObject
+) -> None:
+    tool = grasped.best_grasp()
+    best = grasped.best_grasp(frame="camera", convention="graspnet")
+    assert (best.frame, best.convention) == ("camera", "graspnet")
+    np.testing.assert_allclose(best.matrix, tool.matrix @ _fixed(mine, "camera", "graspnet"), atol=1e-9)
+    np.testing.assert_allclose(best.tool_matrix, tool.matrix, atol=1e-9)
+    np.testing.assert_allclose(best.approach, tool.approach, atol=1e-9)
+    assert best.summary()["pose of"] == "camera, axes as graspnet"
+    # Given back, it is what it says.
+    likely = grasped.likelihood(best)
+    np.testing.assert_allclose(likely.log_density, grasped.likelihood(tool).log_density, rtol=1e-6)
+    with pytest.raises(ValueError, match="these poses are of camera"):
+        grasped.likelihood(best, frame="tool")
+    ranked = grasped.best_grasps(count=2, candidates=[best], frame="camera", convention="graspnet")
+    assert ranked[0].candidate == 0
+    receipt = best.report(True, achieved_pose=best.matrix)
+    (trial,) = grasped.trials.list(batch=receipt.batch)
+    np.testing.assert_allclose(matrices(trial.position, trial.quaternion_xyzw), tool.matrix, atol=1e-9)
+    assert trial.achieved_pose is not None
+    np.testing.assert_allclose(trial.achieved_pose.position, tool.position, atol=1e-9)
+    grasped.batches.delete(receipt.batch)
+
+
+def test_draws_and_trials_in_a_frame(mine: wire.GripperInfo, grasped: GraspObject) -> None:
+    drawn = grasped.samples(20, seed=3, frame="flange")
+    assert drawn.frame == "flange"
+    plain = grasped.samples(20, seed=3)
+    np.testing.assert_allclose(drawn.matrices, plain.matrices @ _fixed(mine, "flange"), atol=1e-9)
+    receipt = grasped.trials.add(drawn, False, gripper=mine.id)
+    stored = grasped.trials.list(batch=receipt.batch).arrays()
+    np.testing.assert_allclose(stored.matrices, plain.matrices, atol=1e-9)
+    there = grasped.trials.list(batch=receipt.batch, frame="flange").arrays()
+    assert there.frame == "flange"
+    np.testing.assert_allclose(there.matrices, drawn.matrices, atol=1e-9)
+    one = grasped.trials.get(int(stored.seq[0]), frame="flange")
+    np.testing.assert_allclose(one.position, drawn.position[0], atol=1e-9)
+    records = [{**pose, "outcome": False} for pose in ({"matrix": m.tolist()} for m in drawn.matrices[:2])]
+    again = grasped.trials.add_records(records, gripper=mine.id, frame="flange")
+    rows = grasped.trials.list(batch=again.batch).arrays()
+    np.testing.assert_allclose(rows.matrices, plain.matrices[:2], atol=1e-9)
+
+
+def test_the_nearer_twin_and_a_frame_of_the_object(grasped: GraspObject) -> None:
+    tool = grasped.best_grasp()
+    twin = tool.matrix @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    for wanted in (tool.matrix, twin):
+        found = grasped.best_grasp(near=quaternions_of(wanted[None, :3, :3])[0])
+        np.testing.assert_allclose(found.matrix, wanted, atol=1e-9)
+    world = matrices([0.4, 0.1, 0.2], [0, 0, 0.6, 0.8])
+    tracker = world @ matrices([0, 0.1, 0], [0, 0, 1, 0])
+    seen = grasped.best_grasp(object_pose=tracker, object_frame="tracker")
+    np.testing.assert_allclose(seen.world, grasped.best_grasp(object_pose=world).world, atol=1e-9)
+    assert list(grasped.info.frames) == ["mesh", "tracker"]
+    assert list(grasped.patch(frames=None).info.frames) == ["mesh"]
+
+
+def test_a_sweep_takes_and_tells_poses_of_a_frame(db: Client, mine: wire.GripperInfo, fresh_id: str) -> None:
+    item = db.objects.create(f"s-{fresh_id}", mesh=trimesh.creation.box([0.04, 0.05, 0.08]), mass_kg=0.1)
+    item.upload_convex_parts([trimesh.creation.box([0.04, 0.05, 0.08])])
+    tool = matrices([[0, 0, 0.04]], [[1.0, 0, 0, 0]])
+    sweep = item.sweep(poses=tool @ _fixed(mine, "camera"), frame="camera", gripper=mine.id)
+    assert sweep.info.poses == 1
+    outcomes = sweep.outcomes(frame="camera")
+    assert (len(outcomes), outcomes.frame) == (0, "camera")
+    with pytest.raises(InvalidInput, match="frame"):
+        item.sweep(max_poses=10, frame="camera", gripper=mine.id)
+    sweep.cancel()
+
+
+def test_frames_on_the_command_line(
+    run: Callable[..., tuple[int, str, str]], grasped: GraspObject, mine: wire.GripperInfo, tmp_path: Path
+) -> None:
+    file = tmp_path / "frames.png"
+    code, told, error = run("frames", mine.id, "--pose=0,0,0.1,1,0,0,0", "--frame", "flange", "-o", str(file))
+    assert (code, error) == (0, "")
+    assert "camera in the base" in told
+    assert file.read_bytes().startswith(b"\x89PNG")
+    assert run("frames", mine.id, "-o", str(tmp_path / "frames.gif"))[0] == 2
+    assert run("frames", mine.id, "--frame", "wrist", "-o", str(file))[0] == 1
+    code, told, _ = run("best-grasp", grasped.id, "--frame", "flange", "--near=1,0,0,0", "--prior")
+    assert code == 0
+    assert "pose of" in told
+    code, told, _ = run("--json", "best-grasp", grasped.id, "--convention", "acronym")
+    assert json.loads(told)["convention"] == "acronym"
+    assert run("trials", "list", grasped.id, "--frame", "base")[0] == 0
+    assert run("samples", grasped.id, "--frame", "base", "--count", "3")[0] == 0
+    code, told, _ = run("objects", "change", grasped.id, "--frame", "lid=0,0,0.1,0,0,0,1")
+    assert (code, "mesh, lid, tracker" in told or "mesh, tracker, lid" in told) == (0, True)
+    assert run("objects", "change", grasped.id, "--frame", "lid")[0] == 2
+    shown = json.loads(run("grippers", "show", mine.id)[1])
+    assert set(shown["frames"]) == {"base", "tool", "flange", "camera"}
+    (tmp_path / "copy.json").write_text(json.dumps(shown))
+    assert run("grippers", "create", f"{mine.id}-copy", str(tmp_path / "copy.json"))[0] == 0

@@ -348,7 +348,7 @@ BAD = [
     ({"sphere": [0, 0, 0, -1]}, {"sphere"}),
     ({"above_plane": [0, 0, 0, 1]}, {"above_plane"}),
     ({"frame": "world"}, {"object_pose"}),
-    ({"frame": "camera"}, {"frame"}),
+    ({"frame": "a camera"}, {"frame"}),
     ({"object_pose": [0, 0, 0, 0, 0, 0, 0]}, {"object_pose"}),
     ({"object_pose": [0, 0, 0, 0, 0, 0, 2]}, {"object_pose"}),
     ({"count": 0}, {"count"}),

@@ -64,8 +64,9 @@ def test_few_decide_nothing(sqlite_http: httpx.Client, thing: str) -> None:
 
 def test_promises_that_are_kept_and_such_that_are_not(sqlite_http: httpx.Client, thing: str) -> None:
     trials = _tried(sqlite_http, thing, [i not in (3, 11) for i in range(24)])
-    # Never tried.
-    sqlite_http.post(f"/objects/{thing}/best-grasp", json={"count": 7})
+    # Never tried; once it is read, it is written.
+    untried = sqlite_http.post(f"/objects/{thing}/best-grasp", json={"count": 7}).json()["answer"]
+    assert sqlite_http.get(f"/answers/{untried}").status_code == 200
     found = _report(sqlite_http, thing)
     assert (found["verdict"], found["answers"], found["unmatched"]) == ("as-promised", 24, 0)
     assert (found["answers_given"], found["answers_never_tried"]) == (25, 1)

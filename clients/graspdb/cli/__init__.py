@@ -15,6 +15,7 @@ from rich.markup import escape
 from graspdb import __version__
 from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
+from graspdb.cli.drawing.frames import frames
 from graspdb.cli.exchange import bundle
 from graspdb.cli.grippers import making
 from graspdb.cli.options import Commands
@@ -67,6 +68,7 @@ app.command("add-example")(objects.add_example)
 objects.grippers.command("from-urdf")(making.from_urdf)
 objects.grippers.command("explain")(making.explain)
 app.add_typer(objects.grippers, name="grippers")
+app.command("frames")(frames)
 app.add_typer(trials.trials, name="trials")
 app.add_typer(trials.batches, name="batches")
 app.add_typer(access.keys, name="keys")

@@ -21,6 +21,14 @@ GripperId = Annotated[str, typer.Argument(metavar="GRIPPER", show_default=False)
 ProfileFile = Annotated[
     Path, typer.Argument(help="JSON file with the profile, as `grippers show` prints it.", show_default=False)
 ]
+ObjectFrames = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--frame",
+        metavar="NAME=x,y,z,qx,qy,qz,qw",
+        help="A frame of the object, its pose in the mesh's; may stand several times.",
+    ),
+]
 Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
 Scale = Annotated[float, typer.Option(help="Factor to the mesh's coordinates, beside their unit.")]
 
@@ -60,8 +68,11 @@ def create_object(
     convex_parts: Annotated[
         Path | None, typer.Option(help="GLB with one convex geometry a part, metres.")
     ] = None,
+    frame: ObjectFrames = None,
 ) -> None:
     """Create an object, with its mesh if given."""
+    if frame:
+        properties["frames"] = _frames(frame)
     item = state.db.objects.create(
         id, mesh=mesh, unit=unit, scale=scale, convex_parts=convex_parts, **properties
     )
@@ -69,10 +80,29 @@ def create_object(
 
 
 @objects.command("change")
-def change_object(state: State, id: ObjectId, properties: ObjectProperties) -> None:
+def change_object(
+    state: State, id: ObjectId, properties: ObjectProperties, frame: ObjectFrames = None
+) -> None:
     """Change properties of an object; those not given stay."""
-    item = state.db.objects.get(id).patch(**properties)
+    item = state.db.objects.get(id)
+    if frame:
+        properties["frames"] = {**item.info.frames, **_frames(frame)}
+    item.patch(**properties)
     state.show(item.info, item.summary())
+
+
+def _frames(given: list[str]) -> dict[str, list[float]]:
+    """Poses by name."""
+    found = {}
+    for text in given:
+        name, _, numbers = text.partition("=")
+        try:
+            found[name] = [float(part) for part in numbers.split(",")]
+        except ValueError:
+            raise typer.BadParameter(
+                f"{text!r} is not NAME=x,y,z,qx,qy,qz,qw", param_hint="--frame"
+            ) from None
+    return found
 
 
 @objects.command("set-mesh")

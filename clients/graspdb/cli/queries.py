@@ -37,7 +37,7 @@ from graspdb.resources.results import (
     chance,
     pose_columns,
 )
-from graspdb.resources.selection import Constraints, LikelihoodSelection, Selection
+from graspdb.resources.selection import Constraints, DrawSelection, LikelihoodSelection, Selection
 from graspdb.wire import SelectionInfo
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
@@ -90,8 +90,8 @@ def best_grasp(
 ) -> None:
     """Find the best grasp within constraints.
 
-    All constraints are in the world's frame if --object-pose is given, else in the object's; --frame object
-    keeps them in the object's. A table of several grasps has their poses in that frame.
+    All constraints are in the world's frame if --object-pose is given, else in the object's; --reference
+    object keeps them in the object's. A table of several grasps has their poses in that frame.
     """
     try:
         found = state.db.objects.get(id).best_grasps(count=count, verify=verify, **constraints)
@@ -102,8 +102,8 @@ def best_grasp(
             raise typer.Exit(1) from None
         raise
     if state.json:
-        head = ("status", "ranking", "revision", "kernel", "selection", "calibration", "warnings")
-        names = (*head, "answer", "newer_revision", "stale")
+        head = ("frame", "convention", "reference", "status", "ranking", "revision", "kernel", "selection")
+        names = (*head, "calibration", "warnings", "answer", "newer_revision", "stale")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())
@@ -111,7 +111,7 @@ def best_grasp(
         show_rows({**found[0].summary(), **_ranked_by(found)})
         _tell_kept(found)
     else:
-        _show_grasps(found, in_world=found[0].world is not None and constraints.get("frame") != "object")
+        _show_grasps(found, in_world=found[0].world is not None and found.reference == "world")
     if not state.json:
         _mind(found.warnings)
 
@@ -146,7 +146,7 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
         "": lambda g: 1 + found.index(g),
         f"{frame}position [m]": lambda g: numbers(_matrix(g, in_world)[:3, 3]),
         f"{frame}quaternion xyzw": lambda g: numbers(as_poses(_matrix(g, in_world)).quaternion_xyzw[0]),
-        f"{frame}approach": lambda g: numbers(_matrix(g, in_world)[:3, 2], digits=2),
+        f"{frame}approach": lambda g: numbers(_approach(g, in_world), digits=2),
         "density": lambda g: f"{g.density:.4g}",
         "relative": lambda g: f"{g.relative:.3f}",
         "success probability": lambda g: "unknown" if g.success_probability is None else g.chance(),
@@ -180,6 +180,11 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
 
 def _matrix(grasp: Grasp, in_world: bool) -> NDArray[np.float64]:
     return grasp.world if in_world and grasp.world is not None else grasp.matrix
+
+
+def _approach(grasp: Grasp, in_world: bool) -> NDArray[np.float64]:
+    tool = grasp.tool_world if in_world else None
+    return grasp.approach if tool is None else tool[:3, 2]
 
 
 def _nearest(grasp: Grasp) -> str | None:
@@ -251,7 +256,12 @@ def _cell(values: Any, row: int) -> str:
 
 
 def samples(
-    state: State, id: ObjectId, selection: Selection, count: Count = 10, seed: Seed = None, csv: Csv = False
+    state: State,
+    id: ObjectId,
+    selection: DrawSelection,
+    count: Count = 10,
+    seed: Seed = None,
+    csv: Csv = False,
 ) -> None:
     """Draw grasps from an object's density."""
     _show_poses(state, state.db.objects.get(id).samples(count, seed=seed, **selection), csv)
@@ -260,7 +270,7 @@ def samples(
 def proposals(
     state: State,
     id: ObjectId,
-    selection: Selection,
+    selection: DrawSelection,
     count: Count = 10,
     strategy: Annotated[
         str,

@@ -13,12 +13,13 @@ from typing_extensions import Unpack
 from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
-from graspdb.poses import as_poses
+from graspdb.poses import as_poses, pose_frame
 from graspdb.resources.answers import report_grasp
 from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
     Constraints,
+    DrawSelection,
     LikelihoodSelection,
     Selection,
     best_grasp_request,
@@ -35,7 +36,8 @@ QUERY_POSES = 100_000
 class GraspQueries(Resource):
     """The questions about one object; all take the trials and kernel of a density, see :class:`Selection`.
 
-    All poses are of the tool frame in the object frame, in metres, quaternions xyzw.
+    All poses are of the tool frame, or of ``frame`` of the gripper where that is given, in the object frame,
+    in metres, quaternions xyzw.
     """
 
     def __init__(self, transport: Transport, info: wire.ObjectInfo) -> None:
@@ -72,6 +74,7 @@ class GraspQueries(Resource):
         """
         options = known_keywords(LikelihoodSelection, selection, "likelihood")
         given = as_poses(poses)
+        options |= pose_frame(poses, options.get("frame"), options.get("convention"))
         options |= {
             "include": None if include is None else names(include),
             "name": name,
@@ -147,7 +150,7 @@ class GraspQueries(Resource):
         """The grasps with their outcomes in simulation, by the gripper and protocol of their trials."""
         chosen = self.density(**{name: given.get(name) for name in ("gripper", "protocol", "source")})
         protocol = chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None
-        plan: SweepOptions = {"poses": grasps.matrices, "gripper": chosen.gripper, "protocol": protocol}
+        plan: SweepOptions = {"poses": list(grasps), "gripper": chosen.gripper, "protocol": protocol}
         plan |= {"fidelity": "fine", "purpose": "check"}
         sweep = create_sweep(self._transport, self._path, plan)
         try:
@@ -165,13 +168,13 @@ class GraspQueries(Resource):
         seed: int | None = None,
         name: str | None = None,
         timeout_s: float | None = None,
-        **selection: Unpack[Selection],
+        **selection: Unpack[DrawSelection],
     ) -> SampledPoses:
         """Poses drawn from the density; the same seed and revision give the same poses.
 
         ``name`` keeps the answer, as in :class:`Constraints`; of at most 1,000 poses.
         """
-        fields = known_keywords(Selection, selection, "samples")
+        fields = known_keywords(DrawSelection, selection, "samples")
         fields |= {"count": count, "seed": seed, "name": name, "timeout_s": timeout_s}
         request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
@@ -186,7 +189,7 @@ class GraspQueries(Resource):
         pre_opening_m: float | str | None = None,
         name: str | None = None,
         timeout_s: float | None = None,
-        **selection: Unpack[Selection],
+        **selection: Unpack[DrawSelection],
     ) -> SampledPoses:
         """Grasps to try next; send ``proposal_density`` back with their trials.
 
@@ -196,7 +199,7 @@ class GraspQueries(Resource):
         free, as far open as ``pre_opening_m`` says (see :class:`Constraints`). ``name`` keeps the answer, as
         for :meth:`samples`.
         """
-        fields = known_keywords(Selection, selection, "proposals")
+        fields = known_keywords(DrawSelection, selection, "proposals")
         fields |= {"count": count, "seed": seed, "strategy": strategy, "pre_opening_m": pre_opening_m}
         fields |= {"name": name, "timeout_s": timeout_s}
         request = validate(wire.ProposalsRequest, fields)

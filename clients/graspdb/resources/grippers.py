@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from graspdb import wire
+from graspdb.poses import pose_documents
 from graspdb.resources.pages import Listing, Resource, segment, validate
 
 
@@ -13,8 +14,11 @@ class Grippers(Resource):
     """``db.grippers``: ``pg70``, ``panda`` and your own."""
 
     def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
-        """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`."""
-        request = validate(wire.GripperCreate, {"id": id, "name": name, **profile})
+        """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`.
+
+        Poses of ``base_to_tool`` and ``frames`` may be (4, 4) or ``x y z qx qy qz qw``, too.
+        """
+        request = validate(wire.GripperCreate, {"id": id, "name": name, **_plain(profile)})
         return self._transport.model(wire.GripperInfo, "POST", self._path, body=request, idempotent=True)
 
     def get(self, id: str) -> wire.GripperInfo:
@@ -27,7 +31,7 @@ class Grippers(Resource):
         The id stands for it from now on; what was tried keeps its version, ``panda@1``. The same profile
         again makes none. ``name`` None leaves the name as it is.
         """
-        request = validate(wire.GripperUpdate, {"name": name, **profile})
+        request = validate(wire.GripperUpdate, {"name": name, **_plain(profile)})
         path = f"{self._path}/{segment(id)}"
         return self._transport.model(wire.GripperInfo, "PUT", path, body=request)
 
@@ -45,3 +49,13 @@ class Grippers(Resource):
 
     def __iter__(self) -> Iterator[wire.GripperInfo]:
         return self.list()
+
+
+def _plain(profile: dict[str, Any]) -> dict[str, Any]:
+    """A profile as requests take it: its poses as such."""
+    fields = dict(profile)
+    if fields.get("frames") is not None:
+        fields["frames"] = pose_documents(fields["frames"])
+    if fields.get("base_to_tool") is not None:
+        fields |= pose_documents({"base_to_tool": fields["base_to_tool"]})
+    return fields

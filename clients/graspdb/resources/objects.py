@@ -6,12 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, TypedDict
 
 import numpy as np
+from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from graspdb import wire
 from graspdb.errors import GraspDBError
 from graspdb.files.meshes import GLB, MeshLike, read_mesh, scene_of
 from graspdb.options import Option, known_keywords
+from graspdb.poses import pose_documents
 from graspdb.reports import Reports
 from graspdb.resources.answers import Answers
 from graspdb.resources.grasp_queries import GraspQueries
@@ -23,13 +25,17 @@ from graspdb.transport import Model, Transport
 
 
 class ObjectProperties(TypedDict, total=False):
-    """``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` and ``metadata`` of an object."""
+    """``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` and ``metadata`` of an object.
+
+    ``frames``: poses in the frame of its mesh by name, each (4, 4) or ``x y z qx qy qz qw``.
+    """
 
     name: Annotated[str | None, Option("A name for people.")]
     mass_kg: Annotated[float | None, Option("Mass in kg.")]
     density_kg_m3: Annotated[float | None, Option("Mass density, where the mass is not known.")]
     friction: Annotated[float | None, Option("Coefficient of friction.")]
     metadata: Mapping[str, Any] | None
+    frames: Mapping[str, ArrayLike | Any] | None
 
 
 class GraspObject(GraspQueries):
@@ -50,10 +56,13 @@ class GraspObject(GraspQueries):
         return self._update(self._transport.json("GET", self._path))
 
     def patch(self, /, **changes: Unpack[ObjectProperties]) -> GraspObject:
-        """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction`` or ``metadata``; None clears."""
-        validate(wire.ObjectPatch, changes)
+        """Change ``name``, ``mass_kg``, ``density_kg_m3``, ``friction``, ``metadata`` or ``frames``, all
+        frames at once; None clears.
+        """
+        fields = _plain(known_keywords(ObjectProperties, changes, "patch"))
+        validate(wire.ObjectPatch, fields)
         # Nulls are meant in a patch.
-        return self._update(self._transport.json("PATCH", self._path, body=changes))
+        return self._update(self._transport.json("PATCH", self._path, body=fields))
 
     def copy(self, id: str, *, trials: bool = False) -> GraspObject:
         """Copy the object with mesh and convex parts, and with all its ``trials`` if asked.
@@ -141,6 +150,9 @@ class GraspObject(GraspQueries):
         ):
             if value is not None:
                 rows[label] = f"{value:g} {unit}".rstrip()
+        others = [name for name in info.frames if name != "mesh"]
+        if others:
+            rows["frames"] = ", ".join(["mesh", *others])
         if info.mesh is not None:
             size = np.subtract(info.mesh.bounding_box.upper, info.mesh.bounding_box.lower) * 1000
             rows["mesh"] = (
@@ -193,7 +205,7 @@ class Objects(Resource):
         :meth:`GraspObject.upload_mesh`, ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`, the
         rest :class:`ObjectProperties`.
         """
-        fields = known_keywords(ObjectProperties, properties, "create")
+        fields = _plain(known_keywords(ObjectProperties, properties, "create"))
         request = validate(wire.ObjectCreate, {"id": id, **fields})
         loaded = None if mesh is None else read_mesh(mesh, media_type)
         info = self._transport.model(wire.ObjectInfo, "POST", self._path, body=request, idempotent=True)
@@ -224,3 +236,9 @@ class Objects(Resource):
     def delete(self, id: str) -> None:
         """Delete an object with everything that belongs to it."""
         self._transport.request("DELETE", f"{self._path}/{segment(id)}")
+
+
+def _plain(properties: dict[str, Any]) -> dict[str, Any]:
+    """Properties as requests take them: frames as poses."""
+    frames = properties.get("frames")
+    return properties if frames is None else {**properties, "frames": pose_documents(frames)}

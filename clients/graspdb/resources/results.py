@@ -68,6 +68,8 @@ def distance(nearest: wire.NearestAttempt) -> str:
 class Grasp:
     """A grasp: the pose of the tool frame in the object frame, metres and unit xyzw, and what is known of it.
 
+    - ``frame``, ``convention``: the frame of the gripper that the pose is of instead, and whose axes it has,
+      where the question asked for another; ``tool_to_frame`` is that one's pose in the tool frame, (4, 4).
     - ``world``: the same grasp in the world frame, (4, 4); None unless the query gave the object's pose.
     - ``score``: what it was ranked by; ``Grasps.ranking`` says what that is.
     - ``density``, ``log_density``: in 1/(m^3 rad^3), and its natural logarithm.
@@ -109,14 +111,15 @@ class Grasp:
     simulated: str | None = None
     prior: bool = False
     answer: str | None = None
+    frame: str = "tool"
+    convention: str = "graspdb"
+    tool_to_frame: Floats | None = None
     raw: wire.Grasp | None = field(default=None)
     reporter: Reporter | None = field(default=None)
 
     @classmethod
-    def from_wire(
-        cls, grasp: wire.Grasp, answer: str | None = None, reporter: Reporter | None = None
-    ) -> Grasp:
-        """From the service's answer, by the id that this has; ``reporter`` posts what became of it."""
+    def from_wire(cls, grasp: wire.Grasp, answer: wire.BestGrasps, reporter: Reporter | None = None) -> Grasp:
+        """From the service's answer that it is of; ``reporter`` posts what became of it."""
         fields = {name: getattr(grasp, name) for name in wire.Grasp.model_fields}
         world = grasp.world
         fields |= {
@@ -126,14 +129,21 @@ class Grasp:
             "nearest_trials": tuple(grasp.nearest_trials),
             "active_constraints": tuple(grasp.active_constraints),
         }
-        return cls(**fields, answer=answer, raw=grasp, reporter=reporter)
+        fixed = answer.tool_to_frame
+        fields |= {
+            "frame": answer.frame,
+            "convention": answer.convention,
+            "tool_to_frame": None if fixed is None else matrices(fixed.position, fixed.quaternion_xyzw),
+        }
+        return cls(**fields, answer=answer.answer, raw=grasp, reporter=reporter)
 
     def report(
         self, outcome: bool | str, *, achieved_pose: Any | None = None, source: str = "robot", **trial: Any
     ) -> Any:
         """Post what became of the grasp: a trial that names the answer, with its gripper and protocol.
 
-        ``achieved_pose`` is where the tool was after all, (4, 4) or x y z qx qy qz qw in the object frame;
+        ``achieved_pose`` is where the grasp's ``frame`` was after all, (4, 4) or x y z qx qy qz qw in the
+        object frame;
         what else is known of the trial as ``trials.add`` takes it (``width_m``, ...). The receipt.
 
         It waits for the service, also in an asynchronous program: there call ``trials.add`` with ``answer``.
@@ -149,18 +159,36 @@ class Grasp:
 
     @property
     def matrix(self) -> Floats:
-        """(4, 4) homogeneous matrix: tool frame in the object frame, metres."""
+        """(4, 4) homogeneous matrix: the grasp's ``frame`` in the object frame, metres."""
         return matrices(self.position, self.quaternion_xyzw)
+
+    @property
+    def tool_matrix(self) -> Floats:
+        """(4, 4) homogeneous matrix: the tool frame in the object frame, metres, whatever ``frame`` is."""
+        return self._of_tool(self.matrix)
+
+    @property
+    def tool_world(self) -> Floats | None:
+        """(4, 4) the tool frame in the world frame, whatever ``frame`` is; None as ``world``."""
+        return None if self.world is None else self._of_tool(self.world)
 
     @property
     def approach(self) -> Floats:
         """(3,) direction in which the tool moves to the object: the tool's z axis, object frame."""
-        return self.matrix[:3, 2]
+        return self.tool_matrix[:3, 2]
 
     @property
     def closing(self) -> Floats:
         """(3,) direction in which the fingers close: the tool's y axis, object frame."""
-        return self.matrix[:3, 1]
+        return self.tool_matrix[:3, 1]
+
+    def _of_tool(self, matrix: Floats) -> Floats:
+        return matrix if self.tool_to_frame is None else matrix @ np.linalg.inv(self.tool_to_frame)
+
+    def _told_frame(self) -> str:
+        """What the pose is of, in words."""
+        axes = "" if self.convention == "graspdb" else f", axes as {self.convention}"
+        return f"{self.frame}{axes}"
 
     def chance(self) -> str:
         """The success probability in words: never without its interval and the trials it rests on."""
@@ -173,16 +201,17 @@ class Grasp:
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
         rows = {
+            **({} if self.tool_to_frame is None else {"pose of": self._told_frame()}),
             "position [m]": _vector(self.position),
             "quaternion xyzw": _vector(self.quaternion_xyzw),
             "approach": _vector(self.approach, 2),
         }
-        if self.world is not None:
+        if self.world is not None and self.tool_world is not None:
             world = as_poses(self.world)
             rows |= {
                 "position in the world [m]": _vector(world.position[0]),
                 "quaternion in the world xyzw": _vector(world.quaternion_xyzw[0]),
-                "approach in the world": _vector(self.world[:3, 2], 2),
+                "approach in the world": _vector(self.tool_world[:3, 2], 2),
             }
         rows |= {
             "density [1/(m³ rad³)]": f"{self.density:.4g}",
@@ -219,7 +248,7 @@ class Grasp:
         )
 
     def _repr_html_(self) -> str:
-        return table_html("Grasp (tool frame in the object frame)", self.summary())
+        return table_html(f"Grasp ({self._told_frame()} frame in the object frame)", self.summary())
 
 
 class Grasps(Sequence[Grasp]):
@@ -232,8 +261,9 @@ class Grasps(Sequence[Grasp]):
     ``ranking`` says what they are ranked by, ``reach`` how far from an attempt success probabilities are
     told, ``selection`` whose trials count. ``answer`` is the id that the service keeps them under, None where
     it does not; ``newer_revision`` the object's revision now, where a name keeps them of an older one;
-    ``stale``: the database did not answer, so they are from what the service had read before. Where they
-    were simulated before they were answered (``verify=True``), those that held come first.
+    ``stale``: the database did not answer, so they are from what the service had read before. ``frame`` and
+    ``convention`` say what the poses are of, as each grasp does, ``reference`` what the constraints were in.
+    Where they were simulated before they were answered (``verify=True``), those that held come first.
     """
 
     def __init__(self, answer: wire.BestGrasps, reporter: Reporter | None = None) -> None:
@@ -249,12 +279,13 @@ class Grasps(Sequence[Grasp]):
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
         self.stale = answer.stale
-        self.nearest = (
-            None if answer.nearest is None else Grasp.from_wire(answer.nearest, answer.answer, reporter)
-        )
+        self.frame, self.convention = answer.frame, answer.convention
+        self.reference = answer.reference
+        nearest = answer.nearest
+        self.nearest = None if nearest is None else Grasp.from_wire(nearest, answer, reporter)
         self.conflict = tuple(answer.conflict)
         self.relax = dict(answer.relax)
-        self._grasps = tuple(Grasp.from_wire(grasp, answer.answer, reporter) for grasp in answer.grasps)
+        self._grasps = tuple(Grasp.from_wire(grasp, answer, reporter) for grasp in answer.grasps)
 
     @overload
     def __getitem__(self, index: int) -> Grasp: ...
@@ -287,7 +318,7 @@ class Grasps(Sequence[Grasp]):
         if self.nearest is not None:
             at, along = (
                 " ".join(f"{number:+.3f}" for number in vector)
-                for vector in (self.nearest.position, self.nearest.matrix[:3, 2])
+                for vector in (self.nearest.tool_matrix[:3, 3], self.nearest.approach)
             )
             told += f"; the nearest grasp outside is at {at} m and approaches along {along} (object's frame)"
         return told
@@ -301,12 +332,12 @@ class Grasps(Sequence[Grasp]):
 
     @property
     def matrices(self) -> Floats:
-        """(N, 4, 4) tool frames in the object frame."""
+        """(N, 4, 4) poses of ``frame``, by default the tool's, in the object frame."""
         return np.array([grasp.matrix for grasp in self._grasps]).reshape(-1, 4, 4)
 
     @property
     def worlds(self) -> Floats | None:
-        """(N, 4, 4) tool frames in the world frame; None unless the query gave the object's pose."""
+        """(N, 4, 4) poses of ``frame`` in the world frame; None unless the query gave the object's pose."""
         worlds = [grasp.world for grasp in self._grasps if grasp.world is not None]
         return np.array(worlds) if worlds else None
 
@@ -529,14 +560,19 @@ def _joined(answers: Sequence[wire.Likelihoods], name: str) -> list[Any] | None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoseArrays(Columns):
-    """N tool frames in the object frame: ``position`` (N, 3) metres, ``quaternion_xyzw`` (N, 4)."""
+    """N tool frames in the object frame: ``position`` (N, 3) metres, ``quaternion_xyzw`` (N, 4).
+
+    ``frame`` and ``convention`` say what they are of where another frame of the gripper was asked for.
+    """
 
     position: Floats
     quaternion_xyzw: Floats
+    frame: str = field(default="tool", kw_only=True)
+    convention: str = field(default="graspdb", kw_only=True)
 
     @property
     def matrices(self) -> Floats:
-        """(N, 4, 4) tool frames in the object frame."""
+        """(N, 4, 4) poses of ``frame``, by default the tool's, in the object frame."""
         return matrices(self.position, self.quaternion_xyzw)
 
     @property
@@ -593,6 +629,8 @@ class SampledPoses(PoseArrays):
             position=np.array(answer.position, dtype=np.float64).reshape(-1, 3),
             quaternion_xyzw=np.array(answer.quaternion_xyzw, dtype=np.float64).reshape(-1, 4),
             proposal_density=np.array(answer.proposal_density, dtype=np.float64),
+            frame=answer.frame,
+            convention=answer.convention,
             seed=answer.seed,
             revision=answer.revision,
             kernel=answer.kernel,
@@ -640,9 +678,13 @@ class TrialArrays(TriedPoses):
         }
 
     @classmethod
-    def of(cls, trials: Sequence[wire.TrialOut]) -> TrialArrays:
-        """The columns of these trials."""
+    def of(
+        cls, trials: Sequence[wire.TrialOut], frame: str | None = None, convention: str | None = None
+    ) -> TrialArrays:
+        """The columns of these trials, whose poses are of this frame."""
         return cls(
+            frame=frame or "tool",
+            convention=convention or "graspdb",
             seq=np.array([t.seq for t in trials], dtype=np.int64),
             position=np.array([t.position for t in trials], dtype=np.float64).reshape(-1, 3),
             quaternion_xyzw=np.array([t.quaternion_xyzw for t in trials], dtype=np.float64).reshape(-1, 4),

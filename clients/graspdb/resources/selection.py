@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from graspdb import wire
 from graspdb.options import Corners, Option, PoseFile, Vector
-from graspdb.poses import as_poses, as_vector7, vector
+from graspdb.poses import as_poses, as_vector7, pose_frame, vector
 from graspdb.resources.pages import validate
+from graspdb.wire.frames.gripper_frames import RESERVED
 
 Kernel = wire.KernelSpec | Mapping[str, Any] | str
 
@@ -53,6 +54,25 @@ class Selection(TrialSelection, total=False):
     sigma_rotation_deg: Annotated[float | None, Option("Kernel width in rotation, degrees.")]
 
 
+class PoseFrame(TypedDict, total=False):
+    """What poses are of, those that are given and those that are answered.
+
+    ``frame`` is a frame of the gripper by its name: ``base``, ``flange`` or another of its profile's
+    ``frames``, by default ``tool``. ``convention`` renames its axes: ``acronym`` and ``graspgen`` approach
+    along z and close along x, ``graspnet`` along x and y, ``graspdb``, ``vgn`` and ``moveit`` along z and y.
+    Grasps and samples that came in another frame say so themselves where they are given back.
+    """
+
+    frame: Annotated[str | None, Option("Frame of the gripper that poses are of: tool, base, flange, ...")]
+    convention: Annotated[
+        str | None, Option("Whose axes poses have: graspdb, acronym, graspgen, graspnet, vgn, moveit.")
+    ]
+
+
+class DrawSelection(Selection, PoseFrame, total=False):
+    """A :class:`Selection` to draw from, and what the draws are of (:class:`PoseFrame`)."""
+
+
 CalibratedFor = Annotated[
     str | None,
     Option("Correct simulated success probabilities for these real trials: robot, human or import."),
@@ -65,9 +85,10 @@ PreOpening = Annotated[
 ]
 
 
-class LikelihoodSelection(Selection, total=False):
-    """A :class:`Selection`, and ``calibrated_for``: the source of real trials (``robot``, ``human``,
-    ``import``) that success probabilities of simulated trials, which are then selected, are corrected for.
+class LikelihoodSelection(Selection, PoseFrame, total=False):
+    """A :class:`Selection`, what the poses are of (:class:`PoseFrame`), and ``calibrated_for``: the source
+    of real trials (``robot``, ``human``, ``import``) that success probabilities of simulated trials, which
+    are then selected, are corrected for.
 
     ``pre_opening_m``: how far open the jaw comes, as in :class:`Constraints`; ``opening_m`` of the answer
     tells it.
@@ -80,7 +101,8 @@ class LikelihoodSelection(Selection, total=False):
 class Constraints(Selection, total=False):
     """What a best grasp is chosen by, besides the :class:`Selection`.
 
-    All constraints are in ``frame``: the world's if ``object_pose`` is given, else the object's.
+    All constraints are in ``reference``: the world if ``object_pose`` is given (which is whatever frame that
+    is in, such as the robot's base), else the object's frame. They are about the tool, whatever ``frame`` is.
 
     - ``objective``: ``density`` (the default), ``success_probability`` (ranks by the lower end of its
       interval), or ``robust``: the mean success probability, or density (``robust_of``), under noise.
@@ -104,8 +126,13 @@ class Constraints(Selection, total=False):
     - ``calibrated_for``: the source of real trials, such as ``robot``, that success probabilities of
       simulated trials, which are then selected, are corrected for; ``calibration`` says whether that helped.
     - ``candidates``: rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is its place.
-    - ``exclude``: poses to stay away from, by the separation.
-    - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``.
+    - ``exclude``: poses to stay away from, by the separation; as candidates, of ``frame`` in ``reference``.
+    - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``; of its mesh's frame, or of
+      ``object_frame``, one of the object's ``frames``.
+    - ``reference``: ``world`` or ``object``; ``frame="world"`` and ``"object"`` mean the same.
+    - ``frame``, ``convention``: what poses are of, as in :class:`PoseFrame`: the grasps, too.
+    - ``near``: unit quaternion (4,): of the two grasps that are one for a symmetric jaw the one whose
+      rotation, of ``frame`` in ``reference``, is nearer to it.
     - ``min_separation_m``, ``min_separation_deg``: how far apart, in either, two grasps count as distinct.
     - ``include``: scores to compute, as in `GraspObject.likelihood`. By default the success probability comes
       along where the objective needs it or there are at most 500,000 attempts.
@@ -151,7 +178,15 @@ class Constraints(Selection, total=False):
     ]
     exclude: Annotated[ArrayLike | Any | None, PoseFile("Stay away from these poses: a file.")]
     object_pose: Annotated[ArrayLike | Any | None, Vector("The object in the world.", of="x,y,z,qx,qy,qz,qw")]
-    frame: Annotated[str | None, Option("Frame of the constraints: world or object.")]
+    object_frame: Annotated[str | None, Option("The object's frame that --object-pose is of.")]
+    reference: Annotated[str | None, Option("What the constraints are in: world or object.")]
+    frame: Annotated[str | None, Option("Frame of the gripper that poses are of: tool, base, flange, ...")]
+    convention: Annotated[
+        str | None, Option("Whose axes poses have: graspdb, acronym, graspgen, graspnet, vgn, moveit.")
+    ]
+    near: Annotated[
+        ArrayLike | None, Vector("Of a symmetric jaw's two twins that nearer to this turn.", of="qx,qy,qz,qw")
+    ]
     include: Sequence[str] | None
     min_separation_m: Annotated[float | None, Option("Distinct from this distance on.")]
     min_separation_deg: Annotated[float | None, Option("Distinct from this angle on.")]
@@ -196,6 +231,7 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
         ("above_plane", "nx, ny, nz, d"),
         ("approach", "x, y, z"),
         ("closing", "x, y, z"),
+        ("near", "qx, qy, qz, qw"),
     ):
         if name in fields:
             fields[name] = vector(name, fields[name], of)
@@ -206,6 +242,8 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
         fields["obstacles"] = {**obstacles, "points": _rows("points", obstacles["points"], "x, y, z")}
     for name in ("candidates", "exclude"):
         if name in fields:
+            asked = None if fields.get("frame") in RESERVED else fields.get("frame")
+            fields |= pose_frame(fields[name], asked, fields.get("convention"))
             fields[name] = as_poses(fields[name]).columns()
     if "object_pose" in fields:
         fields["object_pose"] = as_vector7(fields["object_pose"])

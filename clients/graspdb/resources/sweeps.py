@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,9 +23,10 @@ from rich.progress import (
 from graspdb import wire
 from graspdb.errors import SweepFailed
 from graspdb.options import Corners, Option, PoseFile
-from graspdb.poses import as_poses, numbers, vector
+from graspdb.poses import as_poses, numbers, pose_frame, vector
 from graspdb.resources.pages import Listing, Resource, answers, segment, validate
 from graspdb.resources.results import TriedPoses, pose_columns, table_html
+from graspdb.resources.selection import PoseFrame
 from graspdb.transport import Transport
 
 ProgressCallback = Callable[[wire.SweepInfo], None]
@@ -50,13 +51,13 @@ class OutcomeArrays(TriedPoses):
         return f"OutcomeArrays({len(self)} poses of {self.sweep}, {int(self.success.sum())} successes)"
 
 
-class SweepOptions(TypedDict, total=False):
+class SweepOptions(PoseFrame, total=False):
     """What a sweep simulates: a grid (the default), given ``poses``, or ``sample`` draws from the density.
 
     The grid has ``position_step_m``, ``rotation_step_deg``, a ``margin_m`` about the bounding box, and a
     ``region``, the box (lower, upper) it is cut to; ``max_poses`` takes a random part of it, by ``seed``.
     Poses are stored with their ``proposal_density``, (N,) or one number, 1/(m^3 rad^3), NaN where unknown; by
-    default that of the samples or proposals that ``poses`` are.
+    default that of the samples or proposals that ``poses`` are. What poses are of: :class:`PoseFrame`.
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
     counter gravity in every direction) or ``lift``; ``fidelity`` ``standard`` or ``fine`` (smaller time
     step); ``purpose`` ``collect``, or ``check``: outcomes are stored but enter no density.
@@ -186,8 +187,9 @@ class Sweep(Resource):
             return None
         return f"no worker has come yet: graspdb-simworker run --url {self._transport.url}"
 
-    def outcomes(self) -> OutcomeArrays:
-        """Every pose of the finished chunks with its outcome, as arrays."""
+    def outcomes(self, *, frame: str | None = None, convention: str | None = None) -> OutcomeArrays:
+        """Every pose of the finished chunks with its outcome, as arrays; poses of a frame of the gripper."""
+        framed = pose_frame(None, frame, convention)
         # Straight into arrays: a model of millions of rows would take longer than their simulation's answer.
         pages: list[dict[str, NDArray[Any]]] = [
             {
@@ -196,10 +198,13 @@ class Sweep(Resource):
                 "quaternion_xyzw": np.array(page["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
                 "outcome": np.array(page["outcome"], dtype=np.str_),
             }
-            for page in answers(self._transport, f"{self._path}/outcomes", {"limit": _OUTCOMES_PAGE})
+            for page in answers(
+                self._transport, f"{self._path}/outcomes", {"limit": _OUTCOMES_PAGE, **framed}
+            )
         ]
         columns = {name: np.concatenate([page[name] for page in pages]) for name in pages[0]}
-        return OutcomeArrays(sweep=self.id, **columns)
+        of: dict[str, Any] = {"sweep": self.id, **columns, **framed}
+        return OutcomeArrays(**of)
 
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
@@ -263,6 +268,7 @@ def create_sweep(transport: Transport, path: str, options: SweepOptions) -> Swee
         if seed:
             raise ValueError("seed is for a grid or for sample: given poses are simulated as they are")
         given = as_poses(poses)
+        fields |= pose_frame(poses, fields.get("frame"), fields.get("convention"))
         drawn = fields.pop("proposal_density", getattr(poses, "proposal_density", None))
         if drawn is not None:
             fields["proposal_density"] = numbers("proposal_density", drawn, len(given.position))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,10 +19,10 @@ from typing_extensions import Unpack
 from graspdb import wire
 from graspdb.errors import GraspDBError, add_note
 from graspdb.options import Option, known_keywords
-from graspdb.poses import as_poses, first_masked, listed, numbers
+from graspdb.poses import as_poses, first_masked, listed, numbers, pose_frame
 from graspdb.resources.pages import Listing, Resource, segment
 from graspdb.resources.results import TrialArrays
-from graspdb.resources.selection import TrialSelection
+from graspdb.resources.selection import PoseFrame, TrialSelection
 
 CHUNK_TRIALS = 50_000
 """Trials a request: some 10 MB of JSON, well under the service's default body limit."""
@@ -56,12 +56,13 @@ class DoubtfulTrials(UserWarning):
     """The service stored trials and found something doubtful about them: see ``Receipt.findings``."""
 
 
-class Upload(TypedDict, total=False):
-    """How trials are sent, ``chunk`` a request; each is stored wholly or not at all, as its own batch.
+class Upload(PoseFrame, total=False):
+    """What the poses are of (:class:`PoseFrame`, each of its trial's gripper), and how trials are sent.
 
-    Repeat a failed upload with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice.
-    Trials too far from a known object to be grasps of it are refused, unless ``accept_implausible``.
-    ``progress=True`` shows a bar; a function is called with trials stored and total.
+    They go ``chunk`` a request; each is stored wholly or not at all, as its own batch. Repeat a failed upload
+    with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice. Trials too far from a
+    known object to be grasps of it are refused, unless ``accept_implausible``. ``progress=True`` shows a bar;
+    a function is called with trials stored and total.
     """
 
     idempotency_key: Annotated[
@@ -79,9 +80,10 @@ class Upload(TypedDict, total=False):
     progress: bool | ProgressCallback
 
 
-class TrialFilters(TrialSelection, total=False):
+class TrialFilters(TrialSelection, PoseFrame, total=False):
     """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch``, ``since_revision``,
-    ``withdrawn`` and ``licence``.
+    ``withdrawn`` and ``licence``; and what their poses are to be of (:class:`PoseFrame`), each of its trial's
+    gripper.
     """
 
     outcome: Annotated[str | None, Option("Only this outcome.")]
@@ -96,7 +98,7 @@ class TrialListing(Listing[wire.TrialOut]):
 
     def arrays(self) -> TrialArrays:
         """All of them as columns."""
-        return TrialArrays.of(tuple(self))
+        return TrialArrays.of(tuple(self), self._params.get("frame"), self._params.get("convention"))
 
     def to_pandas(self) -> Any:
         """All of them as a DataFrame (extra ``pandas``)."""
@@ -134,15 +136,15 @@ class Trials(Resource):
         What the service finds doubtful about them is in the receipt's ``findings``, and warned of as
         :class:`DoubtfulTrials`.
 
-        - ``poses``: tool frames in the object frame: (N, 4, 4) matrices or (N, 7) rows x y z qx qy qz qw, or
-          one pose; a :class:`~graspdb.resources.results.Grasp` or samples are taken too.
+        - ``poses``: tool frames, or ``frame``, in the object frame: (N, 4, 4) matrices or (N, 7) rows
+          x y z qx qy qz qw, or one pose; a :class:`~graspdb.resources.results.Grasp` or samples go too.
         - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
         - ``gripper``, ``source``, ``protocol``: of the whole upload.
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
         - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
         - ``qualities``: scores by name, each as ``quality``, at most 32; the first stands for ``quality``,
           too, where that is unknown.
-        - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, tool frame.
+        - ``pose_covariance``: (6, 6) or (N, 6, 6), translation first, along and about the frame's axes.
         - ``measured_at``, ``metadata``: one for all, or a sequence with one a trial; NumPy's times are UTC.
         - ``answer``: id or name of the answer that was tried, one for all or one a trial: ``best.answer``.
         - ``achieved_poses``: where the tool was after all, as ``poses``, which are then what was commanded;
@@ -151,6 +153,7 @@ class Trials(Resource):
           the whole upload, kept with its batches.
         """
         given = as_poses(poses)
+        framed = pose_frame(poses, upload.get("frame"), upload.get("convention"))
         count = len(given.position)
         columns = {**given.columns(), "outcome": _outcomes(outcomes, count)}
         given_numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
@@ -183,7 +186,7 @@ class Trials(Resource):
                 own["qualities"] = {name: values[start:stop] for name, values in scores.items()}
             return {"columns": own}
 
-        return self._send(part, shared, count, upload)
+        return self._send(part, shared, count, upload, framed)
 
     def add_records(
         self,
@@ -194,13 +197,15 @@ class Trials(Resource):
         idempotency_key: str | None = None,
         accept_implausible: bool = False,
         progress: bool | ProgressCallback = False,
+        frame: str | None = None,
+        convention: str | None = None,
         **shared: Any,
     ) -> Receipt:
         """Store trials given as mappings with the fields of the HTTP interface; sent as :meth:`add` does.
 
         ``shared`` stands once for all that do not say it themselves: ``gripper``, ``source``, ``protocol``,
         ``proposal_density``, ``metadata``, ``answer``; and ``licence``, ``citation``, ``origin`` of the
-        batches.
+        batches. ``frame`` and ``convention`` are what all poses are of, those achieved, too.
         """
         trials = [dict(record) for record in records]
         if not trials:
@@ -211,7 +216,10 @@ class Trials(Resource):
             "accept_implausible": accept_implausible,
             "progress": progress,
         }
-        return self._send(lambda start, stop: {"trials": trials[start:stop]}, shared, len(trials), upload)
+        framed = pose_frame(None, frame, convention)
+        return self._send(
+            lambda start, stop: {"trials": trials[start:stop]}, shared, len(trials), upload, framed
+        )
 
     def _send(
         self,
@@ -219,6 +227,7 @@ class Trials(Resource):
         shared: Mapping[str, Any],
         count: int,
         upload: Upload,
+        framed: Mapping[str, str],
     ) -> Receipt:
         known_keywords(Upload, upload, "add")
         chunk = upload.get("chunk", CHUNK_TRIALS)
@@ -226,7 +235,7 @@ class Trials(Resource):
             raise ValueError("chunk must be at least 1")
         key = upload.get("idempotency_key") or str(uuid.uuid4())
         shared = {name: value for name, value in shared.items() if value is not None}
-        params = {"accept_implausible": "true"} if upload.get("accept_implausible") else None
+        params = {**framed, **({"accept_implausible": "true"} if upload.get("accept_implausible") else {})}
         receipts: list[wire.BatchReceipt] = []
         findings: list[wire.Finding] = []
         with _upload_bar(upload.get("progress", False)) as report:
@@ -265,9 +274,10 @@ class Trials(Resource):
             findings=tuple(findings),
         )
 
-    def get(self, seq: int) -> wire.TrialInfo:
-        """One trial, and in ``history`` what it was before it was corrected."""
-        return self._transport.model(wire.TrialInfo, "GET", f"{self._path}/{int(seq)}")
+    def get(self, seq: int, *, frame: str | None = None, convention: str | None = None) -> wire.TrialInfo:
+        """One trial, its pose that of ``frame``, and in ``history`` what it was before it was corrected."""
+        params = pose_frame(None, frame, convention)
+        return self._transport.model(wire.TrialInfo, "GET", f"{self._path}/{int(seq)}", params=params)
 
     def withdraw(self, seq: int, *, reason: str | None = None) -> None:
         """Take a trial out of every count and estimate; Conflict for a trial of a sweep.

@@ -268,6 +268,35 @@ ToolRotations = Annotated[
     ),
 ]
 
+AskedPosition = Annotated[
+    Triple,
+    Field(
+        description="Origin of the tool frame, or of the gripper's ``frame`` asked for, in the object frame:"
+        " x, y, z, metres."
+    ),
+]
+AskedRotation = Annotated[
+    Quadruple,
+    Field(
+        description="Rotation of the tool frame, or of the ``frame`` and ``convention`` that were asked for,"
+        " in the object frame: unit quaternion x, y, z, w."
+    ),
+]
+AskedPositions = Annotated[
+    list[Triple],
+    Field(
+        description="Origins of the tool frame, or of the gripper's ``frame`` that was asked for, in the"
+        " object frame, one x, y, z a pose, metres."
+    ),
+]
+AskedRotations = Annotated[
+    list[Quadruple],
+    Field(
+        description="Rotations of the tool frame, or of the ``frame`` and ``convention`` that were asked for,"
+        " in the object frame, one unit quaternion x, y, z, w a pose."
+    ),
+]
+
 
 def no_nul(text: str) -> str:
     """The text, or ValueError for what no database stores."""

@@ -10,6 +10,7 @@ from pydantic import Field
 from graspdb.wire.base import (
     Metadata,
     OutcomeCounts,
+    Pose,
     Request,
     Response,
     Slug,
@@ -18,6 +19,7 @@ from graspdb.wire.base import (
     Triple,
     Warnings,
 )
+from graspdb.wire.frames.object_frames import ObjectFrames
 
 Mass = Annotated[float, Field(gt=0, le=10_000)]
 MassDensity = Annotated[float, Field(gt=0, le=30_000)]
@@ -37,6 +39,10 @@ class ObjectCreate(Request):
     """Mass density, kg/m^3; null if unknown."""
     friction: Friction | None = None
     """Coulomb's coefficient of friction, without a unit; null if unknown, then the gripper's counts."""
+    frames: ObjectFrames | None = None
+    """Frames of the object by name, each its pose in the frame of its mesh, which is the object frame: where
+    a tracker or a drawing has its origin, all of them. Answers have ``mesh``, the identity, too. ``world``
+    and ``object`` are no names of frames; null for none."""
     metadata: Metadata | None = None
     """Any JSON object of the user's, which GraspDB keeps as it is; null for none."""
 
@@ -52,6 +58,10 @@ class ObjectPatch(Request):
     """Mass density, kg/m^3; null if unknown."""
     friction: Friction | None = None
     """Coulomb's coefficient of friction, without a unit; null if unknown."""
+    frames: ObjectFrames | None = None
+    """Frames of the object by name, each its pose in the frame of its mesh, which is the object frame: where
+    a tracker or a drawing has its origin, all of them. Answers have ``mesh``, the identity, too. ``world``
+    and ``object`` are no names of frames; null for none."""
     metadata: Metadata | None = None
     """Any JSON object of the user's, which replaces the one before; null for none."""
 
@@ -150,6 +160,9 @@ class ObjectInfo(Response):
     """Mass density, kg/m^3; null if unknown."""
     friction: float | None = None
     """Coulomb's coefficient of friction, without a unit; null if unknown."""
+    frames: dict[str, Pose] = Field(default_factory=dict)
+    """Frames of the object by name, each its pose in the frame of its mesh, which is the object frame and
+    always among them, as ``mesh``."""
     metadata: StoredMetadata | None = None
     """The user's own JSON object; null where there is none."""
     revision: int

@@ -11,6 +11,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from graspdb.wire.base import (
     MANY,
+    AskedPosition,
+    AskedPositions,
+    AskedRotation,
+    AskedRotations,
     Ball,
     ChosenGripper,
     ChosenProtocol,
@@ -32,16 +36,21 @@ from graspdb.wire.base import (
     Slug,
     Source,
     SourceWeights,
-    ToolPosition,
-    ToolPositions,
-    ToolRotation,
-    ToolRotations,
     Triple,
     Vector7,
     Warnings,
     _split_commas,
     _unit,
 )
+from graspdb.wire.frames.asking import (
+    ASKED_FRAME,
+    AskedConvention,
+    AskedFrame,
+    ToldConvention,
+    ToldFrame,
+    ToolToFrame,
+)
+from graspdb.wire.frames.gripper_frames import RESERVED, TOOL, FrameName
 from graspdb.wire.support import (
     CalibrationInfo,
     EstimatorInfo,
@@ -326,7 +335,10 @@ class LikelihoodRequest(Selection):
     """Poses to say the likelihood of."""
 
     poses: Annotated[list[Pose], Field(min_length=1), MANY] | PoseColumns
-    """Poses of the tool frame in the object frame, in a list or in columns; 1 to 1,000,000."""
+    """Poses of the tool frame, or of ``frame``, in the object frame, in a list or in columns; 1 to
+    1,000,000."""
+    frame: AskedFrame = None
+    convention: AskedConvention = None
     include: IncludedColumns = None
     pre_opening_m: PreOpeningField = None
     name: AnswerName = None
@@ -385,6 +397,9 @@ class Likelihoods(Response):
     """How far every pose is from what was tried; null if not asked for."""
     prior_success_probability: list[float | None] | None = None
     """What geometry alone tells where no attempt is near enough, as a grasp's; null if not asked for."""
+    frame: ToldFrame = TOOL
+    convention: ToldConvention = "graspdb"
+    tool_to_frame: ToolToFrame = None
     reach: ReachField = None
     estimator: EstimatorField = None
     warnings: Warnings = Field(default_factory=list)
@@ -411,6 +426,10 @@ def _object_pose(value: Any) -> Any:
 
 ObjectPose = Annotated[Vector7, BeforeValidator(_object_pose)]
 """The object frame in the world frame: x, y, z, qx, qy, qz, qw (a pose's object is accepted too)."""
+
+
+Reference = Literal["world", "object"]
+"""What constraints are in; the world is whatever frame ``object_pose`` is in, such as the robot's base."""
 
 
 def _pre_opening(value: Any) -> Any:
@@ -456,23 +475,27 @@ MAX_CANDIDATES = 10_000
 MAX_EXCLUDED = 1_000
 
 
+_FRAME_OR_REFERENCE = (
+    ASKED_FRAME + " ``world`` and ``object`` are taken as the ``reference``, which they were called before."
+)
+
+
 class ObstacleBox(Pose):
     """A box that the gripper must not touch."""
 
     size_m: tuple[Extent, Extent, Extent]
     """Edge lengths along the box's own x, y, z, metres."""
     quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
-    """Rotation of the box in ``frame``: a unit quaternion x, y, z, w."""
+    """Rotation of the box in the ``reference`` frame: a unit quaternion x, y, z, w."""
 
 
 class Obstacles(Request):
     """What else stands around."""
 
     boxes: Annotated[list[ObstacleBox], Field(max_length=MAX_OBSTACLE_BOXES)] = Field(default_factory=list)
-    """Boxes that the open gripper must not touch, in the frame of the constraints."""
+    """Boxes that the open gripper must not touch, in the ``reference`` frame."""
     points: Annotated[list[Position], Field(max_length=MAX_OBSTACLE_POINTS)] = Field(default_factory=list)
-    """Points of a sensor that the open gripper must not touch, x, y, z in the frame of the constraints,
-    metres."""
+    """Points of a sensor that the open gripper must not touch, x, y, z in the ``reference`` frame, metres."""
     point_radius_m: Annotated[float, Field(ge=0, le=1)] = 0.005
     """Radius of the ball that each point stands for, metres."""
 
@@ -480,7 +503,8 @@ class Obstacles(Request):
 class GraspConstraints(Selection):
     """What a best grasp is chosen by, as far as it fits a query string.
 
-    All constraints are in ``frame``: world if ``object_pose`` is given, else object.
+    All constraints are in ``reference``: world if ``object_pose`` is given, else object; and they are about
+    the tool frame, its origin and its axes, whatever ``frame`` poses come and go in.
     """
 
     count: Annotated[int, Field(ge=1, le=1_000)] = 1
@@ -506,21 +530,24 @@ class GraspConstraints(Selection):
     ``prior``. By default it does where a gripper is known; true says what is missing where it can't, false
     leaves it at ``no_successes``."""
     box_min: Position | None = None
-    """Lower corner x,y,z of the box that the tool's origin lies in, in ``frame``, metres; by default none."""
+    """Lower corner x,y,z of the box that the tool's origin lies in, in the ``reference`` frame, metres; by
+    default none."""
     box_max: Position | None = None
-    """Upper corner x,y,z of the box that the tool's origin lies in, in ``frame``, metres; by default none."""
+    """Upper corner x,y,z of the box that the tool's origin lies in, in the ``reference`` frame, metres; by
+    default none."""
     sphere: Ball | None = None
-    """Centre x,y,z and radius r of the ball that the tool's origin lies in, in ``frame``, metres; by default
-    none."""
+    """Centre x,y,z and radius r of the ball that the tool's origin lies in, in the ``reference`` frame,
+    metres; by default none."""
     above_plane: Plane | None = None
-    """nx,ny,nz,d: keeps n.x >= d at the tool's origin x, in ``frame``, d in metres; by default none."""
+    """nx,ny,nz,d: keeps n.x >= d at the tool's origin x, in the ``reference`` frame, d in metres; by default
+    none."""
     approach: Direction | None = None
-    """Direction x,y,z in ``frame`` that the tool's z axis points in; by default any."""
+    """Direction x,y,z in the ``reference`` frame that the tool's z axis points in; by default any."""
     approach_cone_deg: Angle | None = None
     """Half angle of the cone about ``approach``, degrees; null without ``approach``, which needs it."""
     closing: Direction | None = None
-    """Direction x,y,z in ``frame`` that the tool's y axis points in, with either sign for a symmetric jaw; by
-    default any."""
+    """Direction x,y,z in the ``reference`` frame that the tool's y axis points in, with either sign for a
+    symmetric jaw; by default any."""
     closing_cone_deg: Angle | None = None
     """Half angle of the cone about ``closing``, degrees; null without ``closing``, which needs it."""
     collision_free: bool | None = None
@@ -538,10 +565,20 @@ class GraspConstraints(Selection):
     """Fewest effective trials that the success probability rests on, with the nearest attempt within the
     estimator's reach; by default none."""
     object_pose: ObjectPose | None = None
-    """Pose of the object frame in the world frame: x,y,z in metres and a unit quaternion x,y,z,w; null if not
-    known, then there is no world."""
-    frame: Literal["world", "object"] | None = None
-    """Frame of the constraints; by default the world's if ``object_pose`` is given, else the object's."""
+    """Pose of the object in the world frame: x,y,z in metres and a unit quaternion x,y,z,w; null if not
+    known, then there is no world. It is that of the object frame, which is its mesh's, or of
+    ``object_frame``."""
+    object_frame: FrameName | None = None
+    """Frame of the object that ``object_pose`` is of: one of its ``frames`` by name, such as a tracker's; by
+    default that of its mesh."""
+    reference: Reference | None = None
+    """What constraints, candidates and ``near`` are in: the world, which is whatever frame ``object_pose`` is
+    in (the robot's base, say), or the object frame; by default the world if ``object_pose`` is given."""
+    frame: Annotated[FrameName | None, Field(description=_FRAME_OR_REFERENCE)] = None
+    convention: AskedConvention = None
+    near: Quaternion | None = None
+    """Unit quaternion x,y,z,w: of the two grasps that are one for a symmetric jaw the answer gives the one
+    whose rotation, of ``frame`` in ``reference``, is nearer to this; null for either."""
     min_separation_m: Annotated[float, Field(gt=0, le=10)] | None = None
     """Grasps are distinct from this distance of their origins on, metres; by default 0.01."""
     min_separation_deg: Angle | None = None
@@ -550,38 +587,51 @@ class GraspConstraints(Selection):
     calibrated_for: CalibratedFor = None
     timeout_s: TimeoutS = None
 
+    @property
+    def pose_frame(self) -> str | None:
+        """The frame of the gripper that poses are of; None for the tool's."""
+        return None if self.frame in RESERVED else self.frame
+
+    @property
+    def in_world(self) -> bool:
+        """Whether constraints are in the world, which takes the object's pose in it."""
+        said = self.frame if self.reference is None and self.frame in RESERVED else self.reference
+        return said == "world" if said is not None else self.object_pose is not None
+
 
 class BestGraspRequest(GraspConstraints):
     """The constrained maximum (figure 2)."""
 
     half_spaces: Annotated[list[Plane], Field(max_length=MAX_HALF_SPACES)] | None = None
-    """Rows nx, ny, nz, d that keep n.x >= d at the tool's origin x, in ``frame``, d in metres; by default
-    none."""
+    """Rows nx, ny, nz, d that keep n.x >= d at the tool's origin x, in the ``reference`` frame, d in metres;
+    by default none."""
     obstacles: Obstacles | None = None
-    """What else the open gripper must not touch, in ``frame``; null for nothing."""
+    """What else the open gripper must not touch, in the ``reference`` frame; null for nothing."""
     candidates: Annotated[list[Pose], Field(min_length=1, max_length=MAX_CANDIDATES)] | PoseColumns | None = (
         None
     )
-    """Only these poses, in the object frame, are ranked, as they are; a grasp's ``candidate`` is its place
-    among them; null for any pose."""
+    """Only these poses, of ``frame`` in ``reference``, are ranked, as they are; a grasp's ``candidate`` is
+    its place among them; null for any pose."""
     exclude: Annotated[list[Pose], Field(max_length=MAX_EXCLUDED)] | PoseColumns | None = None
-    """No grasp within both separations of one of these poses, in the object frame; null for none."""
+    """No grasp within both separations of one of these poses, of ``frame`` in ``reference``; null for
+    none."""
 
 
 class WorldPose(Response):
-    """The pose of a tool frame in the world frame."""
+    """The pose of a grasp in the world frame."""
 
     position: Triple
-    """Origin of the tool frame in the world frame: x, y, z, metres."""
+    """Origin of the tool frame, or of the ``frame`` that was asked for, in the world: x, y, z, metres."""
     quaternion_xyzw: Quadruple
-    """Rotation of the tool frame in the world frame: unit quaternion x, y, z, w."""
+    """Rotation of the tool frame, or of the ``frame`` that was asked for, in the world: unit quaternion x, y,
+    z, w."""
 
 
 class Grasp(Response):
     """A grasp in the object frame, and in the world's where the object's pose was given."""
 
-    position: ToolPosition
-    quaternion_xyzw: ToolRotation
+    position: AskedPosition
+    quaternion_xyzw: AskedRotation
     world: WorldPose | None = None
     """The same grasp in the world frame; null unless the object's pose was given."""
     score: float | None = None
@@ -652,6 +702,12 @@ class BestGrasps(Response):
     those that no such value was found for."""
     ranking: Ranking | None = None
     """What the grasps were ranked by; null where there was nothing to rank."""
+    frame: ToldFrame = TOOL
+    convention: ToldConvention = "graspdb"
+    tool_to_frame: ToolToFrame = None
+    reference: Reference = "object"
+    """What the constraints were in, and ``near``: the object frame, or the world; ``position`` and
+    ``quaternion_xyzw`` of a grasp are in the object frame whatever this is."""
     revision: Revision
     kernel: KernelInfo
     """The kernel of the density that answered."""
@@ -672,6 +728,8 @@ class SamplesRequest(Selection):
     """How many poses to draw."""
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
     """The same seed and revision give the same poses; by default a new one."""
+    frame: AskedFrame = None
+    convention: AskedConvention = None
     name: AnswerName = None
     timeout_s: TimeoutS = None
 
@@ -684,8 +742,11 @@ class Samples(Response):
     """The kernel of the density that they were drawn from."""
     seed: int
     """The seed that draws the same poses again."""
-    position: ToolPositions
-    quaternion_xyzw: ToolRotations
+    position: AskedPositions
+    quaternion_xyzw: AskedRotations
+    frame: ToldFrame = TOOL
+    convention: ToldConvention = "graspdb"
+    tool_to_frame: ToolToFrame = None
     proposal_density: list[float]
     """Density that each pose was drawn with, 1/(m^3 rad^3); sent back with the trial, it weights it."""
     support: SupportColumns | None = None
@@ -737,9 +798,11 @@ class LikelihoodQuery(SelectionQuery):
     """One pose in a query string."""
 
     position: Position
-    """Origin of the tool frame in the object frame: x,y,z in metres."""
+    """Origin of the tool frame, or of ``frame``, in the object frame: x,y,z in metres."""
     quaternion_xyzw: Quaternion
-    """Rotation of the tool frame in the object frame: a unit quaternion x,y,z,w."""
+    """Rotation of the tool frame, or of ``frame``, in the object frame: a unit quaternion x,y,z,w."""
+    frame: AskedFrame = None
+    convention: AskedConvention = None
     include: Annotated[IncludedColumns, BeforeValidator(_listed)] = None
     pre_opening_m: PreOpeningField = None
     name: AnswerName = None
@@ -757,6 +820,8 @@ class BestGraspQuery(GraspConstraints):
 class LikelihoodOptions(Selection):
     """A likelihood request without its poses, which are read as arrays."""
 
+    frame: AskedFrame = None
+    convention: AskedConvention = None
     include: IncludedColumns = None
     pre_opening_m: PreOpeningField = None
     name: AnswerName = None

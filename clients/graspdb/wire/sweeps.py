@@ -9,6 +9,8 @@ from pydantic import Field, model_validator
 
 from graspdb.wire.base import (
     MANY,
+    AskedPositions,
+    AskedRotations,
     GripperRef,
     ObjectId,
     OneGripperVersion,
@@ -18,10 +20,10 @@ from graspdb.wire.base import (
     Request,
     Response,
     Slug,
-    ToolPositions,
-    ToolRotations,
     Warnings,
 )
+from graspdb.wire.frames.asking import AskedConvention, AskedFrame, ToldConvention, ToldFrame
+from graspdb.wire.frames.gripper_frames import TOOL
 from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
 from graspdb.wire.trials import ProposalDensity
@@ -83,7 +85,10 @@ class SweepCreate(Request):
     grid: GridSpec | None = None
     """Simulate a grid about the object; null for another plan."""
     poses: Annotated[list[Pose], Field(min_length=1), MANY] | PoseColumns | None = None
-    """Simulate exactly these poses of the tool frame in the object frame; null for another plan."""
+    """Simulate exactly these poses of the tool frame, or of ``frame``, in the object frame; null for another
+    plan."""
+    frame: AskedFrame = None
+    convention: AskedConvention = None
     proposal_density: Annotated[list[ProposalDensity | None], MANY] | ProposalDensity | None = None
     """Density that each of ``poses`` was drawn with, or all of them, 1/(m^3 rad^3), as proposals have it: it
     weighs their trials; null where it is not known."""
@@ -107,6 +112,8 @@ class SweepCreate(Request):
             raise ValueError("give one of grid, poses and sample")
         if self.proposal_density is not None and self.poses is None:
             raise ValueError("proposal_density is of given poses: grids and samples have their own")
+        if (self.frame, self.convention) != (None, None) and self.poses is None:
+            raise ValueError("frame and convention are of given poses: leave them out")
         return self
 
 
@@ -204,8 +211,10 @@ class SweepOutcomes(Response):
     """Id of the sweep."""
     pose_index: list[int]
     """Index of each pose in the sweep's plan."""
-    position: ToolPositions
-    quaternion_xyzw: ToolRotations
+    position: AskedPositions
+    quaternion_xyzw: AskedRotations
+    frame: ToldFrame = TOOL
+    convention: ToldConvention = "graspdb"
     outcome: list[str]
     """What became of each pose, by name."""
     next: str | None = None

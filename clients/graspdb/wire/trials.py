@@ -10,6 +10,8 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from graspdb.wire.base import (
     MANY,
     MAX_QUALITIES,
+    AskedPosition,
+    AskedRotation,
     GripperRef,
     Licence,
     Metadata,
@@ -17,6 +19,7 @@ from graspdb.wire.base import (
     OneGripperVersion,
     Outcome,
     OutcomeCounts,
+    Page,
     Pose,
     Position,
     Quality,
@@ -29,10 +32,10 @@ from graspdb.wire.base import (
     StoredMetadata,
     StoredRevision,
     Text,
-    ToolPosition,
-    ToolRotation,
     no_nul,
 )
+from graspdb.wire.frames.asking import ToldConvention, ToldFrame
+from graspdb.wire.frames.gripper_frames import TOOL
 
 
 def _outcome_of_bool(value: Any) -> Any:
@@ -170,8 +173,8 @@ class TrialColumnsIn(BatchDefaults):
 class AchievedPose(Response):
     """The pose that a trial achieved."""
 
-    position: ToolPosition
-    quaternion_xyzw: ToolRotation
+    position: AskedPosition
+    quaternion_xyzw: AskedRotation
 
 
 class TrialOut(Response):
@@ -182,8 +185,8 @@ class TrialOut(Response):
     revision: StoredRevision
     batch: str
     """Id of the batch that it arrived in."""
-    position: ToolPosition
-    quaternion_xyzw: ToolRotation
+    position: AskedPosition
+    quaternion_xyzw: AskedRotation
     outcome: Outcome
     """What became of it, by name."""
     gripper: str | None = None
@@ -203,8 +206,8 @@ class TrialOut(Response):
     width_m: float | None = None
     """Distance between the fingers at the end, metres; null if unknown."""
     pose_covariance: list[list[float]] | None = None
-    """6x6, of the pose in the tool frame, translation in metres first, then rotation vector in radians; null
-    if unknown."""
+    """6x6, along and about the axes of the frame that the pose is of, translation in metres first, then
+    rotation vector in radians; null if unknown."""
     measured_at: datetime | None = None
     """When it was tried, UTC; null if unknown."""
     metadata: StoredMetadata | None = None
@@ -216,7 +219,7 @@ class TrialOut(Response):
     answer: str | None = None
     """Id of the answer that it tried; null where it names none."""
     achieved_pose: AchievedPose | None = None
-    """Where the tool was after all, in the object frame: estimates take this pose; null if unknown."""
+    """Where the frame was after all, in the object frame: estimates take this pose; null if unknown."""
     withdrawn: bool = False
     """Whether it is kept, but out of every count and estimate."""
 
@@ -325,3 +328,10 @@ class BatchInfo(Response):
     """What was doubtful about its trials when they came."""
     created_at: datetime
     """When it was stored, UTC."""
+
+
+class TrialsPage(Page[TrialOut]):
+    """A page of trials, with what their poses are of."""
+
+    frame: ToldFrame = TOOL
+    convention: ToldConvention = "graspdb"

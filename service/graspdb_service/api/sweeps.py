@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
@@ -10,7 +10,13 @@ from graspdb.wire import Page, SweepCreate, SweepInfo, SweepOutcomes
 from graspdb.wire.states import AnySweepState
 from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, name_cursor
-from graspdb_service.api.routing.parameters import Creating, Ctx, ObjectId, SweepId
+from graspdb_service.api.routing.parameters import (
+    Creating,
+    Ctx,
+    Framed,
+    ObjectId,
+    SweepId,
+)
 from graspdb_service.api.routing.scopes import scope
 from graspdb_service.formats.json_bodies import read_object, validated
 from graspdb_service.formats.negotiation import ARROW, BINARY, JSON, accepted
@@ -88,7 +94,12 @@ def retry_sweep(ctx: Ctx, id: SweepId) -> SweepInfo:
     **scope("read"),
 )
 def get_outcomes(
-    ctx: Ctx, id: SweepId, request: Request, limit: PosesLimit = None, cursor: Cursor = None
+    ctx: Ctx,
+    id: SweepId,
+    request: Request,
+    frame: Framed,
+    limit: PosesLimit = None,
+    cursor: Cursor = None,
 ) -> Response:
     """Every pose of the finished chunks with its outcome, collisions included, in columns.
 
@@ -96,7 +107,8 @@ def get_outcomes(
     As an Arrow stream (`Accept: application/vnd.apache.arrow.stream`) all of them come at once.
     """
     kind, start = accepted(request, JSON, ARROW), name_cursor(cursor) or None
+    head: dict[str, Any] = {"sweep": id, **frame.told()}
     if kind == ARROW and limit is None:
-        return stream_response(id, outcomes.pages(ctx.database, id, cursor=start))
-    page, following = outcomes.page(ctx.database, id, limit=limit or 10_000, cursor=start)
-    return page_response(id, page, encode_cursor(following), kind)
+        return stream_response(head, outcomes.pages(ctx.database, id, frame, cursor=start))
+    page, following = outcomes.page(ctx.database, id, frame, limit=limit or 10_000, cursor=start)
+    return page_response({**head, "next": encode_cursor(following)}, page, kind)

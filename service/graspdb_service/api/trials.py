@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
 
@@ -16,11 +16,10 @@ from graspdb.wire import (
     Source,
     TrialIn,
     TrialInfo,
-    TrialOut,
     TrialPatch,
     TrialsIn,
 )
-from graspdb.wire.trials import TrialColumnsIn
+from graspdb.wire.trials import TrialColumnsIn, TrialsPage
 from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import etag, not_modified, tagged_json
 from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, number_cursor
@@ -28,6 +27,7 @@ from graspdb_service.api.routing.parameters import (
     BatchId,
     Creating,
     Ctx,
+    Framed,
     ObjectId,
     ToldOfBatch,
     UnderLicence,
@@ -62,25 +62,28 @@ def add_trials(
     request: Request,
     sent: Creating,
     told: ToldOfBatch,
+    frame: Framed,
     accept_implausible: Annotated[
         bool, Query(description="Store trials, too, that lie too far from the object to be grasps of it.")
     ] = False,
 ) -> object:
     """Store one trial, a list, columns, lines or an Arrow stream as one batch: whole, or not at all.
 
+    Their poses, those achieved and covariances are of ``frame`` of each trial's gripper; kept, and used, are
+    those of the tool.
+
     What is doubtful about them against mesh and gripper is answered as findings; trials farther from a known
     object than ten times its size and the gripper's together are refused (`implausible-poses`).
     """
     media = media_type(request)
-    made = posting.add(
-        ctx, id, ctx.scenes, ctx.answers, sent, media, accept_implausible=accept_implausible, told=told
-    )
+    more: dict[str, Any] = {"accept_implausible": accept_implausible, "told": told, "frame": frame}
+    made = posting.add(ctx, id, ctx.scenes, ctx.answers, sent, media, **more)
     return sent.answered(made)
 
 
 @router.get(
     "/objects/{id}/trials",
-    response_model=Page[TrialOut],
+    response_model=TrialsPage,
     responses={200: {"content": {NDJSON: {"schema": {"type": "string"}}, ARROW: {"schema": BINARY}}}},
     **scope("read"),
 )
@@ -88,6 +91,7 @@ def list_trials(
     ctx: Ctx,
     id: ObjectId,
     request: Request,
+    frame: Framed,
     outcome: Annotated[
         Outcome | None, Query(description="Only trials that ended so; by default all.")
     ] = None,
@@ -132,15 +136,16 @@ def list_trials(
         return fresh
     headers = {"ETag": tag, "Vary": "Accept"}
     if kind != JSON and limit is None:
-        return stream_response(listing.pages(ctx.database, id, chosen, after=after), kind, headers)
-    page, last = listing.page(ctx.database, id, chosen, after=after, limit=limit or 100)
-    return page_response(page, encode_cursor(last), kind, headers)
+        rows = listing.pages(ctx.database, id, chosen, frame, after=after)
+        return stream_response(rows, kind, headers, frame.told())
+    page, last = listing.page(ctx.database, id, chosen, frame, after=after, limit=limit or 100)
+    return page_response(page, encode_cursor(last), kind, headers, frame.told())
 
 
 @router.get("/objects/{id}/trials/{seq}", response_model=TrialInfo, **scope("read"))
-def get_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: Request) -> Response:
+def get_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: Request, frame: Framed) -> Response:
     """One trial, and what it was before it was corrected."""
-    return tagged_json(request, corrections.get(ctx.database, id, seq))
+    return tagged_json(request, corrections.get(ctx.database, id, seq, frame))
 
 
 @router.delete("/objects/{id}/trials/{seq}", status_code=204, **scope("trials:write"))

@@ -73,21 +73,18 @@ def _array(name: str, values: list[Any]) -> NDArray[Any]:
     return np.array(values, dtype=np.int64 if name == "pose_index" else np.float64)
 
 
-def stream_response(sweep: str, pages: Iterator[TrialColumns]) -> Response:
-    """All outcomes as an Arrow stream."""
-    return StreamingResponse(
-        _stream({"sweep": sweep, "next": None}, pages), media_type=ARROW, headers=_HEADERS
-    )
+def stream_response(head: dict[str, Any], pages: Iterator[TrialColumns]) -> Response:
+    """All outcomes as an Arrow stream, with ``head`` in its schema's metadata."""
+    return StreamingResponse(_stream({**head, "next": None}, pages), media_type=ARROW, headers=_HEADERS)
 
 
-def page_response(sweep: str, page: TrialColumns, following: str | None, kind: str) -> Response:
-    """A page of outcomes; where the next one starts stands beside them."""
-    head: dict[str, Any] = {"sweep": sweep, "next": following}
+def page_response(head: dict[str, Any], page: TrialColumns, kind: str) -> Response:
+    """A page of outcomes; ``head``, and where the next one starts in it, stands beside them."""
     if kind == ARROW:
         return Response(b"".join(_stream(head, iter([page]))), media_type=ARROW, headers=_HEADERS)
     columns = {name: getattr(page, name) for name in ("pose_index", "position", "quaternion_xyzw")}
     outcome = np.array(OUTCOMES, dtype=object)[page.outcome].tolist()
-    return columns_json({"sweep": sweep, "outcome": outcome, "next": following}, columns, _HEADERS)
+    return columns_json({**head, "outcome": outcome}, columns, _HEADERS)
 
 
 def _stream(told: dict[str, Any], pages: Iterator[TrialColumns]) -> Iterator[bytes]:

@@ -25,18 +25,24 @@ def parse(body: bytes, media: str, *, limit: int, allowed: Allowed) -> TrialBatc
     raise unsupported(f"Trials come as {JSON}, {NDJSON} or {ARROW}: say which by Content-Type", media)
 
 
-def stream_response(pages: Iterator[TrialPage], kind: str, headers: dict[str, str]) -> Response:
-    """Trials page by page, as lines or as an Arrow stream."""
-    content = trial_arrow.stream(pages) if kind == ARROW else map(trial_json.lines, pages)
+def stream_response(
+    pages: Iterator[TrialPage], kind: str, headers: dict[str, str], frame: dict[str, str]
+) -> Response:
+    """Trials page by page, as lines or as an Arrow stream, which says the ``frame`` of its poses."""
+    content = trial_arrow.stream(pages, frame) if kind == ARROW else map(trial_json.lines, pages)
     return StreamingResponse(content, media_type=kind, headers=headers)
 
 
-def page_response(page: TrialPage, following: str | None, kind: str, headers: dict[str, str]) -> Response:
-    """A page of trials; where the next one starts stands beside them, but for lines."""
+def page_response(
+    page: TrialPage, following: str | None, kind: str, headers: dict[str, str], frame: dict[str, str]
+) -> Response:
+    """A page of trials; where the next one starts and the ``frame`` of poses stand beside them, but for
+    lines.
+    """
     if kind == ARROW:
-        body = b"".join(trial_arrow.stream([page], {"next": following}))
+        body = b"".join(trial_arrow.stream([page], {"next": following, **frame}))
     elif kind == NDJSON:
         body = trial_json.lines(page)
     else:
-        body = orjson.dumps({"items": trial_json.documents(page), "next": following})
+        body = orjson.dumps({"items": trial_json.documents(page), "next": following, **frame})
     return Response(body, media_type=kind, headers=headers)

@@ -40,6 +40,7 @@ class ObjectRow:
     updated_at: datetime
     copied_from: dict[str, Any] | None
     quality_names: list[str] | None
+    frames: dict[str, Any] | None
 
 
 def create(tx: Tx, slug: str, properties: Mapping[str, Any]) -> bool:

@@ -133,6 +133,8 @@ objects = Table(
     Column("copied_from", JSON(none_as_null=True)),
     # Names of the qualities that its trials have, or had: they leave with the object only.
     Column("quality_names", JSON(none_as_null=True)),
+    # By name, each a pose in the frame of the mesh, which itself is not among them.
+    Column("frames", JSON(none_as_null=True)),
     sqlite_autoincrement=True,
     info=WHOLLY_AUDITED,
 )

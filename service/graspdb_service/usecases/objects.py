@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, ObjectCreate, ObjectInfo, ObjectPatch
+from graspdb.wire.frames.gripper_frames import IDENTITY
+from graspdb.wire.frames.object_frames import MESH
 from graspdb_service import principal
 from graspdb_service.problems import conflict, found
 from graspdb_service.storage import assets, objects
@@ -19,7 +21,7 @@ def create(database: Database, request: ObjectCreate, sent: Sent) -> Created:
     principal.refuse_hidden(request.id)
 
     def make(tx: Tx) -> Created:
-        if not objects.create(tx, request.id, request.model_dump(exclude={"id"})):
+        if not objects.create(tx, request.id, request.model_dump(mode="json", exclude={"id"})):
             raise conflict("already-exists", f"There is an object {request.id!r} already: choose another id")
         audit.record(tx, "object.create", object=request.id)
         return Created(
@@ -60,7 +62,7 @@ def page(database: Database, *, after: str, limit: int) -> tuple[list[ObjectInfo
 
 def change(database: Database, slug: str, patch: ObjectPatch) -> ObjectInfo:
     """Set the properties that are given; an explicit null clears one."""
-    given = patch.model_dump(exclude_unset=True)
+    given = patch.model_dump(mode="json", exclude_unset=True)
     with database.write() as tx:
         row = require(tx, slug, lock=True)
         different = {name: value for name, value in given.items() if getattr(row, name) != value}
@@ -95,6 +97,7 @@ def info(row: ObjectRow, counts: dict[int, int]) -> ObjectInfo:
             "id": row.slug,
             "mesh": row.mesh_info,
             "convex_parts": row.parts_info,
+            "frames": {MESH: IDENTITY, **(row.frames or {})},
             "trials": sum(counts.values()),
             "outcomes": {OUTCOMES[code]: number for code, number in sorted(counts.items())},
         }

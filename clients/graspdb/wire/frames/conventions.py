@@ -6,6 +6,7 @@ fixed rotation on the right, :func:`to_graspdb`, and goes back by its transpose;
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Literal, get_args
 
 from graspdb.wire.base import Quadruple, Triple, rotation_to_quaternion
@@ -40,6 +41,7 @@ def to_graspdb(convention: Convention) -> Rotation:
     return first, second, third
 
 
+@cache
 def axes_in_graspdb(convention: Convention) -> Quadruple:
     """The unit quaternion x, y, z, w of the convention's axes in GraspDB's: the way back."""
     return rotation_to_quaternion([list(row) for row in zip(*to_graspdb(convention), strict=True)])

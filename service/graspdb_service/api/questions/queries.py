@@ -110,7 +110,8 @@ def post_likelihood(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> 
 def get_best_grasp(
     ctx: Ctx, id: ObjectId, request: Request, query: Annotated[BestGraspQuery, Query()]
 ) -> Response:
-    """The best distinct grasps in a workspace; all constraints in ``frame`` (world given ``object_pose``)."""
+    """The best distinct grasps in a workspace; all constraints in ``reference`` (world given
+    ``object_pose``), and about the tool."""
 
     def answer(query: BestGraspQuery) -> Response:
         return _told(asking.best_grasps(ctx, id, query), query)

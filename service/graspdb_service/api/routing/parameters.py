@@ -9,12 +9,15 @@ from typing import Annotated, Any
 from fastapi import Depends, Header, Path, Query, Request, Response
 from pydantic import WithJsonSchema
 
-from graspdb.wire import Slug
+from graspdb.wire import Convention, Slug
 from graspdb.wire.base import Licence
+from graspdb.wire.frames.asking import ASKED_CONVENTION, ASKED_FRAME
+from graspdb.wire.frames.gripper_frames import FrameName
 from graspdb.wire.trials import BatchDefaults, Origin
 from graspdb_service.api.context import Context
 from graspdb_service.problems import invalid
 from graspdb_service.usecases.runtime.idempotency import Created, Sent
+from graspdb_service.usecases.trials.frames import AskedFrame
 
 
 async def context(request: Request) -> Context:
@@ -41,6 +44,17 @@ AnswerRef = Annotated[str, _id("Id of the answer, or a name that it was given.")
 RunId = Annotated[str, _id("Id of the run, as the 202 that started it answered it.")]
 SweepId = Annotated[str, _id("Id of the sweep, as planning it answered it.")]
 JobId = Annotated[str, _id("Id of the job, as the claim answered it.")]
+
+
+async def _framed(
+    frame: Annotated[FrameName | None, Query(description=ASKED_FRAME)] = None,
+    convention: Annotated[Convention | None, Query(description=ASKED_CONVENTION)] = None,
+) -> AskedFrame:
+    return AskedFrame(frame, convention)
+
+
+Framed = Annotated[AskedFrame, Depends(_framed)]
+"""What poses of trials are of, those that are sent or those that are answered."""
 
 _KeyHeader = Annotated[
     Annotated[str, WithJsonSchema({"type": "string", "maxLength": 200, "pattern": r"^[\x21-\x7e]+$"})] | None,

@@ -52,6 +52,7 @@ _OWN = (
     "density_kg_m3",
     "friction",
     "metadata",
+    "frames",
     "mesh_sha256",
     "mesh_info",
     "parts_sha256",

@@ -33,6 +33,7 @@ from graspdb_service.usecases.grasps import likelihood as likelihoods
 from graspdb_service.usecases.grasps.samples import Draw
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.asked import outage, outage_warnings
+from graspdb_service.usecases.trials.pose_frames import PoseFrame, frame_of
 from graspdb_service.usecases.trials.selection import Selected
 
 #: Answers of more poses are not kept, nor larger ones.
@@ -100,8 +101,10 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     before = _under_name(ctx, slug, "likelihood", request.name, question)
     if before is not None:
         return before
-    built, reach, calibration, columns = likelihoods.likelihood(ctx, slug, request, poses, request.include)
-    head = _head(ctx, built, built.kernel)
+    built, frame, reach, calibration, columns = likelihoods.likelihood(
+        ctx, slug, request, poses, request.include
+    )
+    head = _head(ctx, built, built.kernel, frame)
     if reach is not None:
         head["reach"] = reach.model_dump()
     if calibration is not None:
@@ -127,11 +130,12 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
         more = {"strategy": request.strategy, "criterion": criterion}
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
-    head = {**_head(ctx, drawn.built, drawn.kernel), "seed": drawn.seed, "prior": drawn.prior, **more}
+    frame = frame_of(drawn.selected, request.frame, request.convention)
+    head = {**_head(ctx, drawn.built, drawn.kernel, frame), "seed": drawn.seed, "prior": drawn.prior, **more}
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
     asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo(), seed)
-    return _in_columns(ctx, asked, few, head, drawn.columns())
+    return _in_columns(ctx, asked, few, head, drawn.columns(frame))
 
 
 def ask(ctx: Asking, slug: str, kind: str, question: Mapping[str, Any]) -> Told:
@@ -170,13 +174,18 @@ def _question(request: Selection) -> dict[str, Any]:
     }
 
 
-def _head(ctx: Asking, built: Built, kernel: KernelInfo) -> dict[str, Any]:
+def _head(ctx: Asking, built: Built, kernel: KernelInfo, frame: PoseFrame) -> dict[str, Any]:
     return {
+        **frame.told(),
         "revision": built.revision,
         "kernel": kernel.model_dump(),
         "estimator": EstimatorInfo().model_dump(),
         "selection": built.selection.model_dump(),
-        "warnings": [*outage_warnings(built.revision), *ctx.evidence.warnings(built)],
+        "warnings": [
+            *outage_warnings(built.revision),
+            *ctx.evidence.warnings(built),
+            *frame.warnings,
+        ],
         "stale": outage() is not None,
     }
 

@@ -16,9 +16,11 @@ from graspdb.wire import (
     Grasp,
     GraspConstraints,
     Interval,
+    Pose,
     ReachInfo,
     WorldPose,
 )
+from graspdb.wire.base import Quadruple
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -30,9 +32,13 @@ from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
 from graspdb_service.usecases.grasps.search import ScoreSearch, closest
 from graspdb_service.usecases.runtime.asked import outage, outage_warnings
+from graspdb_service.usecases.trials.pose_frames import frame_of
 from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
+_NO_TWINS = (
+    "near= chooses between the twins of a symmetric jaw, which this gripper's is not: it changed nothing"
+)
 
 
 def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, Selected]:
@@ -45,7 +51,8 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     request = of_simulation(request)
     with ctx.compute.within(request):
         selected = ctx.densities.selections.resolve(slug, request)
-        limits = constraints(request, jaw_symmetric=selected.jaw_symmetric)
+        frame = frame_of(selected, request.pose_frame, request.convention)
+        limits = constraints(request, selected, frame)
         built = ctx.densities.get(selected, choice)
         question = question_of(ctx, request, built, limits)
         answer: dict[str, Any] = {"status": "no_successes", "grasps": [], "kernel": built.kernel}
@@ -57,7 +64,13 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "calibration": question.calibration,
                 **_answer(ctx, request, question),
             }
+    near = request.near if selected.jaw_symmetric else None
+    answer["grasps"] = [_as_asked(grasp, limits, near) for grasp in answer["grasps"]]
+    if answer.get("nearest") is not None:
+        answer["nearest"] = _as_asked(answer["nearest"], limits, near)
     told = {
+        **frame.told(),
+        "reference": "world" if limits.in_world else "object",
         "revision": built.revision,
         "estimator": EstimatorInfo(),
         "selection": built.selection,
@@ -66,6 +79,8 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *outage_warnings(built.revision),
             *ctx.evidence.warnings(built),
             *doubts(None if question is None else question.calibration),
+            *frame.warnings,
+            *([_NO_TWINS] if request.near is not None and near is None else []),
         ],
     }
     return BestGrasps.model_validate({**told, **answer}), built.selected
@@ -103,7 +118,7 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
     built = question.built
 
     def ask(request: GraspConstraints) -> Grasp | None:
-        limits = constraints(request, jaw_symmetric=built.selected.jaw_symmetric)
+        limits = constraints(request, built.selected, question.limits.frame)
         other = question_of(ctx, request, built, limits)
         if other is None:
             return None
@@ -157,7 +172,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
                 {
                     "position": tuple(item.position.tolist()),
                     "quaternion_xyzw": tuple(item.quaternion_xyzw.tolist()),
-                    "world": _world(limits, item),
+                    "world": _world(limits, se3.Poses(item.position, item.quaternion_xyzw)),
                     "score": density if question.ranking.objective == "density" else item.score,
                     "density": density,
                     "log_density": item.log_density,
@@ -189,13 +204,37 @@ def _chances(estimates: Estimates, row: int, reach: ReachInfo | None) -> dict[st
     return chances
 
 
-def _world(limits: Constraints, item: Maximum) -> WorldPose | None:
-    """A grasp in the world frame, where the object's pose is known."""
+def _world(limits: Constraints, pose: se3.Poses) -> WorldPose | None:
+    """One pose in the object frame as one in the world, where the object's pose is known."""
     if limits.object_pose is None:
         return None
-    p, q = se3.compose(limits.object_pose, se3.Poses(item.position, item.quaternion_xyzw))
+    p, q = se3.compose(limits.object_pose, pose)
     q = se3.canonical(se3.normalise(q))
     return WorldPose(position=tuple(p.tolist()), quaternion_xyzw=tuple(q.tolist()))
+
+
+def _as_asked(grasp: Grasp, limits: Constraints, near: Quadruple | None) -> Grasp:
+    """A grasp of the tool as one of the frame that was asked for, the twin that is nearer to a rotation of
+    that frame in the reference.
+    """
+    frame = limits.frame
+    if frame.fixed is None and near is None:
+        return grasp
+    quaternions = [np.array(grasp.quaternion_xyzw)]
+    if near is not None:
+        quaternions.append(se3.canonical(se3.jaw_twin(quaternions[0])))
+    twins = []
+    for quaternion in quaternions:
+        tool = Pose.model_construct(position=grasp.position, quaternion_xyzw=tuple(quaternion.tolist()))
+        pose = frame.one_from_tool(tool)
+        rotation = se3.canonical(np.array(pose.quaternion_xyzw))
+        world = _world(limits, se3.Poses(np.array(pose.position), rotation))
+        said = world.quaternion_xyzw if limits.in_world and world is not None else rotation
+        away = 0.0 if near is None else float(se3.angle_between(np.array(said), np.array(near)))
+        twins.append((away, pose.position, tuple(rotation.tolist()), world))
+    _, position, rotation_found, world = min(twins, key=lambda twin: twin[0])
+    given = {"position": position, "quaternion_xyzw": rotation_found, "world": world}
+    return grasp.model_copy(update=given)
 
 
 def _place(limits: Constraints, item: Maximum) -> int | None:

@@ -125,8 +125,7 @@ def _value(value: Floats) -> Value:
 
 def _needed(request: GraspConstraints, name: str, grasp: Grasp) -> Floats | None:
     """The value of a constraint that a grasp fulfils, and no wider one; None where a number says nothing."""
-    in_world = request.object_pose is not None and request.frame != "object"
-    pose = grasp.world if in_world and grasp.world is not None else grasp
+    pose = grasp.world if request.in_world and grasp.world is not None else grasp
     position = np.array(pose.position)
     _, closing, approach = se3.to_matrix(np.array(pose.quaternion_xyzw)).T
     given = getattr(request, name)

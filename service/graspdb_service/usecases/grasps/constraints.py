@@ -10,11 +10,16 @@ import numpy as np
 from scipy.optimize import nnls
 
 from graspdb.wire import BestGraspRequest, GraspConstraints, Obstacles, Pose, PoseColumns
+from graspdb.wire.frames.gripper_frames import RESERVED, NoSuchFrame
+from graspdb.wire.frames.object_frames import MESH, mesh_placed
 from graspdb_density import Region, se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError, invalid_fields
+from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.trials.pose_frames import PoseFrame
+from graspdb_service.usecases.trials.selection import Selected
 
 _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.
@@ -26,14 +31,17 @@ _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 class Constraints:
     """What bounds a grasp, in the object frame, and what its parts were called in the request.
 
-    ``object_pose`` is the object frame in the world frame, one pose, where it was given; ``obstacles`` what
-    the gripper must not touch besides the object; ``candidates`` the only poses to rank, ``exclude`` those to
-    stay away from.
+    ``object_pose`` is the object frame in the world frame, one pose, where it was given, ``in_world`` whether
+    the request's constraints were in that; ``frame`` what its poses were of. ``obstacles`` are what the
+    gripper must not touch besides the object; ``candidates`` the only poses to rank, ``exclude`` those to
+    stay away from, all of the tool.
     """
 
     region: Region
     half_space_names: tuple[str, ...]
     object_pose: Poses | None
+    in_world: bool
+    frame: PoseFrame
     obstacles: tuple[Scene | PointCloud, ...] = ()
     candidates: Poses | None = None
     exclude: Poses | None = None
@@ -50,18 +58,14 @@ class Constraints:
         return list(dict.fromkeys(names))
 
 
-def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Constraints:
+def constraints(request: GraspConstraints, selected: Selected, frame: PoseFrame) -> Constraints:
     """Check a request's constraints and bring them to the object frame; 422 names fields that contradict.
 
-    Boxes become half spaces, for in the object frame they may stand askew. ``jaw_symmetric``: the tool's y
-    and its opposite close alike.
+    Boxes become half spaces, for in the object frame they may stand askew. ``frame``: what its poses are of.
     """
     _check(request)
-    pose = None
-    if request.object_pose is not None:
-        values = np.array(request.object_pose)
-        pose = Poses(values[:3], values[3:])
-    in_world = pose is not None and request.frame != "object"
+    pose = _object_pose(request, selected.row)
+    in_world = request.in_world
     shift, turn = pose if in_world and pose is not None else (np.zeros(3), se3.IDENTITY)
     rotation = se3.to_matrix(turn)
 
@@ -85,7 +89,7 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
             closing=None if request.closing is None else rotation.T @ np.array(request.closing),
             closing_angle=_radians(request.closing_cone_deg),
             spheres=spheres,
-            closing_signed=not jaw_symmetric,
+            closing_signed=not selected.jaw_symmetric,
         )
     except ValueError as error:
         # What is left to contradict after the checks above are the two cones.
@@ -97,10 +101,27 @@ def constraints(request: GraspConstraints, *, jaw_symmetric: bool = True) -> Con
         region,
         tuple(names),
         pose,
+        in_world,
+        frame,
         _obstacles(posted.obstacles, into),
-        _moved(posted.candidates, into),
-        _moved(posted.exclude, into),
+        _moved(posted.candidates, into, frame),
+        _moved(posted.exclude, into, frame),
     )
+
+
+def _object_pose(request: GraspConstraints, row: ObjectRow) -> Poses | None:
+    """The object frame in the world frame, where it is known; 422 for a frame that the object has not."""
+    if request.object_pose is None:
+        return None
+    values = request.object_pose
+    given = Pose.model_construct(position=values[:3], quaternion_xyzw=values[3:])
+    frames = {name: Pose.model_validate(pose) for name, pose in (row.frames or {}).items()}
+    try:
+        pose = mesh_placed(given, frames, request.object_frame or MESH)
+    except NoSuchFrame as error:
+        told = f"{error}: PATCH /objects/{row.slug} with it in frames adds one"
+        raise invalid_fields([("object_frame", told)]) from None
+    return Poses(np.array(pose.position), np.array(pose.quaternion_xyzw))
 
 
 def _planes(request: GraspConstraints) -> list[tuple[str, Floats, float]]:
@@ -130,10 +151,10 @@ def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud
     return tuple(solids)
 
 
-def _moved(given: Sequence[Pose] | PoseColumns | None, into: Poses) -> Poses | None:
+def _moved(given: Sequence[Pose] | PoseColumns | None, into: Poses, frame: PoseFrame) -> Poses | None:
     if given is None:
         return None
-    p, q = se3.compose(into, poses_of(given))
+    p, q = se3.compose(into, frame.to_tool(poses_of(given)))
     return Poses(p, se3.normalise(q))
 
 
@@ -209,8 +230,13 @@ def _check(request: GraspConstraints) -> None:
             errors.append((name, "its first three numbers are the normal and must not be zero"))
         if max(abs(x) for x in value) > 1e6:
             errors.append((name, "metres, and at most 1e6: is the unit right?"))
-    if request.frame == "world" and request.object_pose is None:
+    if request.frame in RESERVED and request.reference is not None:
+        message = f"frame={request.frame} is reference={request.frame} by its older name: give one"
+        errors += [("frame", message), ("reference", message)]
+    elif request.in_world and request.object_pose is None:
         errors.append(("object_pose", "constraints in the world frame need the object's pose in it"))
+    if request.object_frame is not None and request.object_pose is None:
+        errors.append(("object_pose", "object_frame needs it: the pose that this frame of the object has"))
     if request.object_pose is not None and max(abs(x) for x in request.object_pose[:3]) > 1e6:
         errors.append(("object_pose", "metres, and at most 1e6: is the unit right?"))
     if request.pregrasp_distance_m is not None and request.collision_free is False:

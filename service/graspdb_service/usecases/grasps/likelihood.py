@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, ReachInfo, Selection
-from graspdb.wire.queries import LikelihoodColumn, PreOpening
+from graspdb.wire import CalibrationInfo, ReachInfo
+from graspdb.wire.queries import LikelihoodColumn, LikelihoodOptions, LikelihoodQuery, PreOpening
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError
@@ -20,6 +20,7 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.evidence.calibrations import calibrated, of_simulation
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.densities.support import reach_info, support_columns
+from graspdb_service.usecases.trials.pose_frames import PoseFrame, frame_of
 
 #: Columns that take a model of the attempts.
 CHANCES = (
@@ -34,12 +35,12 @@ CHANCES = (
 def likelihood(
     ctx: Estimators,
     slug: str,
-    request: Selection,
+    request: LikelihoodOptions | LikelihoodQuery,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> tuple[Built, ReachInfo | None, CalibrationInfo | None, dict[str, Any]]:
-    """How likely poses (n,) in the object frame are under the density of the successes, and that density;
-    how far from an attempt success probabilities are told, and how they were calibrated.
+) -> tuple[Built, PoseFrame, ReachInfo | None, CalibrationInfo | None, dict[str, Any]]:
+    """How likely poses (n,) in the object frame are under the density of the successes, that density, the
+    frame they were of, how far from an attempt success probabilities are told, how they were calibrated.
 
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
     is minus infinity where the density is exactly zero; NaN stands for not known.
@@ -56,6 +57,8 @@ def likelihood(
 
     with ctx.compute.within(request):
         built = ctx.densities.requested(slug, request)
+        frame = frame_of(built.selected, request.frame, request.convention)
+        poses = frame.to_tool(poses)
         columns: dict[str, Any] = {}
         free = test = reach = None
         threads = ctx.compute.threads
@@ -86,7 +89,7 @@ def likelihood(
         if test is not None and pre_opening_m is not None:
             blocks = ctx.compute.blocks(poses, partial(test.openings, threads=threads))
             known["opening_m"] = np.concatenate(blocks)
-    return built, reach, calibration, known
+    return built, frame, reach, calibration, known
 
 
 def _densities(

@@ -18,6 +18,7 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.support import support_columns
 from graspdb_service.usecases.grasps.likelihood import log_density
 from graspdb_service.usecases.grasps.question import FEW_ATTEMPTS
+from graspdb_service.usecases.trials.pose_frames import PoseFrame
 from graspdb_service.usecases.trials.selection import Selected
 
 #: Draws see more of the kernels' tails than a plain question.
@@ -46,10 +47,11 @@ class Draw:
     def selected(self) -> Selected:
         return self.built.selected
 
-    def columns(self) -> dict[str, Any]:
-        """Those of an answer, by name."""
-        names = ("position", "quaternion_xyzw", "proposal_density", "support")
-        return {name: getattr(self, name) for name in names}
+    def columns(self, frame: PoseFrame) -> dict[str, Any]:
+        """Those of an answer, by name, the poses of a frame."""
+        position, quaternion = frame.from_tool(se3.Poses(self.position, self.quaternion_xyzw))
+        rest = {name: getattr(self, name) for name in ("proposal_density", "support")}
+        return {"position": position, "quaternion_xyzw": quaternion, **rest}
 
 
 def draw(

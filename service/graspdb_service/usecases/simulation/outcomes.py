@@ -8,12 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from graspdb_density.se3 import Poses
 from graspdb_service.problems import invalid
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.simulation import outcomes as packed
+from graspdb_service.storage.trials import provenances
 from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.simulation.sweeps import require_sweep
 from graspdb_service.usecases.trials import sweep_plan
+from graspdb_service.usecases.trials.frames import AskedFrame, frames_of
+from graspdb_service.usecases.trials.pose_frames import PoseFrame
 
 #: Poses read at a time where all are asked for.
 STREAM_POSES = 100_000
@@ -22,9 +26,10 @@ _CURSOR = re.compile(r"(\d{1,9})\.(\d{1,9})")
 
 
 def page(
-    database: Database, sweep_id: str, *, limit: int, cursor: str | None
+    database: Database, sweep_id: str, asked: AskedFrame, *, limit: int, cursor: str | None
 ) -> tuple[TrialColumns, str | None]:
-    """Poses of finished chunks with outcome and pose index, in the plan's order; where the next page starts.
+    """Poses of finished chunks with outcome and pose index, in the plan's order, of a frame of the sweep's
+    gripper; where the next page starts.
 
     While a sweep runs, a page has the chunks that are finished by then: read it again at the end.
     """
@@ -36,6 +41,8 @@ def page(
         number, skip = int(match[1]), int(match[2])
     with database.read() as tx:
         row = require_sweep(tx, sweep_id)
+        names = provenances.of_object(tx, row.object_id)
+        frame = frames_of(tx, names, [row.provenance_id], asked).get(row.provenance_id, PoseFrame())
         # One pose more than asked for tells whether there is another page.
         chunks = packed.page(tx, sweep_id, first_number=number, poses=limit + skip + 1)
         stored = {chunk.number: sweep_plan.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
@@ -60,23 +67,26 @@ def page(
         if last < chunk.stop - chunk.start:
             following = f"{chunk.number}.{last}"
             break
+    poses_found = frame.from_tool(Poses.concatenate([part.poses for part in parts]))
     columns = TrialColumns(
-        position=np.concatenate([part.position for part in parts]),
-        quaternion_xyzw=np.concatenate([part.quaternion_xyzw for part in parts]),
+        position=poses_found.positions,
+        quaternion_xyzw=poses_found.quaternions_xyzw,
         outcome=np.concatenate([part.outcome for part in parts]),
         pose_index=np.concatenate([part.pose_index for part in parts]),
     )
     return columns, following
 
 
-def pages(database: Database, sweep_id: str, *, cursor: str | None) -> Iterator[TrialColumns]:
+def pages(
+    database: Database, sweep_id: str, asked: AskedFrame, *, cursor: str | None
+) -> Iterator[TrialColumns]:
     """All poses of finished chunks from a cursor on."""
-    columns, following = page(database, sweep_id, limit=STREAM_POSES, cursor=cursor)
+    columns, following = page(database, sweep_id, asked, limit=STREAM_POSES, cursor=cursor)
 
     def rest(columns: TrialColumns, following: str | None) -> Iterator[TrialColumns]:
         yield columns
         while following is not None:
-            columns, following = page(database, sweep_id, limit=STREAM_POSES, cursor=following)
+            columns, following = page(database, sweep_id, asked, limit=STREAM_POSES, cursor=following)
             yield columns
 
     return rest(columns, following)

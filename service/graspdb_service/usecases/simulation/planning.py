@@ -34,6 +34,7 @@ from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_o
 from graspdb_service.usecases.simulation import feasibility
 from graspdb_service.usecases.simulation.sweeps import require_sweep, sweep_info
 from graspdb_service.usecases.trials import sweep_plan
+from graspdb_service.usecases.trials.pose_frames import pose_frame
 
 #: More chunks than this are bookkeeping without a use: no lab has so many workers.
 MAX_CHUNKS = 100_000
@@ -139,7 +140,8 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
 
 def _request(spec: SweepCreate, plan: _Plan) -> dict[str, Any]:
     """What was asked for, defaults filled in; given poses are stored as the plan's."""
-    asked = spec.model_dump(mode="json", exclude={"poses", "proposal_density"}, exclude_none=True)
+    apart = {"poses", "proposal_density", "frame", "convention"}
+    asked = spec.model_dump(mode="json", exclude=apart, exclude_none=True)
     if plan.grid is not None:
         asked["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
     return asked
@@ -215,7 +217,8 @@ def _mass(row: ObjectRow) -> float | None:
 
 def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World, given: Given | None) -> _Plan:
     if given is not None:
-        return _given(ctx, given)
+        frame = pose_frame(spec.frame, spec.convention, world.profile, spec.gripper)
+        return _given(ctx, Given(frame.to_tool(given.poses), given.proposal_density))
     if spec.sample is not None:
         return _drawn(ctx, slug, spec, spec.sample)
     wish = spec.grid or GridSpec()

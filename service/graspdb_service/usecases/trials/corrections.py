@@ -14,13 +14,14 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import changes, findings, provenances, rows
 from graspdb_service.storage.trials.changes import TrialRow
 from graspdb_service.usecases.objects import require
+from graspdb_service.usecases.trials.frames import AskedFrame, out_of_tool
 from graspdb_service.usecases.trials.listing import page_of
 
 
-def get(database: Database, slug: str, seq: int) -> TrialInfo:
-    """One trial, and what it was before (404)."""
+def get(database: Database, slug: str, seq: int, frame: AskedFrame) -> TrialInfo:
+    """One trial, its pose of a frame, and what it was before (404)."""
     with database.read() as tx:
-        return _read(tx, require(tx, slug), seq)
+        return _read(tx, require(tx, slug), seq, frame)
 
 
 def withdraw(database: Database, slug: str, seq: int, *, reason: str | None) -> None:
@@ -64,7 +65,7 @@ def correct(database: Database, slug: str, seq: int, patch: TrialPatch) -> Trial
             _count(tx, before, after)
             if withdrawn:
                 findings.drop_trial(tx, row.id, seq)
-        return _read(tx, row, seq)
+        return _read(tx, row, seq, AskedFrame())
 
 
 def _changed(before: TrialRow, given: dict[str, Any]) -> TrialRow:
@@ -96,10 +97,10 @@ def _require(tx: Tx, row: ObjectRow, seq: int) -> TrialRow:
     return found(stored, "trial", str(seq), f"GET /objects/{row.slug}/trials lists them by seq")
 
 
-def _read(tx: Tx, row: ObjectRow, seq: int) -> TrialInfo:
+def _read(tx: Tx, row: ObjectRow, seq: int, frame: AskedFrame) -> TrialInfo:
     _require(tx, row, seq)
     columns = rows.page(tx, row.id, after_seq=seq - 1, up_to_seq=seq, limit=1)
     names = provenances.of_object(tx, row.id)
-    page = page_of(tx, row, columns, names)
+    page = out_of_tool(tx, page_of(tx, row, columns, names), frame)
     history = [change._asdict() for change in changes.of_trial(tx, row.id, seq)]
     return TrialInfo.model_validate({**documents(page)[0], "history": history})

@@ -25,6 +25,7 @@ from graspdb_service.usecases.runtime.idempotency import Created, Sent, replay_o
 from graspdb_service.usecases.runtime.runtime import Runtime
 from graspdb_service.usecases.trials.findings import inspection, words
 from graspdb_service.usecases.trials.findings.inspection import Concern, Geometries
+from graspdb_service.usecases.trials.frames import AskedFrame, into_tool, unknown_grippers
 
 
 class GivenAnswers(Protocol):
@@ -44,14 +45,16 @@ def add(
     *,
     accept_implausible: bool,
     told: BatchDefaults,
+    frame: AskedFrame,
 ) -> Created:
     """Store the trials of one request as a batch, and say what is doubtful about them.
 
-    ``told`` is what the request's address says of the batch. 422 ``implausible-poses`` for trials that can't
-    be of the object, unless they are accepted.
+    ``told`` is what the request's address says of the batch, ``frame`` what its poses are of. 422
+    ``implausible-poses`` for trials that can't be of the object, unless they are accepted.
     """
     scope = f"POST /objects/{slug}/trials"
     beside = told.model_dump_json(exclude_none=True).encode() if told.model_fields_set else b""
+    beside += b"" if frame.is_tool else f"{frame.told()}\n".encode()
     meant = Sent(sent.key, sent.body, media.encode() + b"\n" + beside)
     with ctx.database.read() as tx:
         require(tx, slug)
@@ -65,6 +68,7 @@ def add(
     quotas.check_batch(limits, batch)
     with ctx.database.read() as tx:
         known = require(tx, slug)
+        batch = into_tool(tx, batch, frame)
         profiles = inspection.profiles_of(tx, batch)
     concerns = inspection.inspect(ctx.compute, geometries, known, profiles, batch)
     if not accept_implausible:
@@ -177,13 +181,7 @@ def _held_grippers(tx: Tx, batch: TrialBatch) -> list[Provenance]:
     held = grippers.held(tx, names)
     unknown = sorted(names - held.keys())[: inspection.FIRST]
     if unknown:
-        raise ProblemError(
-            422,
-            "unknown-gripper",
-            f"There is no gripper {', '.join(map(repr, unknown))}:"
-            " GET /grippers lists them, POST /grippers makes one",
-            errors=[(batch.field_of_gripper(name), f"there is no gripper {name!r}") for name in unknown],
-        )
+        raise unknown_grippers(batch, unknown)
     return [
         item if item.gripper is None else item._replace(gripper=held[item.gripper])
         for item in batch.provenances

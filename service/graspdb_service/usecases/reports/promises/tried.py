@@ -11,13 +11,14 @@ import numpy as np
 import orjson
 from scipy.special import ndtri
 
-from graspdb.wire import OUTCOME_CODES
+from graspdb.wire import OUTCOME_CODES, Pose
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
 from graspdb_service.storage import answers
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.trials import rows
 from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
+from graspdb_service.usecases.trials.pose_frames import PoseFrame
 from graspdb_service.usecases.trials.selection import Selected
 
 _SUCCESS, _NO_ATTEMPT = OUTCOME_CODES["success"], OUTCOME_CODES["simulation_error"]
@@ -140,6 +141,9 @@ def _promised(kind: str, question: Mapping[str, Any], result: Mapping[str, Any])
     else:
         columns, level = dict(result), None
     poses = Poses(_floats(columns["position"], 0), _floats(columns["quaternion_xyzw"], 0))
+    told = result.get("tool_to_frame")
+    if told is not None:
+        poses = PoseFrame(fixed=Pose.model_validate(told)).to_tool(poses)
     count = len(poses)
     low, high = (_floats(columns.get(end), count) for end in ("low", "high"))
     # The interval in standard errors, as if it were a normal distribution's.

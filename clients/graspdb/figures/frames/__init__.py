@@ -1,0 +1,1 @@
+"""Figures of grippers: their boxes and frames."""
