@@ -182,6 +182,7 @@ class AsyncTrials(Mirror[Trials]):
 
     add = _awaited(Trials.add)
     add_records = _awaited(Trials.add_records)
+    add_columns = _awaited(Trials.add_columns)
     get = _awaited(Trials.get)
     withdraw = _awaited(Trials.withdraw)
     correct = _awaited(Trials.correct)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +18,7 @@ from typing_extensions import Unpack
 
 from graspdb import wire
 from graspdb.errors import GraspDBError, add_note
+from graspdb.files import arrow
 from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses, first_masked, listed, numbers, pose_frame
 from graspdb.resources.pages import Listing, Resource, segment
@@ -56,8 +57,8 @@ class DoubtfulTrials(UserWarning):
     """The service stored trials and found something doubtful about them: see ``Receipt.findings``."""
 
 
-class Upload(PoseFrame, total=False):
-    """What the poses are of (:class:`PoseFrame`, each of its trial's gripper), and how trials are sent.
+class Sending(TypedDict, total=False):
+    """How trials are sent.
 
     They go ``chunk`` a request; each is stored wholly or not at all, as its own batch. Repeat a failed upload
     with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice. Trials too far from a
@@ -78,6 +79,12 @@ class Upload(PoseFrame, total=False):
         ),
     ]
     progress: bool | ProgressCallback
+
+
+class Upload(Sending, PoseFrame, total=False):
+    """How trials are sent (:class:`Sending`), and what the poses are of (:class:`PoseFrame`, each of its
+    trial's gripper).
+    """
 
 
 class TrialFilters(TrialSelection, PoseFrame, total=False):
@@ -221,6 +228,34 @@ class Trials(Resource):
             lambda start, stop: {"trials": trials[start:stop]}, shared, len(trials), upload, framed
         )
 
+    def add_columns(
+        self,
+        parts: Iterable[Mapping[str, Any]],
+        total: int,
+        /,
+        *,
+        idempotency_key: str | None = None,
+        accept_implausible: bool = False,
+        progress: bool | ProgressCallback = False,
+        **shared: Any,
+    ) -> Receipt:
+        """Store trials that come by pieces, each a batch: columns of the HTTP interface as arrays or lists.
+
+        ``total`` is how many there are in all, for ``progress``; no more than one piece is held at a time.
+        They go as Arrow where pyarrow is installed and the service takes it, else as JSON. ``shared`` stands
+        once for all, as in :meth:`add_records`.
+        """
+        upload: Upload = {
+            "chunk": max(1, total),
+            "idempotency_key": idempotency_key,
+            "accept_implausible": accept_implausible,
+            "progress": progress,
+        }
+        shared = {name: value for name, value in shared.items() if value is not None}
+        return self._post(
+            ((len(part["outcome"]), {"columns": part}) for part in parts), shared, total, upload, {}
+        )
+
     def _send(
         self,
         part: Callable[[int, int], dict[str, Any]],
@@ -233,25 +268,31 @@ class Trials(Resource):
         chunk = upload.get("chunk", CHUNK_TRIALS)
         if chunk < 1:
             raise ValueError("chunk must be at least 1")
-        key = upload.get("idempotency_key") or str(uuid.uuid4())
         shared = {name: value for name, value in shared.items() if value is not None}
+        stops = [min(start + chunk, count) for start in range(0, count, chunk)]
+        pieces = ((stop - start, part(start, stop)) for start, stop in zip([0, *stops], stops, strict=False))
+        return self._post(pieces, shared, count, upload, framed)
+
+    def _post(
+        self,
+        pieces: Iterable[tuple[int, Mapping[str, Any]]],
+        shared: Mapping[str, Any],
+        count: int,
+        upload: Upload,
+        framed: Mapping[str, str],
+    ) -> Receipt:
+        """A request for each piece; warns of findings for whoever called the method that called this."""
+        key, chunk = upload.get("idempotency_key") or str(uuid.uuid4()), upload.get("chunk", CHUNK_TRIALS)
         params = {**framed, **({"accept_implausible": "true"} if upload.get("accept_implausible") else {})}
         receipts: list[wire.BatchReceipt] = []
         findings: list[wire.Finding] = []
+        start = 0
         with _upload_bar(upload.get("progress", False)) as report:
-            for number, start in enumerate(range(0, count, chunk)):
-                stop = min(start + chunk, count)
+            for number, (size, piece) in enumerate(pieces):
+                stop = start + size
                 try:
-                    body = {**shared, **part(start, stop)}
-                    own = key if count <= chunk else f"{key}-{number}"
-                    receipt = self._transport.model(
-                        wire.BatchReceipt,
-                        "POST",
-                        self._path,
-                        body=body,
-                        params=params,
-                        idempotency_key=own,
-                    )
+                    own = key if count <= chunk and size == count else f"{key}-{number}"
+                    receipt = self._sent(piece, shared, params=params, idempotency_key=own)
                     receipts.append(receipt)
                     findings += [_from_row(finding, start) for finding in receipt.findings]
                 except GraspDBError as error:
@@ -264,14 +305,35 @@ class Trials(Resource):
                         )
                     raise
                 report(stop, count)
+                start = stop
         for finding in findings:
-            # To whoever called add, which called this.
-            warnings.warn(f"{finding.message}. {finding.remedy}", DoubtfulTrials, stacklevel=3)
+            # To whoever called add, which called what called this.
+            warnings.warn(f"{finding.message}. {finding.remedy}", DoubtfulTrials, stacklevel=4)
         return Receipt(
             batches=tuple(receipt.batch for receipt in receipts),
             inserted=sum(receipt.inserted for receipt in receipts),
             revision=receipts[-1].revision,
             findings=tuple(findings),
+        )
+
+    def _sent(self, piece: Mapping[str, Any], shared: Mapping[str, Any], **options: Any) -> wire.BatchReceipt:
+        """One request: as Arrow where its columns are arrays and both sides can, else as JSON."""
+        columns = piece.get("columns", {})
+        if isinstance(columns.get("position"), np.ndarray):
+            if arrow.available():
+                headers = {"Content-Type": arrow.MEDIA_TYPE}
+                content = arrow.encoded(columns, shared)
+                try:
+                    return self._transport.model(
+                        wire.BatchReceipt, "POST", self._path, content=content, headers=headers, **options
+                    )
+                except GraspDBError as error:
+                    # The service was installed without Arrow.
+                    if error.status != 415:
+                        raise
+            piece = {"columns": {name: _plain(values) for name, values in columns.items()}}
+        return self._transport.model(
+            wire.BatchReceipt, "POST", self._path, body={**shared, **piece}, **options
         )
 
     def get(self, seq: int, *, frame: str | None = None, convention: str | None = None) -> wire.TrialInfo:
@@ -335,6 +397,15 @@ class Batches(Resource):
     def delete(self, batch: str) -> None:
         """Delete a batch with all its trials (and, a sweep's, its packed outcomes)."""
         self._transport.request("DELETE", f"{self._path}/{segment(batch)}")
+
+
+def _plain(values: Any) -> Any:
+    """An array as lists, NaN as None."""
+    if isinstance(values, Mapping):
+        return {name: _plain(column) for name, column in values.items()}
+    if isinstance(values, np.ndarray) and values.dtype.kind == "f" and values.ndim == 1:
+        return [None if x != x else x for x in values.tolist()]
+    return values.tolist() if isinstance(values, np.ndarray) else values
 
 
 def _from_row(finding: wire.Finding, start: int) -> wire.Finding:

@@ -1,0 +1,88 @@
+"""``graspdb import``."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Annotated, Any
+
+import typer
+
+from graspdb.cli.common import State, show_findings
+from graspdb.interop import ReadOptions
+from graspdb.interop.first_look import FirstLook
+from graspdb.interop.grasps import Report
+from graspdb.interop.importing import Import
+from graspdb.resources.trials import DoubtfulTrials, Sending
+
+
+def import_files(
+    state: State,
+    files: Annotated[
+        list[str], typer.Argument(metavar="FILE...", help="Files of one format.", show_default=False)
+    ],
+    object: Annotated[str, typer.Option("--object", help="The object that was grasped.", show_default=False)],
+    gripper: Annotated[
+        str, typer.Option("--gripper", help="The gripper that grasped: grippers list.", show_default=False)
+    ],
+    reading: ReadOptions,
+    upload: Sending,
+    source: Annotated[str, typer.Option(help="simulation, robot, human or import.")] = "import",
+    protocol: Annotated[str | None, typer.Option(help="How the trials were judged.")] = None,
+    licence: Annotated[str | None, typer.Option(help="Licence of the data, as in CC-BY-NC-4.0.")] = None,
+    citation: Annotated[str | None, typer.Option(help="What to cite for the data.")] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Look at the files and say what would be stored.")
+    ] = False,
+) -> None:
+    """Store the grasps of files in the formats of other projects, after a first look at them.
+
+    ACRONYM (.h5, .json), GraspGen (.json), isaac_grasp (.yaml), GraspNet (.npy, .npz), VGN (.csv),
+    MultiGripperGrasp (.json), moveit_msgs/Grasp (.yaml, .json), GraspIt! and UIBK (.xml), and tables with any
+    columns (.csv, .jsonl, .parquet). Nothing is stored where a file can't be read or can't be right.
+    """
+    item, chosen = state.db.objects.get(object), state.db.grippers.get(gripper)
+    found = Import(item, chosen, files, **reading)
+    accepted = upload.get("accept_implausible", False)
+    refused = found.look.refusals if not accepted else []
+    told = {
+        "report": found.report,
+        "first_look": found.look,
+        "batches": [],
+        "inserted": 0,
+        "dry_run": dry_run,
+    }
+    if not state.json:
+        for line in _lines(found.report, found.look):
+            typer.echo(line)
+    if refused:
+        if state.json:
+            state.show(told, {})
+        raise ValueError(
+            f"{'; '.join(refused)}. Nothing was stored; --accept-implausible stores it all the same"
+        )
+    if dry_run:
+        state.show(told, f"{found.report.grasps:,} trials would be stored; nothing was.")
+        return
+    upload["progress"] = not state.json and found.report.grasps > 1_000
+    with warnings.catch_warnings():
+        # They are told below.
+        warnings.simplefilter("ignore", DoubtfulTrials)
+        receipt = found.send(source=source, protocol=protocol, licence=licence, citation=citation, **upload)
+    told |= {"batches": receipt.batches, "inserted": receipt.inserted, "revision": receipt.revision}
+    stored = f"{receipt.inserted:,} trials stored in batch {', '.join(receipt.batches)}"
+    state.show(
+        told | {"findings": receipt.findings}, f"{stored}; {object} is at revision {receipt.revision}."
+    )
+    if not state.json:
+        show_findings(receipt.findings)
+
+
+def _lines(report: Report, look: FirstLook) -> Any:
+    yield f"{report.file}: {report.format}, {report.grasps:,} grasps"
+    for kind in ("recognised", "assumed", "mapped", "dropped"):
+        for line in getattr(report, kind):
+            yield f"  {kind}: {line}"
+    outcomes = ", ".join(f"{number:,} {name}" for name, number in report.outcomes.items())
+    yield f"  outcomes: {outcomes} ({report.rule})"
+    for line in look.lines():
+        yield f"  first look: {line}"

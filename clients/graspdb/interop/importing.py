@@ -1,0 +1,159 @@
+"""An import: files looked at as a whole before the first trial is sent, then sent by pieces."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from graspdb.interop.first_look import FirstLook, first_look, gathered, target_of
+from graspdb.interop.grasps import FileGrasps, Report, joined, problem, together
+from graspdb.interop.reading import Reading, ReadOptions, opened
+from graspdb.resources.objects import GraspObject
+from graspdb.resources.trials import Receipt, Sending
+from graspdb.wire import GripperInfo
+from graspdb.wire.trials import TrialColumns, TrialColumnsIn
+
+PIECE = 200_000
+"""Trials a request."""
+
+_LOOKED_AT = 2_000
+
+
+class Import:
+    """Files of one format about one object and one gripper, read and looked at; :meth:`send` stores them.
+
+    ``report`` says what was recognised, assumed, mapped and dropped, ``look`` whether they can be grasps of
+    the object. FileProblem where a file, anywhere in it, can't be read: nothing is sent then.
+    """
+
+    def __init__(
+        self,
+        item: GraspObject,
+        gripper: GripperInfo,
+        files: Sequence[str | PathLike[str]],
+        **options: Unpack[ReadOptions],
+    ) -> None:
+        if not files:
+            raise ValueError("give at least one file")
+        self._item, self._gripper = item, gripper
+        self._readings = [opened(file, gripper, **options) for file in files]
+        reports = [_read_through(reading) for reading in self._readings]
+        self.report = together(reports)
+        if not self.report.grasps:
+            raise problem(self.report.file, "no grasp of it is left")
+        self.look = self._looked_at(reports[0])
+
+    def _looked_at(self, report: Report) -> FirstLook:
+        most = max(1, _LOOKED_AT // len(self._readings))
+        firsts = [_first(reading) for reading in self._readings[:_LOOKED_AT]]
+        raw = gathered(firsts, max(_LOOKED_AT, most))
+        mesh = None if self._item.info.mesh is None else self._item.download_mesh()
+        target = target_of(self._item.info, self._gripper.profile, mesh)
+        return first_look(raw, self._readings[0].placing, target, report)
+
+    def send(
+        self,
+        *,
+        source: str | None = "import",
+        protocol: str | None = None,
+        licence: str | None = None,
+        citation: str | None = None,
+        **upload: Unpack[Sending],
+    ) -> Receipt:
+        """Store all of it, in batches of ``chunk`` trials; ``source``, ``protocol``, ``licence`` and
+        ``citation`` are of all of them.
+        """
+        chunk = upload.pop("chunk", PIECE)
+        about = {"source": source, "protocol": protocol, "gripper": self._gripper_name()}
+        about = {name: value for name, value in about.items() if value is not None}
+        return self._item.trials.add_columns(
+            (_columns(part) for part in self._pieces(chunk)),
+            self.report.grasps,
+            **about,
+            **_provenance(self._readings, licence, citation),
+            **upload,
+        )
+
+    def _gripper_name(self) -> str:
+        known = self._gripper
+        return known.id if known.version == known.newest_version else f"{known.id}@{known.version}"
+
+    def _pieces(self, size: int) -> Iterator[FileGrasps]:
+        """The grasps of all files, so many at a time, the last ones fewer."""
+        waiting: list[FileGrasps] = []
+        count = 0
+        for reading in self._readings:
+            for found in reading.chunks(reading.new_report()):
+                waiting.append(found)
+                count += len(found)
+                while count >= size:
+                    whole = joined(waiting)
+                    yield whole.part(slice(0, size))
+                    waiting, count = [whole.part(slice(size, None))], count - size
+        if count:
+            yield joined(waiting)
+
+
+def _read_through(reading: Reading) -> Report:
+    """The report of a whole file: what can't be read is found before anything is sent."""
+    report = reading.new_report()
+    for _ in reading.chunks(report):
+        pass
+    return report
+
+
+def _first(reading: Reading) -> Any:
+    return next(raw for raw in reading.raws(reading.new_report()) if len(raw))
+
+
+def _columns(grasps: FileGrasps) -> dict[str, Any]:
+    """A piece as columns of the HTTP interface."""
+    columns: dict[str, Any] = {
+        "position": grasps.position,
+        "quaternion_xyzw": grasps.quaternion_xyzw,
+        "outcome": grasps.outcomes,
+    }
+    columns |= {name: values for name, values in grasps.more.items() if any(x is not None for x in values)}
+    known = {name: values for name, values in grasps.qualities.items() if not np.isnan(values).all()}
+    return columns | _scores(known, columns.get("metadata"), len(grasps))
+
+
+def _scores(qualities: dict[str, Any], metadata: Any, count: int) -> dict[str, Any]:
+    """Named qualities: as they are where the wire has them, else each trial's in its metadata."""
+    if not qualities:
+        return {}
+    if "qualities" in TrialColumns.model_fields:
+        return {"qualities": qualities}
+    first = next(iter(qualities.values()))
+    rows = [dict(row or {}) for row in (metadata or [None] * count)]
+    for name, values in qualities.items():
+        for row, value in zip(rows, values.tolist(), strict=True):
+            if value == value:
+                row.setdefault("qualities", {})[name] = value
+    return {"quality": first, "metadata": rows}
+
+
+def _provenance(readings: Sequence[Reading], licence: str | None, citation: str | None) -> dict[str, Any]:
+    """Where a batch comes from: fields of its own where the wire has them, else in its metadata."""
+    first = readings[0].source
+    origin = {"file": first.path.name, "format": readings[0].kind.name, "sha256": _digest(first.path)}
+    if len(readings) > 1:
+        origin["file"] = f"{first.path.name} and {len(readings) - 1:,} more"[:255]
+        del origin["sha256"]
+    told = {"licence": licence, "citation": citation, "origin": origin}
+    told = {name: value for name, value in told.items() if value is not None}
+    fields = TrialColumnsIn.model_fields
+    return told if "origin" in fields else {"metadata": told}
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,217 @@
+"""``graspdb import``: what is stored, what is said before, what is refused and which flag mends it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import trimesh
+
+import foreign_files as files
+from graspdb import Client, interop
+from graspdb.resources.objects import GraspObject
+
+Run = Callable[..., tuple[int, str, str]]
+RADIUS_M, HEIGHT_M = 0.03, 0.2
+
+
+def _can(db: Client, id: str, scale: float = 1.0) -> GraspObject:
+    """A can that stands about the origin."""
+    mesh = trimesh.creation.cylinder(RADIUS_M * scale, HEIGHT_M * scale)
+    return db.objects.create(id, mesh=mesh)
+
+
+def _about_the_can(count: int = 60) -> np.ndarray:
+    """Tools (N, 4, 4) that reach for the can's axis from its sides, and close across it."""
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, count), rng.uniform(-0.04, 0.04, count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    approach = np.stack([-np.cos(angle), -np.sin(angle), 0 * angle], axis=1)
+    closing = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+    poses[:, :3, 2], poses[:, :3, 1] = approach, closing
+    poses[:, :3, 0], poses[:, 2, 3] = np.cross(closing, approach), height
+    return poses
+
+
+def _panda_bases(db: Client, tools: np.ndarray) -> np.ndarray:
+    way = db.grippers.get("panda").profile.base_to_tool
+    assert way is not None
+    fixed = np.eye(4)
+    fixed[:3, 3] = way.position
+    return np.asarray(tools @ np.linalg.inv(fixed))
+
+
+@pytest.fixture
+def acronym(db: Client, tmp_path: Path) -> str:
+    """An ACRONYM file of the can's grasps, every third of which failed."""
+    poses = files.turned(_panda_bases(db, _about_the_can()), files.TO_ZX)
+    return files.acronym_h5(tmp_path / "can.h5", poses, [int(i % 3 > 0) for i in range(len(poses))])
+
+
+def test_an_acronym_file_becomes_trials(db: Client, run: Run, fresh_id: str, acronym: str) -> None:
+    can = _can(db, fresh_id)
+    arguments = ("import", acronym, "--object", fresh_id, "--gripper", "panda", "--licence", "CC-BY-NC-4.0")
+    code, out, err = run(*arguments)
+    assert code == 0, err
+    for told in ("acronym, 60 grasps", "gripper panda", "z approaches and x closes", "60 of 60 lie within"):
+        assert told in out, out
+    assert "60 of 60 closings meet the object" in out
+    assert "Doubtful" not in out
+    trials = can.trials.list().arrays()
+    assert trials.matrices == pytest.approx(_about_the_can(), abs=1e-9)
+    assert trials.outcome.tolist() == ["success" if i % 3 else "failure" for i in range(60)]
+    (batch,) = can.batches
+    assert batch.sources == ["import"]
+    assert batch.grippers == ["panda"]
+    assert "CC-BY-NC-4.0" in batch.model_dump_json()
+    assert "can.h5" in batch.model_dump_json()
+    assert "object_motion_during_shaking_linear" in next(iter(can.trials)).model_dump_json()
+
+
+def test_a_dry_run_stores_nothing_and_says_it_as_data(
+    db: Client, run: Run, fresh_id: str, acronym: str
+) -> None:
+    can = _can(db, fresh_id)
+    arguments = ("--json", "import", acronym, "--object", fresh_id, "--gripper", "panda", "--dry-run")
+    code, out, err = run(*arguments)
+    assert code == 0, err
+    told = json.loads(out)
+    assert told["report"]["grasps"] == 60
+    assert told["report"]["outcomes"] == {"failure": 20, "success": 40}
+    assert told["first_look"]["fingertips_in_box"] == 60
+    assert told["first_look"]["refusals"] == []
+    assert (told["inserted"], told["dry_run"]) == (0, True)
+    assert can.refresh().info.trials == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "told", "mend"),
+    [
+        (("--unit", "mm"), "no fingertip comes near|few grasps fit", "--unit m"),
+        (("--scale", "10"), "no fingertip comes near|few grasps fit", "--unit m"),
+        (("--frame", "tool"), "no fingertip comes near|few grasps fit", "--frame base"),
+        (("--convention", "graspnet"), "no fingertip comes near|few grasps fit", "--convention acronym"),
+        (("--convention", "graspdb"), "few grasps fit", "--convention acronym"),
+    ],
+)
+def test_what_cannot_be_right_is_refused_with_the_flag_that_mends_it(
+    db: Client, run: Run, fresh_id: str, acronym: str, flags: tuple[str, ...], told: str, mend: str
+) -> None:
+    can = _can(db, fresh_id)
+    code, out, err = run("import", acronym, "--object", fresh_id, "--gripper", "panda", *flags)
+    assert code == 1, out
+    assert any(part in err for part in told.split("|")), err
+    assert mend in err, err
+    assert can.refresh().info.trials == 0, out
+
+
+def test_quaternions_in_the_other_order_are_seen(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
+    can = _can(db, fresh_id)
+    # From above: level grasps would be as good with their quaternions in the other order.
+    tools = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (60, 1, 1))
+    tools[:, 2, 3] = HEIGHT_M / 2 - 0.015
+    turn = np.linspace(0.1, 3, 60)
+    spin = np.tile(np.eye(4), (60, 1, 1))
+    spin[:, 0, 0] = spin[:, 1, 1] = np.cos(turn)
+    spin[:, 1, 0], spin[:, 0, 1] = np.sin(turn), -np.sin(turn)
+    tools = spin @ tools
+    bases = _panda_bases(db, tools)
+    turns = np.array([files.quaternion(pose[:3, :3])[[3, 0, 1, 2]] for pose in bases])
+    columns = {"position": bases[:, :3, 3].tolist(), "q": turns.tolist(), "outcome": [True] * len(tools)}
+    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
+    arguments = ("import", str(tmp_path / "t.parquet"), "--object", fresh_id, "--gripper", "panda")
+    arguments += ("--frame", "base")
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert "quaternions fit the other order better" in err
+    assert "--quaternion-order wxyz" in err
+    code, _, err = run(*arguments, "--quaternion-order", "wxyz")
+    assert code == 0, err
+    assert can.trials.list().arrays().matrices == pytest.approx(tools, abs=1e-9)
+
+
+def test_a_can_a_metre_tall_is_refused_with_the_scale_of_its_mesh(
+    db: Client, run: Run, fresh_id: str, tmp_path: Path
+) -> None:
+    _can(db, fresh_id, scale=20)
+    poses = files.turned(_panda_bases(db, _about_the_can()), files.TO_ZX)
+    volume = float(trimesh.creation.cylinder(RADIUS_M, HEIGHT_M).volume)
+    for number, more in enumerate([{}, {"volume": volume}]):
+        path = files.acronym_h5(tmp_path / f"{number}.h5", poses, [1] * 60, scale=0.05, **more)
+        arguments = ("import", path, "--object", fresh_id, "--gripper", "panda")
+        code, out, err = run(*arguments)
+        assert code == 1, out
+        assert "--scale 0.05" in err, err
+    code, out, err = run(*arguments, "--accept-implausible")
+    assert code == 0, err
+    assert "60 trials stored" in out
+
+
+def test_files_are_one_import_and_pieces_are_batches(
+    db: Client, run: Run, fresh_id: str, tmp_path: Path
+) -> None:
+    can = _can(db, fresh_id)
+    tools = _about_the_can(7)
+    worlds = [
+        files.graspit_world(tmp_path / f"{i}.xml", np.eye(4), base)
+        for i, base in enumerate(_panda_bases(db, tools))
+    ]
+    arguments = ("import", *worlds, "--object", fresh_id, "--gripper", "panda", "--outcome", "success")
+    code, out, err = run(*arguments, "--chunk", "3")
+    assert code == 0, err
+    assert "7 files: graspit, 7 grasps" in out
+    assert [batch.inserted for batch in can.batches] == [3, 3, 1]
+    assert can.trials.list().arrays().matrices == pytest.approx(tools, abs=1e-9)
+
+
+def test_a_file_that_ends_badly_stores_nothing(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
+    can = _can(db, fresh_id)
+    row = {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1], "outcome": True}
+    lines = [json.dumps(row)] * 50 + [json.dumps({**row, "position": [0, 0, None]})]
+    (tmp_path / "t.jsonl").write_text("\n".join(lines))
+    arguments = ("import", str(tmp_path / "t.jsonl"), "--object", fresh_id, "--gripper", "panda")
+    code, _, err = run(*arguments, "--chunk", "10", "--accept-implausible")
+    assert code == 1
+    assert "grasp 50 has a position that is not finite" in err
+    assert can.refresh().info.trials == 0
+
+
+def test_without_a_mesh_there_is_nothing_to_compare(
+    db: Client, run: Run, fresh_id: str, acronym: str
+) -> None:
+    db.objects.create(fresh_id)
+    code, out, err = run("import", acronym, "--object", fresh_id, "--gripper", "panda", "--dry-run")
+    assert code == 0, err
+    assert "the object has no mesh" in out
+
+
+def test_what_the_sdk_read_goes_where_trials_go(db: Client, fresh_id: str, acronym: str) -> None:
+    can = _can(db, fresh_id)
+    read = interop.read(acronym, gripper=db.grippers.get("panda"))
+    receipt = can.trials.add(read, read.outcomes, gripper="panda", source="import")
+    assert receipt.inserted == 60
+    assert can.trials.list().arrays().matrices == pytest.approx(read.matrices, abs=1e-9)
+
+
+def test_columns_go_as_json_where_arrow_is_not_installed(
+    db: Client, fresh_id: str, acronym: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    can = _can(db, fresh_id)
+    tools = _about_the_can(4)
+    columns = {
+        "position": tools[:, :3, 3],
+        "quaternion_xyzw": np.array([files.quaternion(pose[:3, :3]) for pose in tools]),
+        "outcome": np.array(["success"] * 4),
+        "quality": np.array([1.0, np.nan, 2.0, 3.0]),
+    }
+    for there in (True, False):
+        monkeypatch.setattr("graspdb.files.arrow.available", lambda there=there: there)
+        assert can.trials.add_columns([columns], 4, gripper="panda").inserted == 4
+    stored = list(can.trials)
+    assert [trial.quality for trial in stored] == [1.0, None, 2.0, 3.0] * 2
+    assert stored[0].quaternion_xyzw == stored[4].quaternion_xyzw
