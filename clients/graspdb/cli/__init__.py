@@ -17,6 +17,7 @@ from graspdb.cli import access, answers, kernels, objects, queries, reports, swe
 from graspdb.cli.common import ERRORS, State
 from graspdb.cli.drawing.frames import frames
 from graspdb.cli.exchange import bundle
+from graspdb.cli.exchange.exporting import export
 from graspdb.cli.exchange.importing import import_files
 from graspdb.cli.grippers import making
 from graspdb.cli.options import Commands
@@ -73,6 +74,7 @@ app.command("frames")(frames)
 app.add_typer(trials.trials, name="trials")
 app.add_typer(trials.batches, name="batches")
 app.command("import")(import_files)
+app.command("export")(export)
 app.add_typer(access.keys, name="keys")
 app.command("audit")(access.audit)
 app.command("density")(queries.density)

@@ -11,11 +11,11 @@ import numpy as np
 
 from graspdb.files.trials import METRES
 from graspdb.interop.formats.known import TIPS
-from graspdb.interop.frames import CONVENTIONS, frames_of, rotated, to_graspdb, to_tool
+from graspdb.interop.frames import frames_of, rotated, to_graspdb, to_tool
 from graspdb.interop.grasps import Floats, Raw, Report
 from graspdb.interop.placing import Placing
 from graspdb.poses import matrices
-from graspdb.wire import GripperProfile, ObjectInfo
+from graspdb.wire import CONVENTIONS, GripperProfile, ObjectInfo
 
 NEAR_M = 0.01
 """Fingertips this far outside the object's box still count as within: jaws close about what sticks out."""

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import re
+from typing import cast
 
 import numpy as np
 
 from graspdb.interop.grasps import Floats
 from graspdb.poses import Poses, matrices, quaternions_of
-from graspdb.wire import GripperProfile, Pose
-
-CONVENTIONS: dict[str, str] = {
-    "graspdb": "z/y",
-    "acronym": "z/x",
-    "graspgen": "z/x",
-    "graspnet": "x/y",
-    "vgn": "z/y",
-    "moveit": "z/y",
-}
-"""The axis of approach and that in which the fingers close, of each convention."""
+from graspdb.wire import CONVENTIONS, Convention, GripperProfile, Pose
+from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING
 
 _AXES = re.compile(r"([+-]?)([xyz])/([+-]?)([xyz])")
 
@@ -26,9 +18,11 @@ _AXES = re.compile(r"([+-]?)([xyz])/([+-]?)([xyz])")
 def to_graspdb(convention: str) -> Floats:
     """The rotation (3, 3) that makes a pose of this convention one with approach z and closing y: T R.
 
-    A name of :data:`CONVENTIONS`, or the two axes themselves, as in ``x/y`` or ``-z/x``; else ValueError.
+    A name of :data:`graspdb.wire.CONVENTIONS`, or the two axes themselves, as in ``x/y`` or ``-z/x``; else
+    ValueError.
     """
-    found = _AXES.fullmatch(CONVENTIONS.get(convention, convention))
+    named = APPROACH_AND_CLOSING.get(cast("Convention", convention))
+    found = _AXES.fullmatch("/".join(named) if named else convention)
     if found is None or found[2] == found[4]:
         known = ", ".join(CONVENTIONS)
         raise ValueError(
@@ -45,12 +39,7 @@ def _axis(sign: str, letter: str) -> Floats:
 
 def frames_of(gripper: GripperProfile | None) -> dict[str, Pose]:
     """The frames of a gripper by name, poses in its base; without a gripper only ``tool`` can be meant."""
-    if gripper is None:
-        return {}
-    own: dict[str, Pose] = dict(getattr(gripper, "frames", {}))
-    identity = Pose(position=(0.0, 0.0, 0.0), quaternion_xyzw=(0.0, 0.0, 0.0, 1.0))
-    tool = {} if gripper.base_to_tool is None else {"tool": gripper.base_to_tool}
-    return {**own, "base": identity, **tool}
+    return {} if gripper is None else gripper.frames
 
 
 def to_tool(frame: str, convention: str, gripper: GripperProfile | None) -> Floats:

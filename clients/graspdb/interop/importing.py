@@ -6,9 +6,10 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
+from typing_extensions import Unpack
 
 from graspdb.interop.first_look import FirstLook, first_look, gathered, target_of
 from graspdb.interop.grasps import FileGrasps, Report, joined, problem, together
@@ -16,7 +17,6 @@ from graspdb.interop.reading import Reading, ReadOptions, opened
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.trials import Receipt, Sending
 from graspdb.wire import GripperInfo
-from graspdb.wire.trials import TrialColumns, TrialColumnsIn
 
 PIECE = 200_000
 """Trials a request."""
@@ -75,7 +75,9 @@ class Import:
             (_columns(part) for part in self._pieces(chunk)),
             self.report.grasps,
             **about,
-            **_provenance(self._readings, licence, citation),
+            licence=licence,
+            citation=citation,
+            origin=_origin(self._readings),
             **upload,
         )
 
@@ -120,35 +122,23 @@ def _columns(grasps: FileGrasps) -> dict[str, Any]:
     }
     columns |= {name: values for name, values in grasps.more.items() if any(x is not None for x in values)}
     known = {name: values for name, values in grasps.qualities.items() if not np.isnan(values).all()}
-    return columns | _scores(known, columns.get("metadata"), len(grasps))
+    # "quality" has a column of its own.
+    if "quality" in known:
+        columns["quality"] = known.pop("quality")
+    return columns | ({"qualities": known} if known else {})
 
 
-def _scores(qualities: dict[str, Any], metadata: Any, count: int) -> dict[str, Any]:
-    """Named qualities: as they are where the wire has them, else each trial's in its metadata."""
-    if not qualities:
-        return {}
-    if "qualities" in TrialColumns.model_fields:
-        return {"qualities": qualities}
-    first = next(iter(qualities.values()))
-    rows = [dict(row or {}) for row in (metadata or [None] * count)]
-    for name, values in qualities.items():
-        for row, value in zip(rows, values.tolist(), strict=True):
-            if value == value:
-                row.setdefault("qualities", {})[name] = value
-    return {"quality": first, "metadata": rows}
-
-
-def _provenance(readings: Sequence[Reading], licence: str | None, citation: str | None) -> dict[str, Any]:
-    """Where a batch comes from: fields of its own where the wire has them, else in its metadata."""
+def _origin(readings: Sequence[Reading]) -> dict[str, str]:
+    """What a batch was read from; of several files the first one's name."""
     first = readings[0].source
-    origin = {"file": first.path.name, "format": readings[0].kind.name, "sha256": _digest(first.path)}
-    if len(readings) > 1:
-        origin["file"] = f"{first.path.name} and {len(readings) - 1:,} more"[:255]
-        del origin["sha256"]
-    told = {"licence": licence, "citation": citation, "origin": origin}
-    told = {name: value for name, value in told.items() if value is not None}
-    fields = TrialColumnsIn.model_fields
-    return told if "origin" in fields else {"metadata": told}
+    if len(readings) == 1:
+        return {
+            "file": first.path.name[-255:],
+            "format": readings[0].kind.name,
+            "sha256": _digest(first.path),
+        }
+    told = f" and {len(readings) - 1:,} more"
+    return {"file": first.path.name[: 255 - len(told)] + told, "format": readings[0].kind.name}
 
 
 def _digest(path: Path) -> str:

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
+from typing_extensions import Unpack
 
 from graspdb.files.trials import METRES
 from graspdb.interop.formats.columns import parsed
 from graspdb.interop.formats.known import FORMATS, TIPS, Format, recognised
 from graspdb.interop.formats.source import SourceFile, Wishes
-from graspdb.interop.frames import CONVENTIONS, frames_of, to_graspdb, to_tool
+from graspdb.interop.frames import frames_of, to_graspdb, to_tool
 from graspdb.interop.grasps import Codes, FileGrasps, Floats, Raw, Report, joined, problem
 from graspdb.interop.outcomes import Rule, named, rule_of
 from graspdb.interop.placing import Placing
 from graspdb.options import Option, Vector, known_keywords
 from graspdb.poses import as_vector7, matrices
-from graspdb.wire import GripperInfo, GripperProfile
+from graspdb.wire import CONVENTIONS, GripperInfo, GripperProfile
+from graspdb.wire.base import MAX_QUALITIES
+
+#: Limits of a quality's number and of its name.
+_LARGEST, _LONGEST = 1e9, 64
 
 _WHERE_OBJECT = (
     "(--object-pose x,y,z,qx,qy,qz,qw; the identity 0,0,0,0,0,0,1 where it is the object's own frame)"
@@ -60,12 +66,33 @@ class Reading:
             except ValueError as error:
                 raise problem(self.source.name, str(error)) from None
             codes, kept = self._outcomes(raw, report)
-            found = FileGrasps(*poses, codes, dict(raw.qualities), {k: list(v) for k, v in raw.more.items()})
+            more = {name: list(values) for name, values in raw.more.items()}
+            found = FileGrasps(*poses, codes, self._qualities(raw, report), more)
             if not kept.all():
                 found = found.part(kept)
             report.count(found)
             if len(found):
                 yield found
+
+    def _qualities(self, raw: Raw, report: Report) -> dict[str, Floats]:
+        """The qualities under names that are stored; one line names a number that can't be."""
+        found: dict[str, Floats] = {}
+        for name, values in raw.qualities.items():
+            beyond = np.flatnonzero(np.abs(values) > _LARGEST)
+            if beyond.size:
+                place = int(beyond[0])
+                told = (
+                    f"grasp {raw.first + place}: {name} is {values[place]:g}; at most {_LARGEST:g} is stored"
+                )
+                raise problem(self.source.name, told)
+            plain = re.sub(r"[^A-Za-z0-9._/-]", "_", name)[:_LONGEST].lstrip("._/-") or "quality"
+            if plain != name:
+                report.map(f"{name} to the quality {plain}")
+            if len(found) == MAX_QUALITIES:
+                report.drop(f"{name}: a trial has at most {MAX_QUALITIES} qualities")
+                continue
+            found[plain] = values
+        return found
 
     def _check_references(self, report: Report) -> None:
         if report.references and self.placing.into_object is None:
@@ -123,7 +150,7 @@ class ReadOptions(TypedDict, total=False):
 
     - ``format``: ``auto``, or one of :data:`FORMATS`.
     - ``frame``: which frame of the gripper its poses are of; by default the format's own.
-    - ``convention``: which axes approach and close: a name of :data:`graspdb.interop.frames.CONVENTIONS`, or
+    - ``convention``: which axes approach and close: a name of :data:`graspdb.wire.CONVENTIONS`, or
       the axes themselves, as in ``z/x``. ``graspdb`` are the frame's own, as the gripper's profile has them.
     - ``unit``, ``scale``: positions are in this unit, and are multiplied.
     - ``columns``: of a table, ``{"position": "px:py:pz", "quaternion_wxyz": "q", "quality.force": "f"}`` or

@@ -1,0 +1,144 @@
+"""Grasps written in the formats of other projects, with a report of what the format cannot say."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from graspdb.interop.frames import follow, frames_of, to_graspdb, to_tool
+from graspdb.interop.grasps import FileGrasps, Report
+from graspdb.interop.writers import matrices, messages, tables
+from graspdb.interop.writers.content import Content
+from graspdb.poses import as_poses
+from graspdb.wire import OUTCOMES, GripperInfo, GripperProfile
+
+
+@dataclass(frozen=True)
+class _Writer:
+    """Who writes a format, what its poses are of where nobody says, and how its files' names end."""
+
+    write: Callable[[Path, Content, Report], None]
+    frame: str
+    convention: str
+    suffixes: tuple[str, ...]
+
+
+_WRITERS = {
+    "acronym": _Writer(matrices.acronym, "base", "acronym", (".h5", ".hdf5")),
+    "graspgen": _Writer(matrices.graspgen, "base", "graspgen", (".json",)),
+    "isaac": _Writer(messages.isaac, "base", "graspdb", (".yaml", ".yml")),
+    "moveit": _Writer(messages.moveit, "flange", "graspdb", (".yaml", ".yml", ".json")),
+    "csv": _Writer(tables.csv_file, "tool", "graspdb", (".csv",)),
+    "jsonl": _Writer(tables.json_lines, "tool", "graspdb", (".jsonl", ".ndjson")),
+    "parquet": _Writer(tables.parquet, "tool", "graspdb", (".parquet",)),
+}
+
+WRITTEN = tuple(_WRITERS)
+"""The formats that are written, by name."""
+
+
+def write(
+    path: str | PathLike[str],
+    grasps: ArrayLike | Any,
+    *,
+    format: str | None = None,
+    frame: str | None = None,
+    convention: str | None = None,
+    gripper: GripperProfile | GripperInfo | None = None,
+    outcomes: ArrayLike | None = None,
+    qualities: Mapping[str, ArrayLike] | None = None,
+    object: str | None = None,
+) -> Report:
+    """Write grasps to a file; the report says what was mapped, assumed, and dropped.
+
+    ``grasps`` are poses of the tool in the object's frame: what :func:`graspdb.interop.read` gave, trials,
+    samples, grasps, (N, 4, 4) or (N, 7). ``format`` is one of :data:`WRITTEN`, by default as the name ends;
+    ``frame`` and ``convention`` are what its poses are to be of, by default the format's own; ``gripper`` is
+    needed for any frame but the tool. ``outcomes`` (N,) names and ``qualities`` (N,) numbers by name are
+    those of the grasps where they have any, unless given. The file is replaced when it is whole.
+    """
+    target = Path(path)
+    name = format or _by_name(target)
+    if name not in _WRITERS:
+        raise ValueError(f"format is {name!r}; expected one of {', '.join(WRITTEN)}")
+    writer = _WRITERS[name]
+    profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
+    report = Report(str(path), name)
+    chosen, axes = frame or writer.frame, convention or writer.convention
+    if frame is None and chosen == "flange" and "flange" not in frames_of(profile):
+        raise ValueError(
+            "moveit_msgs/Grasp has poses of the end effector's parent link, and the gripper has no frame"
+            " flange: say which of its frames that link is (--frame base, or another)"
+        )
+    report.frame, report.convention = chosen, axes
+    fixed = np.asarray(np.linalg.inv(to_tool(chosen, axes, profile)), dtype=np.float64)
+    poses = as_poses(grasps)
+    content = Content(
+        follow(poses, fixed),
+        chosen,
+        axes,
+        # The approach is z of ours: what that is in the axes that are written.
+        to_graspdb(axes)[:, 2],
+        _outcomes(grasps, outcomes, len(poses.position)),
+        _qualities(grasps, qualities, len(poses.position)),
+        _more(grasps),
+        profile,
+        gripper.id if isinstance(gripper, GripperInfo) else None,
+        object,
+    )
+    whole = target.with_name(f"{target.name}.part{os.getpid()}{target.suffix}")
+    try:
+        writer.write(whole, content, report)
+        os.replace(whole, target)
+    finally:
+        whole.unlink(missing_ok=True)
+    report.grasps = len(content)
+    return report
+
+
+def _by_name(path: Path) -> str:
+    suffix = path.suffix.lower()
+    fitting = [name for name, writer in _WRITERS.items() if suffix in writer.suffixes]
+    if len(fitting) != 1:
+        which = (
+            f"{suffix or 'no suffix'} is {' or '.join(fitting)}"
+            if fitting
+            else f"no format ends in {suffix!r}"
+        )
+        raise ValueError(f"{path}: {which}; name it (--format), one of {', '.join(WRITTEN)}")
+    return fitting[0]
+
+
+def _outcomes(grasps: Any, given: ArrayLike | None, count: int) -> Any:
+    found = getattr(grasps, "outcomes", getattr(grasps, "outcome", None)) if given is None else given
+    if found is None or callable(found):
+        return None
+    array = np.asarray(found)
+    if array.dtype == bool:
+        array = np.where(array, "success", "failure")
+    if array.shape != (count,):
+        raise ValueError(f"outcomes have shape {array.shape}; expected {(count,)}")
+    wrong = sorted(set(array.tolist()) - set(OUTCOMES))
+    if wrong:
+        raise ValueError(f"outcome {wrong[0]!r}; expected one of {', '.join(OUTCOMES)}")
+    return array
+
+
+def _qualities(grasps: Any, given: Mapping[str, ArrayLike] | None, count: int) -> dict[str, Any]:
+    found = getattr(grasps, "qualities", {}) if given is None else given
+    named = {name: np.asarray(values, dtype=np.float64) for name, values in dict(found).items()}
+    for name, values in named.items():
+        if values.shape != (count,):
+            raise ValueError(f"quality {name!r} has shape {values.shape}; expected {(count,)}")
+    return named
+
+
+def _more(grasps: Any) -> dict[str, list[Any]]:
+    return dict(grasps.more) if isinstance(grasps, FileGrasps) else {}
