@@ -136,6 +136,11 @@ def test_proposals_are_drawn_where_the_pre_shaped_jaw_is_free(slot: httpx.Client
         for more in ({}, {"pre_opening_m": "auto"})
     )
     assert auto.status_code == 200, auto.text
+    openings = np.array(auto.json()["opening_m"])
+    assert openings.shape == (200,)
+    assert ((openings > 0.01) & (openings <= 0.08)).all()
+    by_density = slot.post("/objects/thing/proposals", json={"count": 3, "pre_opening_m": 0.05}).json()
+    assert by_density["opening_m"] == [0.05] * 3
     across = np.abs(np.array(auto.json()["position"])[:, 1]) < 0.01
     assert across.mean() > 0.05
     if wide.status_code == 200:

@@ -279,11 +279,16 @@ def proposals(
             " edges: where the jaw can close, before any trial (needs a mesh and --gripper)."
         ),
     ] = "density",
+    pre_opening_m: Annotated[
+        str | None, typer.Option(help="How far open the jaw comes: metres, or auto.", show_default=False)
+    ] = None,
     seed: Seed = None,
     csv: Csv = False,
 ) -> None:
     """Draw grasps to try next; their proposal_density goes back with the trials."""
-    drawn = state.db.objects.get(id).proposals(count, strategy=strategy, seed=seed, **selection)
+    drawn = state.db.objects.get(id).proposals(
+        count, strategy=strategy, pre_opening_m=pre_opening_m, seed=seed, **selection
+    )
     _show_poses(state, drawn, csv)
 
 
@@ -301,4 +306,6 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
         if found.support is not None:
             columns["nearest attempt"] = partial(_nearest_of, found.support)
             columns["within reach"] = partial(_cell, found.support.enough)
+        if found.opening_m is not None:
+            columns["opening [m]"] = partial(_cell, found.opening_m)
         show_table(range(len(found)), columns, empty="No samples.")

@@ -124,9 +124,12 @@ class GraspQueries(Resource):
         ``verify`` has a worker simulate the grasps at the fine step before they are answered:
         ``grasp.simulated`` is what became of each, and those that held come first. The outcomes are stored as
         a check. With the gripper and protocol of the trials, where they say; else ``pg70`` and ``wrench``.
-        TimeoutError if that takes longer than ``verify_timeout_s``; it says so where no worker has come.
+        The jaw opens wide in it, so ``pre_opening_m`` is refused beside it (ValueError). TimeoutError if that
+        takes longer than ``verify_timeout_s``; it says so where no worker has come.
         """
         given = known_keywords(Constraints, constraints, "best_grasps")
+        if verify and given.get("pre_opening_m") is not None:
+            raise ValueError("verify simulates with the jaw wide open: leave it out, or pre_opening_m")
         request = best_grasp_request(count, given)
         answer = self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
         grasps = Grasps(answer, partial(report_grasp, self._transport, self.id))

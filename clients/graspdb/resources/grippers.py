@@ -11,7 +11,7 @@ from graspdb.resources.pages import Listing, Resource, segment, validate
 
 
 class Grippers(Resource):
-    """``db.grippers``: ``pg70``, ``panda`` and your own."""
+    """``db.grippers``: those that are there from the start, such as ``panda``, and your own."""
 
     def create(self, /, id: str, *, name: str | None = None, **profile: Any) -> wire.GripperInfo:
         """Create a gripper profile; the fields are those of :class:`graspdb.wire.GripperProfile`.

@@ -607,7 +607,8 @@ class SampledPoses(PoseArrays):
     what was tried; None where that was not looked up. ``prior``: geometry drew them, no trial. ``selection``
     says whose trials count. ``answer`` is the id that the service keeps them under, None where it does not;
     ``newer_revision`` the object's revision now, where a name keeps them of an older one; ``stale``: the
-    database did not answer, so they are from what the service had read before.
+    database did not answer, so they are from what the service had read before. ``opening_m`` (N,) is the
+    opening to command at each proposal, metres, where ``pre_opening_m`` asked for it.
     """
 
     proposal_density: Floats
@@ -621,10 +622,12 @@ class SampledPoses(PoseArrays):
     newer_revision: int | None = None
     stale: bool = False
     selection: wire.SelectionInfo | None = None
+    opening_m: Floats | None = None
 
     @classmethod
     def from_wire(cls, answer: wire.Samples) -> SampledPoses:
         """From the service's answer."""
+        openings = answer.opening_m if isinstance(answer, wire.Proposals) else None
         return cls(
             position=np.array(answer.position, dtype=np.float64).reshape(-1, 3),
             quaternion_xyzw=np.array(answer.quaternion_xyzw, dtype=np.float64).reshape(-1, 4),
@@ -641,10 +644,13 @@ class SampledPoses(PoseArrays):
             newer_revision=answer.newer_revision,
             stale=answer.stale,
             selection=answer.selection,
+            opening_m=None if openings is None else np.array(openings, dtype=np.float64),
         )
 
     def _columns(self) -> dict[str, Any]:
         columns = {**pose_columns(self), "proposal_density": self.proposal_density}
+        if self.opening_m is not None:
+            columns["opening_m"] = self.opening_m
         return columns if self.support is None else columns | self.support.columns()
 
     def __repr__(self) -> str:

@@ -780,6 +780,9 @@ class Proposals(Samples):
     """The strategy that was asked for."""
     criterion: str
     """How they were drawn, in words."""
+    opening_m: list[float] | None = None
+    """How far open the jaw comes to each pose, metres: the opening to command; null without
+    ``pre_opening_m``."""
 
 
 # -- in query strings, and beside poses that are read as arrays

@@ -7,6 +7,8 @@ tells it at each draw: sent back with the trial, it undoes the choice (eq 1).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -54,10 +56,25 @@ def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw
     409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
     """
     if request.strategy == "density":
-        return samples.draw(ctx, slug, request, request.count, request.seed), CRITERIA["density"]
-    samples.check_count(ctx, request.count)
-    drawn = _uncertain if request.strategy == "uncertainty" else _from_edges
-    return drawn(ctx, slug, request), CRITERIA[request.strategy]
+        drawn = samples.draw(ctx, slug, request, request.count, request.seed)
+    else:
+        samples.check_count(ctx, request.count)
+        drawn = (_uncertain if request.strategy == "uncertainty" else _from_edges)(ctx, slug, request)
+    return _preshaped(ctx, request, drawn), CRITERIA[request.strategy]
+
+
+def _preshaped(ctx: Estimators, request: ProposalsRequest, drawn: Draw) -> Draw:
+    """The draws with how far open the jaw comes to each, where that was asked."""
+    asked = request.pre_opening_m
+    if asked is None:
+        return drawn
+    poses = Poses(drawn.position, drawn.quaternion_xyzw)
+    with ctx.compute.within(request):
+        test = ctx.scenes.test(drawn.selected, asked)
+        if test is None:
+            return replace(drawn, opening_m=np.full(len(poses), float(asked)))
+        found = ctx.compute.blocks(poses, partial(test.openings, threads=ctx.compute.threads))
+    return replace(drawn, opening_m=np.concatenate(found))
 
 
 def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:

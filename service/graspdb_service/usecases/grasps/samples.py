@@ -31,7 +31,8 @@ class Draw:
     object's trials.
 
     ``selected`` are the trials that it is about; ``support``: columns of how far the draws are from what was
-    tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial.
+    tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial. ``opening_m`` (n,)
+    is how far open the jaw comes to each, where that was asked.
     """
 
     built: Built
@@ -42,6 +43,7 @@ class Draw:
     proposal_density: Floats
     support: dict[str, Any] | None = None
     prior: bool = False
+    opening_m: Floats | None = None
 
     @property
     def selected(self) -> Selected:
@@ -50,7 +52,8 @@ class Draw:
     def columns(self, frame: PoseFrame) -> dict[str, Any]:
         """Those of an answer, by name, the poses of a frame."""
         position, quaternion = frame.from_tool(se3.Poses(self.position, self.quaternion_xyzw))
-        rest = {name: getattr(self, name) for name in ("proposal_density", "support")}
+        names = ["proposal_density", "support", *(["opening_m"] if self.opening_m is not None else [])]
+        rest = {name: getattr(self, name) for name in names}
         return {"position": position, "quaternion_xyzw": quaternion, **rest}
 
 
