@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from graspdb.wire.base import Pose, Request, Response, Slug, Text
 from graspdb.wire.frames.conventions import Convention
-from graspdb.wire.frames.gripper_frames import BASE, MAX_FRAMES, TOOL, FrameName, completed, in_tool
+from graspdb.wire.frames.gripper_frames import BASE, NAMED, TOOL, FrameName, completed, in_tool
 
 SHAPE_FIELDS = ("max_opening_m", "finger.", "tip_offset", "palm_size_m")
 """What the fields of a profile that make the gripper's shape begin with."""
@@ -85,14 +85,12 @@ class GripperProfile(Request):
     """Whether the fingers are alike, so that half a turn about the approach is the same grasp."""
     base_to_tool: Pose | None = None
     """Pose of the tool frame in the gripper's base frame, metres and a unit quaternion; null if unknown."""
-    frames: Annotated[dict[FrameName, Pose], Field(max_length=MAX_FRAMES)] = Field(default_factory=dict)
+    frames: Annotated[dict[FrameName, Pose], NAMED] = Field(default_factory=dict)
     """Frames of the gripper by name, each its pose in the gripper's base frame: ``flange``, where the robot
     ends, and any of your own. Answers have ``base``, the identity, and ``tool``, the same as
     ``base_to_tool``, too; of the others poses can be taken and given once the tool is known. ``world`` and
     ``object`` are no names of frames."""
-    joints: Annotated[dict[JointName, JointValues], Field(max_length=MAX_FRAMES)] = Field(
-        default_factory=dict
-    )
+    joints: Annotated[dict[JointName, JointValues], NAMED] = Field(default_factory=dict)
     """The gripper's joints by name, as the robot's description has them, each with its value open and
     closed."""
     source: Text | None = None

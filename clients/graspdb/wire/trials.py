@@ -52,6 +52,8 @@ _Covariance = Annotated[float, Field(ge=-1e6, le=1e6)]
 Row6 = tuple[_Covariance, _Covariance, _Covariance, _Covariance, _Covariance, _Covariance]
 Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
 
+_QUALITIES = Field(max_length=MAX_QUALITIES, json_schema_extra={"additionalProperties": False})
+
 
 class Origin(Request):
     """What a batch was read from."""
@@ -101,7 +103,7 @@ class TrialIn(Pose, TrialDefaults):
     """What became of it, by name; true and false mean success and failure."""
     quality: Quality | None = None
     """Any score of the user's, without a unit; null for the batch's first of ``qualities``, or none."""
-    qualities: Annotated[dict[QualityName, Quality | None], Field(max_length=MAX_QUALITIES)] | None = None
+    qualities: Annotated[dict[QualityName, Quality | None], _QUALITIES] | None = None
     """Scores by name, without a unit; all trials of a batch have at most 32 names together; null for none."""
     width_m: Width | None = None
     """Distance between the fingers at the end, metres; null if unknown."""
@@ -141,10 +143,7 @@ class TrialColumns(Request):
     """Density that each pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: Annotated[list[Quality | None], MANY] | None = None
     """Any score of each, without a unit; null for the first of ``qualities``, or none."""
-    qualities: (
-        Annotated[dict[QualityName, Annotated[list[Quality | None], MANY]], Field(max_length=MAX_QUALITIES)]
-        | None
-    ) = None
+    qualities: Annotated[dict[QualityName, Annotated[list[Quality | None], MANY]], _QUALITIES] | None = None
     """Scores by name, a list with one value a trial each; the first name's also stand for ``quality`` where
     that is null; null for none."""
     width_m: Annotated[list[Width | None], MANY] | None = None

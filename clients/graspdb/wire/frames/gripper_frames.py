@@ -23,6 +23,8 @@ RESERVED = ("world", "object")
 """Names that no frame of a gripper or an object may have: they are those of references."""
 
 MAX_FRAMES = 64
+NAMED = Field(max_length=MAX_FRAMES, json_schema_extra={"additionalProperties": False})
+"""A mapping by names: the schema says that there are no others than those of the names' pattern."""
 IDENTITY = Pose(position=(0.0, 0.0, 0.0), quaternion_xyzw=(0.0, 0.0, 0.0, 1.0))
 
 #: Frames given twice agree within rounding of what other programs print, metres and parts of a quaternion.

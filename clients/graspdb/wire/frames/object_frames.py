@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
 from graspdb.wire.base import Pose
 from graspdb.wire.frames.gripper_frames import (
     IDENTITY,
-    MAX_FRAMES,
+    NAMED,
     RESERVED,
     FrameName,
     NoSuchFrame,
@@ -35,7 +35,7 @@ def _others(frames: dict[str, Pose]) -> dict[str, Pose]:
 
 ObjectFrames = Annotated[
     dict[FrameName, Pose],
-    Field(max_length=MAX_FRAMES),
+    NAMED,
     AfterValidator(_others),
 ]
 """Frames by name, each its pose in the mesh's frame."""
