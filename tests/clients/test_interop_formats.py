@@ -249,6 +249,23 @@ def test_multigrippergrasp_has_w_first_and_needs_its_axes(
         interop.read(hand, gripper=panda, convention="x/y")
 
 
+def test_what_graspit_planned_has_w_last_and_no_outcomes(
+    tmp_path: Path, panda: GripperProfile, tools: np.ndarray
+) -> None:
+    rows = [[*pose[:3, 3].tolist(), *files.quaternion(pose[:3, :3]).tolist()] for pose in _bases(tools)]
+    grasps = {
+        str(i): {"body": "Can" if i < 3 else "Mug", "pose": row, "epsilon": 0.01 * i, "dofs": [1.0]}
+        for i, row in enumerate(rows)
+    }
+    path = files.written(tmp_path / "a.json", {"total_plans": {"0": 5}, "grasps": grasps})
+    rule: dict[str, Any] = {"success_from": "epsilon", "success_above": 0.005}
+    with pytest.raises(FileProblem, match="--only body="):
+        interop.read(path, gripper=panda, convention="graspdb", **rule)
+    found = interop.read(path, gripper=panda, convention="graspdb", only="body=Can", **rule)
+    _is(found, tools[:3])
+    assert found.outcomes.tolist() == ["failure", "success", "success"]
+
+
 @pytest.mark.parametrize("name", ["a.yaml", "a.json"])
 def test_moveit_is_of_the_link_that_somebody_names(
     tmp_path: Path, panda: GripperProfile, tools: np.ndarray, name: str

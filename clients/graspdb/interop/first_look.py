@@ -21,8 +21,10 @@ NEAR_M = 0.01
 """Fingertips this far outside the object's box still count as within: jaws close about what sticks out."""
 _REACH_M = 0.05
 """Fingertips that stay farther off than this never come near."""
-_FEW = 8
+_FEW = 12
 """Of fewer grasps no share is compared."""
+_FAR_WORSE = 0.6
+"""Grasps that fit so much less often than they would otherwise are taken for a mistake."""
 _CRAMMED = 0.05
 """A share of the object's size."""
 _CLOSINGS = 128
@@ -113,9 +115,13 @@ def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report
     closed = now.closings()
     if closed is not None:
         seen.closings_meet, seen.closings_looked_at = int(closed[0].sum()), len(closed[0])
-    others = [(_Placed(raw, other, target), flag) for flag, other in _others(raw, placing, target, report)]
-    others = [(placed, flag) for placed, flag in others if placed.spread_out()]
-    best, flag = max(others, key=lambda item: item[0].score(), default=(now, ""))
+    best, flag = now, ""
+    if now.score() <= _FAR_WORSE:
+        others = (
+            (_Placed(raw, other, target), flag) for flag, other in _others(raw, placing, target, report)
+        )
+        likely = [(placed, flag) for placed, flag in others if placed.spread_out()]
+        best, flag = max(likely, key=lambda item: item[0].score(), default=(now, ""))
     mends = f"; with {flag} {_share(best)}" if best.score() >= 0.5 else ""
     nearest = float(now.distance.min())
     if nearest > _REACH_M:
@@ -123,7 +129,7 @@ def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report
             f"no fingertip comes near the object: the nearest stays {_length(nearest)} outside its box"
             + (mends or ": check --frame, --convention, --unit and --scale, and the object's mesh")
         )
-    elif len(raw) >= _FEW and best.score() >= 0.5 and now.score() <= best.score() / 2:
+    elif len(raw) >= _FEW and best.score() >= 0.5 and now.score() <= _FAR_WORSE * best.score():
         what = (
             "quaternions fit the other order better" if "quaternion" in flag else "few grasps fit the object"
         )

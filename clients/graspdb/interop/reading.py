@@ -250,6 +250,10 @@ def _placing(
         fixed[:3, :3] = to_graspdb(axes)
     else:
         fixed = to_tool(frame, axes, profile)
+        if profile is not None and frame == "base":
+            tips = fixed[:3, 3] + profile.tip_offset_m * fixed[:3, 2]
+            ahead = float(tips @ to_graspdb(axes)[:, 2])
+            assumed.append(f"fingertips {ahead:.4f} m ahead of the base, as the named gripper has them")
     return Placing(
         frame,
         axes,

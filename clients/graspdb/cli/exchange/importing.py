@@ -15,6 +15,7 @@ from graspdb.interop.importing import Import
 from graspdb.resources.trials import DoubtfulTrials, Sending
 
 
+# long: most of it declares options.
 def import_files(
     state: State,
     files: Annotated[
@@ -69,7 +70,9 @@ def import_files(
         warnings.simplefilter("ignore", DoubtfulTrials)
         receipt = found.send(source=source, protocol=protocol, licence=licence, citation=citation, **upload)
     told |= {"batches": receipt.batches, "inserted": receipt.inserted, "revision": receipt.revision}
-    stored = f"{receipt.inserted:,} trials stored in batch {', '.join(receipt.batches)}"
+    many = len(receipt.batches)
+    stored = f"{receipt.inserted:,} trials stored in "
+    stored += f"{many} batches" if many > 3 else f"batch {', '.join(receipt.batches)}"
     state.show(
         told | {"findings": receipt.findings}, f"{stored}; {object} is at revision {receipt.revision}."
     )

@@ -208,7 +208,4 @@ def _say(
             raise problem(name, "has grasps of a suction cup; GraspDB knows parallel jaws")
         report.recognise(f"gripper {gripper}")
         if gripper.lower() == "panda":
-            report.recognise(
-                f"fingertips are the named gripper's; ACRONYM draws the Panda's {_MARKER_TIP_M:.4f} m"
-                " ahead of its base"
-            )
+            report.recognise(f"ACRONYM draws the Panda's fingertips {_MARKER_TIP_M:.4f} m ahead of its base")

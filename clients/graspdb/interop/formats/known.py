@@ -152,6 +152,10 @@ def _of_data(data: Any) -> Format | None:
         return _ACRONYM_JSON
     if isinstance(data.get("pose"), list) and ("gripper" in data or "object_ID" in data):
         return _MULTIGRIPPER
+    if isinstance(grasps, dict) and any(
+        "body" in g and "pose" in g for g in grasps.values() if isinstance(g, dict)
+    ):
+        return _MULTIGRIPPER
     if isinstance(grasps, dict) and any("orientation" in g for g in grasps.values() if isinstance(g, dict)):
         return _ISAAC
     return None

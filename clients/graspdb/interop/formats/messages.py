@@ -26,6 +26,9 @@ _LEFT = (
 def read_multigripper(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """A dictionary of lists: ``pose`` [x, y, z, qw, qx, qy, qz], ``result`` 1 or 0, and other numbers."""
     data = mapping_of(source.name, source.json, "the file")
+    if "pose" not in data and isinstance(data.get("grasps"), dict):
+        yield _planned(source.name, data["grasps"], wishes, report)
+        return
     gripper = data.get("gripper")
     if isinstance(gripper, str):
         if _HANDS.search(gripper):
@@ -57,6 +60,30 @@ def read_multigripper(source: SourceFile, wishes: Wishes, report: Report) -> Ite
             qualities[key] = column
     same_length(source.name, len(poses), {"result": outcome} if outcome is not None else {})
     yield Raw(0, poses[:, :3], quaternion=quaternion, order=order, outcome=outcome, qualities=qualities)
+
+
+def _planned(file: str, grasps: dict[str, Any], wishes: Wishes, report: Report) -> Raw:
+    """What GraspIt! planned before its simulation: ``{number: {body, pose, quality, ...}}``, w last."""
+    order = wishes.quaternion_order or "xyzw"
+    report.recognise("planned by GraspIt!, not simulated yet")
+    report.assume(f"quaternions {order}")
+    rows = [mapping_of(file, grasp, f"grasp {number}") for number, grasp in grasps.items()]
+    bodies = sorted({str(row.get("body", "")) for row in rows})
+    wanted = wishes.only.get("body")
+    if wanted is None and len(bodies) > 1:
+        raise problem(file, f"has grasps of {', '.join(bodies[:8])}: name one with --only body=...")
+    chosen = [row for row in rows if wanted in (None, str(row.get("body", "")))]
+    poses = numbers(file, "pose", [row.get("pose") for row in chosen], (None, 7))
+    names = sorted({key for row in chosen for key, value in row.items() if isinstance(value, float)})
+    qualities = {
+        name: np.array(
+            [x if isinstance(x := row.get(name), (int, float)) else np.nan for row in chosen], float
+        )
+        for name in names
+    }
+    report.drop("contacts and joints' values")
+    quaternion = poses[:, 3:] if order == "xyzw" else poses[:, [4, 5, 6, 3]]
+    return Raw(0, poses[:, :3], quaternion=quaternion, order=order, qualities=qualities)
 
 
 def read_moveit(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:

@@ -140,7 +140,8 @@ def _planned(file: str, names: Sequence[str], wishes: Wishes, report: Report) ->
         if name != column:
             report.map(f"{column} to {name}")
     for name, column in chosen.qualities.items():
-        report.map(f"{column} to the quality {name}")
+        if name != column:
+            report.map(f"{column} to the quality {name}")
     left = [name for name in names if name not in chosen.names]
     if left:
         shown = ", ".join(left[:12]) + (f" and {len(left) - 12} more" if len(left) > 12 else "")
