@@ -21,6 +21,7 @@ ENDS = {
     "graspgen": ".json",
     "isaac": ".yaml",
     "moveit": ".json",
+    "rosbag": "",
     "csv": ".csv",
     "jsonl": ".jsonl",
     "parquet": ".parquet",
@@ -31,6 +32,9 @@ SAID: dict[str, dict[str, Any]] = {
     "isaac": {"frame": "base", "convention": "graspdb"},
     "moveit": {"frame": "base", "success_from": "grasp_quality", "success_above": 0.5},
 }
+SAID["rosbag"] = SAID["moveit"]
+#: What has one score, which is then success, unless told otherwise.
+MOVEITS = ("moveit", "rosbag")
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +67,9 @@ def _grasps(seed: int, outcomes: list[str]) -> FileGrasps:
 
 def _written(folder: Path, grasps: FileGrasps, format: str, gripper: GripperProfile) -> FileGrasps:
     """The same grasps, through a file of this format."""
-    path = folder / f"{format}{ENDS[format]}"
-    frame = "base" if format == "moveit" else None
-    qualities = {} if format == "moveit" else None
+    path = folder / f"{len(list(folder.iterdir()))}{ENDS[format]}"
+    frame = "base" if format in MOVEITS else None
+    qualities = {} if format in MOVEITS else None
     report = interop.write(path, grasps, format=format, frame=frame, gripper=gripper, qualities=qualities)
     assert report.grasps == len(grasps)
     return interop.read(path, gripper=gripper, **SAID.get(format, {}))
@@ -128,6 +132,7 @@ def test_acronym_keeps_numbers_by_name(tmp_path: Path, gripper: GripperProfile) 
         ("acronym", ("why a grasp failed (slipped)", "width_m, measured_at")),
         ("isaac", ("why a grasp failed (slipped)", "joints' values", "force, quality")),
         ("moveit", ("postures", "quality, width_m, measured_at")),
+        ("rosbag", ("postures", "quality, width_m, measured_at")),
     ],
 )
 def test_what_a_format_cannot_say_is_reported(
@@ -167,3 +172,36 @@ def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, gripper: GripperP
     with pytest.raises(ValueError, match="name it"):
         interop.write(tmp_path / "a.yaml", grasps, gripper=gripper)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bag_has_poses_for_every_viewer_and_is_never_written_over(
+    tmp_path: Path, gripper: GripperProfile
+) -> None:
+    grasps, bag = _grasps(5, ["success", "failure", "success"]), tmp_path / "bag"
+    interop.write(bag, grasps, format="rosbag", frame="base", gripper=gripper, qualities={})
+    told: dict[str, Any] = {"frame": "base", "convention": "graspdb", "outcome": "success"}
+    # A bag says of plain poses neither frame nor axes, as isaac_grasp doesn't.
+    with pytest.raises(ValueError, match="--frame and --convention"):
+        interop.read(bag, gripper=gripper, only={"topic": "/grasps/poses"})
+    poses = interop.read(bag, gripper=gripper, only={"topic": "/grasps/poses"}, **told)
+    assert poses.matrices == pytest.approx(grasps.matrices, abs=1e-9)
+    beside = interop.read(next(bag.glob("*.db3")), gripper=gripper, **SAID["rosbag"])
+    assert beside.outcomes.tolist() == ["success", "failure", "success"]
+    with pytest.raises(ValueError, match=r"has no topic .* /grasps/poses"):
+        interop.read(bag, gripper=gripper, only={"topic": "/tf"}, **told)
+    with pytest.raises(ValueError, match="exists already"):
+        interop.write(bag, grasps, format="rosbag", frame="base", gripper=gripper)
+
+
+def test_bags_that_are_none_are_told_in_a_line(tmp_path: Path, gripper: GripperProfile) -> None:
+    bag = tmp_path / "bag"
+    interop.write(bag, _grasps(5, ["success"] * 50), format="rosbag", frame="base", gripper=gripper)
+    (data,) = bag.glob("*.db3")
+    data.write_bytes(data.read_bytes()[: data.stat().st_size // 2])
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "metadata.yaml").write_text("a: [")
+    for name in ("bag", "old.bag", "empty"):
+        with pytest.raises(ValueError, match="is no whole bag") as caught:
+            interop.read(tmp_path / name, gripper=gripper, **SAID["rosbag"])
+        assert "\n" not in str(caught.value)

@@ -131,14 +131,13 @@ def _columns(grasps: FileGrasps) -> dict[str, Any]:
 def _origin(readings: Sequence[Reading]) -> dict[str, str]:
     """What a batch was read from; of several files the first one's name."""
     first = readings[0].source
-    if len(readings) == 1:
-        return {
-            "file": first.path.name[-255:],
-            "format": readings[0].kind.name,
-            "sha256": _digest(first.path),
-        }
-    told = f" and {len(readings) - 1:,} more"
-    return {"file": first.path.name[: 255 - len(told)] + told, "format": readings[0].kind.name}
+    name = Path(first.name).name
+    if len(readings) > 1:
+        told = f" and {len(readings) - 1:,} more"
+        return {"file": name[: 255 - len(told)] + told, "format": readings[0].kind.name}
+    origin = {"file": name[-255:], "format": readings[0].kind.name}
+    # Of a bag that is a folder no one file is all of it.
+    return origin if first.bag not in (None, first.path) else origin | {"sha256": _digest(first.path)}
 
 
 def _digest(path: Path) -> str:

@@ -206,7 +206,8 @@ def opened(
         raise ValueError(f"quaternion_order is {order!r}; expected xyzw or wxyz")
     columns = parsed(options.get("columns") or {})
     source = SourceFile(path)
-    kind = recognised(source, options.get("format") or "auto")
+    only = _pairs(options.get("only") or {})
+    kind = recognised(source, options.get("format") or "auto", only.get("topic"))
     if columns and not kind.table:
         raise ValueError(f"columns are named in tables; {source.name} is {kind.name}")
     if place is None and kind.reference != "object":
@@ -218,9 +219,7 @@ def opened(
     profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
     assumed: list[str] = []
     placing = _placing(source, kind, profile, options, assumed)
-    wishes = Wishes(
-        order, columns, _pairs(options.get("only") or {}), () if rule is None else (rule.quality,)
-    )
+    wishes = Wishes(order, columns, only, () if rule is None else (rule.quality,))
     return Reading(source, kind, placing, wishes, rule, None if outcome is None else named(outcome), assumed)
 
 

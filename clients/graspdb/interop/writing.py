@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from graspdb.interop.frames import follow, frames_of, to_graspdb, to_tool
 from graspdb.interop.grasps import FileGrasps, Report
-from graspdb.interop.writers import matrices, messages, tables
+from graspdb.interop.writers import matrices, messages, rosbags, tables
 from graspdb.interop.writers.content import Content
 from graspdb.poses import as_poses
 from graspdb.wire import OUTCOMES, GripperInfo, GripperProfile
@@ -28,6 +29,7 @@ class _Writer:
     frame: str
     convention: str
     suffixes: tuple[str, ...]
+    folder: bool = False
 
 
 _WRITERS = {
@@ -35,6 +37,7 @@ _WRITERS = {
     "graspgen": _Writer(matrices.graspgen, "base", "graspgen", (".json",)),
     "isaac": _Writer(messages.isaac, "base", "graspdb", (".yaml", ".yml")),
     "moveit": _Writer(messages.moveit, "flange", "graspdb", (".yaml", ".yml", ".json")),
+    "rosbag": _Writer(rosbags.bag, "flange", "graspdb", (), folder=True),
     "csv": _Writer(tables.csv_file, "tool", "graspdb", (".csv",)),
     "jsonl": _Writer(tables.json_lines, "tool", "graspdb", (".jsonl", ".ndjson")),
     "parquet": _Writer(tables.parquet, "tool", "graspdb", (".parquet",)),
@@ -93,12 +96,13 @@ def write(
         gripper.id if isinstance(gripper, GripperInfo) else None,
         object,
     )
-    whole = target.with_name(f"{target.name}.part{os.getpid()}{target.suffix}")
-    try:
+    if writer.folder and target.exists():
+        raise ValueError(f"{target} exists already: a bag is a folder of its own")
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        # Under its own name, which some formats repeat inside.
+        whole = Path(folder) / target.name
         writer.write(whole, content, report)
         os.replace(whole, target)
-    finally:
-        whole.unlink(missing_ok=True)
     report.grasps = len(content)
     return report
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from graspdb.interop.formats import acronym, graspnet, isaac, messages, scenes, tables
+from graspdb.interop.formats import acronym, graspnet, isaac, messages, rosbags, scenes, tables
 from graspdb.interop.formats.source import SourceFile, Wishes
 from graspdb.interop.grasps import Raw, Report, problem
 from graspdb.interop.outcomes import Rule
@@ -42,6 +42,8 @@ _LABELS = Format("graspnet", graspnet.read_labels, TIPS, "graspnet")
 _VGN = Format("vgn", tables.read_vgn, TIPS, "vgn", reference="scene")
 _MULTIGRIPPER = Format("multigrippergrasp", messages.read_multigripper, "base", None)
 _MOVEIT = Format("moveit", messages.read_moveit, "flange", "graspdb")
+_BAG_GRASPS = Format("rosbag", rosbags.read_grasps, "flange", "graspdb")
+_BAG_POSES = Format("rosbag", rosbags.read_poses, None, None)
 _GRASPIT = Format(
     "graspit", scenes.read_graspit, "base", "graspdb", "mm", assumed="the robot's axes are those of the base"
 )
@@ -51,17 +53,30 @@ _JSONL = Format("jsonl", tables.read_json_lines, "tool", "graspdb", table=True)
 _PARQUET = Format("parquet", tables.read_parquet, "tool", "graspdb", table=True)
 
 FORMATS = (
-    *("acronym", "graspgen", "isaac", "graspnet", "vgn", "multigrippergrasp", "moveit", "graspit", "uibk"),
+    *(
+        "acronym",
+        "graspgen",
+        "isaac",
+        "graspnet",
+        "vgn",
+        "multigrippergrasp",
+        "moveit",
+        "rosbag",
+        "graspit",
+        "uibk",
+    ),
     *("csv", "jsonl", "parquet"),
 )
 """The formats that are read, by name."""
 
 
-def recognised(source: SourceFile, name: str) -> Format:
-    """The format of a file: of this name, or by its content (``auto``); one line says why none."""
+def recognised(source: SourceFile, name: str, topic: str | None = None) -> Format:
+    """The format of a file: of this name, or by its content (``auto``), of a bag by that of its ``topic``;
+    one line says why none.
+    """
     if name not in ("auto", *FORMATS):
         raise ValueError(f"format is {name!r}; expected auto or one of {', '.join(FORMATS)}")
-    binary = _binary(source)
+    binary = _bag(source, topic) if source.bag is not None else _binary(source)
     if binary is not None:
         found: Format | None = binary
     elif name in ("auto", "acronym"):
@@ -77,8 +92,8 @@ def recognised(source: SourceFile, name: str) -> Format:
         return found
     if found is not None and found.name != name:
         raise problem(source.name, f"is {found.name}, not {name}")
-    if found is None and name == "parquet":
-        raise problem(source.name, "is no Parquet")
+    if found is None and name in ("parquet", "rosbag"):
+        raise problem(source.name, f"is no {'Parquet' if name == 'parquet' else 'bag of ROS'}")
     return found or _BY_NAME[name]
 
 
@@ -94,6 +109,10 @@ _BY_NAME = {
     "csv": _CSV,
     "jsonl": _JSONL,
 }
+
+
+def _bag(source: SourceFile, topic: str | None) -> Format:
+    return _BAG_GRASPS if rosbags.has_grasps(source, topic) else _BAG_POSES
 
 
 def _binary(source: SourceFile) -> Format | None:

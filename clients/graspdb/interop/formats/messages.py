@@ -17,7 +17,7 @@ _HANDS = re.compile(
     r"allegro|barrett|human|shadow|jaco|3f|3_?finger|leap|h5_?hand|inspire|dexee|svh|ability", re.I
 )
 QUALITY = "grasp_quality"
-_LEFT = (
+LEFT = (
     *("pre_grasp_posture", "grasp_posture", "pre_grasp_approach", "post_grasp_retreat"),
     *("post_place_retreat", "max_contact_force", "allowed_touch_objects"),
 )
@@ -108,7 +108,7 @@ def read_moveit(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[
         quality.append(
             np.nan if score is None else float(numbers(source.name, f"grasp {number}: {QUALITY}", score, ()))
         )
-        for key in _LEFT:
+        for key in LEFT:
             if grasp.get(key):
                 report.drop(key)
     report.references = sorted(references - {""})

@@ -24,6 +24,8 @@ CHUNK = 65_536
 #: What is parsed as a whole takes many times its size in memory.
 _LARGEST = {"JSON": 512 * MIB, "YAML": 128 * MIB, "XML": 256 * MIB}
 _DEEPEST = 100
+#: What a folder with a bag of ROS 2 has, and the files that lie beside it.
+_BAG, _IN_BAGS = "metadata.yaml", (".db3", ".mcap")
 _MOST_YAML_NODES = 50_000_000
 _EXTRA = "pip install 'graspdb[interop]'"
 
@@ -52,6 +54,13 @@ class SourceFile:
     def __init__(self, path: str | PathLike[str]) -> None:
         self.path = Path(path)
         self.name = str(path)
+        folder = self.path if self.path.is_dir() else self.path.parent
+        #: The bag that the file is, or is a part of; None where it is none.
+        self.bag: Path | None = None
+        if self.path.suffix.lower() == ".bag":
+            self.bag = self.path
+        elif (folder == self.path or self.path.suffix.lower() in _IN_BAGS) and (folder / _BAG).is_file():
+            self.bag, self.path = folder, folder / _BAG
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.name}: {'is no file' if self.path.exists() else 'no such file'}")
         with self.path.open("rb") as file:

@@ -62,6 +62,15 @@ def isaac(path: Path, content: Content, report: Report) -> None:
 
 def moveit(path: Path, content: Content, report: Report) -> None:
     """A list of moveit_msgs/Grasp, JSON or YAML by the name's end, in the object's frame."""
+    grasps = grasp_messages(content, report)
+    if path.suffix.lower() == ".json":
+        path.write_text(json.dumps(grasps, allow_nan=False), encoding="utf-8")
+    else:
+        _dump(path, grasps)
+
+
+def grasp_messages(content: Content, report: Report) -> list[dict[str, Any]]:
+    """moveit_msgs/Grasp as plain data, the gripper's postures, approach and retreats included."""
     name = next(iter(content.qualities), None)
     if name is None:
         quality = content.held(report).astype(float).tolist()
@@ -98,10 +107,7 @@ def moveit(path: Path, content: Content, report: Report) -> None:
         for number, (position, quaternion, score) in enumerate(rows)
     ]
     content.left(report, *([] if name is None else [name]))
-    if path.suffix.lower() == ".json":
-        path.write_text(json.dumps(grasps, allow_nan=False), encoding="utf-8")
-    else:
-        _dump(path, grasps)
+    return grasps
 
 
 def _posture(joints: dict[str, float]) -> dict[str, Any]:
