@@ -15,11 +15,8 @@ from graspdb.interop.first_look import FirstLook, first_look, gathered, target_o
 from graspdb.interop.grasps import FileGrasps, Report, joined, problem, together
 from graspdb.interop.reading import Reading, ReadOptions, opened
 from graspdb.resources.objects import GraspObject
-from graspdb.resources.trials import Receipt, Sending
+from graspdb.resources.trials import CHUNK_TRIALS, Receipt, Sending
 from graspdb.wire import GripperInfo
-
-PIECE = 200_000
-"""Trials a request."""
 
 _LOOKED_AT = 2_000
 
@@ -68,7 +65,7 @@ class Import:
         """Store all of it, in batches of ``chunk`` trials; ``source``, ``protocol``, ``licence`` and
         ``citation`` are of all of them.
         """
-        chunk = upload.pop("chunk", PIECE)
+        chunk = upload.pop("chunk", CHUNK_TRIALS)
         about = {"source": source, "protocol": protocol, "gripper": self._gripper_name()}
         about = {name: value for name, value in about.items() if value is not None}
         return self._item.trials.add_columns(
