@@ -24,7 +24,9 @@ from graspdb import interop
 from graspdb.files.trials import FileProblem
 from graspdb.interop.formats import graspnet
 from graspdb.interop.frames import to_graspdb
+from graspdb.poses import matrices
 from graspdb.wire import CONVENTIONS, GripperProfile
+from graspdb.wire.presets.grippers import PRESETS
 
 TIP_OFFSET = 0.011
 BASE_TO_TOOL = np.eye(4)
@@ -97,6 +99,17 @@ def test_acronym_and_graspgen_are_bases_that_close_along_x(
     assert found.report.frame == "base"
     if write is not files.graspgen:
         assert found.qualities["object_motion_during_closing_linear"].shape == (5,)
+
+
+@pytest.mark.parametrize("write", [files.acronym_json, files.graspgen], ids=["acronym", "graspgen"])
+def test_a_base_that_closes_along_x_itself_is_the_files_own(
+    tmp_path: Path, tools: np.ndarray, write: Callable[..., str]
+) -> None:
+    preset = PRESETS["robotiq-2f-85"].profile
+    assert preset.base_to_tool is not None
+    way = matrices(preset.base_to_tool.position, preset.base_to_tool.quaternion_xyzw)
+    found = interop.read(write(tmp_path / "a.json", tools @ np.linalg.inv(way), HELD), gripper=preset)
+    _is(found, tools)
 
 
 def test_a_file_is_recognised_by_its_content(

@@ -12,6 +12,8 @@ from graspdb.poses import Poses, matrices, quaternions_of
 from graspdb.wire import CONVENTIONS, Convention, GripperProfile, Pose
 from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING
 
+#: Conventions that are of a gripper's base.
+_OF_EVERY_BASE = ("acronym", "graspgen")
 _AXES = re.compile(r"([+-]?)([xyz])/([+-]?)([xyz])")
 
 
@@ -45,7 +47,9 @@ def frames_of(gripper: GripperProfile | None) -> dict[str, Pose]:
 def to_tool(frame: str, convention: str, gripper: GripperProfile | None) -> Floats:
     """The fixed pose (4, 4) on the right of a pose of ``frame`` with the axes of ``convention``.
 
-    ValueError, saying what to give, where the gripper lacks the frame or the way to its tool.
+    ACRONYM and GraspGen say of every gripper's base that z approaches and x closes, whatever axes its
+    description gives that: theirs are at the base's origin along the tool's. ValueError, saying what to give,
+    where the gripper lacks the frame or the way to its tool.
     """
     fixed = np.eye(4)
     fixed[:3, :3] = to_graspdb(convention)
@@ -62,7 +66,10 @@ def to_tool(frame: str, convention: str, gripper: GripperProfile | None) -> Floa
             f"where the tool is in the gripper's base is not known, so poses of {frame!r} can't be used: give"
             " its profile base_to_tool (graspdb grippers update), or poses of the tool (--frame tool)"
         )
-    way: Floats = fixed @ np.linalg.inv(_matrix(frames[frame])) @ _matrix(frames["tool"])
+    there, tool = _matrix(frames[frame]), _matrix(frames["tool"])
+    if frame == "base" and convention in _OF_EVERY_BASE:
+        there[:3, :3] = tool[:3, :3]
+    way: Floats = fixed @ np.linalg.inv(there) @ tool
     return way
 
 
