@@ -66,10 +66,11 @@ def to_tool(frame: str, convention: str, gripper: GripperProfile | None) -> Floa
             f"where the tool is in the gripper's base is not known, so poses of {frame!r} can't be used: give"
             " its profile base_to_tool (graspdb grippers update), or poses of the tool (--frame tool)"
         )
-    there, tool = _matrix(frames[frame]), _matrix(frames["tool"])
+    origin, tool = _matrix(frames[frame]), _matrix(frames["tool"])
     if frame == "base" and convention in _OF_EVERY_BASE:
-        there[:3, :3] = tool[:3, :3]
-    way: Floats = fixed @ np.linalg.inv(there) @ tool
+        origin[:3, :3] = tool[:3, :3]
+    back: Floats = np.asarray(np.linalg.inv(origin), dtype=np.float64)
+    way: Floats = fixed @ back @ tool
     return way
 
 

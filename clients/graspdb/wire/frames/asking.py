@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from graspdb.wire.base import Pose
+from graspdb.wire.base import Quadruple, Response, Triple
 from graspdb.wire.frames.conventions import Convention
 from graspdb.wire.frames.gripper_frames import FrameName
 
@@ -24,8 +24,19 @@ AskedFrame = Annotated[FrameName | None, Field(description=ASKED_FRAME)]
 AskedConvention = Annotated[Convention | None, Field(description=ASKED_CONVENTION)]
 ToldFrame = Annotated[str, Field(description="Frame of the gripper that the answer's poses are of.")]
 ToldConvention = Annotated[Convention, Field(description="Whose axes the answer's poses have.")]
+
+
+class FixedPose(Response):
+    """The pose of one frame of a gripper in another, however far off that is."""
+
+    position: Triple
+    """Origin of the frame in the tool frame: x, y, z, metres."""
+    quaternion_xyzw: Quadruple
+    """Rotation of the frame in the tool frame: unit quaternion x, y, z, w."""
+
+
 ToolToFrame = Annotated[
-    Pose | None,
+    FixedPose | None,
     Field(
         description="Pose of that frame, with the axes of that convention, in the tool frame; null where it"
         " is the tool frame itself. A pose of the tool times this is one as the answer's."

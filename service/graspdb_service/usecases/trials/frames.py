@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from graspdb.wire import Convention, GripperProfile
+from graspdb.wire.base import MAX_COORDINATE_M
 from graspdb.wire.frames.gripper_frames import TOOL
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
-from graspdb_service.problems import ProblemError, conflict
+from graspdb_service.problems import ProblemError, conflict, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
 from graspdb_service.trial_columns import Floats, Provenance, TrialBatch, TrialColumns, TrialPage
@@ -67,6 +68,10 @@ def into_tool(tx: Tx, batch: TrialBatch, asked: AskedFrame) -> TrialBatch:
         # Another version may come in before they are stored; these poses are of this one's frames.
         named.append(item if found is None else item._replace(gripper=found.versioned))
     columns = _moved(batch.columns, dict(enumerate(frames)), PoseFrame.to_tool, back=True)
+    far = np.flatnonzero((np.abs(columns.position) > MAX_COORDINATE_M).any(axis=1))
+    if len(far):
+        told = f"its tool is more than {MAX_COORDINATE_M:g} m from the origin: look at the gripper's frames"
+        raise invalid(batch.field_of(int(far[0]), "position"), told)
     return replace(batch, columns=columns, provenances=named)
 
 

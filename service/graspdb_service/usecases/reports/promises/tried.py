@@ -143,7 +143,7 @@ def _promised(kind: str, question: Mapping[str, Any], result: Mapping[str, Any])
     poses = Poses(_floats(columns["position"], 0), _floats(columns["quaternion_xyzw"], 0))
     told = result.get("tool_to_frame")
     if told is not None:
-        poses = PoseFrame(fixed=Pose.model_validate(told)).to_tool(poses)
+        poses = PoseFrame(fixed=Pose.model_construct(**told)).to_tool(poses)
     count = len(poses)
     low, high = (_floats(columns.get(end), count) for end in ("low", "high"))
     # The interval in standard errors, as if it were a normal distribution's.
