@@ -52,7 +52,13 @@ def _fill(db: Client, count: int = 60) -> None:
     """Two objects, a gripper in two versions, trials with all that they can have, a kernel."""
     db.grippers.create("mine", name="ours", **MINE)
     mug = db.objects.create(
-        "mug", mesh=_box(40, 60, 100), unit="mm", scale=0.5, mass_kg=0.3, metadata={"shelf": 4}
+        "mug",
+        mesh=_box(40, 60, 100),
+        unit="mm",
+        scale=0.5,
+        mass_kg=0.3,
+        metadata={"shelf": 4},
+        frames={"marker": [0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]},
     )
     rng = np.random.default_rng(1)
     poses = np.tile([0.0, 0.0, 0.03, 1.0, 0.0, 0.0, 0.0], (count, 1))
@@ -99,6 +105,8 @@ def test_another_database_takes_it_in_whole(here: Client, there: Client, tmp_pat
     ]
     assert (sorted(saved.grippers), saved.kernels) == (["mine@1", "mine@2"], 1)
     assert saved.licences == ["CC-BY-NC-4.0"]
+    with zipfile.ZipFile(path) as file:
+        assert all(info.compress_size < info.file_size for info in file.infolist() if info.file_size)
     made = loading.load(there, path, renamed={"plain": "bare"})
     assert made.objects == {"mug": "mug", "plain": "bare"}
     assert made.grippers == {"mine@1": "mine@1", "mine@2": "mine@2"}
@@ -106,7 +114,17 @@ def test_another_database_takes_it_in_whole(here: Client, there: Client, tmp_pat
 
     assert _trials(there, "mug") == _trials(here, "mug")
     before, after = here.objects.get("mug").info, there.objects.get("mug").info
-    kept = {"name", "mass_kg", "density_kg_m3", "friction", "metadata", "mesh", "convex_parts", "outcomes"}
+    kept = {
+        "name",
+        "frames",
+        "mass_kg",
+        "density_kg_m3",
+        "friction",
+        "metadata",
+        "mesh",
+        "convex_parts",
+        "outcomes",
+    }
     assert after.model_dump(include=kept) == before.model_dump(include=kept)
     assert there.objects.get("mug").download_mesh() == here.objects.get("mug").download_mesh()
     assert there.objects.get("bare").info.friction == 0.4

@@ -295,6 +295,8 @@ def test_what_the_address_says_belongs_to_the_request(sqlite_http: httpx.Client)
     twice = _post(sqlite_http, body, "application/json", licence="MIT")
     assert twice.status_code == 422
     assert twice.json()["errors"][0]["field"] == "licence"
+    misplaced = _post(sqlite_http, json.dumps({**GRASP, "licence": "MIT"}).encode(), LINES)
+    assert "in the address" in misplaced.json()["errors"][0]["message"]
     headers = {"Content-Type": LINES, "Idempotency-Key": "k"}
     line = json.dumps(GRASP)
 

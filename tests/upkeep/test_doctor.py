@@ -49,7 +49,15 @@ def test_all_is_well_with_a_world_in_order(world_database: Database) -> None:
     found = examined(world_database)
     # A mesh outlives the object that was deleted only if another has the same.
     assert {check: d for check, d in found.items() if d.level != "ok"} == {}
-    assert {"tallies", "batches", "revisions", "packed outcomes", "owners", "references"} <= found.keys()
+    assert {
+        "tallies",
+        "batches",
+        "revisions",
+        "qualities",
+        "packed outcomes",
+        "owners",
+        "references",
+    } <= found.keys()
 
 
 ROWS: list[tuple[str, str, str, bool]] = [
@@ -71,6 +79,8 @@ ROWS: list[tuple[str, str, str, bool]] = [
         False,
     ),
     ("DELETE FROM packed_outcomes WHERE number = 0", "packed outcomes", "has no outcomes", False),
+    ("UPDATE objects SET quality_names = NULL", "qualities", "does not list", False),
+    ("UPDATE batches SET quality_layout = NULL", "qualities", "bytes of qualities instead of 0", False),
     ("UPDATE trials SET batch_id = 999 WHERE seq = 1", "owners", "1 trials whose batch", False),
     ("UPDATE trials SET provenance_id = 999 WHERE seq = 1", "owners", "1 trials whose provenance", False),
     ("UPDATE jobs SET state = 'queued' WHERE number = 0", "owners", "jobs that are not done", False),

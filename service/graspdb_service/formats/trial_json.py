@@ -15,6 +15,7 @@ from graspdb.wire.trials import BatchDefaults
 from graspdb_service.formats.json_pieces import WHOLE, Allowed, LongArray, lenient, loads
 from graspdb_service.formats.trial_fields import (
     BLOCK,
+    DEFAULTS,
     NAMES,
     QUALITIES,
     REQUIRED,
@@ -29,6 +30,8 @@ from graspdb_service.formats.trial_fields import (
 )
 from graspdb_service.problems import invalid
 from graspdb_service.trial_columns import TrialBatch, TrialPage, gripper_parts
+
+_OF_BATCH = "stands once for a batch: beside trials or columns, or in the address, as ?licence=CC-BY-4.0"
 
 
 def parse(body: bytes, *, limit: int, allowed: Allowed) -> TrialBatch:
@@ -222,7 +225,7 @@ def _from_rows(rows: list[Any], faults: Faults, place: Place) -> Fields:
     if not names <= NAMES:
         for i, row in enumerate(rows):
             for name in sorted(row.keys() - NAMES):
-                faults.add(place(i, str(name)), "unknown field")
+                faults.add(place(i, str(name)), _OF_BATCH if name in DEFAULTS else "unknown field")
     for name in REQUIRED:
         missing = [i for i, row in enumerate(rows) if row.get(name) is None]
         for i in missing:

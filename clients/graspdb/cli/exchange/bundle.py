@@ -17,7 +17,7 @@ from graspdb.files.bundles import loading, saving
 def bundle(
     state: State,
     objects: Annotated[
-        list[str] | None, typer.Argument(metavar="OBJECT...", help="Objects to save.", show_default=False)
+        list[str] | None, typer.Argument(metavar="OBJECT", help="Objects to save.", show_default=False)
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Save to this file, a zip.")] = None,
     load: Annotated[Path | None, typer.Option(help="Take this file in instead.")] = None,

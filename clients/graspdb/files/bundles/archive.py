@@ -118,14 +118,14 @@ class BundleWriter:
     @contextmanager
     def lines(self, name: str) -> Iterator[LineSink]:
         """A member of one JSON document a line."""
-        with self._archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as file:
+        with self._archive.open(_packed(name), "w", force_zip64=True) as file:
             sink = LineSink(file)
             yield sink
         self._members[name] = sink.member()
 
     def content(self, name: str, content: bytes) -> None:
         """A member of these bytes."""
-        with self._archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as file:
+        with self._archive.open(_packed(name), "w", force_zip64=True) as file:
             sink = LineSink(file)
             sink.bytes(content)
         self._members[name] = sink.member()
@@ -133,8 +133,15 @@ class BundleWriter:
     def manifest(self, manifest: Manifest) -> Manifest:
         """Close with what the bundle holds."""
         manifest = manifest.model_copy(update={"members": self._members})
-        self._archive.writestr(zipfile.ZipInfo(_MANIFEST), manifest.model_dump_json(indent=1))
+        self._archive.writestr(_packed(_MANIFEST), manifest.model_dump_json(indent=1))
         return manifest
+
+
+def _packed(name: str) -> zipfile.ZipInfo:
+    """A member without the time of its making: the same content makes the same file."""
+    info = zipfile.ZipInfo(name)
+    info.compress_type = zipfile.ZIP_DEFLATED
+    return info
 
 
 class LineSink:
@@ -169,7 +176,7 @@ def writing(path: Path) -> Iterator[BundleWriter]:
     """A new bundle at this path, which has it once it is whole."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        with zipfile.ZipFile(partial, "w") as archive:
             yield BundleWriter(archive)
         partial.replace(path)
     finally:

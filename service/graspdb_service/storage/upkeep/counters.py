@@ -193,6 +193,35 @@ def chunks_that_differ(tx: Tx) -> list[Disagreement]:
     return different
 
 
+def qualities_that_differ(tx: Tx) -> list[Disagreement]:
+    """Batches whose trials' qualities are not as wide as their names and types say, or whose names their
+    object does not list.
+    """
+    different = []
+    layouts: dict[int, list[list[str]]] = {}
+    query = select(batches.c.id, batches.c.key, batches.c.object_id, batches.c.quality_layout)
+    listed = query.add_columns(objects.c.quality_names).join(objects, objects.c.id == batches.c.object_id)
+    for number, key, object_id, layout, names in tx.execute(
+        listed.where(batches.c.quality_layout.is_not(None))
+    ):
+        layouts[number] = layout
+        if unlisted := {name for name, _ in layout} - set(names or ()):
+            told = f"batch {key}: its object does not list the quality {min(unlisted)}"
+            different.append(Disagreement(object_id, told))
+    width = func.length(trials.c.qualities)
+    widths = select(trials.c.object_id, trials.c.batch_id, width, func.count()).where(
+        trials.c.qualities.is_not(None)
+    )
+    grouped = widths.group_by(trials.c.object_id, trials.c.batch_id, width)
+    for object_id, batch, bytes_each, count in tx.execute(grouped):
+        # The last character of a type is how many bytes a number of it has.
+        wanted = sum(int(kind[-1]) for _, kind in layouts.get(batch, []))
+        if bytes_each != wanted:
+            told = f"{count} trials of batch {batch} have {bytes_each} bytes of qualities instead of {wanted}"
+            different.append(Disagreement(object_id, told))
+    return different
+
+
 def recount(tx: Tx, object_id: int) -> None:
     """Make an object's tallies, batches and counters those of its rows, in a new epoch of it.
 

@@ -127,6 +127,15 @@ def _rows(tx: Tx) -> Iterator[Diagnosis]:
     )
     yield _counted(
         tx,
+        "qualities",
+        counters.qualities_that_differ(tx),
+        "are packed as their batches say",
+        "These trials can't be listed.",
+        "Restore a backup, or delete the batch.",
+        repairable=False,
+    )
+    yield _counted(
+        tx,
         "packed outcomes",
         counters.chunks_that_differ(tx),
         "are what was counted when they came",
