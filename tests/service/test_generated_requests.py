@@ -41,7 +41,7 @@ LIMITS = {
     "max_query_poses": 300,
     "max_sweep_poses": 2_000,
     "report_wait_s": 0.5,
-    "max_mesh_seconds": 5.0,
+    "max_mesh_seconds": 60.0,
 }
 
 Serve = Callable[..., str]
