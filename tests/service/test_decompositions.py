@@ -124,6 +124,7 @@ def test_sweeps_wait_for_one_decomposition_and_go_on_with_its_parts(bell: httpx.
         "mesh": "/objects/bell/mesh",
         "mesh_sha256": mesh["sha256"],
         "media_type": "model/stl",
+        "scale": 1.0,
         "unit": "m",
         "max_parts": meshes.MAX_PARTS,
     }
