@@ -65,7 +65,7 @@ def stored(*sweeps: tuple[SweepRow, int], rows: int = 0) -> Stored:
     )  # fmt: skip
     now = datetime.now(UTC)
     nothing = [None] * 5
-    thing = ObjectRow(1, "thing", *nothing, 1, 0, rows, *nothing[:4], now, now, None)
+    thing = ObjectRow(1, "thing", *nothing, 1, 0, rows, *nothing[:4], now, now, *nothing[:3])
     selected = Selected(
         row=thing, gripper="pg70", protocol="wrench", source=None, source_weight=None, profile=None,
         provenances={7: True}, sources={7: "simulation"}, outcomes={},
