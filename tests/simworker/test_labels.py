@@ -15,7 +15,11 @@ from graspdb_simworker.simulation.labels import Outcome, label_of
 
 def jaw(mass_kg: float) -> Gripper:
     return Gripper(
-        0.07, 0.02, 0.015, 0.07, 0.023, (0.08, 0.112, 0.092), 0.1, 0.06, 40.0, closing_force(40.0, mass_kg)
+        *(0.07, 0.02, 0.015, 0.07, 0.023, (0.08, 0.112, 0.092)),
+        finger_mass_kg=0.1,
+        max_speed_m_s=0.06,
+        force_n=40.0,
+        closing_force_n=closing_force(40.0, mass_kg),
     )
 
 
