@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from graspdb_service.usecases.grippers import BUILTIN
+from graspdb.wire.presets.grippers import PRESETS
 from graspdb_simworker import cli
 from graspdb_simworker.inspection import inputs, pictures
 
@@ -96,9 +96,7 @@ def test_pictures_are_written_as_they_are(tmp_path: Path) -> None:
     assert pictures.write(tmp_path / "none.gif", []) == ""
 
 
-@pytest.mark.parametrize("gripper", ["pg70", "panda"])
-def test_a_gripper_without_a_service_is_the_one_that_services_have(gripper: str) -> None:
+@pytest.mark.parametrize("gripper", sorted(PRESETS))
+def test_a_gripper_is_known_without_a_service(gripper: str) -> None:
     payload, _ = inputs.load("cone", gripper)
-    _, profile = BUILTIN[gripper]
-    not_simulated = {"base_to_tool", "frames", "joints", "max_acceleration_m_s2"}
-    assert payload.gripper.model_dump(exclude=not_simulated) == profile.model_dump(exclude=not_simulated)
+    assert payload.gripper.max_opening_m == PRESETS[gripper].profile.max_opening_m
