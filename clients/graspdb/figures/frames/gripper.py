@@ -257,7 +257,7 @@ def _draw_there(
     _draw_solid(axes, boxes, [origin, own], turned @ there, length)
     axes.plot(*np.stack([np.zeros(3), pose[:3, 3]]).T, color=GREY, linewidth=1.0, linestyle="--")
     at = ", ".join(f"{x:.3f}" for x in pose[:3, 3])
-    _say(axes, f"{frame} at {at} m in the object frame, z upwards")
+    _say(axes, f"{frame} at {at} m\nin the object frame, z upwards")
 
 
 def _say(axes: Space, title: str) -> None:
