@@ -75,7 +75,7 @@ def _written(folder: Path, grasps: FileGrasps, format: str, gripper: GripperProf
     return interop.read(path, gripper=gripper, **SAID.get(format, {}))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     outcomes=st.lists(st.sampled_from(["success", "failure"]), min_size=1, max_size=6),
@@ -97,7 +97,7 @@ def test_poses_and_success_go_through_every_pair(
         grasps = found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**31), outcomes=st.lists(st.sampled_from(OUTCOMES), min_size=1, max_size=6))
 @pytest.mark.parametrize(("first", "second"), list(itertools.product(TABLES, TABLES)))
 def test_tables_keep_all(
