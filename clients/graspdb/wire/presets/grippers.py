@@ -192,7 +192,7 @@ PRESETS: dict[str, Preset] = {
         source="robotiq_hande_link of AGH-CEAI/robotiq_hande_description: travel, meshes, mass, force, speed",
         unverified=[
             _FRICTION,
-            "force_n: 130 N by the description; older data sheets say 185 N",
+            "force_n: 130 N by the description; 185 N is told as well",
             "frames.flange: with the I/O coupling, 11 mm high",
         ],
     ),
@@ -254,8 +254,10 @@ PRESETS: dict[str, Preset] = {
         max_acceleration_m_s2=2.5,
         force_n=80.0,
         source="base_link of nalt/wsg50-ros-pkg: travel, housing and its force-measuring fingers (WSG-FMF);"
-        " stroke, force, speed and acceleration as published for the WSG 50-110",
+        " stroke by its name (WSG 50-110); force, speed and acceleration second-hand",
         unverified=[
+            "force_n: not from a data sheet",
+            "max_acceleration_m_s2: not from a data sheet",
             _FRICTION,
             _HALF,
             "max_opening_m: of the guides; fingers with a lip, as the WSG-FMF's of 3 mm, open less",
