@@ -54,6 +54,10 @@ def away(
         outcomes = ["failure" if i % 4 == 0 else "success" for i in range(len(two_clusters[0]))]
         post(http, slug, two_clusters, outcomes, gripper="pg70", protocol="lift", source="robot")
         make_object(http, "other")
+        make_object(http, "gone")
+        assert http.get("/objects/gone/best-grasp").status_code == 200
+        assert http.delete("/objects/gone").is_success
+        assert http.get("/objects/gone/best-grasp").status_code == 404
         fitted = http.post("/kernels", json={"object": slug, "gripper": "pg70", "components": 2})
         assert fitted.status_code == 201, fitted.text
         for kernel in ("isotropic", "anisotropic"):
@@ -86,6 +90,8 @@ def test_stale(away: tuple[httpx.Client, str], postgres: PostgresServer, eventua
     # What was never asked, what changes something, and what needs the database is refused.
     for method, path, body in [
         ("GET", "/objects/other/best-grasp", None),
+        # What the service has told to be gone no outage brings back.
+        ("GET", "/objects/gone/best-grasp", None),
         ("GET", f"/objects/{slug}", None),
         ("GET", f"/objects/{slug}/reports/projection", None),
         ("POST", f"/objects/{slug}/trials", {**POSE, "outcome": True}),

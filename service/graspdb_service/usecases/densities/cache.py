@@ -13,7 +13,7 @@ from graspdb.wire import KernelSpec, Selection
 from graspdb.wire.queries import TrialSelection
 from graspdb_density.kde.isotropic import CUTOFF
 from graspdb_service import principal
-from graspdb_service.problems import conflict, invalid_fields, not_found
+from graspdb_service.problems import ProblemError, conflict, invalid_fields, not_found
 from graspdb_service.storage import kernels
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.kernels import KernelRow
@@ -108,7 +108,12 @@ class Densities:
             known = self._found.get(key)
         if known is not None and not principal.sees(stored_kernel.owner(known)):
             known = None
-        found = or_kept(partial(self._find_stored, selected, name), known)
+        try:
+            found = or_kept(partial(self._find_stored, selected, name), known)
+        except ProblemError:
+            with self._lock:
+                self._found.pop(key, None)
+            raise
         with self._lock:
             self._found[key] = found
             self._found.move_to_end(key)

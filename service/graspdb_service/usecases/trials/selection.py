@@ -14,7 +14,7 @@ from graspdb.wire.base import source_weights
 from graspdb.wire.grippers import SHAPE_FIELDS
 from graspdb.wire.queries import TrialSelection
 from graspdb_service import principal
-from graspdb_service.problems import conflict, found, invalid
+from graspdb_service.problems import ProblemError, conflict, found, invalid
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.grippers import GripperRow
@@ -137,7 +137,13 @@ class Selections:
                 holds = known is not None and known.row.id == row.id and _still_holds(tx, known, row)
                 return known if known is not None and holds else resolve(tx, row, asked)
 
-        selected = or_kept(read, known)
+        try:
+            selected = or_kept(read, known)
+        except ProblemError:
+            # Gone, or ambiguous by now: no outage may bring it back.
+            with self._lock:
+                self._resolved.pop(key, None)
+            raise
         if selected is known:
             return selected
         with self._lock:
