@@ -41,6 +41,11 @@ class Poses(NamedTuple):
     position: Floats
     quaternion_xyzw: Floats
 
+    @classmethod
+    def of(cls, matrices: Floats) -> Poses:
+        """The poses of (N, 4, 4) homogeneous matrices."""
+        return cls(matrices[:, :3, 3].copy(), quaternions_of(matrices[:, :3, :3]))
+
     @property
     def matrices(self) -> Floats:
         """(N, 4, 4) homogeneous matrices."""
@@ -57,9 +62,7 @@ class Poses(NamedTuple):
         With ``gripper.profile.in_tool("flange")`` poses of the tool become those of the flange, and with its
         :func:`graspdb.wire.frames.gripper_frames.inverse` go back.
         """
-        moved = self.matrices @ matrices(fixed.position, fixed.quaternion_xyzw)
-        quaternion = quaternions_of(moved[:, :3, :3])
-        return Poses(moved[:, :3, 3].copy(), quaternion)
+        return Poses.of(self.matrices @ matrices(fixed.position, fixed.quaternion_xyzw))
 
     def columns(self, part: slice = slice(None)) -> dict[str, Any]:
         """As requests take them, all or a part."""

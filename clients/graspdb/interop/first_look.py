@@ -11,7 +11,7 @@ import numpy as np
 
 from graspdb.files.trials import METRES
 from graspdb.interop.formats.known import TIPS
-from graspdb.interop.frames import frames_of, rotated, to_graspdb, to_tool
+from graspdb.interop.frames import approach_of, frames_of, to_graspdb, to_tool
 from graspdb.interop.grasps import Floats, Raw, Report
 from graspdb.interop.placing import Placing
 from graspdb.poses import matrices
@@ -172,8 +172,9 @@ class _Placed:
     def __init__(self, raw: Raw, placing: Placing, target: Target) -> None:
         self._target = target
         gripper = target.gripper
-        self.position, self.quaternion = placing.place(raw)
-        approach = rotated(self.quaternion, np.array([0.0, 0.0, 1.0]))
+        poses = placing.place(raw)
+        self.position, self.quaternion = poses
+        approach = approach_of(poses)
         self.tips = self.position + gripper.tip_offset_m * approach
         palm = self.tips - gripper.finger.length_m * approach
         self.distance = _outside(self.tips, target)

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 
 from graspdb.interop.grasps import Floats
-from graspdb.poses import Poses, matrices, quaternions_of
+from graspdb.poses import Poses, matrices
 from graspdb.wire import CONVENTIONS, Convention, GripperProfile, Pose
 from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING
 
@@ -79,45 +79,15 @@ def _matrix(pose: Pose) -> Floats:
 
 
 def follow(poses: Poses, fixed: Floats) -> Poses:
-    """Poses with a fixed one (4, 4) on their right."""
-    if np.array_equal(fixed, np.eye(4)):
-        return poses
-    turn = quaternions_of(fixed[None, :3, :3])[0]
-    moved = poses.position + rotated(poses.quaternion_xyzw, fixed[:3, 3])
-    return Poses(moved, unit(times(poses.quaternion_xyzw, turn)))
+    """Poses with a fixed one (4, 4) on their right; as they are where that is the identity."""
+    return poses if np.array_equal(fixed, np.eye(4)) else Poses.of(poses.matrices @ fixed)
 
 
 def precede(fixed: Floats, poses: Poses) -> Poses:
     """Poses with a fixed one (4, 4) on their left."""
-    turn = quaternions_of(fixed[None, :3, :3])[0]
-    moved = poses.position @ fixed[:3, :3].T + fixed[:3, 3]
-    turns = np.broadcast_to(turn, poses.quaternion_xyzw.shape)
-    return Poses(moved, unit(times(turns, poses.quaternion_xyzw)))
+    return Poses.of(fixed @ poses.matrices)
 
 
-def rotated(quaternion_xyzw: Floats, vector: Floats) -> Floats:
-    """Vectors (3,) or (N, 3) turned by unit quaternions (N, 4)."""
-    axis, w = quaternion_xyzw[:, :3], quaternion_xyzw[:, 3:]
-    vector = np.broadcast_to(vector, axis.shape)
-    twice = 2.0 * np.cross(axis, vector)
-    return np.asarray(vector + w * twice + np.cross(axis, twice))
-
-
-def times(a: Floats, b: Floats) -> Floats:
-    """Hamilton products (N, 4) of quaternions xyzw: the rotation b, then a."""
-    ax, ay, az, aw = np.moveaxis(a, -1, 0)
-    bx, by, bz, bw = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=-1,
-    )
-
-
-def unit(quaternions: Floats) -> Floats:
-    """The same rotations by unit quaternions."""
-    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
+def approach_of(poses: Poses) -> Floats:
+    """The unit vectors (N, 3) of their z axes."""
+    return poses.matrices[:, :3, 2]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from graspdb.interop.formats.known import TIPS
-from graspdb.interop.frames import follow, precede, rotated
+from graspdb.interop.frames import approach_of, follow, precede
 from graspdb.interop.grasps import Floats, Raw
 from graspdb.poses import Poses, quaternions_of
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
@@ -47,8 +47,7 @@ class Placing:
         assert raw.ahead_m is not None
         # With our axes z approaches: the tool's origin lies its tip offset behind the fingertips.
         ahead = (raw.ahead_m * self.factor - self.tip_offset_m)[:, None]
-        approach = rotated(poses.quaternion_xyzw, np.array([0.0, 0.0, 1.0]))
-        return Poses(poses.position + ahead * approach, poses.quaternion_xyzw)
+        return Poses(poses.position + ahead * approach_of(poses), poses.quaternion_xyzw)
 
     def _quaternions(self, raw: Raw) -> Floats:
         if raw.rotation is not None:

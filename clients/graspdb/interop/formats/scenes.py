@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from graspdb.interop.formats.source import SourceFile, Wishes
-from graspdb.interop.frames import precede, unit
+from graspdb.interop.frames import precede
 from graspdb.interop.grasps import Floats, Raw, Report, problem
 from graspdb.interop.outcomes import SUCCESS
 from graspdb.poses import Poses, matrices, quaternions_of
@@ -67,7 +67,8 @@ def _transform(file: str, element: Element) -> tuple[Floats, Floats]:
             raise ValueError
     except ValueError:
         raise problem(file, f"a fullTransform is (qw qx qy qz)[x y z], not {text.strip()[:80]!r}") from None
-    return position, unit(np.array([x, y, z, w]))
+    quaternion = np.array([x, y, z, w])
+    return position, quaternion / np.linalg.norm(quaternion)
 
 
 def read_uibk(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
