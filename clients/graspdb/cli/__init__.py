@@ -13,6 +13,7 @@ import typer
 from rich.markup import escape
 
 from graspdb import __version__
+from graspdb.agents.command import mcp
 from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
 from graspdb.cli.drawing.frames import frames
@@ -90,6 +91,7 @@ app.add_typer(sweeps.sweeps, name="sweeps")
 app.command("workers")(sweeps.workers)
 app.command("info")(sweeps.info)
 app.command("bundle")(bundle.bundle)
+app.command("mcp")(mcp)
 app.command("demo")(demo)
 
 
