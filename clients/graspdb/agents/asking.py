@@ -23,10 +23,14 @@ MOST_ITEMS = 64
 """Items of a list in a report that an agent gets to read."""
 
 Object = Annotated[str, Field(description="Id of the object, as tool `objects` lists it.")]
-Gripper = Annotated[str, Field(description="Id of the gripper, as `grippers` lists it, or a version, panda@1.")]
+Gripper = Annotated[
+    str, Field(description="Id of the gripper, as `grippers` lists it, or a version, panda@1.")
+]
 Cursor = Annotated[str | None, Field(description="`next` of the answer before, for the items after it.")]
 Limit = Annotated[int, Field(ge=1, le=100, description="So many items at most.")]
-Axes = Annotated[wire.Convention, Field(description="Whose axes the frame has; graspdb: z approach, y closing.")]
+Axes = Annotated[
+    wire.Convention, Field(description="Whose axes the frame has; graspdb: z approach, y closing.")
+]
 
 
 class Questions:
@@ -46,7 +50,7 @@ class Questions:
         return self._get("/objects", limit=limit, cursor=cursor)
 
     def object_details(self, object: Object) -> dict[str, Any]:
-        """One object: mass, friction, named frames, the mesh's bounding box in metres, trials by outcome."""
+        """One object: mass, friction, named frames, the mesh's box in metres, trials by outcome."""
         return self._get(f"/objects/{segment(object)}")
 
     def trials(
@@ -71,7 +75,7 @@ class Questions:
         return self._get("/grippers", limit=limit, cursor=cursor)
 
     def frames(self, gripper: Gripper) -> dict[str, Any]:
-        """The named frames of a gripper, each as its pose in the gripper's base, and the axes' conventions."""
+        """The named frames of a gripper as poses in its base, and whose axes conventions have."""
         profile = self._profile(gripper)
         return {
             "gripper": gripper,
@@ -107,9 +111,9 @@ class Questions:
     def best_grasp(self, object: Object, question: wire.BestGraspRequest | None = None) -> dict[str, Any]:
         """The best grasps within constraints, best first, with success probability and its interval.
 
-        Give object_pose (the object in the robot's base) and frame="flange" for where the robot's flange goes:
-        that is `world`. Status infeasible tells which constraints exclude each other (`conflict`) and what
-        would do (`relax`). success_probability is null where too little was tried near there (`support`).
+        Give object_pose (the object in the robot's base) and frame="flange" for where the robot's flange
+        goes: that is `world`. Status infeasible tells which constraints exclude each other (`conflict`), and
+        what would do (`relax`). success_probability is null where too little was tried near (`support`).
         """
         body = wire.BestGraspRequest() if question is None else question
         return self._post(f"/objects/{segment(object)}/best-grasp", body)
@@ -118,7 +122,7 @@ class Questions:
         """How likely grasps at given poses hold: columns in the poses' order; at most 200 poses."""
         poses = question.poses.position if isinstance(question.poses, wire.PoseColumns) else question.poses
         if len(poses) > MOST_POSES:
-            raise ValueError(f"{len(poses)} poses: ask {MOST_POSES} at a time, or use the SDK, which takes arrays")
+            raise ValueError(f"{len(poses)} poses: ask {MOST_POSES} at a time, or by the SDK")
         return self._post(f"/objects/{segment(object)}/likelihood", question)
 
     def report(
@@ -127,7 +131,9 @@ class Questions:
         report: Annotated[ReportName, Field(description="Which report.")],
         options: Annotated[
             dict[str, str | float | bool] | None,
-            Field(description="Parameters by name, vectors as 'x,y,z'; which each report has is listed above."),
+            Field(
+                description="Parameters by name, vectors as 'x,y,z'; which each report has is listed above."
+            ),
         ] = None,
     ) -> dict[str, Any]:
         """A report: its answer in words (`text`), what to mind (`warnings`), and its numbers.

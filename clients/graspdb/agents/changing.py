@@ -31,7 +31,7 @@ class Changes:
             str,
             Field(
                 pattern=r"^[!-~]{8,200}$",
-                description="A UUID, or any name without spaces that you give this batch: sent again under the"
+                description="A UUID, or any name without spaces: sent again under the"
                 " same, it is stored once.",
             ),
         ],

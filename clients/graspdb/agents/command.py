@@ -14,11 +14,13 @@ from graspdb.transport import Transport
 def mcp(
     state: State,
     http: Annotated[
-        bool, typer.Option("--http", help="Serve on this machine over HTTP instead of standard input and output.")
+        bool,
+        typer.Option("--http", help="Serve on this machine over HTTP instead of standard input and output."),
     ] = False,
     port: Annotated[int, typer.Option(min=1, max=65_535, help="The port of --http.")] = 8765,
     write: Annotated[
-        bool, typer.Option("--write", help="Let agents store trials and start sweeps, too; by default they read.")
+        bool,
+        typer.Option("--write", help="Let agents store trials and start sweeps, too; by default they read."),
     ] = False,
 ) -> None:
     """Let an agent ask: a server of the Model Context Protocol, with the key of --api-key.

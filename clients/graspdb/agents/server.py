@@ -17,22 +17,23 @@ if TYPE_CHECKING:
     from mcp.server.mcpserver import MCPServer
 
 INSTRUCTIONS = """\
-GraspDB keeps grasp trials (a gripper's pose relative to an object, and whether it held) and answers where to grasp.
+GraspDB keeps grasp trials (a gripper's pose relative to an object, and whether it held) and answers where to
+grasp.
 
-Units are metres and radians (degrees only in names that end in _deg); quaternions are x, y, z, w. A grasp is the \
-pose of the gripper's tool frame in the object's frame: origin midway between the fingers, z approach, y closing. \
-Robots are told where their flange goes: ask with frame="flange", and give object_pose (the object in the robot's \
-base) to get each grasp's `world` pose and to have constraints in the robot's base. Tool `frames` says which frames \
-there are.
+Units are metres and radians (degrees only in names that end in _deg); quaternions are x, y, z, w. A grasp is
+the pose of the gripper's tool frame in the object's frame: origin midway between the fingers, z approach, y
+closing. Robots are told where their flange goes: ask with frame="flange", and give object_pose (the object in
+the robot's base) to get each grasp's `world` pose and to have constraints in the robot's base. Tool `frames`
+says which frames there are.
 
-A density is not a probability: say success_probability with its interval, and null means that too little was tried \
-near there. Pass on `warnings`, `status` and `prior`: a grasp marked prior comes from the shape alone. \
+A density is not a probability: say success_probability with its interval; null means that too little was
+tried near there. Pass on `warnings`, `status` and `prior`: a grasp marked prior comes from the shape alone.
 The resource graspdb://guide has the user guide.
 """
 
 
 def build_server(transport: Transport, *, write: bool = False) -> MCPServer[Any]:
-    """A server whose tools ask through ``transport``; ``write`` adds those that store trials and start sweeps.
+    """A server whose tools ask through ``transport``; ``write`` adds what stores trials and starts sweeps.
 
     ImportError names the extra that is missing.
     """
