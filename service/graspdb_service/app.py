@@ -145,6 +145,7 @@ def _open_database(settings: Settings) -> Database:
         settings.database_url,
         pool_size=settings.max_database_connections,
         statement_s=settings.max_statement_seconds,
+        password_file=settings.database_password_file,
     )
     try:
         if database.is_sqlite:

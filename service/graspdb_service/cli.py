@@ -21,10 +21,10 @@ try:
     from graspdb_service import connections
     from graspdb_service.commands import access, upkeep
     from graspdb_service.commands.keys import keys
-    from graspdb_service.commands.options import DatabaseUrl, fail, settings_from
+    from graspdb_service.commands.options import DatabaseUrl, database_of, fail, settings_from
     from graspdb_service.settings import Settings
     from graspdb_service.storage import schema
-    from graspdb_service.storage.database import CANNOT_OPEN, Database, UnsupportedDatabase, why
+    from graspdb_service.storage.database import CANNOT_OPEN, UnsupportedDatabase, why
     from graspdb_service.telemetry import logs, traces
 except ModuleNotFoundError as error:
     sys.exit(NEEDS.format(error.name))
@@ -92,7 +92,7 @@ def migrate(database_url: DatabaseUrl = None) -> None:
     """Bring the database's schema to this version; safe to run from several places at once."""
     settings = settings_from(database_url=database_url)
     with _opening(settings):
-        typer.echo(f"The schema is at {schema.upgrade(Database(settings.database_url))}.")
+        typer.echo(f"The schema is at {schema.upgrade(database_of(settings))}.")
 
 
 @contextmanager
@@ -103,7 +103,7 @@ def _opening(settings: Settings) -> Iterator[None]:
     except (schema.StaleSchema, UnsupportedDatabase) as error:
         fail(str(error))
     except CANNOT_OPEN as error:
-        url = Database(settings.database_url).url.render_as_string(hide_password=True)
+        url = database_of(settings).url.render_as_string(hide_password=True)
         fail(f"The database {url} cannot be opened: {why(error)}")
 
 

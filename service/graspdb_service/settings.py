@@ -48,6 +48,8 @@ class Settings(BaseSettings):
 
     database_url: str = "sqlite:///graspdb.sqlite"
     """``sqlite:///relative.sqlite``, ``sqlite:////absolute.sqlite`` or ``postgresql://user@host/name``."""
+    database_password_file: Path | None = None
+    """A file with PostgreSQL's password, read for every new connection; a password in the URL comes first."""
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65_535), BeforeValidator(_port)] = DEFAULT_PORT
     root_path: str = ""

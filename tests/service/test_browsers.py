@@ -21,8 +21,10 @@ def test_an_unknown_host_is_refused_with_the_way_out(sqlite_http: httpx.Client, 
     assert answer.status_code == 421
     assert answer.json()["type"].endswith(":unknown-host")
     assert "GRASPDB_ALLOWED_HOSTS" in answer.json()["title"]
-    # Supervisors ask by a container's address.
+    # Supervisors ask by a container's address, and so does Prometheus, which a page's name is not.
     assert sqlite_http.get("/livez", headers={"Host": host}).status_code == 200
+    by_address = host in ("192.168.1.7", "[::2]")
+    assert sqlite_http.get("/metrics", headers={"Host": host}).status_code == (200 if by_address else 421)
 
 
 @pytest.mark.parametrize("host", ["localhost:{port}", "LOCALHOST", "127.0.0.9", "[::1]:{port}"])

@@ -12,7 +12,7 @@ import typer
 from pydantic import BaseModel, ValidationError
 
 from graspdb.wire.access.keys import KeyCreate, KeyInfo, KeyRotate
-from graspdb_service.commands.options import DatabaseUrl, fail, settings_from
+from graspdb_service.commands.options import DatabaseUrl, database_of, fail, settings_from
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import CANNOT_OPEN, Database, UnsupportedDatabase, why
@@ -111,7 +111,7 @@ def _opened(database_url: str | None) -> Iterator[Database]:
     """The database, its schema current; one line for what a person can mend."""
     database = None
     try:
-        database = Database(settings_from(database_url=database_url).database_url)
+        database = database_of(settings_from(database_url=database_url))
         if database.is_sqlite:
             schema.upgrade(database)
         else:

@@ -8,6 +8,7 @@ import typer
 from pydantic import ValidationError
 
 from graspdb_service.settings import Settings
+from graspdb_service.storage.database import Database
 
 DatabaseUrl = Annotated[
     str | None, typer.Option("--database-url", help="sqlite:///FILE or postgresql://USER@HOST/NAME")
@@ -22,6 +23,11 @@ def settings_from(**given: Any) -> Settings:
         fail("; ".join(f"{_variable(e['loc'])}: {e['msg']}, not {e['input']!r}" for e in error.errors()))
     except ValueError as error:
         fail(str(error))
+
+
+def database_of(settings: Settings) -> Database:
+    """The database that a command works on; UnsupportedDatabase where the URL names none."""
+    return Database(settings.database_url, password_file=settings.database_password_file)
 
 
 def _variable(place: tuple[int | str, ...]) -> str:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from sqlalchemy.exc import DBAPIError
 
-from graspdb_service.commands.options import DatabaseUrl, fail, settings_from
+from graspdb_service.commands.options import DatabaseUrl, database_of, fail, settings_from
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database, UnsupportedDatabase
 from graspdb_service.storage.upkeep import backup as copies
@@ -129,7 +129,7 @@ def _show(diagnosis: Diagnosis) -> None:
 @contextmanager
 def _database(url: str | None, code: int = 1) -> Iterator[Database]:
     with _failures(code):
-        database = Database(settings_from(database_url=url).database_url)
+        database = database_of(settings_from(database_url=url))
         try:
             yield database
         finally:

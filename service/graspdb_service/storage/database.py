@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 from weakref import WeakSet
 
@@ -204,11 +205,20 @@ class Database:
 
     Writers on SQLite take ``BEGIN IMMEDIATE``, so that a read-modify-write can't lose another's update
     nor fail halfway with "database is locked"; readers have an engine of their own and never take a write
-    lock. On PostgreSQL a reader sees one snapshot (REPEATABLE READ, read only).
+    lock. On PostgreSQL a reader sees one snapshot (REPEATABLE READ, read only). ``password_file`` has
+    PostgreSQL's password, where the URL has none.
     """
 
-    def __init__(self, url: str, *, pool_size: int = 40, statement_s: float | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        pool_size: int = 40,
+        statement_s: float | None = None,
+        password_file: Path | None = None,
+    ) -> None:
         self.url = _normalised(url)
+        self._password_file = password_file
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self.path = self.url.database if self.is_sqlite else None
         """The file of a SQLite database."""
@@ -288,7 +298,19 @@ class Database:
         told = {name: value for name, value in told.items() if name not in self.url.query}
         engine = create_engine(self.url, connect_args=told, **pool)
         event.listen(engine, "connect", lambda connection, _: self._drivers.add(connection))
+        event.listen(engine, "do_connect", self._show_password)
         return engine
+
+    def _show_password(self, dialect: Any, _record: Any, _arguments: Any, options: Any) -> None:
+        # Read for every connection, so that a password that is changed needs no restart.
+        if self._password_file is None or self.url.password is not None:
+            return
+        try:
+            # Whoever writes such a file with an editor ends its line; nothing else is cut off.
+            options["password"] = self._password_file.read_text("utf-8").removesuffix("\n")
+        except (OSError, UnicodeDecodeError) as error:
+            told = f"GRASPDB_DATABASE_PASSWORD_FILE can't be read: {error}"
+            raise dialect.dbapi.OperationalError(told) from error
 
     def cut(self) -> None:
         """Break every connection to a PostgreSQL that hangs: whoever waits for an answer gets an error."""

@@ -8,6 +8,7 @@ refused.
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Callable, Collection
 from urllib.parse import urlsplit
 
@@ -20,6 +21,8 @@ from graspdb_service.settings import is_loopback
 
 #: Supervisors ask for these by whatever address a container has.
 _HEALTH = {"/livez", "/readyz"}
+#: Prometheus as well, at addresses that it looked up: no page that had its name resolved comes under one.
+_BY_ADDRESS = "/metrics"
 ANY_HOST = "*"
 
 
@@ -41,11 +44,12 @@ class BrowserGuard:
         self._answer = answer
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["path"].removeprefix(scope.get("root_path", "")) not in _HEALTH:
+        path = scope["path"].removeprefix(scope.get("root_path", "")) if scope["type"] == "http" else None
+        if path is not None and path not in _HEALTH:
             headers = Headers(scope=scope)
             problem = self._untyped(headers)
             if problem is None and self._hosts is not None:
-                problem = self._unknown_host(headers) or self._foreign(headers)
+                problem = self._unknown_host(headers, path) or self._foreign(headers)
             if problem is not None:
                 request_id = scope.get("state", {}).get("request_id", "")
                 await self._answer(problem, request_id)(scope, receive, send)
@@ -61,9 +65,9 @@ class BrowserGuard:
             415, "unsupported-media-type", "Say by Content-Type what the body is, such as application/json"
         )
 
-    def _unknown_host(self, headers: Headers) -> ProblemError | None:
+    def _unknown_host(self, headers: Headers, path: str) -> ProblemError | None:
         host = headers.get("host", "")
-        if self._is_known(_name(host)):
+        if self._is_known(_name(host)) or (path == _BY_ADDRESS and _is_address(_name(host))):
             return None
         return ProblemError(
             421,
@@ -97,6 +101,14 @@ class BrowserGuard:
     def _is_known(self, name: str) -> bool:
         assert self._hosts is not None
         return is_loopback(name) or name in self._hosts or ANY_HOST in self._hosts
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 def _name(host: str) -> str:
