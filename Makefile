@@ -3,13 +3,14 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PACKAGES := graspdb_density graspdb_geometry graspdb_service graspdb_simworker graspdb
+PACKAGES := graspdb_density graspdb_geometry graspdb_service graspdb_simworker graspdb graspdb_viewer
 # How many processes run tests; the suite is made for two cores.
 JOBS ?= 2
 KEEP ?=
+VIEW ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-core test-long check format bench openapi requirements clean
+.PHONY: help install demo test chromium test-core test-long check format bench openapi requirements clean
 
 help:  ## What can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -20,18 +21,21 @@ $(VENV)/installed: requirements.txt pyproject.toml
 	@PYTHON="$(PYTHON)" VENV="$(VENV)" sh .ci/install
 	@touch $@
 
-demo: install  ## Real physics on the mug: from nothing to a best grasp (KEEP=1 leaves the service running)
-	$(BIN)/graspdb demo $(if $(KEEP),--keep)
+demo: install  ## Real physics on the mug: from nothing to a best grasp (KEEP=1 leaves the service running, VIEW=1 shows it)
+	$(BIN)/graspdb demo $(if $(KEEP),--keep) $(if $(VIEW),--view)
 
-test: check  ## Every check and every test, on SQLite and on a real PostgreSQL
+test: chromium check  ## Every check and every test, on SQLite and on a real PostgreSQL
 	@sh .ci/faketime
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long" --ignore tests/architecture
+
+chromium:
+	@sh .ci/chromium
 
 test-core: install  ## The tests without a browser
 	@sh .ci/faketime
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long and not browser"
 
-test-long: install  ## Also what takes many minutes
+test-long: chromium install  ## Also what takes many minutes
 	@sh .ci/faketime
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 

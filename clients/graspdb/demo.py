@@ -6,6 +6,7 @@ Service and worker run as processes of their own, exactly as in a laboratory; th
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import math
 import os
 import shutil
@@ -43,6 +44,7 @@ LEVEL = 0.90
 LOG_LINES = 15
 START_S = 120.0
 STOP_S = 10.0
+VIEWER_PORT = 8080
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 # The workspace: the mug stands on a table half a metre in front of the robot, turned by 30 degrees, and
@@ -162,6 +164,9 @@ def demo(
     keep: Annotated[
         bool, typer.Option("--keep", help="Leave service and worker running until Ctrl-C.")
     ] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the first object in a browser at the end; implies --keep.")
+    ] = False,
     objects: Annotated[
         str, typer.Option(help="Examples to grasp, comma-separated: cone, elongated-d, screwdriver, mug.")
     ] = "mug",
@@ -180,7 +185,9 @@ def demo(
     # A log gets whole lines, a terminal lines broken between words.
     console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     names = [name.strip() for name in objects.split(",") if name.strip()]
-    started = time.monotonic()
+    if view and importlib.util.find_spec("viser") is None:
+        raise ImportError("--view needs the viewer: pip install 'graspdb[view]'")
+    keep, started = keep or view, time.monotonic()
     try:
         with (
             _folder(folder) as place,
@@ -193,6 +200,8 @@ def demo(
             stays = "" if keep else " (while it runs: --keep, or make demo KEEP=1, leaves it running)"
             console.print(f"API docs: {db.url}/docs{stays}")
             console.print(f"Took {duration(time.monotonic() - started)}.")
+            if view:
+                _view(db, children, names[0], console)
             if keep:
                 _hold(db, children, names[0], console)
     except KeyboardInterrupt:
@@ -245,9 +254,9 @@ def _running(
                 raise
 
 
-def _port(wanted: int | None) -> int:
-    """The wanted port, else 8000, else a free one."""
-    for candidate in (wanted,) if wanted is not None else (8000, 0):
+def _port(wanted: int | None, usual: int = 8000) -> int:
+    """The wanted port, else the usual one, else a free one."""
+    for candidate in (wanted,) if wanted is not None else (usual, 0):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
@@ -376,6 +385,24 @@ def _share(outcomes: OutcomeArrays) -> str:
     count, total = int(outcomes.success.sum()), len(outcomes)
     low, high = wilson_interval(count, total)
     return f"{count} ({count / total:.2f}; {100 * LEVEL:.0f} % interval {low:.2f} to {high:.2f})"
+
+
+def _view(db: Client, children: Children, name: str, console: Console) -> None:
+    """The viewer beside the service, and where it is to be looked at."""
+    port = _port(None, VIEWER_PORT)
+    children.start("graspdb", "--url", db.url, "view", name, "--port", str(port))
+    deadline = time.monotonic() + START_S
+    while not _listens(port):
+        children.check()
+        if time.monotonic() > deadline:
+            raise DemoFailed(f"no page in {START_S:g} s:\n{children.log('graspdb')}")
+        time.sleep(0.1)
+    console.print(f"[bold]Look at http://127.0.0.1:{port}[/] in a browser.")
+
+
+def _listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def _hold(db: Client, children: Children, name: str, console: Console) -> None:

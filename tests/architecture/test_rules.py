@@ -20,6 +20,7 @@ PACKAGES = (
     "service/graspdb_service",
     "simworker/graspdb_simworker",
     "clients/graspdb",
+    "clients/graspdb_viewer",
 )
 
 

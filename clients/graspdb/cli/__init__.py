@@ -17,6 +17,7 @@ from graspdb.agents.command import mcp
 from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
 from graspdb.cli.common import ERRORS, State
 from graspdb.cli.drawing.frames import frames
+from graspdb.cli.drawing.view import view
 from graspdb.cli.exchange import bundle
 from graspdb.cli.exchange.exporting import export
 from graspdb.cli.exchange.importing import import_files
@@ -25,6 +26,7 @@ from graspdb.cli.options import Commands
 from graspdb.cli.wording import in_commands
 from graspdb.demo import demo
 from graspdb.errors import GraspDBError
+from graspdb.processes import LIFELINE_HELP
 
 __all__ = ["app", "main"]
 
@@ -92,6 +94,7 @@ app.command("workers")(sweeps.workers)
 app.command("info")(sweeps.info)
 app.command("bundle")(bundle.bundle)
 app.command("mcp")(mcp)
+app.command("view", epilog=LIFELINE_HELP)(view)
 app.command("demo")(demo)
 
 

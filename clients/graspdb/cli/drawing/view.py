@@ -1,0 +1,46 @@
+"""``graspdb view``: the web viewer, from this process until Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import threading
+import webbrowser
+from typing import Annotated
+
+import typer
+
+from graspdb.cli.common import ERRORS, State
+from graspdb.processes import end_with_parent
+
+PORT = 8080
+
+
+def view(
+    state: State,
+    id: Annotated[
+        str | None, typer.Argument(metavar="[OBJECT]", help="The object to show first.", show_default=False)
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0: any that is free.")] = PORT,
+    host: Annotated[
+        str,
+        typer.Option(help="Address to listen on. Whoever reaches it sees what the viewer's key may read."),
+    ] = "127.0.0.1",
+    browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = False,
+) -> None:
+    """Look at an object, its grasps and trials in a browser, and drag constraints about (extra `view`)."""
+    end_with_parent()
+    try:
+        viewer = importlib.import_module("graspdb_viewer.serving")
+    except ImportError as error:
+        raise ImportError(f"the viewer needs {error.name}: pip install 'graspdb[view]'") from error
+    keyed = bool(state.api_key or os.environ.get("GRASPDB_API_KEY"))
+    start = importlib.import_module("graspdb_viewer.view").View(object=id)
+    with viewer.serving(state.db, host=host, port=port, view=start, keyed=keyed) as server:
+        typer.echo(f"Look at {server.url} (Ctrl-C ends it)")
+        if browser:
+            webbrowser.open(server.url)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+    ERRORS.print("The viewer has ended.")

@@ -1,0 +1,146 @@
+"""The best grasps within what the user drags about: workspace, cone, obstacle, and the object itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+
+from graspdb.errors import Infeasible
+from graspdb.poses import Poses
+from graspdb.resources.results import Grasp, Grasps
+from graspdb_viewer.page import OBJECT, Page, Subject, put
+from graspdb_viewer.panels import words
+from graspdb_viewer.panels.closing import Closing
+from graspdb_viewer.panels.gizmos import Gizmos
+from graspdb_viewer.panels.spoken import constraints, spoken
+from graspdb_viewer.scene import colours, shapes
+
+_OBJECTIVES: dict[str, Literal["density", "success_probability"]] = {
+    "density": "density",
+    "success probability": "success_probability",
+}
+_NEAREST = (140, 140, 140)
+
+
+class QuestionPanel:
+    """What is asked for, and what is answered; ``changed`` is called at every change, and while dragging."""
+
+    def __init__(self, page: Page, closing: Closing, changed: Callable[[], None], *, keyed: bool) -> None:
+        self._page, self._closing, self._keyed = page, closing, keyed
+        gui, view = page.client.gui, page.view
+        self._count = gui.add_slider("Best grasps", 0, 20, 1, initial_value=view.best)
+        self._objective = gui.add_dropdown(
+            "Ranked by", tuple(_OBJECTIVES), initial_value=view.objective.replace("_", " ")
+        )
+        self.gizmos = Gizmos(page, changed)
+        self._answer = gui.add_markdown("")
+        self._latency = gui.add_markdown("")
+        with gui.add_folder("Ask it elsewhere", expand_by_default=False):
+            gui.add_markdown("The same question, to select and copy:")
+            self._spoken = [
+                gui.add_text(label, "", multiline=True) for label in ("curl", "Python", "Command line")
+            ]
+        self.answered: Grasps | None = None
+        self.questions = 0
+
+        def on_change(_: Any) -> None:
+            view.best = int(self._count.value)
+            view.objective = _OBJECTIVES[self._objective.value]
+            changed()
+
+        for control in (self._count, self._objective):
+            control.on_update(on_change)
+
+    def ask(self) -> None:
+        """Ask for the best grasps of the view, and show them or why there are none."""
+        page, view, subject = self._page, self._page.view, self._page.subject
+        if subject is None or view.best == 0:
+            self._nothing("")
+            return
+        given = constraints(view, subject.selection)
+        if subject.density is None or not subject.successes:
+            if subject.gripper is None or subject.mesh is None:
+                self._nothing("**No best grasp yet**: nothing has succeeded.")
+                return
+            given["gripper"] = subject.gripper
+        said = spoken(page.db.url, subject.item.id, view.best, given, keyed=self._keyed)
+        for control, text in zip(self._spoken, said, strict=True):
+            put(control, text)
+        began = time.perf_counter()
+        try:
+            found = subject.item.best_grasps(count=view.best, **given)
+        except Infeasible as error:
+            self._infeasible(error)
+            return
+        self.answered = found
+        self._show(subject, found)
+        self.questions += 1
+        self._latency.content = (
+            f"Answered in {1e3 * (time.perf_counter() - began):.0f} ms, at revision {found.revision:,}."
+        )
+
+    def _show(self, subject: Subject, found: Grasps) -> None:
+        best = found[0]
+        self._closing.show(_pose(best), end_m=best.width_m)
+        others = [_pose(grasp) for grasp in found[1:]]
+        node = None
+        if others and subject.profile is not None:
+            poses = Poses(*(np.concatenate(part) for part in zip(*others, strict=True)))
+            shape = shapes.fingers(subject.profile)
+            node = self._page.instances(
+                f"{OBJECT}/best", shape, poses, colours.SECOND, lod="off", opacity=0.55
+            )
+        self._page.replace("best", node)
+        self._page.replace("nearest", None)
+        fewer = f" Only {len(found)} distinct ones exist." if found.status == "fewer" else ""
+        prior = " **By geometry alone: nothing has succeeded yet.**" if best.prior else ""
+        minded = "".join(f"\n\n*Mind:* {words.plain(warning)}" for warning in found.warnings)
+        self._answer.content = f"**Best grasp.**{prior}{fewer}\n\n{words.table(best.summary())}{minded}"
+
+    def _infeasible(self, error: Infeasible) -> None:
+        nearest = error.nearest if isinstance(error.nearest, Grasp) else None
+        self._nothing(_why_none(error))
+        subject = self._page.subject
+        if nearest is not None and subject is not None and subject.profile is not None:
+            shape = shapes.gripper(subject.profile)
+            node = self._page.instances(
+                f"{OBJECT}/nearest", shape, _pose(nearest), _NEAREST, lod="off", opacity=0.5
+            )
+            self._page.replace("nearest", node)
+
+    def _nothing(self, why: str) -> None:
+        self.answered = None
+        self._closing.show(None)
+        self._page.replace("best", None)
+        self._page.replace("nearest", None)
+        self._answer.content, self._latency.content = why, ""
+        self.questions += 1
+
+
+def _pose(grasp: Grasp) -> Poses:
+    return Poses(np.array([grasp.position]), np.array([grasp.quaternion_xyzw]))
+
+
+def _why_none(error: Infeasible) -> str:
+    """What excludes what, what would do, and what the grey gripper is."""
+    if not error.conflict and error.nearest is None:
+        return f"**No grasp.** {words.plain(error)}"
+    names = [f"`{name}`" for name in error.conflict]
+    what = "all that was tried" if len(names) == 1 else "each other"
+    told = "**No grasp fulfils this**"
+    if names:
+        told += f": {' and '.join(names)} exclude{'s' if len(names) == 1 else ''} {what}."
+    if error.relax:
+        values = (
+            f"`{name}={','.join(f'{number:.4g}' for number in np.atleast_1d(value))}`"
+            if not isinstance(value, bool)
+            else f"`{name}={str(value).lower()}`"
+            for name, value in error.relax.items()
+        )
+        told += f"\n\nThis would do: {' or '.join(values)}."
+    if error.nearest is not None:
+        told += "\n\nGrey: the nearest grasp outside."
+    return told

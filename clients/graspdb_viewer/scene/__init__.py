@@ -1,0 +1,1 @@
+"""What is drawn: shapes of grippers and objects, and their colours, as arrays. No viser here."""

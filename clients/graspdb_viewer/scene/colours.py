@@ -1,0 +1,67 @@
+"""Colours that colour-blind people tell apart: of values between two ends, and of names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Bytes = NDArray[np.uint8]
+UNKNOWN = (150, 150, 150)
+BEST, SECOND = (213, 94, 0), (240, 170, 110)
+#: Some of the colours of viridis (Smith and van der Walt, 2015), between which others are mixed.
+_VIRIDIS = np.array(
+    [
+        *([68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141]),
+        *([39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]),
+    ],
+    dtype=np.float64,
+)
+#: Okabe and Ito's.
+_NAMED = {
+    "success": (0, 158, 115),
+    "failure": (213, 94, 0),
+    "collision": (230, 159, 0),
+    "missed": (86, 180, 233),
+    "slipped": (204, 121, 167),
+    "dropped": (0, 114, 178),
+    "wrench_insufficient": (160, 60, 60),
+    "timeout": (110, 110, 110),
+    "simulation_error": (40, 40, 40),
+    "simulation": (0, 114, 178),
+    "robot": (213, 94, 0),
+    "human": (0, 158, 115),
+    "import": (204, 121, 167),
+}
+
+
+def of_values(values: ArrayLike, low: float, high: float) -> Bytes:
+    """(N, 3) colours of (N,) values from dark at ``low`` to bright at ``high``; grey where unknown (NaN)."""
+    given = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(given)
+    share = np.clip((np.where(known, given, low) - low) / max(high - low, 1e-300), 0.0, 1.0)
+    place = share * (len(_VIRIDIS) - 1)
+    mixed = np.stack([np.interp(place, np.arange(len(_VIRIDIS)), _VIRIDIS[:, k]) for k in range(3)], axis=1)
+    return np.where(known[:, None], mixed, UNKNOWN).astype(np.uint8)
+
+
+def of_names(names: Sequence[str | None]) -> Bytes:
+    """(N, 3) colours of outcomes and sources; grey for what has none."""
+    return np.array([_NAMED.get(name or "", UNKNOWN) for name in names], dtype=np.uint8).reshape(-1, 3)
+
+
+def bar(height: int = 14, width: int = 280) -> Bytes:
+    """All colours of values side by side, (height, width, 3)."""
+    row = of_values(np.linspace(0.0, 1.0, width), 0.0, 1.0)
+    return np.broadcast_to(row, (height, width, 3)).copy()
+
+
+def legend(names: Sequence[str], counts: Sequence[int]) -> str:
+    """Names with their colours, as HTML; the names are the service's own."""
+    rows = []
+    for name, count in zip(names, counts, strict=True):
+        red, green, blue = _NAMED.get(name, UNKNOWN)
+        dot = f"<span style='color:rgb({red},{green},{blue});font-size:1.2em'>&#9679;</span>"
+        rows.append(f"{dot} {name.replace('_', ' ')} {count:,}")
+    return "<div style='padding:0 0.75em;font-size:0.85em;line-height:1.6'>" + "<br>".join(rows) + "</div>"
