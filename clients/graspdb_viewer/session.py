@@ -30,7 +30,7 @@ from graspdb_viewer.view import View
 _POLL_S = 3.0
 _ANY = "any"
 _NONE = "(no object yet)"
-_MESH = (205, 208, 212)
+_MESH = (165, 170, 178)
 _SIZE_M = 0.1
 """Of what is shown without a mesh."""
 
@@ -73,6 +73,7 @@ class Session:
         # No share button: it would open a tunnel to a server of viser's.
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.set_panel_label("GraspDB")
+        gui.main_panel.dock_right()
         self._notice = gui.add_markdown("", visible=False)
         self._again = gui.add_button("Again", visible=False)
         self._objects = gui.add_dropdown("Object", (view.object or _NONE,))
@@ -89,10 +90,9 @@ class Session:
             self._trials = TrialsPanel(self.page, self._redraw, self._show_trial)
         with tabs.add_tab("Reports"):
             self._reports = ReportsPanel(self.page, self._reporting)
-        with tabs.add_tab("Sweeps"):
-            self._sweeps = SweepsPanel(self.page)
-        with tabs.add_tab("About"):
+        with tabs.add_tab("Object"):
             self._about = gui.add_markdown("")
+            self._sweeps = SweepsPanel(self.page)
         self._address = gui.add_text("Link to this view", "", hint="Opens the same view again.")
         self._again.on_click(lambda _: self._drawing.soon(self._load))
         self._objects.on_update(lambda event: self._choose(event.target.value, event.client_id))

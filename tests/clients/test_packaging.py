@@ -15,7 +15,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = {"graspdb", "graspdb_density", "graspdb_geometry", "graspdb_service", "graspdb_simworker"}
+PACKAGES = {
+    "graspdb",
+    "graspdb_density",
+    "graspdb_geometry",
+    "graspdb_service",
+    "graspdb_simworker",
+    "graspdb_viewer",
+}
 
 
 @pytest.fixture(scope="module")

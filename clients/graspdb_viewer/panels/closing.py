@@ -56,9 +56,7 @@ class Closing:
             frame = self._page.client.scene.add_frame(GRIPPER, show_axes=False)
             self._page.replace("gripper", frame)
         frame.position, frame.wxyz, frame.visible = pose.position[0], wxyz(pose.quaternion_xyzw[0]), True
-        self._page.replace(
-            "palm", self._page.solid(f"{GRIPPER}/palm", shapes.palm(profile), _STEEL, opacity=0.6)
-        )
+        self._page.replace("palm", self._page.solid(f"{GRIPPER}/palm", shapes.palm(profile), _STEEL))
         self._draw()
 
     def _draw(self) -> None:

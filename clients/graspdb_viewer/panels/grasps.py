@@ -24,7 +24,7 @@ _COLOURS: dict[str, Literal["density", "success_probability"]] = {
 }
 _SEED = 1
 """Of the draws, so that a link shows the same ones."""
-_OPACITY = 0.3
+_OPACITY = 0.2
 """So that the object is seen through thousands of them."""
 _DARK = -3.0
 """Common logarithm of the relative density that is as dark as none."""
