@@ -160,6 +160,10 @@ def test_a_grasp_knows_what_it_is_of_and_goes_back_so(
     np.testing.assert_allclose(best.tool_matrix, tool.matrix, atol=1e-9)
     np.testing.assert_allclose(best.approach, tool.approach, atol=1e-9)
     assert best.summary()["pose of"] == "camera, axes as graspnet"
+    # The flange is turned against the tool, so a convention of it is no other program's axes: it says so.
+    turned = grasped.best_grasp(frame="flange", convention="graspnet")
+    assert turned.warnings
+    assert all(f"mind: {warning}" in repr(turned) for warning in turned.warnings)
     # Given back, it is what it says.
     likely = grasped.likelihood(best)
     np.testing.assert_allclose(likely.log_density, grasped.likelihood(tool).log_density, rtol=1e-6)

@@ -127,6 +127,18 @@ def test_a_pair_of_sliding_fingers(tmp_path: Path) -> None:
     assert any(text.startswith("friction") for text in found.assumed)
 
 
+def test_a_hand_beside_the_bases_axis_is_as_large_as_it_is(tmp_path: Path) -> None:
+    mounted = pair().replace(
+        '<robot name="two fingers">',
+        '<robot name="two fingers"><link name="mount"/>'
+        + joint("bracket", "fixed", "mount", "hand", "0.015 -0.04 0.02", rpy="0 0 0.5"),
+    )
+    profile = read_gripper(written(tmp_path, mounted)).profile
+    assert profile.palm_size_m == pytest.approx((0.06, 0.2, 0.066), abs=1e-6)
+    assert profile.base_to_tool is not None
+    assert profile.base_to_tool.position == pytest.approx((0.015, -0.04, 0.1234))
+
+
 def test_fingers_without_a_mimic_move_alike_and_meshes_beside_are_read(tmp_path: Path) -> None:
     corners = [(x, y, z) for x in (-10, 10) for y in (0, 15) for z in (0, 45)]
     faces = ["1 2 4", "5 7 8"]

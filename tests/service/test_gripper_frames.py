@@ -55,6 +55,7 @@ def test_frames_that_contradict_name_the_field(sqlite_http: httpx.Client) -> Non
         ),
         ({"frames": {"a b": TOOL}}, "frames.a b"),
         ({"frames": {f"f{i}": TOOL for i in range(65)}}, "frames"),
+        ({"base_to_tool": {"position": [0, 0, 162], "quaternion_xyzw": [0, 0, 0, 1]}}, "body"),
         ({"joints": {"j": {"open": 1}}}, "joints.j.closed"),
         ({"joints": {"j": {"open": 1e9, "closed": 0}}}, "joints.j.open"),
     ]

@@ -529,13 +529,15 @@ def _profile(model: _Model, jaw: _Jaw, swing: _Swing, assumed: list[str]) -> dic
     """Fields of the profile; adds to what is assumed."""
     poses = model.poses(jaw.values(1.0))
     one, other = (model.points(model.rigid(tip), poses) @ jaw.axes for tip in jaw.tips)
-    palm_low, palm_high, face = _palm_box(model, jaw, poses, min(one[:, 2].min(), other[:, 2].min()))
-    tip = float(swing.ahead[-1])
     middle = (one[:, 1].min() + other[:, 1].max()) / 2
     sides = (min(one[:, 0].min(), other[:, 0].min()), max(one[:, 0].max(), other[:, 0].max()))
+    centre = np.array([sum(sides) / 2, middle])
+    begin = min(one[:, 2].min(), other[:, 2].min())
+    palm_low, palm_high, face = _palm_box(model, jaw, poses, centre, begin)
+    tip = float(swing.ahead[-1])
     length = tip - face
     offset = _tool_offset(model, poses, jaw, tip, length, assumed)
-    position = jaw.axes @ np.array([sum(sides) / 2, middle, tip - offset])
+    position = jaw.axes @ np.array([*centre, tip - offset])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = jaw.axes, position
     place = as_poses(pose)
@@ -590,9 +592,11 @@ def _joint_values(model: _Model, jaw: _Jaw, swing: _Swing) -> dict[str, Any]:
 
 
 def _palm_box(
-    model: _Model, jaw: _Jaw, poses: Mapping[str, Floats], tips_begin: float
+    model: _Model, jaw: _Jaw, poses: Mapping[str, Floats], centre: Floats, tips_begin: float
 ) -> tuple[Floats, Floats, float]:
-    """Extents of the palm in the tool's axes, and where the fingers begin: linkage behind them is palm."""
+    """Extents of the palm about the tool's axis, which passes through ``centre`` (2,), and where the fingers
+    begin: linkage behind them is palm.
+    """
     tips = {name for tip in jaw.tips for name in model.rigid(tip)}
     linkage = [link for link in model.subtree(model.root) if link not in tips and len(model.corners[link])]
     points = model.points(linkage, poses) @ jaw.axes
@@ -604,8 +608,8 @@ def _palm_box(
     face = min(float(static[:, 2].max()) if len(static) else 0.0, tips_begin)
     face = max(face, float(points[:, 2].max()))
     low, high = points.min(axis=0), points.max(axis=0)
-    # Boxes lie about the tool's axis.
-    reach = np.maximum(np.abs(low[:2]), np.abs(high[:2]))
+    # The profile's box is even about the tool's axis, wherever the base is.
+    reach = np.maximum(np.abs(low[:2] - centre), np.abs(high[:2] - centre))
     return np.array([*-reach, low[2]]), np.array([*reach, face]), face
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import html
 import importlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
@@ -88,6 +88,7 @@ class Grasp:
     - ``nearest_trials``: ``seq`` of the trials nearest to it.
     - ``active_constraints``: those that hold it where it is.
     - ``answer``: id of the answer that it is of, for the trial that tries it; None where it is not kept.
+    - ``warnings``: what to mind of that answer; printing the grasp says them, too.
     """
 
     position: Floats
@@ -114,6 +115,7 @@ class Grasp:
     frame: str = "tool"
     convention: str = "graspdb"
     tool_to_frame: Floats | None = None
+    warnings: tuple[str, ...] = ()
     raw: wire.Grasp | None = field(default=None)
     reporter: Reporter | None = field(default=None)
 
@@ -134,6 +136,7 @@ class Grasp:
             "frame": answer.frame,
             "convention": answer.convention,
             "tool_to_frame": None if fixed is None else matrices(fixed.position, fixed.quaternion_xyzw),
+            "warnings": tuple(answer.warnings),
         }
         return cls(**fields, answer=answer.answer, raw=grasp, reporter=reporter)
 
@@ -242,13 +245,18 @@ class Grasp:
         return rows
 
     def __repr__(self) -> str:
+        return self.line() + _mind(self.warnings)
+
+    def line(self) -> str:
+        """What it is in one line."""
         return (
             f"Grasp(position={_vector(self.position)}, quaternion_xyzw={_vector(self.quaternion_xyzw)}, "
             f"density={self.density:.4g}, relative={self.relative:.3f}{', prior=True' if self.prior else ''})"
         )
 
     def _repr_html_(self) -> str:
-        return table_html(f"Grasp ({self._told_frame()} frame in the object frame)", self.summary())
+        mind = {"mind": "; ".join(self.warnings)} if self.warnings else {}
+        return table_html(f"Grasp ({self._told_frame()} frame in the object frame)", self.summary() | mind)
 
 
 class Grasps(Sequence[Grasp]):
@@ -374,10 +382,15 @@ class Grasps(Sequence[Grasp]):
         return to_pandas(self.columns())
 
     def __repr__(self) -> str:
-        lines = "".join(f"\n  {grasp!r}," for grasp in self._grasps)
-        return (
+        lines = "".join(f"\n  {grasp.line()}," for grasp in self._grasps)
+        told = (
             f"Grasps(status={self.status!r}, [{lines}\n])" if lines else f"Grasps(status={self.status!r}, [])"
         )
+        return told + _mind(self.warnings)
+
+
+def _mind(warnings: Iterable[str]) -> str:
+    return "".join(f"\n  mind: {warning}" for warning in warnings)
 
 
 _COLUMNS = (

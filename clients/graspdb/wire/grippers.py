@@ -143,7 +143,26 @@ def _alike(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
-class GripperCreate(GripperProfile):
+_FARTHEST_M = 2.0
+
+
+class GivenProfile(GripperProfile):
+    """A profile as it is given: what is stored is not judged again."""
+
+    @model_validator(mode="after")
+    def _in_metres(self) -> GivenProfile:
+        for name, pose in self.frames.items():
+            off = math.hypot(*pose.position)
+            if off > _FARTHEST_M:
+                field = "base_to_tool" if name == TOOL else f"frames.{name}"
+                raise ValueError(
+                    f"{field} is {off:g} m from the gripper's base, which is no gripper's: positions are in"
+                    " metres, so divide millimetres by 1,000"
+                )
+        return self
+
+
+class GripperCreate(GivenProfile):
     """A gripper to store: its profile under an id."""
 
     id: Slug
@@ -152,7 +171,7 @@ class GripperCreate(GripperProfile):
     """A name for people; null for none."""
 
 
-class GripperUpdate(GripperProfile):
+class GripperUpdate(GivenProfile):
     """A gripper's profile from now on: all of it, where a field left out takes its default."""
 
     id: Slug | None = None

@@ -32,6 +32,10 @@ _COMMAND = (
 )
 
 
+PATIENCE = 4.0
+"""A mesh is refused for the processor time it takes, not for what else the machine is doing."""
+
+
 def inspect_in_child(
     data: bytes,
     form: MeshForm,
@@ -44,8 +48,8 @@ def inspect_in_child(
     """Load and measure a mesh; ``as_parts`` one whose geometries are to be convex parts, which are answered.
 
     ``memory_bytes`` is the child's address space, interpreter and libraries (about 0.4 GB) included;
-    ``seconds`` are of processor time, and of waiting. Raises MeshError as `meshes.load`, and when the child
-    exceeds a limit or dies.
+    ``seconds`` are of processor time; on a busy machine it may take ``PATIENCE`` times as long. Raises
+    MeshError as `meshes.load`, and when the child exceeds a limit or dies.
     """
     # Cheap refusals need no child.
     if not meshes.readable(form.media_type, form.unit) or not data:
@@ -66,10 +70,16 @@ def inspect_in_child(
         stderr=subprocess.DEVNULL,
     ) as child:
         try:
-            answer, _ = child.communicate(json.dumps(order).encode() + b"\n" + data, timeout=seconds)
+            answer, _ = child.communicate(
+                json.dumps(order).encode() + b"\n" + data, timeout=PATIENCE * seconds
+            )
         except subprocess.TimeoutExpired:
             child.kill()
-            raise MeshError("mesh", f"reading it takes more than {seconds:g} s: simplify it first") from None
+            raise MeshError(
+                "mesh",
+                f"reading it took more than {PATIENCE * seconds:g} s: this machine is busy, so try again"
+                " later, or simplify it",
+            ) from None
     if child.returncode != 0:
         raise MeshError(
             "mesh",
