@@ -14,7 +14,7 @@ import random
 import re
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import date
 from functools import partial
 from typing import Any, TypeVar
@@ -101,13 +101,46 @@ class Transport:
             send.setdefault("Content-Type", "application/json")
         if idempotency_key or idempotent:
             send["Idempotency-Key"] = idempotency_key or str(uuid.uuid4())
-        query = {key: value for key, value in (params or {}).items() if value is not None}
+        query = _given(params)
+        return self._answered(
+            lambda: self._http.request(method, path, params=query, content=content, headers=send), retries
+        )
+
+    def lines(self, path: str, *, params: Mapping[str, Any] | None = None) -> Iterator[bytes]:
+        """The lines of a list as the service sends them (``application/x-ndjson``), of which one is held at a
+        time; Unreachable where they end too early.
+        """
+        headers = {"Accept": "application/x-ndjson"}
+
+        def sent() -> httpx.Response:
+            response = self._http.send(
+                self._http.build_request("GET", path, params=_given(params), headers=headers), stream=True
+            )
+            if not response.is_success:
+                response.read()
+            return response
+
+        response = self._answered(sent, None)
+        rest = b""
+        try:
+            for piece in response.iter_bytes():
+                *whole, rest = (rest + piece).split(b"\n")
+                yield from filter(None, whole)
+        except httpx.TransportError as error:
+            raise Unreachable(f"{self.url} stopped in the middle of its answer: {error}") from error
+        finally:
+            response.close()
+        if rest:
+            yield rest
+
+    def _answered(self, send: Callable[[], httpx.Response], retries: int | None) -> httpx.Response:
+        """What is answered to a request that is sent until something is, a few times."""
         attempts = 1 + (self._retries if retries is None else retries)
         for attempt in range(attempts):
             last = attempt == attempts - 1
             wait = min(0.2 * 2.0**attempt, 10.0) * random.uniform(0.5, 1.0)
             try:
-                response = self._http.request(method, path, params=query, content=content, headers=send)
+                response = send()
             except httpx.TransportError as error:
                 if last:
                     raise Unreachable(
@@ -130,6 +163,10 @@ class Transport:
     def model(self, model: type[Model], method: str, path: str, **options: Any) -> Model:
         """:meth:`request`, and the answer as this model."""
         return model.model_validate_json(self.request(method, path, **options).content)
+
+
+def _given(params: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {key: value for key, value in (params or {}).items() if value is not None}
 
 
 def _authorization(api_key: str | None) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import uuid
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -102,6 +103,13 @@ class TrialFilters(TrialSelection, PoseFrame, total=False):
 
 class TrialListing(Listing[wire.TrialOut]):
     """Stored trials in commit order; iterate, or read them all as arrays."""
+
+    def documents(self) -> Iterator[dict[str, Any]]:
+        """All of them as mappings with the fields of the HTTP interface, streamed: one is held at a time.
+
+        Far faster than iterating, which makes and checks a :class:`~graspdb.wire.TrialOut` of each.
+        """
+        return map(json.loads, self._transport.lines(self._path, params=self._params))
 
     def arrays(self) -> TrialArrays:
         """All of them as columns."""

@@ -1,4 +1,4 @@
-"""Saving objects as a bundle, read page by page over the public API."""
+"""Saving objects as a bundle, streamed over the public API."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ def silent(done: int, total: int) -> None:
 
 
 #: Fields of a trial that it has to itself: an answer is only where it was given.
-_OWN = frozenset(wire.TrialIn.model_fields) - {"answer"}
+_OWN = tuple(name for name in wire.TrialIn.model_fields if name != "answer")
+_TOLD_EVERY = 1_000
 
 
 def save(db: Client, ids: Sequence[str], path: Path, progress: Progress = silent) -> Manifest:
@@ -128,22 +129,24 @@ class _ObjectSaving:
             for number, batch in enumerate(batches):
                 if batch.licence is not None:
                     self.licences.add(batch.licence)
-                for page in self._item.trials.list(batch=batch.batch).pages():
-                    for trial in page:
-                        sink.line(self._own(trial, batch, number))
-                        withdrawn += trial.withdrawn
-                    trials += len(page)
-                    self._progress(trials)
+                of_batch = batch.model_dump(mode="json")["metadata"]
+                for trial in self._item.trials.list(batch=batch.batch).documents():
+                    sink.line(self._own(trial, of_batch, number))
+                    withdrawn += bool(trial["withdrawn"])
+                    trials += 1
+                    if trials % _TOLD_EVERY == 0:
+                        self._progress(trials)
+                self._progress(trials)
         return trials, withdrawn
 
-    def _own(self, trial: wire.TrialOut, batch: wire.BatchInfo, number: int) -> dict[str, Any]:
-        fields = trial.model_dump(mode="json", include=set(_OWN), exclude_none=True)
-        if trial.gripper is not None:
-            fields["gripper"] = f"{trial.gripper}@{trial.gripper_version}"
+    def _own(self, trial: dict[str, Any], of_batch: Any, number: int) -> dict[str, Any]:
+        fields = {name: trial[name] for name in _OWN if trial.get(name) is not None}
+        if trial["gripper"] is not None:
+            fields["gripper"] = f"{trial['gripper']}@{trial['gripper_version']}"
             self.grippers.add(fields["gripper"])
-        if trial.metadata == batch.metadata:
+        if trial["metadata"] == of_batch:
             fields.pop("metadata", None)
-        if trial.withdrawn:
+        if trial["withdrawn"]:
             fields["withdrawn"] = True
         return {"batch": number, **fields}
 
