@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import itertools
 import json
 import pickle
@@ -22,10 +23,11 @@ from hypothesis import strategies as st
 import foreign_files as files
 from graspdb import interop
 from graspdb.files.trials import FileProblem
-from graspdb.interop.formats import graspnet
+from graspdb.interop.formats import acronym, graspnet, messages
 from graspdb.interop.frames import to_graspdb
+from graspdb.interop.parsing import reader
 from graspdb.poses import matrices
-from graspdb.wire import CONVENTIONS, GripperProfile
+from graspdb.wire import CONVENTIONS, GripperProfile, JointValues
 from graspdb.wire.presets.grippers import PRESETS
 
 TIP_OFFSET = 0.011
@@ -438,12 +440,12 @@ def test_nothing_is_unpickled(tmp_path: Path, panda: GripperProfile) -> None:
     _refused(tmp_path / "e.npy", "a hand of many joints", **identity)
 
 
-def test_xml_without_entities(tmp_path: Path) -> None:
+def test_xml_without_entities(tmp_path: Path, panda: GripperProfile) -> None:
     bomb = '<?xml version="1.0"?><!DOCTYPE w [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><world>&b;</world>'
     (tmp_path / "a.xml").write_text(bomb)
     _refused(tmp_path / "a.xml", "declares types or entities")
     (tmp_path / "b.xml").write_text("<world><graspableBody>")
-    _refused(tmp_path / "b.xml", "no whole XML")
+    _refused(tmp_path / "b.xml", "no whole XML", gripper=panda)
     (tmp_path / "c.xml").write_text("<a>" * 500 + "</a>" * 500)
     _refused(tmp_path / "c.xml", "too deeply")
     (tmp_path / "d.xml").write_text("<svg/>")
@@ -499,7 +501,7 @@ def test_hdf5_stays_in_its_file(tmp_path: Path, panda: GripperProfile, tools: np
     ("name", "content", "match"),
     [
         ("a.json", '{"transforms": [[1, 2], [3]], "quality_flex_object_in_gripper": [1, 0]}', "4 x 4"),
-        ("a.json", '{"transforms": [[[NaN]]]}', "NaN is no JSON number"),
+        ("a.json", '{"transforms": [[[NaN]]]}', "NaN and Infinity are no JSON numbers"),
         ("a.json", "[" * 100_000, "too deeply|no JSON"),
         ("a.json", '{"grasps": {"transforms": []}}', "what became of it|no grasp"),
         ("a.json", '{"a": ', "no JSON"),
@@ -574,3 +576,63 @@ def test_half_a_rule_is_none(tmp_path: Path, panda: GripperProfile, tools: np.nd
             interop.read(path, gripper=panda, **half)
     with pytest.raises(FileProblem, match="has no quality 'x'; there are object_in_gripper"):
         interop.read(path, gripper=panda, success_from="x", success_above=1)
+
+
+def test_large_json_is_read_by_pieces(
+    tmp_path: Path, panda: GripperProfile, monkeypatch: pytest.MonkeyPatch, tools: np.ndarray
+) -> None:
+    """Columns lie in a file of their own, entries come one at a time: both in runs, exact and in order."""
+    for module in (acronym, messages):
+        monkeypatch.setattr(module, "CHUNK", 2)
+    monkeypatch.setattr(reader, "_IN_MEMORY_BYTES", 64)
+    monkeypatch.setattr(reader, "_NUMBERS", 3)
+    frame: dict[str, Any] = {"frame": "tool", "convention": "graspdb"}
+    confidences = np.linspace(0, 1, len(tools)).tolist()
+    held = [int(x > 0.5) for x in confidences]
+    for path in (
+        files.graspgen(tmp_path / "a.json", tools, held),
+        files.isaac(tmp_path / "b.yaml", tools, confidences),
+        files.multigripper(tmp_path / "c.json", tools, held),
+    ):
+        found = interop.read(path, gripper=panda, **frame)
+        assert found.matrices == pytest.approx(tools, abs=1e-9)
+        assert found.outcomes.tolist() == [["failure", "success"][x] for x in held]
+
+
+def test_joints_values_are_kept_and_tell_the_opening(
+    tmp_path: Path, panda: GripperProfile, tools: np.ndarray
+) -> None:
+    path = files.isaac(tmp_path / "a.yaml", tools, [1.0] * len(tools))
+    frame: dict[str, Any] = {"frame": "base", "convention": "graspdb"}
+    sliding = panda.model_copy(update={"joints": {"panda_finger_joint1": JointValues(open=0.04, closed=0.0)}})
+    found = interop.read(path, gripper=sliding, **frame)
+    assert found.more["metadata"][0] == {
+        "joints": {"panda_finger_joint1": 0.01},
+        "joints_before": {"panda_finger_joint1": 0.04},
+    }
+    assert found.more["width_m"] == pytest.approx([0.02] * len(tools))
+    interop.write(tmp_path / "b.yaml", found, format="isaac", gripper=sliding)
+    again = interop.read(tmp_path / "b.yaml", gripper=sliding, **frame)
+    assert again.more["metadata"] == found.more["metadata"]
+    # Where the profile has no joints, or swinging ones, an opening is not made up.
+    swinging = panda.model_copy(update={"joints": {"panda_finger_joint1": JointValues(open=0.0, closed=0.8)}})
+    for gripper in (panda, swinging):
+        unknown = interop.read(path, gripper=gripper, **frame)
+        assert "width_m" not in unknown.more
+        assert any("how far the jaw is open" in told for told in unknown.report.dropped)
+
+
+def test_a_merge_key_and_a_name_twice_lose_no_grasp(tmp_path: Path, panda: GripperProfile) -> None:
+    pose = "position: [0, 0, 1e-05], orientation: {w: 1, xyz: [0, 0, 0]}"
+    (tmp_path / "a.yaml").write_text(
+        "base: &base {confidence: 0.9}\nformat: isaac_grasp\ngrasps:\n"
+        f"  a: {{<<: *base, {pose}}}\n  a: {{confidence: 0, {pose}}}\n"
+    )
+    found = interop.read(tmp_path / "a.yaml", gripper=panda, frame="tool", convention="graspdb")
+    assert found.outcomes.tolist() == ["success", "failure"]
+    assert found.position[:, 2].tolist() == [1e-05, 1e-05]
+
+
+def test_what_is_compressed_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.json.gz").write_bytes(gzip.compress(b"{}"))
+    _refused(tmp_path / "a.json.gz", "gzip")

@@ -14,6 +14,7 @@ from typing_extensions import Unpack
 from graspdb.interop.first_look import FirstLook, first_look, gathered, target_of
 from graspdb.interop.grasps import FileGrasps, Report, joined, problem, together
 from graspdb.interop.reading import Reading, ReadOptions, opened
+from graspdb.poses import matrices
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.trials import CHUNK_TRIALS, Receipt, Sending
 from graspdb.wire import GripperInfo
@@ -38,7 +39,7 @@ class Import:
         if not files:
             raise ValueError("give at least one file")
         self._item, self._gripper = item, gripper
-        self._readings = [opened(file, gripper, **options) for file in files]
+        self._readings = [opened(file, gripper, _frames_of(item), **options) for file in files]
         reports = [_read_through(reading) for reading in self._readings]
         self.report = together(reports)
         if not self.report.grasps:
@@ -51,7 +52,7 @@ class Import:
         raw = gathered(firsts, max(_LOOKED_AT, most))
         mesh = None if self._item.info.mesh is None else self._item.download_mesh()
         target = target_of(self._item.info, self._gripper.profile, mesh)
-        return first_look(raw, self._readings[0].placing, target, report)
+        return first_look(raw, self._readings[0].placing_by(report), target, report)
 
     def send(
         self,
@@ -96,6 +97,15 @@ class Import:
                     waiting, count = [whole.part(slice(size, None))], count - size
         if count:
             yield joined(waiting)
+
+
+def _frames_of(item: GraspObject) -> dict[str, Any]:
+    """Poses (4, 4) of the object's frames in its own, by name; its own has its id."""
+    frames = {
+        name: np.asarray(matrices(pose.position, pose.quaternion_xyzw))
+        for name, pose in item.info.frames.items()
+    }
+    return {item.info.id: np.eye(4), **frames}
 
 
 def _read_through(reading: Reading) -> Report:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Annotated, Any, TypedDict
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from typing_extensions import Unpack
 
 from graspdb.files.trials import METRES
+from graspdb.interop import joints
 from graspdb.interop.formats.columns import parsed
 from graspdb.interop.formats.known import FORMATS, TIPS, Format, recognised
 from graspdb.interop.formats.source import SourceFile, Wishes
@@ -35,7 +36,10 @@ _WHERE_OBJECT = (
 
 @dataclass
 class Reading:
-    """One file that is read: again and again from its beginning, by pieces, with a new report each time."""
+    """One file that is read: again and again from its beginning, by pieces, with a new report each time.
+
+    ``frames`` are poses (4, 4) of frames in the object's, by names by which the file may call them.
+    """
 
     source: SourceFile
     kind: Format
@@ -44,6 +48,8 @@ class Reading:
     rule: Rule | None
     outcome: int | None
     assumed: Sequence[str] = ()
+    gripper: GripperProfile | None = None
+    frames: Mapping[str, Floats] = field(default_factory=dict)
 
     def raws(self, report: Report) -> Iterator[Raw]:
         """The file's grasps as they stand in it."""
@@ -60,13 +66,13 @@ class Reading:
     def chunks(self, report: Report) -> Iterator[FileGrasps]:
         """The file's grasps as ours; the report says more with each piece. FileProblem in one line."""
         for raw in self.raws(report):
-            self._check_references(report)
+            placing = self.placing_by(report)
             try:
-                poses = self.placing.place(raw)
+                poses = placing.place(raw)
             except ValueError as error:
                 raise problem(self.source.name, str(error)) from None
             codes, kept = self._outcomes(raw, report)
-            more = {name: list(values) for name, values in raw.more.items()}
+            more = joints.kept(raw.more, self.gripper, report)
             found = FileGrasps(*poses, codes, self._qualities(raw, report), more)
             if not kept.all():
                 found = found.part(kept)
@@ -94,13 +100,21 @@ class Reading:
             found[plain] = values
         return found
 
-    def _check_references(self, report: Report) -> None:
-        if report.references and self.placing.into_object is None:
-            names = ", ".join(report.references[:4])
+    def placing_by(self, report: Report) -> Placing:
+        """How the file's poses are placed, by the names that it gives to the frame they are in; FileProblem
+        where that frame is not known.
+        """
+        if self.placing.into_object is not None or not report.references:
+            return self.placing
+        names = report.references
+        if len(names) > 1 or names[0] not in self.frames:
+            told = ", ".join(names[:4])
             raise problem(
-                self.source.name,
-                f"has poses in {names}: give the object's pose in it {_WHERE_OBJECT}",
+                self.source.name, f"has poses in {told}: give the object's pose in it {_WHERE_OBJECT}"
             )
+        frame = self.frames[names[0]]
+        report.recognise(f"poses in {names[0]}, which is the object's")
+        return self.placing if np.array_equal(frame, np.eye(4)) else replace(self.placing, into_object=frame)
 
     def _outcomes(self, raw: Raw, report: Report) -> tuple[Codes, Any]:
         """Outcomes (N,), and which grasps have one."""
@@ -191,6 +205,7 @@ class ReadOptions(TypedDict, total=False):
 def opened(
     path: str | PathLike[str],
     gripper: GripperProfile | GripperInfo | None = None,
+    frames: Mapping[str, Floats] | None = None,
     /,
     **options: Unpack[ReadOptions],
 ) -> Reading:
@@ -220,7 +235,8 @@ def opened(
     assumed: list[str] = []
     placing = _placing(source, kind, profile, options, assumed)
     wishes = Wishes(order, columns, only, () if rule is None else (rule.quality,))
-    return Reading(source, kind, placing, wishes, rule, None if outcome is None else named(outcome), assumed)
+    decided = None if outcome is None else named(outcome)
+    return Reading(source, kind, placing, wishes, rule, decided, assumed, profile, frames or {})
 
 
 def _placing(

@@ -4,28 +4,43 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Unpack
 
 from graspdb.interop.frames import follow, frames_of, to_graspdb, to_tool
-from graspdb.interop.grasps import FileGrasps, Report
+from graspdb.interop.grasps import FileGrasps, Floats, Report
 from graspdb.interop.writers import matrices, messages, rosbags, tables
 from graspdb.interop.writers.content import Content
-from graspdb.poses import as_poses
+from graspdb.options import known_keywords
+from graspdb.poses import Poses, as_poses
 from graspdb.wire import OUTCOMES, GripperInfo, GripperProfile
+
+
+@dataclass(frozen=True)
+class Run:
+    """Grasps that are written together: poses of the tool, outcomes by name (N,), qualities and further
+    columns as in :class:`graspdb.interop.FileGrasps`.
+    """
+
+    poses: Poses
+    outcomes: NDArray[np.str_] | None = None
+    qualities: Mapping[str, Floats] = field(default_factory=dict)
+    more: Mapping[str, list[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class _Writer:
     """Who writes a format, what its poses are of where nobody says, and how its files' names end."""
 
-    write: Callable[[Path, Content, Report], None]
+    write: Callable[[Path, Iterator[Content], Report], None]
     frame: str
     convention: str
     suffixes: tuple[str, ...]
@@ -47,63 +62,90 @@ WRITTEN = tuple(_WRITERS)
 """The formats that are written, by name."""
 
 
+class Written(TypedDict, total=False):
+    """How grasps are written.
+
+    ``format`` is one of :data:`WRITTEN`, by default as the name ends; ``frame`` and ``convention`` are what
+    its poses are to be of, by default the format's own; ``gripper`` is needed for any frame but the tool;
+    ``object`` names what is grasped. The file is replaced when it is whole.
+    """
+
+    format: str | None
+    frame: str | None
+    convention: str | None
+    gripper: GripperProfile | GripperInfo | None
+    object: str | None
+
+
 def write(
     path: str | PathLike[str],
     grasps: ArrayLike | Any,
     *,
-    format: str | None = None,
-    frame: str | None = None,
-    convention: str | None = None,
-    gripper: GripperProfile | GripperInfo | None = None,
     outcomes: ArrayLike | None = None,
     qualities: Mapping[str, ArrayLike] | None = None,
-    object: str | None = None,
+    **how: Unpack[Written],
 ) -> Report:
-    """Write grasps to a file; the report says what was mapped, assumed, and dropped.
+    """Write grasps to a file (:class:`Written`); the report says what was mapped, assumed, and dropped.
 
     ``grasps`` are poses of the tool in the object's frame: what :func:`graspdb.interop.read` gave, trials,
-    samples, grasps, (N, 4, 4) or (N, 7). ``format`` is one of :data:`WRITTEN`, by default as the name ends;
-    ``frame`` and ``convention`` are what its poses are to be of, by default the format's own; ``gripper`` is
-    needed for any frame but the tool. ``outcomes`` (N,) names and ``qualities`` (N,) numbers by name are
-    those of the grasps where they have any, unless given. The file is replaced when it is whole.
+    samples, grasps, (N, 4, 4) or (N, 7). ``outcomes`` (N,) names and ``qualities`` (N,) numbers by name are
+    those of the grasps where they have any, unless given.
     """
-    target = Path(path)
-    name = format or _by_name(target)
+    poses = as_poses(grasps)
+    count = len(poses.position)
+    run = Run(poses, _outcomes(grasps, outcomes, count), _qualities(grasps, qualities, count), _more(grasps))
+    return write_runs(path, [run], **how)
+
+
+def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Written]) -> Report:
+    """Write grasps that come by runs, of which one at a time is held, as :func:`write` does."""
+    known_keywords(Written, how, "write")
+    target, gripper = Path(path), how.get("gripper")
+    name = how.get("format") or _by_name(target)
     if name not in _WRITERS:
         raise ValueError(f"format is {name!r}; expected one of {', '.join(WRITTEN)}")
     writer = _WRITERS[name]
     profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
     report = Report(str(path), name)
-    chosen, axes = frame or writer.frame, convention or writer.convention
-    if frame is None and chosen == "flange" and "flange" not in frames_of(profile):
+    chosen, axes = how.get("frame") or writer.frame, how.get("convention") or writer.convention
+    if how.get("frame") is None and chosen == "flange" and "flange" not in frames_of(profile):
         raise ValueError(
             "moveit_msgs/Grasp has poses of the end effector's parent link, and the gripper has no frame"
             " flange: say which of its frames that link is (--frame base, or another)"
         )
     report.frame, report.convention = chosen, axes
     fixed = np.asarray(np.linalg.inv(to_tool(chosen, axes, profile)), dtype=np.float64)
-    poses = as_poses(grasps)
-    content = Content(
-        follow(poses, fixed),
-        chosen,
-        axes,
-        # The approach is z of ours: what that is in the axes that are written.
-        to_graspdb(axes)[:, 2],
-        _outcomes(grasps, outcomes, len(poses.position)),
-        _qualities(grasps, qualities, len(poses.position)),
-        _more(grasps),
-        profile,
-        gripper.id if isinstance(gripper, GripperInfo) else None,
-        object,
-    )
     if writer.folder and target.exists():
         raise ValueError(f"{target} exists already: a bag is a folder of its own")
+
+    def contents() -> Iterator[Content]:
+        for run in runs:
+            if not len(run.poses.position):
+                continue
+            yield Content(
+                follow(run.poses, fixed),
+                chosen,
+                axes,
+                # The approach is z of ours: what that is in the axes that are written.
+                to_graspdb(axes)[:, 2],
+                run.outcomes,
+                run.qualities,
+                run.more,
+                profile,
+                gripper.id if isinstance(gripper, GripperInfo) else None,
+                how.get("object"),
+                report.grasps,
+            )
+            report.grasps += len(run.poses.position)
+
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
         # Under its own name, which some formats repeat inside.
         whole = Path(folder) / target.name
-        writer.write(whole, content, report)
+        first = next(found := contents(), None)
+        if first is None:
+            raise ValueError("there are no grasps to write")
+        writer.write(whole, chain([first], found), report)
         os.replace(whole, target)
-    report.grasps = len(content)
     return report
 
 

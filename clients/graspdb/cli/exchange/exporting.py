@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,15 +12,20 @@ import typer
 
 from graspdb.cli.common import ObjectId, State
 from graspdb.interop import WRITTEN, write
-from graspdb.interop.grasps import FileGrasps
+from graspdb.interop.grasps import Report
+from graspdb.interop.writing import Run, Written, write_runs
+from graspdb.poses import Poses
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.selection import Selection
 from graspdb.resources.trials import TrialFilters
-from graspdb.wire import OUTCOME_CODES, GripperInfo, TrialOut
+from graspdb.wire import GripperInfo
 
 _BEST, _SAMPLES = 20, 1_000
 #: Columns of a trial that tables keep.
 _MORE = ("width_m", "gripper", "source", "protocol", "proposal_density", "measured_at", "metadata")
+#: Fields of a trial that no file has.
+_LEFT = ("achieved_pose", "pose_covariance", "answer")
+_RUN = 20_000
 
 
 def export(
@@ -54,22 +60,23 @@ def export(
         drawn = item.samples(count or _SAMPLES, seed=seed, **selection)
         poses, told = drawn, _chances(item, drawn, selection)
     elif what == "trials":
-        filters.setdefault("withdrawn", False)
-        listing = item.trials.list(**filters)
-        poses, told = _trials(list(listing) if count is None else listing.first(count), id), None
+        told = None
     else:
         raise typer.BadParameter(f"{what!r}; expected best, samples or trials")
-    gripper = _gripper(state, item, selection.get("gripper"))
-    report = write(
-        output,
-        poses,
-        format=format,
-        frame=frame,
-        convention=convention,
-        gripper=gripper,
-        qualities=told,
-        object=id,
-    )
+    how: Written = {
+        "format": format,
+        "frame": frame,
+        "convention": convention,
+        "gripper": _gripper(state, item, selection.get("gripper")),
+        "object": id,
+    }
+    if what == "trials":
+        filters.setdefault("withdrawn", False)
+        trials = _Trials(item, filters, count)
+        report = write_runs(output, trials.runs(), **how)
+        trials.tell(report)
+    else:
+        report = write(output, poses, qualities=told, **how)
     lines = [f"{report.grasps:,} grasps written to {output}: {report.format}, poses of {report.frame}"]
     for kind in ("assumed", "mapped", "dropped"):
         lines += [f"  {kind}: {line}" for line in getattr(report, kind)]
@@ -82,21 +89,49 @@ def _chances(item: GraspObject, poses: Any, selection: Selection) -> dict[str, A
     return {} if found is None else {"success_probability": np.asarray(found)}
 
 
-def _trials(trials: list[TrialOut], id: str) -> FileGrasps:
-    if not trials:
-        raise ValueError(f"{id} has no such trials")
-    scores: list[Mapping[str, float | None]] = [
-        {**(t.qualities or {}), **({} if t.quality is None else {"quality": t.quality})} for t in trials
-    ]
-    names = dict.fromkeys(name for score in scores for name in score)
-    more = {name: [getattr(trial, name) for trial in trials] for name in _MORE}
-    return FileGrasps(
-        np.array([trial.position for trial in trials], dtype=np.float64),
-        np.array([trial.quaternion_xyzw for trial in trials], dtype=np.float64),
-        np.array([OUTCOME_CODES[trial.outcome] for trial in trials], dtype=np.uint8),
-        {name: np.array([score.get(name, np.nan) for score in scores], dtype=np.float64) for name in names},
-        {name: values for name, values in more.items() if any(value is not None for value in values)},
-    )
+class _Trials:
+    """Trials on their way into a file, a run after the other, and what of them is in no file."""
+
+    def __init__(self, item: GraspObject, filters: TrialFilters, count: int | None) -> None:
+        self._item = item
+        self._documents = islice(item.trials.list(**filters).documents(), count)
+        self._left = dict.fromkeys(_LEFT, 0)
+
+    def runs(self) -> Iterator[Run]:
+        """Runs whose columns are alike; ValueError for none."""
+        names: dict[str, None] = {}
+        while run := list(islice(self._documents, _RUN)):
+            scores = [_scores(trial) for trial in run]
+            if not names:
+                # Those that are there come first; later ones can only be the batches'.
+                names = dict.fromkeys(name for score in scores for name in score)
+                names |= dict.fromkeys(name for batch in self._item.batches for name in batch.qualities)
+                names |= {"quality": None}
+            for name in _LEFT:
+                self._left[name] += sum(trial[name] is not None for trial in run)
+            poses = Poses(
+                np.array([trial["position"] for trial in run], dtype=np.float64),
+                np.array([trial["quaternion_xyzw"] for trial in run], dtype=np.float64),
+            )
+            yield Run(
+                poses,
+                np.array([trial["outcome"] for trial in run]),
+                {name: np.array([score.get(name, np.nan) for score in scores], float) for name in names},
+                {name: [trial[name] for trial in run] for name in _MORE},
+            )
+        if not names:
+            raise ValueError(f"{self._item.info.id} has no such trials")
+
+    def tell(self, report: Report) -> None:
+        """Say what of the trials is not in the file."""
+        for name, number in self._left.items():
+            if number:
+                report.drop(f"{name} of {number:,} trials: a bundle keeps it")
+
+
+def _scores(trial: Mapping[str, Any]) -> dict[str, float]:
+    own = {} if trial["quality"] is None else {"quality": trial["quality"]}
+    return {**(trial["qualities"] or {}), **own}
 
 
 def _gripper(state: State, item: GraspObject, named: str | None) -> GripperInfo | None:

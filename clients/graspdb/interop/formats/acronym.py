@@ -15,7 +15,7 @@ from graspdb.interop.formats.source import (
     MIB,
     SourceFile,
     Wishes,
-    extra,
+    column_of,
     mapping_of,
     numbers,
     same_length,
@@ -23,6 +23,8 @@ from graspdb.interop.formats.source import (
 )
 from graspdb.interop.grasps import Floats, Raw, Report, problem
 from graspdb.interop.outcomes import FAILURE, SUCCESS
+from graspdb.interop.parsing.events import extra
+from graspdb.interop.parsing.reader import Column
 
 HELD = "object_in_gripper"
 _LARGEST_CHUNK = 256 * MIB
@@ -121,7 +123,7 @@ def _say_hdf5(h5py: Any, name: str, file: Any, report: Report) -> None:
 
 def read_json(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """ACRONYM's other form: ``object``, ``object_scale``, ``transforms``, ``quality_flex_...``."""
-    data = mapping_of(source.name, source.json, "the file")
+    data = source.mapping(lambda path: path[0] == "transforms" or path[0].startswith("quality_"))
     _say(
         source.name,
         report,
@@ -134,42 +136,44 @@ def read_json(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Ra
         for key, values in data.items()
         if key.startswith("quality_")
     }
-    yield from _of_lists(source.name, data.get("transforms"), qualities)
+    yield from _of_columns(source.name, data.get("transforms"), qualities)
 
 
 def read_graspgen(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """GraspGen's: ``object {file, scale}``, ``grasps {transforms, object_in_gripper}``."""
-    data = mapping_of(source.name, source.json, "the file")
+    data = source.mapping(lambda path: path[0] == "grasps" and len(path) == 2)
     about = mapping_of(source.name, data.get("object", {}), "object")
     grasps = mapping_of(source.name, data.get("grasps"), "grasps")
     gripper = data.get("gripper")
     if isinstance(gripper, dict):
         gripper = gripper.get("type") or gripper.get("name")
     _say(source.name, report, file=about.get("file"), scale=about.get("scale"), gripper=gripper)
-    lists = {key: values for key, values in grasps.items() if key != "transforms"}
-    count = len(grasps.get("transforms") or ())
+    transforms = column_of(source.name, "transforms", grasps.get("transforms"), (4, 4))
     qualities = {
-        key: values for key, values in lists.items() if isinstance(values, list) and len(values) == count
+        key: values
+        for key, values in grasps.items()
+        if key == HELD
+        or (
+            isinstance(values, Column)
+            and values.regular
+            and values.count == len(transforms)
+            and not values.shape
+        )
     }
-    if HELD in lists and HELD not in qualities:
-        qualities[HELD] = lists[HELD]
-    for key in lists.keys() - qualities.keys():
+    for key in grasps.keys() - qualities.keys() - {"transforms"}:
         report.drop(f"grasps.{key}")
-    yield from _of_lists(source.name, grasps.get("transforms"), qualities)
+    yield from _of_columns(source.name, transforms, qualities)
 
 
-def _of_lists(name: str, transforms: Any, qualities: Mapping[str, Any]) -> Iterator[Raw]:
-    if not isinstance(transforms, list):
-        raise problem(name, "has no list of transforms")
-    poses = numbers(name, "transforms", transforms, (None, 4, 4))
-    values = {}
-    for key, column in qualities.items():
-        if not isinstance(column, list):
-            raise problem(name, f"{key} must be a list with a number for each grasp")
-        truths = [float(x) if isinstance(x, bool) else x for x in column]
-        values[key] = numbers(name, key, truths, (None,))
-    same_length(name, len(poses), values)
-    yield _raw(name, poses, values, 0)
+def _of_columns(name: str, transforms: Any, qualities: Mapping[str, Any]) -> Iterator[Raw]:
+    poses = column_of(name, "transforms", transforms, (4, 4))
+    if not len(poses):
+        raise problem(name, "has no grasps")
+    columns = {key: column_of(name, key, column, truths=True) for key, column in qualities.items()}
+    same_length(name, len(poses), columns)
+    for first in range(0, len(poses), CHUNK):
+        values = {key: column.take(first, first + CHUNK) for key, column in columns.items()}
+        yield _raw(name, poses.take(first, first + CHUNK), values, first)
 
 
 def _raw(name: str, transforms: Floats, qualities: dict[str, Floats], first: int) -> Raw:

@@ -10,48 +10,76 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.interop.formats.source import SourceFile, Wishes, mapping_of, numbers
+from graspdb.interop import joints
+from graspdb.interop.formats.messages import in_runs
+from graspdb.interop.formats.source import SourceFile, Wishes, numbers
 from graspdb.interop.frames import to_graspdb
 from graspdb.interop.grasps import Raw, Report, problem
 
 CONFIDENCE = "confidence"
+POSTURES = ("cspace_position", "pregrasp_cspace_position")
+"""Joints' values in the grasp, and before the jaw closes."""
 _DATA_GEN = ("open_limit", "finger_colliders", "base_length", "bite_point", "bite_body_idx")
 
 
 def read(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """``grasps: {name: {confidence, position, orientation {w, xyz}, ...}}``."""
-    documents = source.yaml
-    data = mapping_of(source.name, documents[0] if documents else None, "the file")
-    version = data.get("format_version", 1.0)
-    if str(version) not in ("1.0", "1"):
-        raise problem(source.name, f"is isaac_grasp {version}; 1.0 is read")
-    _say(source.name, data, report)
-    grasps = mapping_of(source.name, data.get("grasps"), "grasps")
-    if not grasps:
-        raise problem(source.name, "has no grasps")
-    position, quaternion, confidence = [], [], []
-    for number, (label, grasp) in enumerate(grasps.items()):
-        where = f"grasp {number} ({str(label)[:60]})"
-        if not isinstance(grasp, dict):
-            raise problem(source.name, f"{where} must be a mapping")
-        orientation = grasp.get("orientation")
-        if not isinstance(orientation, dict) or not isinstance(orientation.get("xyz"), list):
-            raise problem(source.name, f"{where}: orientation must be {{w, xyz: [3]}}")
-        parts = [*orientation["xyz"], orientation.get("w")]
-        position.append(numbers(source.name, f"{where}: position", grasp.get("position"), (3,)))
-        quaternion.append(numbers(source.name, f"{where}: orientation", parts, (4,)))
-        score = grasp.get(CONFIDENCE)
-        confidence.append(
-            np.nan if score is None else float(numbers(source.name, f"{where}: confidence", score, ()))
+    head: dict[str, Any] = {}
+    number = 0
+
+    def rows() -> Iterator[tuple[list[float], float, Any, Any]]:
+        nonlocal number
+        documents = 0
+        for kind, label, value in source.entries(("grasps",)):
+            if documents:
+                report.drop("documents after the first one")
+            elif kind == "head":
+                head[str(label)] = value
+            elif kind == "entry":
+                where = f"grasp {number} ({str(label)[:60]})"
+                yield _grasp(source.name, where, value)
+                number += 1
+            else:
+                # What stands above the grasps explains what may be wrong with them.
+                _say(source.name, head, report)
+                documents += kind == "end"
+
+    def raw(first: int, rows: list[tuple[list[float], float, Any, Any]]) -> Raw:
+        poses = np.array([row[0] for row in rows], dtype=np.float64)
+        scores = np.array([row[1] for row in rows])
+        return Raw(
+            first,
+            poses[:, :3],
+            quaternion=poses[:, 3:],
+            qualities={} if np.isnan(scores).all() else {CONFIDENCE: scores},
+            more={joints.AT: [row[2] for row in rows], joints.BEFORE: [row[3] for row in rows]},
         )
-        if any(key in grasp for key in ("cspace_position", "pregrasp_cspace_position")):
-            report.drop("the joints' values (cspace_position, pregrasp_cspace_position)")
-    scores = np.array(confidence)
-    qualities = {} if np.isnan(scores).all() else {CONFIDENCE: scores}
-    yield Raw(0, np.array(position), quaternion=np.array(quaternion), qualities=qualities)
+
+    yield from in_runs(rows(), raw)
+    if not number:
+        raise problem(source.name, "has no grasps")
+
+
+def _grasp(file: str, where: str, grasp: Any) -> tuple[list[float], float, Any, Any]:
+    """Position and quaternion xyzw, confidence, and the joints' values in the grasp and before."""
+    if not isinstance(grasp, dict):
+        raise problem(file, f"{where} must be a mapping")
+    orientation = grasp.get("orientation")
+    if not isinstance(orientation, dict) or not isinstance(orientation.get("xyz"), list):
+        raise problem(file, f"{where}: orientation must be {{w, xyz: [3]}}")
+    parts = numbers(file, f"{where}: position", grasp.get("position"), (3,)).tolist()
+    turn = [*orientation["xyz"], orientation.get("w")]
+    parts += numbers(file, f"{where}: orientation", turn, (4,)).tolist()
+    score = grasp.get(CONFIDENCE)
+    confidence = np.nan if score is None else float(numbers(file, f"{where}: confidence", score, ()))
+    after, before = (joints.by_name(file, f"{where}: {name}", grasp.get(name)) for name in POSTURES)
+    return parts, confidence, after, before
 
 
 def _say(name: str, data: dict[str, Any], report: Report) -> None:
+    version = data.get("format_version", 1.0)
+    if str(version) not in ("1.0", "1"):
+        raise problem(name, f"is isaac_grasp {version}; 1.0 is read")
     for what in ("object_frame", "gripper_frame"):
         frame = data.get(what, data.get(f"{what}_link"))
         if isinstance(frame, str):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from graspdb.interop.formats import acronym, graspnet, isaac, messages, rosbags, scenes, tables
-from graspdb.interop.formats.source import SourceFile, Wishes
+from graspdb.interop.formats.source import BOM, SourceFile, Wishes
 from graspdb.interop.grasps import Raw, Report, problem
 from graspdb.interop.outcomes import Rule
 
@@ -134,28 +134,28 @@ def _binary(source: SourceFile) -> Format | None:
 
 
 def _text(source: SourceFile) -> Format | None:
-    head = source.head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    head = source.head.removeprefix(BOM).lstrip()
     if head.startswith(b"<"):
-        root = source.xml
-        if root.tag == "world":
+        if source.root_tag == "world":
             return _GRASPIT
-        return _UIBK if root.tag in ("experiments", "experiment", "grasps") else None
+        return _UIBK if source.root_tag in ("experiments", "experiment", "grasps") else None
     if source.suffix in (".csv", ".tsv", ".txt"):
         return _VGN if tables.vgn_like(source) else _CSV
     if source.suffix in (".jsonl", ".ndjson"):
         return _JSONL
     if source.suffix in (".yaml", ".yml"):
-        return _of_data(source.yaml[0] if source.yaml else None)
+        return source.judged(_of_data)
     if head[:1] in (b"{", b"["):
         if tables.many_texts(source):
             return _JSONL
-        return _of_data(source.json) or _JSONL
+        return source.judged(_of_data) or _JSONL
     if b"isaac_grasp" in head:
         return _ISAAC
     return None
 
 
 def _of_data(data: Any) -> Format | None:
+    """The format of an outline, as soon as that is told."""
     if isinstance(data, list):
         data = data[0] if data else None
     if not isinstance(data, dict):
@@ -163,7 +163,7 @@ def _of_data(data: Any) -> Format | None:
     if data.get("format") == "isaac_grasp":
         return _ISAAC
     grasps = data.get("grasps")
-    if "grasp_pose" in data or (isinstance(grasps, list) and grasps and "grasp_pose" in grasps[0]):
+    if "grasp_pose" in data or (isinstance(grasps, list) and grasps and "grasp_pose" in (grasps[0] or ())):
         return _MOVEIT
     if isinstance(grasps, dict) and "transforms" in grasps:
         return _GRASPGEN

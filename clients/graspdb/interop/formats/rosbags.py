@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.interop.formats.messages import LEFT, QUALITY
+from graspdb.interop import joints
+from graspdb.interop.formats.messages import LEFT, POSTURES, QUALITY
 from graspdb.interop.formats.source import CHUNK, SourceFile, Wishes
 from graspdb.interop.grasps import Raw, Report, problem
 
@@ -84,7 +85,7 @@ def _read(source: SourceFile, wishes: Wishes, report: Report, kinds: tuple[str, 
             report.drop(f"topic {topic}")
         for topic in sorted({f"{c.topic} ({c.msgtype})" for c in chosen}):
             report.recognise(f"topic {topic}")
-        first, rows, references = 0, _Rows(), set(report.references)
+        first, rows, references = 0, _Rows(source.name), set(report.references)
         for connection, _, content in bag.messages(connections=chosen):
             try:
                 message = bag.deserialize(content, connection.msgtype)
@@ -97,7 +98,7 @@ def _read(source: SourceFile, wishes: Wishes, report: Report, kinds: tuple[str, 
             report.references = sorted(references - {""})
             if len(rows.numbers) >= CHUNK:
                 yield rows.raw(first)
-                first, rows = first + len(rows.numbers), _Rows()
+                first, rows = first + len(rows.numbers), _Rows(source.name)
         if rows.numbers or not first:
             yield rows.raw(first)
 
@@ -105,9 +106,11 @@ def _read(source: SourceFile, wishes: Wishes, report: Report, kinds: tuple[str, 
 class _Rows:
     """Poses and scores of messages, until they are enough."""
 
-    def __init__(self) -> None:
+    def __init__(self, file: str) -> None:
+        self._file = file
         self.numbers: list[list[float]] = []
         self.scores: list[float] = []
+        self._postures: dict[str, list[Any]] = {kind: [] for kind in joints.KINDS}
 
     def add(self, message: Any, kind: str, references: set[str], report: Report) -> None:
         if kind == GRASP:
@@ -115,6 +118,8 @@ class _Rows:
             references.add(stamped.header.frame_id)
             self._pose(stamped.pose)
             self.scores.append(float(message.grasp_quality))
+            for name, posture in POSTURES.items():
+                self._postures[posture].append(self._posture(name, getattr(message, name), report))
             for name in LEFT:
                 if _said(getattr(message, name)):
                     report.drop(name)
@@ -123,6 +128,17 @@ class _Rows:
         for pose in message.poses if kind == POSE_ARRAY else [message.pose]:
             self._pose(pose)
 
+    def _posture(self, what: str, trajectory: Any, report: Report) -> Any:
+        """The joints' values at a trajectory's end, None where it has none."""
+        if not trajectory.points:
+            return None
+        if len(trajectory.points) > 1:
+            report.drop("points of postures before the last one")
+        last = trajectory.points[-1]
+        if len(last.velocities) or len(last.accelerations) or len(last.effort):
+            report.drop("velocities, accelerations and effort of postures")
+        return joints.values_of(self._file, what, list(trajectory.joint_names), last.positions.tolist())
+
     def _pose(self, pose: Any) -> None:
         p, q = pose.position, pose.orientation
         self.numbers.append([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
@@ -130,13 +146,12 @@ class _Rows:
     def raw(self, first: int) -> Raw:
         values = np.array(self.numbers, dtype=np.float64).reshape(-1, 7)
         qualities = {QUALITY: np.array(self.scores)} if self.scores else {}
-        return Raw(first, values[:, :3], quaternion=values[:, 3:], qualities=qualities)
+        more = self._postures if self.scores else {}
+        return Raw(first, values[:, :3], quaternion=values[:, 3:], qualities=qualities, more=more)
 
 
 def _said(value: Any) -> bool:
     """Whether a field that no trial has holds anything."""
-    if hasattr(value, "joint_names"):
-        return bool(value.joint_names)
     if hasattr(value, "desired_distance"):
         return bool(value.desired_distance)
     return bool(value)

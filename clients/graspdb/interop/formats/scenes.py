@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from graspdb.interop import joints
+from graspdb.interop.formats.messages import in_runs
 from graspdb.interop.formats.source import SourceFile, Wishes
 from graspdb.interop.frames import precede
 from graspdb.interop.grasps import Floats, Raw, Report, problem
@@ -17,6 +21,8 @@ from graspdb.poses import Poses, matrices, quaternions_of
 from graspdb.wire import OUTCOME_CODES
 
 _FULL = re.compile(r"\s*\(([^()]*)\)\s*\[([^\[\]]*)\]\s*")
+#: The code of a grasp of which no outcome is told.
+_UNTOLD = 255
 #: What UIBK's causes of failure begin with, and the outcome that each is.
 _CAUSES = {
     "OBJECTSLIPPED": "slipped",
@@ -30,26 +36,47 @@ _CAUSES = {
 
 def read_graspit(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """Each ``robot`` of a world is a grasp of its one ``graspableBody``."""
-    world = source.xml
-    bodies, robots = world.findall("graspableBody"), world.findall("robot")
-    if len(bodies) != 1:
-        raise problem(source.name, f"has {len(bodies)} graspable bodies; a grasp is of one")
-    if not robots:
-        raise problem(source.name, "has no robot, so no grasp")
+    bodies: list[Element] = []
+    for _, element in source.elements(("graspableBody", "obstacle")):
+        if element.tag == "obstacle":
+            report.drop("obstacles")
+        elif bodies:
+            raise problem(source.name, "has several graspable bodies; a grasp is of one")
+        else:
+            bodies.append(element)
+    if not bodies:
+        raise problem(source.name, "has 0 graspable bodies; a grasp is of one")
     at, turn = _transform(source.name, bodies[0])
     back = np.asarray(np.linalg.inv(matrices(at, turn)), dtype=np.float64)
-    placed = [_transform(source.name, robot) for robot in robots]
-    position = np.array([p for p, _ in placed])
-    quaternion = np.array([q for _, q in placed])
-    moved, turned = precede(back, Poses(position, quaternion))
-    for element in (bodies[0], *robots):
-        name = (element.findtext("filename") or "").strip()
-        report.recognise(f"{'object' if element is bodies[0] else 'gripper'} {name or 'without a name'}")
-    if any(robot.find("dofValues") is not None for robot in robots):
-        report.drop("the joints' values (dofValues)")
-    if world.find("obstacle") is not None:
-        report.drop("obstacles")
-    yield Raw(0, moved, quaternion=turned)
+    _recognise(report, "object", bodies[0])
+    robots = 0
+
+    def placed() -> Iterator[tuple[Floats, Floats, Any]]:
+        nonlocal robots
+        for _, robot in source.elements(("robot",)):
+            _recognise(report, "gripper", robot)
+            values = (robot.findtext("dofValues") or "").split()
+            posture = None
+            if values:
+                found = _floats(source.name, f"robot {robots}: dofValues", " ".join(values), len(values))
+                assert found is not None
+                posture = joints.values_of(source.name, f"robot {robots}: dofValues", None, found.tolist())
+            yield *_transform(source.name, robot), posture
+            robots += 1
+
+    def raw(first: int, rows: list[tuple[Floats, Floats, Any]]) -> Raw:
+        poses = Poses(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]))
+        moved, turned = precede(back, poses)
+        return Raw(first, moved, quaternion=turned, more={joints.AT: [row[2] for row in rows]})
+
+    yield from in_runs(placed(), raw)
+    if not robots:
+        raise problem(source.name, "has no robot, so no grasp")
+
+
+def _recognise(report: Report, what: str, element: Element) -> None:
+    name = (element.findtext("filename") or "").strip()
+    report.recognise(f"{what} {name or 'without a name'}")
 
 
 def _transform(file: str, element: Element) -> tuple[Floats, Floats]:
@@ -73,45 +100,50 @@ def _transform(file: str, element: Element) -> tuple[Floats, Floats]:
 
 def read_uibk(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """``experiments/experiment`` with object, gripper and ``grasps/grasp``: pose, and an outcome."""
-    root = source.xml
-    experiments = root.findall("experiment") if root.tag == "experiments" else [root]
-    kinds = sorted({_kind(experiment, "object") for experiment in experiments})
-    wanted = wishes.only.get("object")
+    told, objects, grippers = False, dict[int, str](), dict[int, str]()
+    for number, element in source.elements(("object", "gripper", "outcome"), "experiment"):
+        if element.tag == "outcome":
+            told = told or element.find("success") is not None or element.find("failure") is not None
+        else:
+            (objects if element.tag == "object" else grippers)[number] = element.get("type", "")
+    kinds, wanted = sorted(set(objects.values())), wishes.only.get("object")
     if wanted is None and len(kinds) > 1:
         raise problem(source.name, f"has grasps of {', '.join(kinds[:8])}: name one with --only object=...")
-    chosen = [e for e in experiments if wanted in (None, _kind(e, "object"))]
-    for what in ("object", "gripper"):
-        for kind in sorted({_kind(experiment, what) for experiment in chosen} - {""}):
-            report.recognise(f"{what} {kind}")
-    grasps = [grasp for experiment in chosen for grasp in _grasps_of(experiment)]
-    if not grasps:
+    for number in sorted({*objects, *grippers}):
+        if wanted in (None, objects.get(number, "")):
+            for what, types in (("object", objects), ("gripper", grippers)):
+                if types.get(number):
+                    report.recognise(f"{what} {types[number]}")
+    counted = untold = 0
+
+    def grasps() -> Iterator[Element]:
+        nonlocal counted
+        for number, grasp in source.elements(("grasp",), "experiment"):
+            if wanted in (None, objects.get(number, "")):
+                yield grasp
+                counted += 1
+
+    for raw in in_runs(grasps(), partial(_of_elements, source.name, report)):
+        assert raw.outcome is not None
+        without = raw.outcome == _UNTOLD
+        untold += int(without.sum())
+        yield raw.part(~without) if told else replace(raw, outcome=None)
+    if not counted:
         raise problem(source.name, "has no grasps" + (f" of {wanted}" if wanted else ""))
-    position, quaternion = [], []
-    for number, grasp in enumerate(grasps):
-        at, turn = _pose(source.name, number, grasp)
-        position.append(at)
-        quaternion.append(turn)
+    if told and untold:
+        report.drop(f"{untold:,} grasps without an outcome")
+
+
+def _of_elements(file: str, report: Report, first: int, grasps: list[Element]) -> Raw:
+    placed = [_pose(file, first + row, grasp) for row, grasp in enumerate(grasps)]
     codes, qualities = _outcomes(grasps, report)
-    untold = codes == 255
-    if untold.any() and not untold.all():
-        report.drop(f"{int(untold.sum()):,} grasps without an outcome")
-    raw = Raw(
-        0,
-        np.array(position),
-        quaternion=np.array(quaternion),
-        outcome=None if untold.all() else codes,
+    return Raw(
+        first,
+        np.array([at for at, _ in placed]),
+        quaternion=np.array([turn for _, turn in placed]),
+        outcome=codes,
         qualities=qualities,
     )
-    yield raw if untold.all() else raw.part(~untold)
-
-
-def _kind(experiment: Element, what: str) -> str:
-    found = experiment.find(what)
-    return "" if found is None else found.get("type", "")
-
-
-def _grasps_of(experiment: Element) -> list[Element]:
-    return experiment.findall("grasps/grasp") or experiment.findall("grasp")
 
 
 def _pose(file: str, number: int, grasp: Element) -> tuple[Floats, Floats]:
@@ -154,8 +186,8 @@ def _floats(file: str, what: str, text: str | None, count: int, *, needed: bool 
 
 
 def _outcomes(grasps: list[Element], report: Report) -> tuple[Any, dict[str, Floats]]:
-    """Codes (N,), 255 where nothing is told, and the qualities by name."""
-    codes = np.full(len(grasps), 255, dtype=np.uint8)
+    """Codes (N,), :data:`_UNTOLD` where nothing is told, and the qualities by name."""
+    codes = np.full(len(grasps), _UNTOLD, dtype=np.uint8)
     qualities: dict[str, Floats] = {}
 
     def note(name: str, row: int, text: str | None) -> None:

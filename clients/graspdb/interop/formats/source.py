@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import functools
-import importlib
-import json
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
-from xml.etree.ElementTree import Element, TreeBuilder
-from xml.parsers import expat
+from typing import Any, TypeVar
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from graspdb.interop.grasps import Floats, problem
+from graspdb.interop.parsing.elements import elements, root_tag
+from graspdb.interop.parsing.events import json_events, yaml_events
+from graspdb.interop.parsing.reader import Column, Reader
 
 MIB = 2**20
 CHUNK = 65_536
 """Grasps that are read at a time."""
 
-#: What is parsed as a whole takes many times its size in memory.
-_LARGEST = {"JSON": 512 * MIB, "YAML": 128 * MIB, "XML": 256 * MIB}
-_DEEPEST = 100
 #: What a folder with a bag of ROS 2 has, and the files that lie beside it.
 _BAG, _IN_BAGS = "metadata.yaml", (".db3", ".mcap")
-_MOST_YAML_NODES = 50_000_000
-_EXTRA = "pip install 'graspdb[interop]'"
-
-
-def extra(module: str, what: str) -> Any:
-    """A package of the extra ``interop``; ImportError that says how to install it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{what} needs {module.split('.')[0]}: {_EXTRA}") from error
+BOM = b"\xef\xbb\xbf"
+#: How compressed files begin.
+_COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"\x28\xb5\x2f\xfd": "zstd"}
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -67,125 +58,69 @@ class SourceFile:
             self.head = file.read(65_536)
         if not self.head:
             raise problem(self.name, "is empty")
+        for start, kind in _COMPRESSED.items():
+            if self.head.startswith(start):
+                raise problem(self.name, f"is compressed ({kind}): unpack it first")
+        self._mapping: dict[str, Any] | None = None
 
     @property
     def suffix(self) -> str:
         """How its name ends, in lower case."""
         return self.path.suffix.lower()
 
-    @functools.cached_property
-    def text(self) -> str:
-        """All of it as text."""
-        try:
-            return self.path.read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise problem(self.name, f"is not UTF-8 ({error.reason} at byte {error.start})") from None
+    @property
+    def is_json(self) -> bool:
+        """Whether it is JSON rather than YAML: by its name, else by its beginning."""
+        if self.suffix in (".yaml", ".yml"):
+            return False
+        return self.suffix == ".json" or self.head.removeprefix(BOM).lstrip()[:1] in (b"{", b"[")
+
+    def reader(self) -> Reader:
+        """Its JSON or YAML from the beginning."""
+        events = json_events if self.is_json else yaml_events
+        return Reader(self.name, events(self.name, self.path))
+
+    def judged(self, judge: Callable[[Any], T | None]) -> T | None:
+        """What ``judge`` says of the outline of its JSON or YAML, as soon as that is anything but None."""
+        for outline in self.reader().outlines():
+            found = judge(outline)
+            if found is not None:
+                return found
+        return None
+
+    def mapping(self, is_column: Callable[[tuple[str, ...]], bool]) -> dict[str, Any]:
+        """Its JSON, a mapping: lists that ``is_column`` names by their path are columns; it is kept."""
+        if self._mapping is None:
+            self._mapping = self.reader().mapping(is_column)
+        return self._mapping
+
+    def entries(self, under: Sequence[str] = ()) -> Iterator[tuple[str, Any, Any]]:
+        """Entries of its JSON or YAML, one at a time: see :meth:`Reader.entries`."""
+        return self.reader().entries(under)
+
+    def grasps(self, under: Sequence[str]) -> Iterator[Any]:
+        """What its JSON or YAML lists, itself or under one of these keys; else each document is one."""
+        alone: dict[Any, Any] | None = {}
+        for kind, key, value in self.entries(under):
+            if kind == "entry":
+                yield value
+            elif kind == "under":
+                alone = None
+            elif kind == "head" and alone is not None:
+                alone[key] = value
+            elif kind == "end":
+                if alone:
+                    yield alone
+                alone = {}
 
     @functools.cached_property
-    def json(self) -> Any:
-        """What its JSON says."""
-        self._bounded("JSON")
+    def root_tag(self) -> str:
+        """The name of the outermost element of its XML."""
+        return root_tag(self.name, self.path)
 
-        def refuse(constant: str) -> Any:
-            raise problem(self.name, f"{constant} is no JSON number")
-
-        try:
-            return json.loads(self.text, parse_constant=refuse)
-        except RecursionError:
-            raise problem(self.name, "its JSON nests too deeply") from None
-        except json.JSONDecodeError as error:
-            raise problem(self.name, f"is no JSON: {error}") from None
-        finally:
-            vars(self).pop("text", None)
-
-    @functools.cached_property
-    def yaml(self) -> list[Any]:
-        """The documents of its YAML, plain data only."""
-        self._bounded("YAML")
-        yaml = extra("yaml", "YAML")
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        try:
-            self._check_yaml(yaml, loader)
-            return list(yaml.load_all(self.text, Loader=loader))
-        except yaml.YAMLError as error:
-            raise problem(self.name, f"is no YAML of plain data: {error}") from None
-        except (ValueError, RecursionError, TypeError, OverflowError) as error:
-            raise error if str(error).startswith(self.name) else problem(self.name, f"{error}") from None
-        finally:
-            vars(self).pop("text", None)
-
-    def _check_yaml(self, yaml: Any, loader: Any) -> None:
-        """Refuse what nests deeply, or what aliases would blow up to more than any file holds."""
-        sizes: dict[str, int] = {}
-        open_nodes: list[tuple[str | None, int]] = []
-        total = 0
-        for event in yaml.parse(self.text, Loader=loader):
-            size = 0
-            if isinstance(event, yaml.AliasEvent):
-                size = sizes.get(event.anchor, 1)
-            elif isinstance(event, yaml.ScalarEvent):
-                size = 1
-                if event.anchor:
-                    sizes[event.anchor] = 1
-            elif isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
-                open_nodes.append((event.anchor, total))
-                size = 1
-                if len(open_nodes) > _DEEPEST:
-                    raise problem(self.name, "its YAML nests too deeply")
-            elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
-                anchor, before = open_nodes.pop()
-                if anchor:
-                    sizes[anchor] = total - before
-            total += size
-            if total > _MOST_YAML_NODES:
-                raise problem(self.name, "its YAML's aliases stand for more than a file of grasps can hold")
-
-    @functools.cached_property
-    def xml(self) -> Element:
-        """The root of its XML; declarations of types and entities are refused."""
-        self._bounded("XML")
-        builder, depth = TreeBuilder(), 0
-        parser = expat.ParserCreate(namespace_separator="}")
-
-        def start(tag: str, attributes: dict[str, str]) -> None:
-            nonlocal depth
-            depth += 1
-            if depth > _DEEPEST:
-                raise problem(self.name, "its XML nests too deeply")
-            builder.start(local_name(tag), attributes)
-
-        def end(tag: str) -> None:
-            nonlocal depth
-            depth -= 1
-            builder.end(local_name(tag))
-
-        def refuse(*_: Any) -> Any:
-            raise problem(self.name, "its XML declares types or entities, which are not read")
-
-        parser.StartElementHandler, parser.EndElementHandler = start, end
-        parser.CharacterDataHandler = builder.data
-        parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-        parser.ExternalEntityRefHandler = refuse
-        try:
-            with self.path.open("rb") as file:
-                parser.ParseFile(file)
-        except expat.ExpatError as error:
-            raise problem(self.name, f"is no whole XML: {error}") from None
-        return builder.close()
-
-    def _bounded(self, kind: str) -> None:
-        size = self.path.stat().st_size
-        if size > _LARGEST[kind]:
-            raise problem(
-                self.name,
-                f"has {size / MIB:,.0f} MiB; {kind} is read up to {_LARGEST[kind] // MIB} MiB: split it, or"
-                " save it as Parquet or JSON Lines",
-            )
-
-
-def local_name(tag: str) -> str:
-    """A name of XML without its name space."""
-    return tag.rpartition("}")[2]
+    def elements(self, kept: Collection[str], within: str = "") -> Iterator[tuple[int, Element]]:
+        """Elements of its XML, one at a time: see :func:`graspdb.interop.parsing.elements.elements`."""
+        return elements(self.name, self.path, kept, within)
 
 
 def numbers(file: str, what: str, values: Any, shape: tuple[int | None, ...]) -> Floats:
@@ -205,6 +140,22 @@ def numbers(file: str, what: str, values: Any, shape: tuple[int | None, ...]) ->
     if not fits:
         raise problem(file, f"{what} must be numbers of shape {wanted}; these have {array.shape}")
     return array
+
+
+def column_of(
+    file: str, what: str, value: Any, shape: tuple[int, ...] = (), *, truths: bool = False
+) -> Column:
+    """A column of numbers, or of numbers of this shape, with ``truths`` true and false among them; else one
+    line that names it.
+    """
+    wanted = " x ".join(["N", *map(str, shape)])
+    if not isinstance(value, Column):
+        raise problem(file, f"has no list of {what}" if value is None else f"{what} must be a list")
+    numbers_alone = value.regular and not value.gaps and (truths or not value.truths)
+    if not numbers_alone or (value.count and value.shape != shape):
+        told = f"; these have {(value.count, *value.shape)}" if numbers_alone else ""
+        raise problem(file, f"{what} must be numbers of shape {wanted}{told}")
+    return value
 
 
 def split_matrices(file: str, transforms: Floats, first: int = 0) -> tuple[Floats, Floats]:

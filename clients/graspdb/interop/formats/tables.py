@@ -6,14 +6,16 @@ import csv
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
 
 from graspdb.interop.formats.columns import MORE, Plan, plan
-from graspdb.interop.formats.source import CHUNK, SourceFile, Wishes, extra
+from graspdb.interop.formats.source import CHUNK, SourceFile, Wishes
 from graspdb.interop.grasps import Codes, Floats, Raw, Report, problem
 from graspdb.interop.outcomes import code_of
+from graspdb.interop.parsing.events import extra
 
 VGN_COLUMNS = ("scene_id", "qx", "qy", "qz", "qw", "x", "y", "z", "width", "label")
 VGN_TIP_M = 0.05
@@ -182,7 +184,7 @@ def _raw(file: str, table: Table, chosen: Plan, first: int) -> Raw:
         None if quaternion is None else chosen.order,
         None if chosen.outcome is None else _codes(file, table, chosen.outcome, first),
         {name: table.floats(column) for name, column in chosen.qualities.items()},
-        more={name: _more(table, name, column) for name, column in chosen.more.items()},
+        more={name: _more(file, table, name, column, first) for name, column in chosen.more.items()},
     )
 
 
@@ -193,10 +195,24 @@ def _wide(file: str, table: Table, names: tuple[str, ...], width: int) -> Floats
     return found
 
 
-def _more(table: Table, name: str, column: str) -> Sequence[Any]:
+def _more(file: str, table: Table, name: str, column: str, first: int) -> Sequence[Any]:
     if name in _NUMBER_COLUMNS:
         return [None if np.isnan(x) else x for x in table.floats(column).tolist()]
-    return [None if value in (None, "") else value for value in table.values(column)]
+    values = [None if value in (None, "") else value for value in table.values(column)]
+    return (
+        [_object(file, first + row, value) for row, value in enumerate(values)]
+        if name == "metadata"
+        else values
+    )
+
+
+def _object(file: str, row: int, value: Any) -> Any:
+    """Metadata as an object, which tables have as text; None for none."""
+    with suppress(ValueError, RecursionError):
+        value = json.loads(value) if isinstance(value, str) else value
+    if value is not None and not isinstance(value, dict):
+        raise problem(file, f"grasp {row}: metadata is {str(value)[:60]!r}, no JSON object")
+    return value
 
 
 def _codes(file: str, table: Table, name: str, first: int) -> Codes:
@@ -339,12 +355,7 @@ def _columns(records: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 def _records(source: SourceFile) -> Iterator[dict[str, Any]]:
     if not many_texts(source) and source.suffix not in (".jsonl", ".ndjson"):
-        data = source.json
-        if isinstance(data, dict):
-            data = data.get("trials", data.get("items", data.get("poses", data.get("grasps", [data]))))
-        if not isinstance(data, list):
-            raise problem(source.name, "has no list of grasps")
-        for number, record in enumerate(data):
+        for number, record in enumerate(source.grasps(("trials", "items", "poses", "grasps"))):
             yield _record(source.name, f"grasp {number}", record)
         return
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +18,23 @@ _VERSION = 8
 TOPIC = "/grasps"
 
 
-def bag(path: Path, content: Content, report: Report) -> None:
-    """A folder with a bag: topics ``/grasps`` (a message a grasp) and ``/grasps/poses`` (all in one)."""
+def bag(path: Path, contents: Iterator[Content], report: Report) -> None:
+    """A folder with a bag: topics ``/grasps`` (a message a grasp), ``/grasps/poses`` (a run in one)."""
     store, rosbag2 = typestore(), extra().rosbag2
     messages = _Messages(store.types)
-    grasps = [messages.grasp(values) for values in grasp_messages(content, report)]
-    poses = [grasp.grasp_pose.pose for grasp in grasps]
-    array = store.types[POSE_ARRAY](header=messages.header(""), poses=poses)
     report.assume("an empty frame_id is the object's frame; every message is of the time 0")
     with rosbag2.Writer(path, version=_VERSION) as file:
-        for topic, kind, sent in ((TOPIC, GRASP, grasps), (f"{TOPIC}/poses", POSE_ARRAY, [array])):
-            connection = file.add_connection(topic, kind, typestore=store)
-            for message in sent:
-                file.write(connection, 0, store.serialize_cdr(message, kind))
+        one = file.add_connection(TOPIC, GRASP, typestore=store)
+        many = file.add_connection(f"{TOPIC}/poses", POSE_ARRAY, typestore=store)
+        scored = None
+        for content in contents:
+            scored = scored if content.first else content.score()
+            grasps = [messages.grasp(values) for values in grasp_messages(content, scored, report)]
+            for message in grasps:
+                file.write(one, 0, store.serialize_cdr(message, GRASP))
+            poses = [grasp.grasp_pose.pose for grasp in grasps]
+            array = store.types[POSE_ARRAY](header=messages.header(""), poses=poses)
+            file.write(many, 0, store.serialize_cdr(array, POSE_ARRAY))
 
 
 class _Messages:
