@@ -113,10 +113,22 @@ def _closer(
     if not shape.tip_offsets:
         # The fingers come in where nothing was, and were free before where they leave.
         return closer
-    # Tips that are farther ahead then may meet what they did not.
-    closer = np.minimum(np.ceil(closer / STEP_M) * STEP_M, openings)
-    free = ~at_each(closer, poses, shape, lambda jaw, some: solid.collides(some, jaw, threads=threads))
-    return np.where(free, closer, openings)
+    # Tips that are farther ahead then may meet what they did not: from there on the jaw opens again, by
+    # halves of what is left up to where it is known to be free.
+    lower, upper = np.minimum(np.ceil(closer / STEP_M) * STEP_M, openings), openings.copy()
+
+    def clear(rows: npt.NDArray[np.intp], at: FloatArray) -> BoolArray:
+        some = _of(poses, rows)
+        return ~at_each(at, some, shape, lambda jaw, own: solid.collides(own, jaw, threads=threads))
+
+    rows = np.arange(len(upper))
+    free = clear(rows, lower)
+    upper[free], rows = lower[free], rows[~free]
+    while len(rows := rows[upper[rows] - lower[rows] > 1.5 * STEP_M]):
+        middle = np.ceil((lower[rows] + upper[rows]) / 2 / STEP_M) * STEP_M
+        free = clear(rows, middle)
+        upper[rows[free]], lower[rows[~free]] = middle[free], middle[~free]
+    return upper
 
 
 def commanded(needed_m: FloatArray, clearance_m: float, shape: GripperShape) -> FloatArray:

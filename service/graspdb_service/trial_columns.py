@@ -182,3 +182,4 @@ class TrialPage:
     batches: Mapping[int, BatchFacts]
     answers: Mapping[int, str]
     qualities: Sequence[str]
+    warnings: Sequence[str] = ()

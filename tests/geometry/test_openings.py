@@ -140,6 +140,24 @@ def test_where_the_open_jaw_is_free_the_need_is_exact_and_round_millimetres_are_
     assert openings.needed(Scene([thing]), nowhere, PANDA).shape == (0,)
 
 
+@settings(max_examples=20, deadline=None)
+@given(ahead=st.floats(0.001, 0.012), width=st.floats(0.005, 0.02))
+def test_tips_on_arcs_open_no_farther_than_a_ledge_takes(ahead: float, width: float) -> None:
+    """A stem on a plate so far ahead of the open tips: closed about the stem they would be in the plate."""
+    near = ARC.tip_offset_m + ahead
+    stem, plate = (
+        box((0.01, width / 2, 0.02), (0, 0, near - 0.02)),
+        box((0.1, 0.1, 0.01), (0, 0, near + 0.01)),
+    )
+    for solid in solids(stem, plate):
+        (found,) = openings.needed(solid, HERE, ARC)
+        assert not solid.collides(HERE, ARC.at(found))[0]
+        assert found >= width - 1e-6
+        # A millimetre and a half less, and either the stem or the plate is met.
+        less = found - 1.5e-3 - 1e-6
+        assert less < width or solid.collides(HERE, ARC.at(less))[0]
+
+
 def test_each_pose_is_tested_at_its_own_opening() -> None:
     rng = np.random.default_rng(5)
     poses = ToolPoses(rng.normal(size=(60, 3)) * 0.03, rng.normal(size=(60, 4)))

@@ -210,3 +210,18 @@ def test_an_unknown_gripper_is_still_named(http: httpx.Client, box: str) -> None
     answer = http.post(f"/objects/{box}/trials", json=_body(_grasps(), gripper="claw"))
     assert answer.status_code == 422
     assert answer.json()["type"].endswith(":unknown-gripper")
+
+
+def test_a_width_beyond_the_jaw_s_is_told(http: httpx.Client, make_object: Callable[..., str]) -> None:
+    """Also where there is no mesh; up to 2 mm are a matter of calibration."""
+    slug = make_object(http, "wide")
+    for width, count in ((0.0819, 0), (0.083, 2), (None, 0)):
+        body = _body(_grasps(2))
+        body["columns"]["width_m"] = [width] * 2
+        body["protocol"] = f"w{width}"
+        receipt = http.post(f"/objects/{slug}/trials", json=body).json()
+        assert _found(receipt).get("wider-than-the-jaw", 0) == count, receipt
+    found = http.get(f"/objects/{slug}/batches").json()["items"][1]["findings"]
+    (told,) = (finding for finding in found if finding["code"] == "wider-than-the-jaw")
+    assert "80 mm" in told["message"]
+    assert told["examined"] == 2

@@ -9,6 +9,7 @@ import typer
 from graspdb.cli.common import ERRORS, ObjectId, State, flat, out, out_csv
 from graspdb.cli.options import Commands
 from graspdb.errors import SweepFailed, add_note
+from graspdb.resources.selection import AnswerFrame
 from graspdb.resources.sweeps import Sweep, SweepOptions, convex_parts_told
 from graspdb.wire import SweepInfo
 
@@ -90,9 +91,9 @@ def retry_sweep(state: State, id: SweepId) -> None:
 
 
 @sweeps.command("outcomes")
-def sweep_outcomes(state: State, id: SweepId) -> None:
+def sweep_outcomes(state: State, id: SweepId, pose_frame: AnswerFrame) -> None:
     """Every simulated pose and its outcome: CSV, or JSON columns with --json."""
-    found = state.db.sweeps.get(id).outcomes()
+    found = state.db.sweeps.get(id).outcomes(**pose_frame)
     if state.json:
         out(found)
         return

@@ -10,6 +10,7 @@ import typer
 from graspdb.cli.common import ObjectId, State, Yes, numbers, show_findings
 from graspdb.cli.options import Commands
 from graspdb.files.trials import as_stated, read_trials
+from graspdb.resources.selection import AnswerFrame
 from graspdb.resources.trials import DoubtfulTrials, TrialFilters, Upload
 from graspdb.wire import TrialInfo
 
@@ -93,9 +94,9 @@ def list_trials(
 
 
 @trials.command("show")
-def show_trial(state: State, id: ObjectId, seq: Seq) -> None:
+def show_trial(state: State, id: ObjectId, seq: Seq, pose_frame: AnswerFrame) -> None:
     """Show one trial and what it was before."""
-    _show_trial(state, state.db.objects.get(id).trials.get(seq))
+    _show_trial(state, state.db.objects.get(id).trials.get(seq, **pose_frame))
 
 
 @trials.command("withdraw")
@@ -110,6 +111,7 @@ def correct_trial(
     state: State,
     id: ObjectId,
     seq: Seq,
+    pose_frame: AnswerFrame,
     outcome: Annotated[str | None, typer.Option(help="What became of it after all.")] = None,
     reinstate: Annotated[bool, typer.Option("--reinstate", help="Take it back in where withdrawn.")] = False,
     reason: Reason = None,
@@ -118,7 +120,7 @@ def correct_trial(
     if outcome is None and not reinstate:
         raise typer.BadParameter("give --outcome or --reinstate")
     found = state.db.objects.get(id).trials.correct(
-        seq, outcome=outcome, withdrawn=False if reinstate else None, reason=reason
+        seq, outcome=outcome, withdrawn=False if reinstate else None, reason=reason, **pose_frame
     )
     _show_trial(state, found)
 

@@ -24,6 +24,7 @@ from graspdb.resources.selection import (
     Selection,
     best_grasp_request,
     names,
+    near_of,
     query,
 )
 from graspdb.resources.sweeps import SweepOptions, create_sweep
@@ -177,7 +178,7 @@ class GraspQueries(Resource):
 
         ``name`` keeps the answer, as in :class:`Constraints`; of at most 1,000 poses.
         """
-        fields = known_keywords(DrawSelection, selection, "samples")
+        fields = _drawn(known_keywords(DrawSelection, selection, "samples"))
         fields |= {"count": count, "seed": seed, "name": name, "timeout_s": timeout_s}
         request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
@@ -202,9 +203,15 @@ class GraspQueries(Resource):
         free, as far open as ``pre_opening_m`` says (see :class:`Constraints`). ``name`` keeps the answer, as
         for :meth:`samples`.
         """
-        fields = known_keywords(DrawSelection, selection, "proposals")
+        fields = _drawn(known_keywords(DrawSelection, selection, "proposals"))
         fields |= {"count": count, "seed": seed, "strategy": strategy, "pre_opening_m": pre_opening_m}
         fields |= {"name": name, "timeout_s": timeout_s}
         request = validate(wire.ProposalsRequest, fields)
         answer = self._transport.model(wire.Proposals, "POST", f"{self._path}/proposals", body=request)
         return SampledPoses.from_wire(answer)
+
+
+def _drawn(selection: dict[str, Any]) -> dict[str, Any]:
+    """A selection to draw from as its request takes it."""
+    near = selection.get("near")
+    return selection if near is None else selection | {"near": near_of(near)}

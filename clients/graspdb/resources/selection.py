@@ -69,8 +69,31 @@ class PoseFrame(TypedDict, total=False):
     ]
 
 
-class DrawSelection(Selection, PoseFrame, total=False):
-    """A :class:`Selection` to draw from, and what the draws are of (:class:`PoseFrame`)."""
+class AnswerFrame(PoseFrame, total=False):
+    """What answered poses are of (:class:`PoseFrame`).
+
+    ``near`` is a unit quaternion (4,): of the two poses that are one grasp for a symmetric jaw the answer has
+    the one whose rotation, of ``frame`` in the object frame, is nearer to it.
+    """
+
+    near: Annotated[
+        ArrayLike | None, Vector("Of a symmetric jaw's two twins that nearer to this turn.", of="qx,qy,qz,qw")
+    ]
+
+
+class DrawSelection(Selection, AnswerFrame, total=False):
+    """A :class:`Selection` to draw from, and what the draws are of (:class:`AnswerFrame`)."""
+
+
+def answer_frame(frame: str | None, convention: str | None, near: ArrayLike | None) -> dict[str, str]:
+    """What answered poses are to be of, as the parameters of a request that has no body."""
+    found = pose_frame(None, frame, convention)
+    return found if near is None else found | {"near": ",".join(map(repr, near_of(near)))}
+
+
+def near_of(near: ArrayLike) -> list[float]:
+    """The rotation that twins are chosen by, as requests take it."""
+    return vector("near", near, "qx, qy, qz, qw")
 
 
 CalibratedFor = Annotated[
@@ -231,10 +254,11 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
         ("above_plane", "nx, ny, nz, d"),
         ("approach", "x, y, z"),
         ("closing", "x, y, z"),
-        ("near", "qx, qy, qz, qw"),
     ):
         if name in fields:
             fields[name] = vector(name, fields[name], of)
+    if "near" in fields:
+        fields["near"] = near_of(fields["near"])
     if "half_spaces" in fields:
         fields["half_spaces"] = _rows("half_spaces", fields["half_spaces"], "nx, ny, nz, d")
     obstacles = fields.get("obstacles")

@@ -26,7 +26,7 @@ from graspdb.options import Corners, Option, PoseFile
 from graspdb.poses import as_poses, numbers, pose_frame, vector
 from graspdb.resources.pages import Listing, Resource, answers, segment, validate
 from graspdb.resources.results import TriedPoses, pose_columns, table_html
-from graspdb.resources.selection import PoseFrame
+from graspdb.resources.selection import PoseFrame, answer_frame
 from graspdb.transport import Transport
 
 ProgressCallback = Callable[[wire.SweepInfo], None]
@@ -187,9 +187,17 @@ class Sweep(Resource):
             return None
         return f"no worker has come yet: graspdb-simworker run --url {self._transport.url}"
 
-    def outcomes(self, *, frame: str | None = None, convention: str | None = None) -> OutcomeArrays:
-        """Every pose of the finished chunks with its outcome, as arrays; poses of a frame of the gripper."""
-        framed = pose_frame(None, frame, convention)
+    def outcomes(
+        self,
+        *,
+        frame: str | None = None,
+        convention: str | None = None,
+        near: ArrayLike | None = None,
+    ) -> OutcomeArrays:
+        """Every pose of the finished chunks with its outcome, as arrays; poses as
+        :class:`~graspdb.resources.selection.AnswerFrame` says.
+        """
+        framed = answer_frame(frame, convention, near)
         # Straight into arrays: a model of millions of rows would take longer than their simulation's answer.
         pages: list[dict[str, NDArray[Any]]] = [
             {
@@ -203,7 +211,8 @@ class Sweep(Resource):
             )
         ]
         columns = {name: np.concatenate([page[name] for page in pages]) for name in pages[0]}
-        of: dict[str, Any] = {"sweep": self.id, **columns, **framed}
+        told = {name: value for name, value in framed.items() if name != "near"}
+        of: dict[str, Any] = {"sweep": self.id, **columns, **told}
         return OutcomeArrays(**of)
 
     def summary(self) -> dict[str, str]:

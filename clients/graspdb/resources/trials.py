@@ -24,7 +24,7 @@ from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses, first_masked, listed, numbers, pose_frame
 from graspdb.resources.pages import Listing, Resource, segment
 from graspdb.resources.results import TrialArrays
-from graspdb.resources.selection import PoseFrame, TrialSelection
+from graspdb.resources.selection import AnswerFrame, PoseFrame, TrialSelection, answer_frame
 
 CHUNK_TRIALS = 50_000
 """Trials a request: some 10 MB of JSON, well under the service's default body limit."""
@@ -88,10 +88,10 @@ class Upload(Sending, PoseFrame, total=False):
     """
 
 
-class TrialFilters(TrialSelection, PoseFrame, total=False):
+class TrialFilters(TrialSelection, AnswerFrame, total=False):
     """Which trials to list: a :class:`TrialSelection`, and ``outcome``, ``batch``, ``since_revision``,
-    ``withdrawn`` and ``licence``; and what their poses are to be of (:class:`PoseFrame`), each of its trial's
-    gripper.
+    ``withdrawn`` and ``licence``; and what their poses are to be of (:class:`AnswerFrame`), each of its
+    trial's gripper.
     """
 
     outcome: Annotated[str | None, Option("Only this outcome.")]
@@ -344,9 +344,18 @@ class Trials(Resource):
             wire.BatchReceipt, "POST", self._path, body={**shared, **piece}, **options
         )
 
-    def get(self, seq: int, *, frame: str | None = None, convention: str | None = None) -> wire.TrialInfo:
-        """One trial, its pose that of ``frame``, and in ``history`` what it was before it was corrected."""
-        params = pose_frame(None, frame, convention)
+    def get(
+        self,
+        seq: int,
+        *,
+        frame: str | None = None,
+        convention: str | None = None,
+        near: ArrayLike | None = None,
+    ) -> wire.TrialInfo:
+        """One trial, its pose as :class:`AnswerFrame` says, and in ``history`` what it was before it was
+        corrected.
+        """
+        params = answer_frame(frame, convention, near)
         return self._transport.model(wire.TrialInfo, "GET", f"{self._path}/{int(seq)}", params=params)
 
     def withdraw(self, seq: int, *, reason: str | None = None) -> None:
@@ -365,18 +374,25 @@ class Trials(Resource):
         metadata: Mapping[str, Any] | None = None,
         withdrawn: bool | None = None,
         reason: str | None = None,
+        frame: str | None = None,
+        convention: str | None = None,
+        near: ArrayLike | None = None,
     ) -> wire.TrialInfo:
         """Change a trial's outcome or metadata, withdraw it or take it back; what is None stays.
 
-        What it was stays in its ``history``, with the ``reason``. Conflict for a trial of a sweep.
+        What it was stays in its ``history``, with the ``reason``; its pose is given as :class:`AnswerFrame`
+        says. Conflict for a trial of a sweep.
         """
         given = {"outcome": outcome, "metadata": metadata, "withdrawn": withdrawn, "reason": reason}
         body = {name: value for name, value in given.items() if value is not None}
-        return self._transport.model(wire.TrialInfo, "PATCH", f"{self._path}/{int(seq)}", body=body)
+        params = answer_frame(frame, convention, near)
+        path = f"{self._path}/{int(seq)}"
+        return self._transport.model(wire.TrialInfo, "PATCH", path, body=body, params=params)
 
     def list(self, **filters: Unpack[TrialFilters]) -> TrialListing:
         """The stored trials that match, read page by page as they are iterated."""
         params = known_keywords(TrialFilters, filters, "list")
+        params |= answer_frame(params.get("frame"), params.get("convention"), params.get("near"))
         return TrialListing(self._transport, self._path, wire.TrialOut, params)
 
     def __iter__(self) -> Iterator[wire.TrialOut]:

@@ -46,6 +46,7 @@ from graspdb.wire.frames.asking import (
     ASKED_FRAME,
     AskedConvention,
     AskedFrame,
+    AskedNear,
     ToldConvention,
     ToldFrame,
     ToolToFrame,
@@ -730,6 +731,7 @@ class SamplesRequest(Selection):
     """The same seed and revision give the same poses; by default a new one."""
     frame: AskedFrame = None
     convention: AskedConvention = None
+    near: AskedNear = None
     name: AnswerName = None
     timeout_s: TimeoutS = None
 

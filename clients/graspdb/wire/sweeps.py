@@ -22,7 +22,13 @@ from graspdb.wire.base import (
     Slug,
     Warnings,
 )
-from graspdb.wire.frames.asking import AskedConvention, AskedFrame, ToldConvention, ToldFrame
+from graspdb.wire.frames.asking import (
+    AskedConvention,
+    AskedFrame,
+    ToldConvention,
+    ToldFrame,
+    ToolToFrame,
+)
 from graspdb.wire.frames.gripper_frames import TOOL
 from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
@@ -215,6 +221,8 @@ class SweepOutcomes(Response):
     quaternion_xyzw: AskedRotations
     frame: ToldFrame = TOOL
     convention: ToldConvention = "graspdb"
+    tool_to_frame: ToolToFrame = None
+    warnings: Warnings = Field(default_factory=list)
     outcome: list[str]
     """What became of each pose, by name."""
     next: str | None = None

@@ -32,6 +32,7 @@ from graspdb.wire.base import (
     StoredMetadata,
     StoredRevision,
     Text,
+    Warnings,
     no_nul,
 )
 from graspdb.wire.frames.asking import ToldConvention, ToldFrame
@@ -254,6 +255,9 @@ class TrialInfo(TrialOut):
 
     history: list[TrialChange] = Field(default_factory=list)
     """Its corrections and withdrawals, oldest first."""
+    frame: ToldFrame = TOOL
+    convention: ToldConvention = "graspdb"
+    warnings: Warnings = Field(default_factory=list)
 
 
 class Finding(Response):
@@ -334,3 +338,4 @@ class TrialsPage(Page[TrialOut]):
 
     frame: ToldFrame = TOOL
     convention: ToldConvention = "graspdb"
+    warnings: Warnings = Field(default_factory=list)

@@ -8,10 +8,10 @@ import numpy.typing as npt
 
 from graspdb_geometry.plausibility import conventions
 from graspdb_geometry.plausibility.doubt import Doubt, Target
-from graspdb_geometry.plausibility.meetings import meetings
+from graspdb_geometry.plausibility.meetings import TOLERANCE_M, meetings
 from graspdb_geometry.poses import PoseArrays, ToolPoses, checked
 
-__all__ = ["Doubt", "Target", "doubts"]
+__all__ = ["TOLERANCE_M", "Doubt", "Target", "doubts"]
 
 
 def doubts(poses: PoseArrays, held: npt.ArrayLike, target: Target | None) -> list[Doubt]:

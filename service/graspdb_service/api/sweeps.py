@@ -13,7 +13,7 @@ from graspdb_service.api.routing.cursors import Cursor, Limit, encode_cursor, na
 from graspdb_service.api.routing.parameters import (
     Creating,
     Ctx,
-    Framed,
+    FramedAnswer,
     ObjectId,
     SweepId,
 )
@@ -97,7 +97,7 @@ def get_outcomes(
     ctx: Ctx,
     id: SweepId,
     request: Request,
-    frame: Framed,
+    frame: FramedAnswer,
     limit: PosesLimit = None,
     cursor: Cursor = None,
 ) -> Response:
@@ -107,8 +107,9 @@ def get_outcomes(
     As an Arrow stream (`Accept: application/vnd.apache.arrow.stream`) all of them come at once.
     """
     kind, start = accepted(request, JSON, ARROW), name_cursor(cursor) or None
-    head: dict[str, Any] = {"sweep": id, **frame.told()}
+    wanted = outcomes.frame_of_sweep(ctx.database, id, frame)
+    head: dict[str, Any] = {"sweep": id, **wanted.told(), "warnings": list(wanted.warnings)}
     if kind == ARROW and limit is None:
-        return stream_response(head, outcomes.pages(ctx.database, id, frame, cursor=start))
-    page, following = outcomes.page(ctx.database, id, frame, limit=limit or 10_000, cursor=start)
+        return stream_response(head, outcomes.pages(ctx.database, id, wanted, cursor=start))
+    page, following = outcomes.page(ctx.database, id, wanted, limit=limit or 10_000, cursor=start)
     return page_response({**head, "next": encode_cursor(following)}, page, kind)

@@ -28,6 +28,7 @@ from graspdb_service.api.routing.parameters import (
     Creating,
     Ctx,
     Framed,
+    FramedAnswer,
     ObjectId,
     ToldOfBatch,
     UnderLicence,
@@ -91,7 +92,7 @@ def list_trials(
     ctx: Ctx,
     id: ObjectId,
     request: Request,
-    frame: Framed,
+    frame: FramedAnswer,
     outcome: Annotated[
         Outcome | None, Query(description="Only trials that ended so; by default all.")
     ] = None,
@@ -143,7 +144,7 @@ def list_trials(
 
 
 @router.get("/objects/{id}/trials/{seq}", response_model=TrialInfo, **scope("read"))
-def get_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: Request, frame: Framed) -> Response:
+def get_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: Request, frame: FramedAnswer) -> Response:
     """One trial, and what it was before it was corrected."""
     return tagged_json(request, corrections.get(ctx.database, id, seq, frame))
 
@@ -163,13 +164,13 @@ def withdraw_trial(
 
 
 @router.patch("/objects/{id}/trials/{seq}", **scope("trials:write"))
-def correct_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: TrialPatch) -> TrialInfo:
+def correct_trial(ctx: Ctx, id: ObjectId, seq: Seq, request: TrialPatch, frame: FramedAnswer) -> TrialInfo:
     """Correct a trial's outcome or metadata, withdraw it or take it back; what it was stays in its history.
 
     409 for a trial of a sweep.
     """
     check_metadata(ctx.settings, request.metadata)
-    return corrections.correct(ctx.database, id, seq, request)
+    return corrections.correct(ctx.database, id, seq, request, frame)
 
 
 @router.get("/objects/{id}/batches", response_model=Page[BatchInfo], **scope("read"))

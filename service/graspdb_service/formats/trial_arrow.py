@@ -114,19 +114,19 @@ def _document(value: Any) -> Any:
 # -- out -----------------------------------------------------------------------------------------------------
 
 
-def stream(pages: Iterable[TrialPage], told: dict[str, Any] | None = None) -> Iterator[bytes]:
-    """Stored trials of one object as an Arrow IPC stream, of one page at least; what else is ``told`` stands
-    in its schema's metadata.
+def stream(pages: Iterable[TrialPage], told: dict[str, Any]) -> Iterator[bytes]:
+    """Stored trials of one object as an Arrow IPC stream, of one page at least; what else is ``told``, and
+    what the first page warns of, stands in its schema's metadata.
     """
     rest = iter(pages)
     first = next(rest)
-    schema = _schema(first.qualities, told)
+    schema = _schema(first.qualities, {**told, "warnings": list(first.warnings)})
     return arrow.stream(
         schema, (_record_batch(page, schema) for page in chain([first], rest) if len(page.columns))
     )
 
 
-def _schema(qualities: Sequence[str], told: dict[str, Any] | None) -> Any:
+def _schema(qualities: Sequence[str], told: dict[str, Any]) -> Any:
     """The columns of stored trials, as ``GET /objects/{id}/trials`` has them."""
     pa = arrow.library()
     achieved = [("position", arrow.vector_type(3)), ("quaternion_xyzw", arrow.vector_type(4))]

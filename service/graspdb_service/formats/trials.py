@@ -36,13 +36,14 @@ def stream_response(
 def page_response(
     page: TrialPage, following: str | None, kind: str, headers: dict[str, str], frame: dict[str, str]
 ) -> Response:
-    """A page of trials; where the next one starts and the ``frame`` of poses stand beside them, but for
-    lines.
+    """A page of trials; where the next one starts, the ``frame`` of poses and what it warns of stand beside
+    them, but for lines.
     """
+    beside = {"next": following, **frame}
     if kind == ARROW:
-        body = b"".join(trial_arrow.stream([page], {"next": following, **frame}))
+        body = b"".join(trial_arrow.stream([page], beside))
     elif kind == NDJSON:
         body = trial_json.lines(page)
     else:
-        body = orjson.dumps({"items": trial_json.documents(page), "next": following, **frame})
+        body = orjson.dumps({"items": trial_json.documents(page), **beside, "warnings": page.warnings})
     return Response(body, media_type=kind, headers=headers)

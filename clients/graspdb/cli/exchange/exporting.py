@@ -52,6 +52,8 @@ def export(
     item = state.db.objects.get(id)
     # What is written is of this frame; what is asked for is the tool's.
     frame, convention = filters.pop("frame", None), filters.pop("convention", None)
+    if filters.pop("near", None) is not None:
+        raise typer.BadParameter("each grasp is written as it is kept: leave it out", param_hint="--near")
     poses: Any
     if what == "best":
         best = item.best_grasps(count=count or _BEST, **selection)

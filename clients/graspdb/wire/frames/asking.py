@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, TypeAdapter, WithJsonSchema
 
-from graspdb.wire.base import Quadruple, Response, Triple
+from graspdb.wire.base import Quadruple, Quaternion, Response, Triple, _split_commas, _unit
 from graspdb.wire.frames.conventions import Convention
 from graspdb.wire.frames.gripper_frames import FrameName
 
@@ -20,8 +20,34 @@ ASKED_CONVENTION = (
     " origin; by default ``graspdb``."
 )
 
+ASKED_NEAR = (
+    "Unit quaternion x,y,z,w: of the two poses that are one grasp for a symmetric jaw the answer gives the"
+    " one whose rotation, of ``frame`` in the object frame, is nearer to this; by default that which is kept."
+)
+
 AskedFrame = Annotated[FrameName | None, Field(description=ASKED_FRAME)]
 AskedConvention = Annotated[Convention | None, Field(description=ASKED_CONVENTION)]
+AskedNear = Annotated[Quaternion | None, Field(description=ASKED_NEAR)]
+
+
+def _near(text: Any) -> Any:
+    parts = _split_commas(text)
+    if not isinstance(parts, (list, tuple)) or len(parts) != 4:
+        raise ValueError("a unit quaternion is four numbers x,y,z,w")
+    try:
+        x, y, z, w = (float(part) for part in parts)
+    except ValueError:
+        raise ValueError("a unit quaternion is four numbers x,y,z,w") from None
+    return _unit((x, y, z, w))
+
+
+NearQuery = Annotated[
+    str | None,
+    AfterValidator(lambda text: None if text is None else _near(text)),
+    WithJsonSchema(TypeAdapter(Quaternion | None).json_schema()),
+]
+"""The same in a query string by itself: a unit quaternion (x, y, z, w), or None."""
+
 ToldFrame = Annotated[str, Field(description="Frame of the gripper that the answer's poses are of.")]
 ToldConvention = Annotated[Convention, Field(description="Whose axes the answer's poses have.")]
 

@@ -171,6 +171,8 @@ PRESETS: dict[str, Preset] = {
             _BOXES,
             _HALF,
             "max_opening_m: with the description's own pads the fingers open to 128.5 mm",
+            "tip_offsets: the linkage's, where it opens by its name; with the description's pads tips are up"
+            " to 4.5 mm farther back near wide open, at the same opening",
         ],
     ),
     "robotiq-hand-e": _preset(
@@ -216,6 +218,8 @@ PRESETS: dict[str, Preset] = {
             _MASS,
             "max_speed_m_s: a guess; it depends on the force",
             "max_opening_m: the description's linkage and rubber tips open to 104 mm",
+            "tip_offsets: the linkage's, where it opens by its name; with the description's pads tips are up"
+            " to 10 mm farther back near wide open, at the same opening",
         ],
     ),
     "onrobot-rg6": _preset(
@@ -238,6 +242,8 @@ PRESETS: dict[str, Preset] = {
             _MASS,
             "max_speed_m_s: a guess; it depends on the force",
             "max_opening_m: the description's linkage and rubber tips open to 151 mm",
+            "tip_offsets: the linkage's, where it opens by its name; with the description's pads tips are up"
+            " to 11 mm farther back near wide open, at the same opening",
         ],
     ),
     "wsg-50": _preset(

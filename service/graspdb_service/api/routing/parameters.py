@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, cast
 
 from fastapi import Depends, Header, Path, Query, Request, Response
 from pydantic import WithJsonSchema
 
 from graspdb.wire import Convention, Slug
-from graspdb.wire.base import Licence
-from graspdb.wire.frames.asking import ASKED_CONVENTION, ASKED_FRAME
+from graspdb.wire.base import Licence, Quadruple
+from graspdb.wire.frames.asking import ASKED_CONVENTION, ASKED_FRAME, ASKED_NEAR, NearQuery
 from graspdb.wire.frames.gripper_frames import FrameName
 from graspdb.wire.trials import BatchDefaults, Origin
 from graspdb_service.api.context import Context
@@ -54,7 +54,18 @@ async def _framed(
 
 
 Framed = Annotated[AskedFrame, Depends(_framed)]
-"""What poses of trials are of, those that are sent or those that are answered."""
+"""What poses of trials are of that are sent."""
+
+
+async def _framed_answer(
+    asked: Framed, near: Annotated[NearQuery, Query(description=ASKED_NEAR)] = None
+) -> AskedFrame:
+    # What it is after its check.
+    return replace(asked, near=cast("Quadruple | None", near))
+
+
+FramedAnswer = Annotated[AskedFrame, Depends(_framed_answer)]
+"""What poses are to be of that are answered."""
 
 _KeyHeader = Annotated[
     Annotated[str, WithJsonSchema({"type": "string", "maxLength": 200, "pattern": r"^[\x21-\x7e]+$"})] | None,

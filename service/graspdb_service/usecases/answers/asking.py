@@ -130,7 +130,7 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
         more = {"strategy": request.strategy, "criterion": criterion}
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
-    frame = frame_of(drawn.selected, request.frame, request.convention)
+    frame = frame_of(drawn.selected, request.frame, request.convention, request.near)
     head = {**_head(ctx, drawn.built, drawn.kernel, frame), "seed": drawn.seed, "prior": drawn.prior, **more}
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}

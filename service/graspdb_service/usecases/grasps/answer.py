@@ -32,13 +32,10 @@ from graspdb_service.usecases.grasps.constraints import Constraints, constraints
 from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
 from graspdb_service.usecases.grasps.search import ScoreSearch, closest
 from graspdb_service.usecases.runtime.asked import outage, outage_warnings
-from graspdb_service.usecases.trials.pose_frames import frame_of
+from graspdb_service.usecases.trials.pose_frames import NO_TWINS, frame_of
 from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
-_NO_TWINS = (
-    "near= chooses between the twins of a symmetric jaw, which this gripper's is not: it changed nothing"
-)
 
 
 def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, Selected]:
@@ -80,7 +77,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *ctx.evidence.warnings(built),
             *doubts(None if question is None else question.calibration),
             *frame.warnings,
-            *([_NO_TWINS] if request.near is not None and near is None else []),
+            *([NO_TWINS] if request.near is not None and near is None else []),
         ],
     }
     return BestGrasps.model_validate({**told, **answer}), built.selected

@@ -25,8 +25,16 @@ STREAM_POSES = 100_000
 _CURSOR = re.compile(r"(\d{1,9})\.(\d{1,9})")
 
 
+def frame_of_sweep(database: Database, sweep_id: str, asked: AskedFrame) -> PoseFrame:
+    """The frame that is asked for, of the gripper that a sweep is simulated with."""
+    with database.read() as tx:
+        row = require_sweep(tx, sweep_id)
+        names = provenances.of_object(tx, row.object_id)
+        return frames_of(tx, names, [row.provenance_id], asked).get(row.provenance_id, PoseFrame())
+
+
 def page(
-    database: Database, sweep_id: str, asked: AskedFrame, *, limit: int, cursor: str | None
+    database: Database, sweep_id: str, frame: PoseFrame, *, limit: int, cursor: str | None
 ) -> tuple[TrialColumns, str | None]:
     """Poses of finished chunks with outcome and pose index, in the plan's order, of a frame of the sweep's
     gripper; where the next page starts.
@@ -41,8 +49,6 @@ def page(
         number, skip = int(match[1]), int(match[2])
     with database.read() as tx:
         row = require_sweep(tx, sweep_id)
-        names = provenances.of_object(tx, row.object_id)
-        frame = frames_of(tx, names, [row.provenance_id], asked).get(row.provenance_id, PoseFrame())
         # One pose more than asked for tells whether there is another page.
         chunks = packed.page(tx, sweep_id, first_number=number, poses=limit + skip + 1)
         stored = {chunk.number: sweep_plan.chunk_poses(tx, row, chunk.start, chunk.stop) for chunk in chunks}
@@ -78,15 +84,15 @@ def page(
 
 
 def pages(
-    database: Database, sweep_id: str, asked: AskedFrame, *, cursor: str | None
+    database: Database, sweep_id: str, frame: PoseFrame, *, cursor: str | None
 ) -> Iterator[TrialColumns]:
     """All poses of finished chunks from a cursor on."""
-    columns, following = page(database, sweep_id, asked, limit=STREAM_POSES, cursor=cursor)
+    columns, following = page(database, sweep_id, frame, limit=STREAM_POSES, cursor=cursor)
 
     def rest(columns: TrialColumns, following: str | None) -> Iterator[TrialColumns]:
         yield columns
         while following is not None:
-            columns, following = page(database, sweep_id, asked, limit=STREAM_POSES, cursor=following)
+            columns, following = page(database, sweep_id, frame, limit=STREAM_POSES, cursor=following)
             yield columns
 
     return rest(columns, following)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import uuid
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,7 @@ class _Plan:
     full_count: int | None = None
     poses: Floats | None = None
     kernel: KernelInfo | None = None
+    warnings: Sequence[str] = ()
 
 
 def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Given | None) -> Created:
@@ -155,6 +157,8 @@ def _snapshot(world: _World, plan: _Plan, spec: SweepCreate) -> dict[str, Any]:
         snapshot["repeat_key"] = sweep_plan.repeat_key(
             world.snapshot, spec.protocol, spec.fidelity, plan.grid
         )
+    if plan.warnings:
+        snapshot["warnings"] = list(plan.warnings)
     if plan.kernel is not None:
         # A sample may name no widths, and those of a density change as it grows.
         snapshot["drawn_with"] = plan.kernel.model_dump(mode="json")
@@ -218,7 +222,8 @@ def _mass(row: ObjectRow) -> float | None:
 def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World, given: Given | None) -> _Plan:
     if given is not None:
         frame = pose_frame(spec.frame, spec.convention, world.profile, spec.gripper)
-        return _given(ctx, Given(frame.to_tool(given.poses), given.proposal_density))
+        told = _given(ctx, Given(frame.to_tool(given.poses), given.proposal_density))
+        return replace(told, warnings=frame.warnings)
     if spec.sample is not None:
         return _drawn(ctx, slug, spec, spec.sample)
     wish = spec.grid or GridSpec()

@@ -104,7 +104,10 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
             "rate_poses_s": rate,
             "time_left_s": left / rate if rate and state == SweepState.RUNNING else None,
             "failed_chunks": done.failed,
-            "warnings": feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
+            "warnings": [
+                *feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
+                *row.snapshot.get("warnings", []),
+            ],
         }
     )
 

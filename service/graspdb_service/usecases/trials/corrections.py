@@ -29,8 +29,11 @@ def withdraw(database: Database, slug: str, seq: int, *, reason: str | None) -> 
     correct(database, slug, seq, TrialPatch(withdrawn=True, reason=reason))
 
 
-def correct(database: Database, slug: str, seq: int, patch: TrialPatch) -> TrialInfo:
-    """Change what a patch gives of a trial, in a new epoch of its object, and keep what it was.
+def correct(
+    database: Database, slug: str, seq: int, patch: TrialPatch, frame: AskedFrame | None = None
+) -> TrialInfo:
+    """Change what a patch gives of a trial, in a new epoch of its object, and keep what it was; it is told
+    in a frame, by default the tool's.
 
     409 ``trial-of-a-sweep`` for what was simulated: its outcome is what came of the simulation.
     """
@@ -65,7 +68,7 @@ def correct(database: Database, slug: str, seq: int, patch: TrialPatch) -> Trial
             _count(tx, before, after)
             if withdrawn:
                 findings.drop_trial(tx, row.id, seq)
-        return _read(tx, row, seq, AskedFrame())
+        return _read(tx, row, seq, frame or AskedFrame())
 
 
 def _changed(before: TrialRow, given: dict[str, Any]) -> TrialRow:
@@ -103,4 +106,5 @@ def _read(tx: Tx, row: ObjectRow, seq: int, frame: AskedFrame) -> TrialInfo:
     names = provenances.of_object(tx, row.id)
     page = out_of_tool(tx, page_of(tx, row, columns, names), frame)
     history = [change._asdict() for change in changes.of_trial(tx, row.id, seq)]
-    return TrialInfo.model_validate({**documents(page)[0], "history": history})
+    told = {**frame.told(), "warnings": list(page.warnings)}
+    return TrialInfo.model_validate({**documents(page)[0], "history": history, **told})

@@ -13,7 +13,7 @@ from graspdb_service.storage.trials import batches, provenances, rows
 from graspdb_service.trial_columns import Provenance, TrialColumns, TrialPage, is_gripper
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
-from graspdb_service.usecases.trials.frames import AskedFrame, frames_of, out_of_tool
+from graspdb_service.usecases.trials.frames import AskedFrame, frames_of, out_of_tool, warnings_of
 from graspdb_service.usecases.trials.selection import outcome_counts
 
 STREAM_ROWS = 5_000
@@ -57,14 +57,15 @@ def pages(
         names = provenances.of_object(tx, row.id)
         # What can't be told is refused before the first page is on its way.
         counts = outcome_counts(tx, row.id)
-        frames_of(tx, names, counts.keys() & _passing(names, chosen), frame)
+        wanted = counts.keys() & _passing(names, chosen)
+        warned = warnings_of(frames_of(tx, names, wanted, frame).values())
 
     def read(after: int) -> Iterator[TrialPage]:
         while True:
             with database.read() as tx:
                 found = _read(tx, row, chosen, after, STREAM_ROWS, row.last_seq)
                 told = out_of_tool(tx, found, frame)
-            yield told
+            yield replace(told, warnings=warned)
             if len(found.columns) < STREAM_ROWS:
                 return
             after = int(found.columns.seq[-1])

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspdb.wire import Convention, GripperProfile, Pose
-from graspdb.wire.frames.gripper_frames import TOOL, NoSuchFrame, ToolUnknown, compose, in_tool, inverse
+from graspdb.wire.base import Quadruple
+from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING
+from graspdb.wire.frames.gripper_frames import (
+    IDENTITY,
+    TOOL,
+    NoSuchFrame,
+    ToolUnknown,
+    compose,
+    in_tool,
+    inverse,
+)
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import conflict, invalid
@@ -18,26 +29,64 @@ from graspdb_service.usecases.trials.selection import Selected
 
 #: Frames turned less than this against the tool have its axes, radians.
 _ALIGNED = 1e-3
+#: The tool of a grasp with the fingers exchanged, in that of the grasp.
+_TWIN = Pose(position=(0.0, 0.0, 0.0), quaternion_xyzw=(0.0, 0.0, 1.0, 0.0))
+
+NO_TWINS = (
+    "near= chooses between the twins of a symmetric jaw, which this gripper's is not: it changed nothing"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseFrame:
     """A frame of a gripper with the axes of a convention; ``fixed`` is its pose in the tool frame, None where
-    it is the tool frame itself.
+    it is the tool frame itself. ``near`` is the rotation of it, in the object frame, that of two twins the
+    nearer one is wanted to; None where they are not chosen between. ``turned``: its axes, which the
+    convention renames, are turned against the tool's.
     """
 
     frame: str = TOOL
     convention: Convention = "graspdb"
     fixed: Pose | None = None
     warnings: Sequence[str] = ()
+    near: Quadruple | None = None
+    turned: bool = False
+
+    @property
+    def is_tool(self) -> bool:
+        """Whether poses are as they are kept."""
+        return self.fixed is None and self.near is None
 
     def to_tool(self, poses: Poses) -> Poses:
         """Poses (n,) of this frame as those of the tool."""
         return poses if self.fixed is None else _followed(poses, inverse(self.fixed))
 
     def from_tool(self, poses: Poses) -> Poses:
-        """Poses (n,) of the tool as those of this frame."""
-        return poses if self.fixed is None else _followed(poses, self.fixed)
+        """Poses (n,) of the tool as those of this frame, each the twin that was asked for."""
+        own = poses if self.fixed is None else _followed(poses, self.fixed)
+        if self.near is None or not len(poses):
+            return own
+        twins, nearer = _followed(poses, self.twin.fixed or IDENTITY), self.exchanged(poses)[:, None]
+        return Poses(
+            np.where(nearer, twins.positions, own.positions),
+            np.where(nearer, twins.quaternions_xyzw, own.quaternions_xyzw),
+        )
+
+    @property
+    def twin(self) -> PoseFrame:
+        """The same frame of the same grasp with its fingers exchanged, as one of this grasp's tool."""
+        return replace(self, fixed=compose(_TWIN, self.fixed or IDENTITY), near=None)
+
+    def exchanged(self, poses: Poses) -> NDArray[np.bool_]:
+        """Of which poses (n,) of the tool the twin is nearer to what was asked for."""
+        if self.near is None:
+            return np.zeros(len(poses), dtype=bool)
+        near = np.array(self.near)
+        own, other = (
+            se3.angle_between(se3.multiply(poses.quaternions_xyzw, np.array(fixed.quaternion_xyzw)), near)
+            for fixed in (self.fixed or IDENTITY, self.twin.fixed or IDENTITY)
+        )
+        return np.asarray(other < own)
 
     def one_from_tool(self, pose: Pose) -> Pose:
         """As :meth:`from_tool`, of one alone, which is faster so."""
@@ -49,9 +98,21 @@ class PoseFrame:
         return {"frame": self.frame, "convention": self.convention, "tool_to_frame": fixed}
 
 
-def frame_of(selected: Selected, frame: str | None, convention: Convention | None) -> PoseFrame:
+def frame_of(
+    selected: Selected, frame: str | None, convention: Convention | None, near: Quadruple | None = None
+) -> PoseFrame:
     """The frame that a question asks for, of the gripper of its selection: refused as :func:`pose_frame`."""
-    return pose_frame(frame, convention, selected.profile, selected.gripper)
+    found = pose_frame(frame, convention, selected.profile, selected.gripper)
+    return with_near(found, near, symmetric=selected.jaw_symmetric)
+
+
+def with_near(frame: PoseFrame, near: Quadruple | None, *, symmetric: bool) -> PoseFrame:
+    """A frame with the rotation that twins are chosen by; a jaw that is not symmetric has none, and it says
+    so.
+    """
+    if near is None or symmetric:
+        return replace(frame, near=near)
+    return replace(frame, warnings=[*frame.warnings, NO_TWINS])
 
 
 def pose_frame(
@@ -72,7 +133,8 @@ def pose_frame(
     else:
         try:
             fixed = profile.in_tool(named, axes)
-            turned = named != TOOL and axes != "graspdb" and _angle(profile.in_tool(named)) > _ALIGNED
+            renamed = APPROACH_AND_CLOSING[axes] != APPROACH_AND_CLOSING["graspdb"]
+            turned = named != TOOL and renamed and _angle(profile.in_tool(named)) > _ALIGNED
         except NoSuchFrame as error:
             way_out = f"{error}: PUT /grippers/{_id(gripper)} with it in frames adds one"
             raise invalid("frame", way_out) from None
@@ -90,7 +152,7 @@ def pose_frame(
             f"convention={axes} renames the axes of {named!r}, which are turned against the tool's: name a"
             " frame with the tool's axes there (frames of the gripper) if those are meant"
         ]
-    return PoseFrame(named, axes, fixed, warnings)
+    return PoseFrame(named, axes, fixed, warnings, turned=turned)
 
 
 def _id(gripper: str | None) -> str:

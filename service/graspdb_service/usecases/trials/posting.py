@@ -68,9 +68,10 @@ def add(
     quotas.check_batch(limits, batch)
     with ctx.database.read() as tx:
         known = require(tx, slug)
-        batch = into_tool(tx, batch, frame)
+        batch, turned = into_tool(tx, batch, frame)
         profiles = inspection.profiles_of(tx, batch)
     concerns = inspection.inspect(ctx.compute, geometries, known, profiles, batch)
+    concerns += inspection.turned_frames(batch, turned, frame.convention)
     if not accept_implausible:
         _refuse_implausible(batch, concerns)
     given.settle(batch.answers)

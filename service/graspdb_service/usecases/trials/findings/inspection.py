@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from graspdb.wire import OUTCOME_CODES, GripperProfile
-from graspdb_geometry.plausibility import Doubt, Target, doubts
+from graspdb_geometry.plausibility import TOLERANCE_M, Doubt, Target, doubts
 from graspdb_geometry.poses import ToolPoses
 from graspdb_service.storage import grippers
 from graspdb_service.storage.database import Tx
@@ -82,13 +82,26 @@ def inspect(
     concerns = []
     for provenance, rows in _groups(batch):
         name = None if provenance is None else batch.provenances[provenance].gripper
-        target = geometries.target(row, None if name is None else profiles.get(name))
+        profile = None if name is None else profiles.get(name)
+        concerns += _too_wide(batch, provenance, rows, profile)
+        target = geometries.target(row, profile)
         poses = ToolPoses(*tried[rows])
         for doubt in compute.run(partial(doubts, poses, held[rows], target)):
             concern = _concern(batch, provenance, rows, doubt, target)
             if len(concern.rows):
                 concerns.append(concern)
     return concerns
+
+
+def turned_frames(batch: TrialBatch, places: Iterable[int], convention: str | None) -> list[Concern]:
+    """What a convention may have meant otherwise: trials of these provenances came in a frame whose axes are
+    turned against the tool's.
+    """
+    found = []
+    for place in places:
+        rows = np.flatnonzero(batch.columns.provenance == place)
+        found.append(Concern(place, "turned-frame", convention or "", rows, len(rows)))
+    return found
 
 
 def repeats(tx: Tx, object_id: int, batch_id: int, batch: TrialBatch, ids: Ints) -> list[FindingRow]:
@@ -114,6 +127,18 @@ def repeats(tx: Tx, object_id: int, batch_id: int, batch: TrialBatch, ids: Ints)
         repeated = rows[np.isin(digests, same)]
         found.append(Concern(whose, "posted-before", "", repeated, len(rows)).stored(ids, other))
     return found
+
+
+def _too_wide(
+    batch: TrialBatch, provenance: int | None, rows: Ints, profile: GripperProfile | None
+) -> list[Concern]:
+    """Trials that end with the fingers farther apart than their gripper opens."""
+    if profile is None or not len(batch.columns.width_m):
+        return []
+    told = rows[~np.isnan(batch.columns.width_m[rows])]
+    wide = told[batch.columns.width_m[told] > profile.max_opening_m + TOLERANCE_M]
+    detail = f"{1e3 * profile.max_opening_m:.4g} mm"
+    return [Concern(provenance, "wider-than-the-jaw", detail, wide, len(told))] if len(wide) else []
 
 
 def _groups(batch: TrialBatch) -> Iterator[tuple[int | None, Ints]]:

@@ -70,9 +70,20 @@ _WORDS = {
         "in {of} nothing is between the open fingers for them to close on",
         f"{_FRAME}. Check the gripper's profile, the mesh's frame and how the object's pose was measured",
     ),
+    "wider-than-the-jaw": _Words(
+        "{of} end with the fingers farther apart than the jaw opens ({detail})",
+        "width_m is the distance between the fingers at the end, in metres: check its unit, which gripper it"
+        " was, and the profile's max_opening_m",
+    ),
     "far-from-the-rest": _Words(
         "{of} lie metres away from the others",
         "Check unit and frame of these trials. With a mesh the object's size tells what is possible",
+    ),
+    "turned-frame": _Words(
+        "{of} came in a frame that is turned against the tool, and convention={detail} renamed the axes of"
+        " that frame as it is",
+        "Leave the convention out if the poses are of the frame as the gripper's profile has it, or name a"
+        " frame with the tool's axes there (frames of the gripper) if those are meant",
     ),
     "posted-before": _Words(
         "{of} equal rows that were posted before, in pose, outcome, width, quality and time",
