@@ -10,7 +10,7 @@ KEEP ?=
 VIEW ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test chromium test-core test-long check format bench openapi requirements clean
+.PHONY: help install demo test chromium test-core test-long check format bench load openapi requirements clean
 
 help:  ## What can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -37,6 +37,7 @@ test-core: install  ## The tests without a browser
 
 test-long: chromium install  ## Also what takes many minutes
 	@sh .ci/faketime
+	@sh .ci/nginx
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 check: install  ## Format, lint, types, import rules, the rules of the house
@@ -52,6 +53,10 @@ format: install  ## Mend what the formatter and the linter can
 
 bench: install  ## Measure speed: a table with medians and ratios taken in one run
 	$(BIN)/python tests/benchmarks
+
+load: install  ## 200 clients and 50 workers at half of what the machine carries (SECONDS=600, on either database)
+	@sh .ci/nginx
+	$(BIN)/python tests/load --seconds $(or $(SECONDS),600)
 
 openapi: install  ## Write docs/openapi.json and docs/scopes.md anew
 	$(BIN)/graspdb-server openapi > docs/openapi.json

@@ -77,6 +77,11 @@ class Process:
     def resume(self) -> None:
         os.killpg(self.pid, signal.SIGCONT)
 
+    def wait(self) -> int:
+        """Until it has ended by itself, and how it did."""
+        assert self._process is not None
+        return self._process.wait(PATIENCE_S)
+
     def stop(self) -> int:
         """Ask it to end, and how it did."""
         assert self._process is not None
