@@ -65,12 +65,14 @@ openapi: install  ## Write docs/openapi.json and docs/scopes.md anew
 PIP_COMPILE = $(BIN)/python -m piptools compile --quiet --generate-hashes --allow-unsafe --strip-extras \
   --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
 
-requirements:  ## Pin what pyproject.toml allows, for development and for the two images (UPGRADE=--upgrade: the newest)
+requirements:  ## Pin what pyproject.toml allows, for development and for the images (UPGRADE=--upgrade: the newest)
 	$(PIP_COMPILE) $(UPGRADE) --all-extras --output-file requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra service --extra postgres --extra plot --extra arrow --build-deps-for wheel \
 	  --output-file service/requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra sim --extra dask --build-deps-for wheel \
 	  --output-file simworker/requirements.txt pyproject.toml
+	$(PIP_COMPILE) -c requirements.txt --extra view --build-deps-for wheel \
+	  --output-file clients/requirements.txt pyproject.toml
 
 clean:  ## Remove the environment and what tools left behind
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo dist

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,11 +28,14 @@ def link_to(origin: str, view: View) -> str:
 class ViewerServer:
     """Serves pages at :attr:`url` until :meth:`stop`.
 
-    ``view`` is what a page shows that is opened without a link. OSError where the port is taken.
+    ``view`` is what a page shows that is opened without a link; ``names`` are those that it may be opened
+    under beside addresses and ``localhost``. OSError where the port is taken.
     """
 
-    def __init__(self, db: Client, *, host: str, port: int, view: View, keyed: bool = False) -> None:
-        self._db, self._view, self._keyed = db, view, keyed
+    def __init__(
+        self, db: Client, *, host: str, port: int, view: View, names: Collection[str], keyed: bool
+    ) -> None:
+        self._db, self._view, self._keyed, self._names = db, view, keyed, names
         self.sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._server = viser.ViserServer(host=host, port=port, label="GraspDB", verbose=False)
@@ -53,7 +57,7 @@ class ViewerServer:
     def _connected(self, client: viser.ClientHandle) -> None:
         asked = self._handshake(client)
         origin = asked.headers.get("Origin") if asked is not None else None
-        if asked is None or origin is None or urlsplit(origin).netloc != asked.headers.get("Host"):
+        if asked is None or origin is None or not self._ours(origin, asked.headers.get("Host")):
             return  # another site's page in the user's browser: it is shown nothing
         view, stale = self._view.model_copy(deep=True), False
         token = urlsplit(asked.path).query
@@ -68,6 +72,18 @@ class ViewerServer:
             session.page.client.add_notification("Link", _STALE, color="yellow")
         with self._lock:
             self.sessions[client.client_id] = session
+
+    def _ours(self, origin: str, host: str | None) -> bool:
+        """Whether a page is this viewer's own, under a name that no other site can give itself."""
+        site = urlsplit(origin)
+        name = site.hostname or ""
+        if site.netloc != host:
+            return False
+        try:
+            ipaddress.ip_address(name)  # a number is nobody's to point elsewhere
+        except ValueError:
+            return name == "localhost" or name in self._names
+        return True
 
     def _gone(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -84,10 +100,16 @@ class ViewerServer:
 
 @contextlib.contextmanager
 def serving(
-    db: Client, *, host: str = "127.0.0.1", port: int = 8080, view: View | None = None, keyed: bool = False
+    db: Client,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    view: View | None = None,
+    names: Collection[str] = (),
+    keyed: bool = False,
 ) -> Iterator[ViewerServer]:
     """A viewer of this service while the context lasts."""
-    server = ViewerServer(db, host=host, port=port, view=view or View(), keyed=keyed)
+    server = ViewerServer(db, host=host, port=port, view=view or View(), names=names, keyed=keyed)
     try:
         yield server
     finally:

@@ -54,7 +54,7 @@ class Session:
         self._client, self._db, self._link, self._keyed = client, db, link, keyed
         self.page = Page(client, db, view, self._say)
         self._drawing, self._asking = Latest(self.page.failed), Latest(self.page.failed)
-        self._reporting, self._linking = Latest(self.page.failed), Latest(lambda _: None)
+        self._linking = Latest(lambda _: None)
         self._closed = threading.Event()
         self._build()
         self._drawing.soon(self._load)
@@ -63,7 +63,7 @@ class Session:
     def close(self) -> None:
         """The tab is gone."""
         self._closed.set()
-        for worker in (self._drawing, self._asking, self._reporting, self._linking):
+        for worker in (self._drawing, self._asking, self._linking, self._reports):
             worker.close()
 
     # The page
@@ -89,7 +89,7 @@ class Session:
         with tabs.add_tab("Trials"):
             self._trials = TrialsPanel(self.page, self._redraw, self._show_trial)
         with tabs.add_tab("Reports"):
-            self._reports = ReportsPanel(self.page, self._reporting)
+            self._reports = ReportsPanel(self.page)
         with tabs.add_tab("Object"):
             self._about = gui.add_markdown("")
             self._sweeps = SweepsPanel(self.page)
@@ -121,6 +121,8 @@ class Session:
         """The link, once nothing changes for a moment."""
         if self._closed.wait(0.3):
             return
+        if OBJECT[1:] not in self.page.nodes:
+            return  # the camera is not yet where the view has it
         camera = self._client.camera
         with contextlib.suppress(ValueError):
             self.page.view.camera = (triple(camera.position), triple(camera.look_at))
@@ -245,7 +247,6 @@ class Session:
         scene.add_light_directional("/lights/key", intensity=1.5, position=(1.0, -1.2, 2.0))
         scene.add_light_directional("/lights/fill", intensity=0.6, position=(-1.5, 1.0, 0.5))
         frame = scene.add_frame(OBJECT, axes_length=0.25 * subject.size_m, axes_radius=0.004 * subject.size_m)
-        page.replace(OBJECT[1:], frame)
         low = float(subject.centre[2] - subject.size_m / 2)
         if subject.mesh is not None:
             low = float(subject.mesh.vertices[:, 2].min())
@@ -267,6 +268,7 @@ class Session:
             triple(subject.centre),
         )
         self._client.camera.position, self._client.camera.look_at = np.array(eye), np.array(target)
+        page.replace(OBJECT[1:], frame)
 
     def _draw(self) -> None:
         """Grasps and trials as the view has them."""

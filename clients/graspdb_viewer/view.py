@@ -61,7 +61,7 @@ class View(_Part):
     grasps: Literal["draws", "successes", "none"] = "draws"
     count: Annotated[int, Field(ge=1, le=MOST_GRASPS)] = 2_000
     colour: Literal["density", "success_probability"] = "density"
-    whole: bool = False
+    drawn: Literal["jaw", "gripper", "cloud"] = "jaw"
     trials: bool = False
     trials_count: Annotated[int, Field(ge=1, le=MOST_GRASPS)] = 2_000
     trials_by: Literal["outcome", "source"] = "outcome"

@@ -26,6 +26,7 @@ from graspdb_viewer.page import in_words
 from graspdb_viewer.panels import words
 from graspdb_viewer.panels.spoken import constraints, spoken
 from graspdb_viewer.scene import colours, shapes
+from graspdb_viewer.serving import serving
 from graspdb_viewer.view import Box, Cone, Obstacle, Placed, View
 
 NUMBER = st.floats(-10, 10, allow_nan=False)
@@ -188,3 +189,17 @@ def test_a_key_is_never_told_and_an_obstacle_is_said_to_be_left_out() -> None:
     assert "'obstacles'" in told.sdk or "obstacles=" in told.sdk
     assert "without the obstacle" in told.command
     assert io.StringIO(told.command).read().count("--") >= 3
+
+
+def test_only_its_own_pages_are_answered(db: Client) -> None:
+    with serving(db, port=0, names=["viewer.lab"]) as server:
+        port = server.url.rpartition(":")[2]
+        for origin, host, ours in (
+            (server.url, f"127.0.0.1:{port}", True),
+            (f"http://localhost:{port}", f"localhost:{port}", True),
+            ("https://viewer.lab", "viewer.lab", True),
+            ("http://evil.example", f"127.0.0.1:{port}", False),
+            (f"http://rebound.example:{port}", f"rebound.example:{port}", False),
+            (server.url, None, False),
+        ):
+            assert server._ours(origin, host) is ours, (origin, host)

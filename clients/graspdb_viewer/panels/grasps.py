@@ -22,6 +22,13 @@ _COLOURS: dict[str, Literal["density", "success_probability"]] = {
     "density": "density",
     "success probability": "success_probability",
 }
+_DRAWN: dict[str, Literal["jaw", "gripper", "cloud"]] = {
+    "jaws": "jaw",
+    "whole grippers": "gripper",
+    "a cloud of points": "cloud",
+}
+_POINT = 0.006
+"""Size of a cloud's points, of the object's diagonal."""
 _SEED = 1
 """Of the draws, so that a link shows the same ones."""
 _OPACITY = 0.2
@@ -42,11 +49,8 @@ class GraspsPanel:
         self._colour = gui.add_dropdown(
             "Coloured by", tuple(_COLOURS), initial_value=view.colour.replace("_", " ")
         )
-        self._whole = gui.add_checkbox(
-            "Whole grippers",
-            initial_value=view.whole,
-            hint="Fingers and palm as boxes, else the jaw's lines.",
-        )
+        drawn = next(words for words, key in _DRAWN.items() if key == view.drawn)
+        self._drawn = gui.add_dropdown("Drawn as", tuple(_DRAWN), initial_value=drawn)
         self._bar = gui.add_image(colours.bar(), format="png")
         self._told = gui.add_markdown("")
         self._kept: tuple[object, Poses, str] | None = None
@@ -55,10 +59,10 @@ class GraspsPanel:
             view.grasps = _SHOWN[self._which.value]
             view.count = int(self._count.value)
             view.colour = _COLOURS[self._colour.value]
-            view.whole = self._whole.value
+            view.drawn = _DRAWN[self._drawn.value]
             changed()
 
-        for control in (self._which, self._count, self._colour, self._whole):
+        for control in (self._which, self._count, self._colour, self._drawn):
             control.on_update(on_change)
 
     def draw(self) -> None:
@@ -75,11 +79,21 @@ class GraspsPanel:
         # The brightest last, so that it lies over the others.
         order = np.argsort(np.where(np.isfinite(values), values, -np.inf), kind="stable")
         there = Poses(poses.position[order], poses.quaternion_xyzw[order])
-        shape = shapes.gripper(subject.profile) if view.whole else shapes.jaw(subject.profile)
         painted = colours.of_values(values[order], low, low + 1.0 if low == 0.0 else 0.0)
-        page.replace(
-            "grasps", page.instances(f"{OBJECT}/grasps", shape, there, painted, lod="off", opacity=_OPACITY)
-        )
+        if view.drawn == "cloud":
+            node: Any = page.client.scene.add_point_cloud(
+                f"{OBJECT}/grasps",
+                there.position,
+                painted,
+                point_size=_POINT * subject.size_m,
+                point_shape="circle",
+                precision="float32",
+            )
+        else:
+            whole = view.drawn == "gripper"
+            shape = shapes.gripper(subject.profile) if whole else shapes.jaw(subject.profile)
+            node = page.instances(f"{OBJECT}/grasps", shape, there, painted, lod="off", opacity=_OPACITY)
+        page.replace("grasps", node)
         unknown = int(np.sum(~np.isfinite(values)))
         grey = f" Grey: unknown, too far from every attempt ({unknown:,})." if unknown else ""
         self._bar.visible = True

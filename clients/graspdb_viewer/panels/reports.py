@@ -20,10 +20,11 @@ _ASPECT = 1.35
 
 
 class ReportsPanel:
-    """A button a report; one is computed at a time."""
+    """A button a report; each is asked by a thread of its own, for some take minutes."""
 
-    def __init__(self, page: Page, work: Latest) -> None:
-        self._page, self._work = page, work
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self._workers: list[Latest] = []
         gui = page.client.gui
         self._figures: dict[str, Any] = {}
         self._texts: dict[str, Any] = {}
@@ -37,7 +38,13 @@ class ReportsPanel:
         with gui.add_folder("Tolerance at the best grasp", expand_by_default=True):
             button = gui.add_button("Draw the tolerance")
             self._tolerance = gui.add_markdown("")
-        button.on_click(lambda _: work.soon(self._told("tolerance", self._tolerance, self._ellipsoid)))
+        tolerance = self._told("tolerance", self._tolerance, self._ellipsoid)
+        self._on_press(button, tolerance)
+
+    def close(self) -> None:
+        """Ask nothing any more."""
+        for worker in self._workers:
+            worker.close()
 
     def clear(self) -> None:
         """Another object: what was said is no longer of what is shown."""
@@ -69,7 +76,12 @@ class ReportsPanel:
             minded = "".join(f"\n\n*Mind:* {words.plain(warning)}" for warning in report.raw.warnings)
             return f"{words.plain(report.raw.text)}{minded}"
 
-        button.on_click(lambda _: self._work.soon(self._told(name, text, compute)))
+        self._on_press(button, self._told(name, text, compute))
+
+    def _on_press(self, button: Any, task: Task) -> None:
+        worker = Latest(self._page.failed)
+        self._workers.append(worker)
+        button.on_click(lambda _: worker.soon(task))
 
     def _told(self, name: str, text: Any, compute: Callable[[Subject], str]) -> Task:
         """A task that says what a report came to, or why there is none, where it stands."""

@@ -71,7 +71,7 @@ class TrialsPanel:
         named = [getattr(trial, view.trials_by) for trial in self._trials]
         poses = _poses(self._trials)
         node = page.instances(
-            f"{OBJECT}/trials", shapes.ball(0.008 * subject.size_m), poses, colours.of_names(named), lod="off"
+            f"{OBJECT}/trials", shapes.ball(0.012 * subject.size_m), poses, colours.of_names(named), lod="off"
         )
         node.on_click(self._clicked)
         page.replace("trials", node)

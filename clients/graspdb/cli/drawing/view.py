@@ -27,6 +27,10 @@ def view(
         str,
         typer.Option(help="Address to listen on. Whoever reaches it sees what the viewer's key may read."),
     ] = "127.0.0.1",
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="A name that the page is opened under, beside addresses and localhost; repeated."),
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = False,
 ) -> None:
     """Look at an object, its grasps and trials in a browser, and drag constraints about (extra `view`)."""
@@ -37,7 +41,7 @@ def view(
         raise ImportError(f"the viewer needs {error.name}: pip install 'graspdb[view]'") from error
     keyed = bool(state.api_key or os.environ.get("GRASPDB_API_KEY"))
     start = importlib.import_module("graspdb_viewer.view").View(object=id)
-    with viewer.serving(state.db, host=host, port=port, view=start, keyed=keyed) as server:
+    with viewer.serving(state.db, host=host, port=port, view=start, names=name or (), keyed=keyed) as server:
         typer.echo(f"Look at {server.url} (Ctrl-C ends it)")
         if browser:
             webbrowser.open(server.url)
