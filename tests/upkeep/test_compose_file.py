@@ -84,7 +84,12 @@ def test_files_variables_and_settings_are_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("image", "packages"), [("service", ("matplotlib", "pyarrow")), ("simworker", ("distributed",))]
+    ("image", "packages"),
+    [
+        ("service", ("matplotlib", "pyarrow")),
+        ("simworker", ("distributed",)),
+        ("clients", ("viser", "plotly")),
+    ],
 )
 def test_images_hold_what_their_users_expect(image: str, packages: tuple[str, ...]) -> None:
     pinned = (ROOT / image / "requirements.txt").read_text()
@@ -97,7 +102,7 @@ def test_images_are_given_every_file_that_the_package_takes_along() -> None:
     taken = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["build"]["targets"]
     for path in taken["wheel"]["force-include"]:
         folder = path.split("/")[0]
-        for image in ("service", "simworker"):
+        for image in ("service", "simworker", "clients"):
             assert f"COPY {folder} {folder}" in (ROOT / image / "Dockerfile").read_text(), path
         assert folder not in ignored, path
         assert f"{folder}/*" not in ignored or f"!{path}" in ignored, path
