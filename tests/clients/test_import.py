@@ -101,6 +101,14 @@ def test_a_dry_run_stores_nothing_and_says_it_as_data(
         (("--frame", "tool"), "no fingertip comes near|few grasps fit", "--frame base"),
         (("--convention", "graspnet"), "no fingertip comes near|few grasps fit", "--convention acronym"),
         (("--convention", "graspdb"), "few grasps fit", "--convention acronym"),
+        # Given with w first: turned about the can's own axis it is as it was.
+        (
+            ("--object-pose", "0,0,0,0.70710678,0,0,0.70710678"),
+            "few grasps fit",
+            "--object-pose=0,0,0,0,0,0.707106781,0.707106781",
+        ),
+        # Of quite another place: no reading fits.
+        (("--object-pose", "0.06,0.05,0,0,0,0.6,0.8"), "hardly a grasp", "--object-pose"),
     ],
 )
 def test_what_cannot_be_right_is_refused_with_the_flag_that_mends_it(

@@ -28,6 +28,7 @@ from graspdb.interop.frames import to_graspdb
 from graspdb.interop.parsing import reader
 from graspdb.poses import matrices
 from graspdb.wire import CONVENTIONS, GripperProfile, JointValues
+from graspdb.wire.frames import gripper_frames
 from graspdb.wire.presets.grippers import PRESETS
 
 TIP_OFFSET = 0.011
@@ -110,8 +111,13 @@ def test_a_base_that_closes_along_x_itself_is_the_files_own(
     preset = PRESETS["robotiq-2f-85"].profile
     assert preset.base_to_tool is not None
     way = matrices(preset.base_to_tool.position, preset.base_to_tool.quaternion_xyzw)
-    found = interop.read(write(tmp_path / "a.json", tools @ np.linalg.inv(way), HELD), gripper=preset)
-    _is(found, tools)
+    path = write(tmp_path / "a.json", tools @ np.linalg.inv(way), HELD)
+    # One meaning, however it is said: z approaches and x closes, which this base does itself.
+    for convention in (None, "acronym", "graspgen", "z/x", "graspdb"):
+        _is(interop.read(path, gripper=preset, convention=convention), tools)
+    for axes in ("acronym", "graspgen"):
+        own = preset.in_tool("base")
+        assert gripper_frames.same(preset.in_tool("base", axes), own)  # type: ignore[arg-type]
 
 
 def test_a_file_is_recognised_by_its_content(

@@ -146,6 +146,37 @@ def test_closing_along_x_is_named(seed: int) -> None:
 
 @few
 @given(SEEDS)
+def test_few_grasps_across_a_bottle_tell_nothing_of_axes(seed: int) -> None:
+    """Tools in an object's middle, at various heights: from one to the middle of all is any direction."""
+    rng = np.random.default_rng(seed)
+    for count in (10, 20, 200):
+        angle = rng.uniform(-np.pi, np.pi, count)
+        approach = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        closing = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+        turns = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+        height = np.array([0, 0, 1]) * rng.uniform(0.02, 0.115, (count, 1))
+        positions = height - approach * rng.normal(0, 0.012, (count, 1))
+        poses = ToolPoses(positions, Rotation.from_matrix(turns).as_quat())
+        assert doubts(poses, np.ones(count), None) == []
+
+
+def test_closing_across_is_likelier_than_from_behind() -> None:
+    """Jaws about a slab's middle close on it from behind as well: the axis that is off is that of closing."""
+    slab = np.array([0.04, 0.16, 0.02])
+    solid = Scene([box_part(slab / 2, (0, 0, 0), (0, 0, 0, 1))])
+    target = Target(-slab / 2, slab / 2, solid, PANDA)
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    # Approach about the slab's long axis, closing along that: across is right.
+    approach = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    closing = np.tile([0.0, 1.0, 0.0], (40, 1))
+    turns = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+    heights = np.array([0.0, 1.0, 0.0]) * np.linspace(-0.06, 0.06, 40)[:, None]
+    found = doubts(ToolPoses(heights, Rotation.from_matrix(turns).as_quat()), np.ones(40), target)
+    assert (found[0].code, found[0].likeness) == ("another-closing-axis", "x")
+
+
+@few
+@given(SEEDS)
 def test_a_cloud_alone_tells_reversed_approaches_wherever_it_lies(seed: int) -> None:
     rng = np.random.default_rng(seed)
     outward = rng.normal(size=(60, 3))

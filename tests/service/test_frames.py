@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graspdb.wire import CONVENTIONS
-from graspdb.wire.frames.conventions import to_graspdb
+from graspdb.wire.frames.conventions import OWN_AXES, to_graspdb
 from graspdb_density import se3
 
 Floats = NDArray[np.float64]
@@ -51,9 +51,10 @@ def expected(tool: Floats, frame: str, convention: str) -> Floats:
     named = {"tool": MINE["base_to_tool"], "base": None, **MINE["frames"]}[frame]
     base_to_tool = matrix(MINE["base_to_tool"]["position"], MINE["base_to_tool"]["quaternion_xyzw"])
     there = np.eye(4) if named is None else matrix(named["position"], named["quaternion_xyzw"])
-    axes = np.eye(4)
-    axes[:3, :3] = np.array(to_graspdb(convention)).T  # type: ignore[arg-type]
-    return tool @ np.linalg.inv(base_to_tool) @ there @ axes
+    fixed = np.asarray(np.linalg.inv(base_to_tool) @ there)
+    if convention not in OWN_AXES:
+        fixed[:3, :3] = np.array(to_graspdb(convention)).T  # type: ignore[arg-type]
+    return np.asarray(tool @ fixed)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from graspdb import Client, wire
 from graspdb.poses import Poses, as_poses, matrices
 from graspdb.wire import CONVENTIONS
-from graspdb.wire.frames.conventions import to_graspdb
+from graspdb.wire.frames.conventions import OWN_AXES, to_graspdb
 
 Floats = NDArray[np.float64]
 SHAPE: dict[str, Any] = {
@@ -53,9 +53,9 @@ class Expected:
 
     def __init__(self, tool: Any, other: Any, frame: str, convention: str, near: Sequence[float]) -> None:
         in_base = {"base": np.eye(4), "tool": matrices(*tool), "own": matrices(*other)}
-        axes = np.eye(4)
-        axes[:3, :3] = np.array(to_graspdb(convention)).T  # type: ignore[arg-type]
-        self.fixed = np.linalg.inv(in_base["tool"]) @ in_base[frame] @ axes
+        self.fixed = np.linalg.inv(in_base["tool"]) @ in_base[frame]
+        if convention not in OWN_AXES:
+            self.fixed[:3, :3] = np.array(to_graspdb(convention)).T  # type: ignore[arg-type]
         self.near = matrices([0, 0, 0], near)[:3, :3]
         self.told: dict[str, Any] = {"frame": frame, "convention": convention}
         self.asked = {**self.told, "near": list(near)}
@@ -200,7 +200,7 @@ def test_outcomes_of_a_sweep_are_of_the_frame(
     assert as_poses(found).position.tolist() == told["position"]
 
 
-def test_a_turned_frame_is_warned_of_wherever_its_axes_are_renamed(
+def test_a_turned_frame_is_warned_of_wherever_other_axes_are_said(
     db: Client, swept: tuple[Any, Floats, Any]
 ) -> None:
     item, sweep = db.objects.get("swept"), swept[0]
@@ -212,7 +212,7 @@ def test_a_turned_frame_is_warned_of_wherever_its_axes_are_renamed(
     assert "turned-frame" in [finding.code for finding in item.batches.get(receipt.batch).findings]
     assert "turned-frame" in [finding.code for finding in item.density().findings]
     assert any("turned" in warning for warning in item.trials.get(1, **turned).warnings)
-    # Where a convention renames nothing, or the tool is meant, there is nothing to mistake.
+    # Where a convention leaves a frame its axes, or the tool is meant, there is nothing to mistake.
     plain = ({"frame": "own"}, {"convention": "acronym"}, {"frame": "own", "convention": "moveit"})
     for place in (f"objects/{item.id}/trials", f"sweeps/{sweep.id}/outcomes"):
         for params, said in ((turned, True), *((others, False) for others in plain)):

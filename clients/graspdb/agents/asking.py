@@ -29,7 +29,7 @@ Gripper = Annotated[
 Cursor = Annotated[str | None, Field(description="`next` of the answer before, for the items after it.")]
 Limit = Annotated[int, Field(ge=1, le=100, description="So many items at most.")]
 Axes = Annotated[
-    wire.Convention, Field(description="Whose axes the frame has; graspdb: z approach, y closing.")
+    wire.Convention, Field(description="Which axes approach and close; graspdb: the frame's own.")
 ]
 
 

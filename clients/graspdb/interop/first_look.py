@@ -11,18 +11,22 @@ import numpy as np
 
 from graspdb.files.trials import METRES
 from graspdb.interop.formats.known import TIPS
-from graspdb.interop.frames import approach_of, frames_of, to_graspdb, to_tool
+from graspdb.interop.frames import approach_of, frames_of, to_tool
 from graspdb.interop.grasps import Floats, Raw, Report
 from graspdb.interop.placing import Placing
-from graspdb.poses import matrices
-from graspdb.wire import CONVENTIONS, GripperProfile, ObjectInfo
+from graspdb.poses import Poses, matrices
+from graspdb.wire import GripperProfile, ObjectInfo
 
 NEAR_M = 0.01
 """Fingertips this far outside the object's box still count as within: jaws close about what sticks out."""
 _REACH_M = 0.05
 """Fingertips that stay farther off than this never come near."""
+_ROOM_M = 10.0
+"""An object whose pose is farther off than this was told in millimetres."""
 _FEW = 12
 """Of fewer grasps no share is compared."""
+_NOTHING = 0.05
+"""Where no more of the closings, or of the fingertips, meet the object, nothing fits it."""
 _FAR_WORSE = 0.6
 """Grasps that fit so much less often than they would otherwise are taken for a mistake."""
 _CRAMMED = 0.05
@@ -32,6 +36,11 @@ _FACES = 50_000_000
 """Triangles times grasps that closings are looked at for."""
 #: Where along the fingers, as shares of their length from the tips back, the jaw's lines of closing are.
 _DEPTHS = (0.05, 0.2, 0.4, 0.6)
+#: Approach and closing along every pair of axes that differ for a jaw, those of known conventions first.
+_AXES = (
+    *("graspdb", "acronym", "graspnet", "z/y", "-z/x", "-z/y", "x/z", "-x/y", "-x/z"),
+    *("y/x", "y/z", "-y/x", "-y/z"),
+)
 
 
 @dataclass(frozen=True)
@@ -134,6 +143,12 @@ def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report
             "quaternions fit the other order better" if "quaternion" in flag else "few grasps fit the object"
         )
         seen.refusals.append(f"{what}: {_share(now)}{mends}")
+    elif len(raw) >= _FEW and now.met() <= _NOTHING:
+        seen.refusals.append(
+            f"hardly a grasp is of the object: {'; '.join(seen.lines())}, and no other frame, axes, unit or"
+            " order of quaternions that was tried fits better: check the object's mesh and, where it is"
+            " given, --object-pose"
+        )
     seen.refusals += _of_size(now, target, report)
     return seen
 
@@ -205,6 +220,11 @@ class _Placed:
             self._closed = closed[:, 0], closed[:, 1]
         return self._closed
 
+    def met(self) -> float:
+        """The share of grasps that close on the object; where that is not looked at, that are at it."""
+        closed = self.closings()
+        return float(self.inside.mean() if closed is None else closed[0].mean())
+
     def score(self) -> float:
         """The share of grasps that look like grasps of the object."""
         fitting = float(self.fits.mean())
@@ -268,6 +288,24 @@ def _others(raw: Raw, placing: Placing, target: Target, report: Report) -> Itera
     scale = report.object_scale
     if scale is not None and not np.isclose(scale, 1.0):
         yield f"--scale {scale:.9g}", replace(placing, factor=placing.factor * scale)
+    if placing.into_object is not None:
+        yield from _object_elsewhere(placing)
+
+
+def _object_elsewhere(placing: Placing) -> Iterator[tuple[str, Placing]]:
+    """The object's pose as others write it: w first, the other way round, in millimetres."""
+    into = Poses.of(np.asarray(placing.into_object)[None])
+    given = Poses.of(np.asarray(np.linalg.inv(into.matrices), dtype=np.float64))
+    others = [
+        (given.position, np.roll(given.quaternion_xyzw, -1, axis=1)),
+        (into.position, into.quaternion_xyzw),
+    ]
+    if np.linalg.norm(given.position) > _ROOM_M:
+        others.append((given.position / 1000.0, given.quaternion_xyzw))
+    for position, quaternion in others:
+        pose = Poses(position, quaternion)
+        row = ",".join(f"{number + 0.0:.9g}" for number in np.round(pose.rows[0], 9))
+        yield f"--object-pose={row}", replace(placing, into_object=np.linalg.inv(pose.matrices[0]))
 
 
 def _turned(placing: Placing, target: Target) -> Iterator[tuple[str, Placing]]:
@@ -275,16 +313,15 @@ def _turned(placing: Placing, target: Target) -> Iterator[tuple[str, Placing]]:
     frames = [placing.frame]
     if "tool" in frames_of(target.gripper):
         frames += [name for name in ("base", "tool", "flange") if name in frames_of(target.gripper)]
-    axes = [placing.convention, *CONVENTIONS]
     seen: list[Floats] = [placing.fixed]
     for frame in dict.fromkeys(frames):
-        for convention in axes:
+        for convention in (placing.convention, *_AXES):
             fixed = to_tool(frame, convention, target.gripper)
             if any(np.allclose(fixed, other) for other in seen):
                 continue
             seen.append(fixed)
             flags = [f"--frame {frame}"] if frame != placing.frame else []
-            if not np.allclose(to_graspdb(convention), to_graspdb(placing.convention)):
+            if convention != placing.convention:
                 flags.append(f"--convention {convention}")
             yield " ".join(flags), replace(placing, frame=frame, convention=convention, fixed=fixed)
 
@@ -293,7 +330,9 @@ def _share(placed: _Placed) -> str:
     closed = placed.closings() if placed.fits.mean() >= 0.3 else None
     if closed is not None:
         good = closed[0] & closed[1]
-        return f"{int(good.sum()):,} of {len(good):,} close on it without colliding"
+        return (
+            f"{int(good.sum()):,} of {len(good):,} close on it, the middles of fingers and palm clear of it"
+        )
     return f"{int(placed.fits.sum()):,} of {len(placed.fits):,} have their fingertips there and point at it"
 
 

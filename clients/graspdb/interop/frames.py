@@ -10,10 +10,8 @@ import numpy as np
 from graspdb.interop.grasps import Floats
 from graspdb.poses import Poses, matrices
 from graspdb.wire import CONVENTIONS, Convention, GripperProfile, Pose
-from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING
+from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING, OWN_AXES
 
-#: Conventions that are of a gripper's base.
-_OF_EVERY_BASE = ("acronym", "graspgen")
 _AXES = re.compile(r"([+-]?)([xyz])/([+-]?)([xyz])")
 
 
@@ -47,9 +45,10 @@ def frames_of(gripper: GripperProfile | None) -> dict[str, Pose]:
 def to_tool(frame: str, convention: str, gripper: GripperProfile | None) -> Floats:
     """The fixed pose (4, 4) on the right of a pose of ``frame`` with the axes of ``convention``.
 
-    ACRONYM and GraspGen say of every gripper's base that z approaches and x closes, whatever axes its
-    description gives that: theirs are at the base's origin along the tool's. ValueError, saying what to give,
-    where the gripper lacks the frame or the way to its tool.
+    As on the service: ``graspdb`` and ``moveit`` are the frame's own axes, any other says which axes of the
+    pose approach and close, whatever axes the gripper's description gives the frame (ACRONYM and GraspGen say
+    so of every base). ValueError, saying what to give, where the gripper lacks the frame or the way to its
+    tool.
     """
     fixed = np.eye(4)
     fixed[:3, :3] = to_graspdb(convention)
@@ -67,7 +66,7 @@ def to_tool(frame: str, convention: str, gripper: GripperProfile | None) -> Floa
             " its profile base_to_tool (graspdb grippers update), or poses of the tool (--frame tool)"
         )
     origin, tool = _matrix(frames[frame]), _matrix(frames["tool"])
-    if frame == "base" and convention in _OF_EVERY_BASE:
+    if convention not in OWN_AXES:
         origin[:3, :3] = tool[:3, :3]
     back: Floats = np.asarray(np.linalg.inv(origin), dtype=np.float64)
     way: Floats = fixed @ back @ tool

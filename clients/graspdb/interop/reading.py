@@ -25,6 +25,8 @@ from graspdb.options import Option, Vector, known_keywords
 from graspdb.poses import as_vector7, matrices
 from graspdb.wire import CONVENTIONS, GripperInfo, GripperProfile
 from graspdb.wire.base import MAX_QUALITIES
+from graspdb.wire.frames.conventions import OWN_AXES
+from graspdb.wire.frames.gripper_frames import TOOL
 
 #: Limits of a quality's number and of its name.
 _LARGEST, _LONGEST = 1e9, 64
@@ -165,7 +167,8 @@ class ReadOptions(TypedDict, total=False):
     - ``format``: ``auto``, or one of :data:`FORMATS`.
     - ``frame``: which frame of the gripper its poses are of; by default the format's own.
     - ``convention``: which axes approach and close: a name of :data:`graspdb.wire.CONVENTIONS`, or
-      the axes themselves, as in ``z/x``. ``graspdb`` are the frame's own, as the gripper's profile has them.
+      the axes themselves, as in ``z/x``. ``graspdb`` and ``moveit`` are the frame's own, as the gripper's
+      profile has them.
     - ``unit``, ``scale``: positions are in this unit, and are multiplied.
     - ``columns``: of a table, ``{"position": "px:py:pz", "quaternion_wxyz": "q", "quality.force": "f"}`` or
       the same as text; ``quaternion_order`` whatever their names say.
@@ -304,8 +307,8 @@ def _settled(
         raise problem(
             source.name,
             f"is {kind.name}, which does not say {told}: give {' and '.join(missing)} (conventions are"
-            " graspdb: z approaches and y closes, as in the gripper's own frames; acronym: z and x; graspnet:"
-            f" x and y; or the axes themselves, as in z/x{frames})",
+            " graspdb: the frame's own axes, as the gripper's profile has them; acronym: z approaches and x"
+            f" closes; graspnet: x and y; or the axes themselves, as in z/x{frames})",
         )
     chosen, axes = frame or kind.frame, convention or kind.convention
     assert chosen is not None
@@ -322,7 +325,12 @@ def _settled(
         assumed.append(f"poses {what}, the format's own")
     if convention is None:
         approach, closing = _letters(axes)
-        assumed.append(f"{approach} approaches and {closing} closes, the format's own")
+        own = axes in OWN_AXES and chosen not in (TIPS, TOOL)
+        assumed.append(
+            f"the own axes of the gripper's {chosen}, as its profile has them"
+            if own
+            else f"{approach} approaches and {closing} closes, the format's own"
+        )
     if kind.assumed and convention is None:
         assumed.append(kind.assumed)
     return chosen, axes

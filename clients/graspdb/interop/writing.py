@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Unpack
 
-from graspdb.interop.frames import follow, frames_of, to_graspdb, to_tool
+from graspdb.interop.frames import follow, frames_of, to_tool
 from graspdb.interop.grasps import FileGrasps, Floats, Report
 from graspdb.interop.writers import matrices, messages, rosbags, tables
 from graspdb.interop.writers.content import Content
@@ -114,7 +114,8 @@ def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Wri
             " flange: say which of its frames that link is (--frame base, or another)"
         )
     report.frame, report.convention = chosen, axes
-    fixed = np.asarray(np.linalg.inv(to_tool(chosen, axes, profile)), dtype=np.float64)
+    way = to_tool(chosen, axes, profile)
+    fixed = np.asarray(np.linalg.inv(way), dtype=np.float64)
     if writer.folder and target.exists():
         raise ValueError(f"{target} exists already: a bag is a folder of its own")
 
@@ -127,7 +128,7 @@ def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Wri
                 chosen,
                 axes,
                 # The approach is z of ours: what that is in the axes that are written.
-                to_graspdb(axes)[:, 2],
+                way[:3, 2],
                 run.outcomes,
                 run.qualities,
                 run.more,

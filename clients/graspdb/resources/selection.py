@@ -58,8 +58,9 @@ class PoseFrame(TypedDict, total=False):
     """What poses are of, those that are given and those that are answered.
 
     ``frame`` is a frame of the gripper by its name: ``base``, ``flange`` or another of its profile's
-    ``frames``, by default ``tool``. ``convention`` renames its axes: ``acronym`` and ``graspgen`` approach
-    along z and close along x, ``graspnet`` along x and y, ``graspdb``, ``vgn`` and ``moveit`` along z and y.
+    ``frames``, by default ``tool``. ``convention`` says along which of their axes they approach and
+    close: ``acronym`` and ``graspgen`` z and x, ``graspnet`` x and y, ``vgn`` z and y; ``graspdb`` (the
+    default) and ``moveit`` are the frame's own axes.
     Grasps and samples that came in another frame say so themselves where they are given back.
     """
 

@@ -112,7 +112,7 @@ class GripperProfile(Request):
         return self
 
     def in_tool(self, frame: str, convention: Convention = "graspdb") -> Pose:
-        """Pose of a frame of the gripper, its axes renamed by a convention, in the tool frame.
+        """Pose of a frame of the gripper, with the axes that a convention says, in the tool frame.
 
         NoSuchFrame; ToolUnknown where no other frame than the tool can be used.
         """

@@ -15,9 +15,9 @@ ASKED_FRAME = (
     " its ``frames`` by name; by default ``tool``."
 )
 ASKED_CONVENTION = (
-    "Whose axes these poses have: ``acronym`` and ``graspgen`` approach along z and close along x,"
-    " ``graspnet`` along x and y, the others along z and y. It renames the axes of ``frame`` and moves no"
-    " origin; by default ``graspdb``."
+    "Along which of their axes these poses approach and close: ``acronym`` and ``graspgen`` along z and x,"
+    " ``graspnet`` along x and y, ``vgn`` along z and y; ``graspdb`` (the default) and ``moveit`` are the own"
+    " axes of ``frame``, in the tool frame z and y. It moves no origin."
 )
 
 ASKED_NEAR = (

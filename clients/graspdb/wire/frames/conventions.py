@@ -1,7 +1,8 @@
-"""Conventions: which axes of a gripper's frame are the approach and the closing direction.
+"""Conventions: along which of a pose's axes a gripper approaches and closes.
 
-GraspDB's are z and y. A pose that comes with the axes of another convention becomes one with GraspDB's by a
+The tool's are z and y. A pose that comes with the axes of another convention becomes one with the tool's by a
 fixed rotation on the right, :func:`to_graspdb`, and goes back by its transpose; origins stay where they are.
+A convention says the axes whatever frame's origin a pose has, but for those of :data:`OWN_AXES`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ APPROACH_AND_CLOSING: dict[Convention, str] = {
     # Of MoveIt Grasps; the message itself says nothing of axes.
     "moveit": "zy",
 }
-"""The axis of approach and that in which the fingers close, of each convention."""
+"""The axis of approach and that in which the fingers close, of each convention; in the tool frame."""
+
+OWN_AXES: tuple[Convention, ...] = ("graspdb", "moveit")
+"""Conventions that leave each frame its own axes, as the gripper's profile has them."""
 
 Rotation = tuple[Triple, Triple, Triple]
 

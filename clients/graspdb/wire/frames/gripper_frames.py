@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import Field
 
 from graspdb.wire.base import Pose, Quadruple, Triple
-from graspdb.wire.frames.conventions import Convention, axes_in_graspdb
+from graspdb.wire.frames.conventions import OWN_AXES, Convention, axes_in_graspdb
 
 FrameName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9._-]{0,63}$")]
 """The name of a frame: letters, digits, ``.``, ``_``, ``-``; at most 64 characters."""
@@ -55,7 +55,7 @@ def completed(frames: Mapping[str, Pose], base_to_tool: Pose | None) -> dict[str
 
 
 def in_tool(frames: Mapping[str, Pose], frame: str, convention: Convention = "graspdb") -> Pose:
-    """The pose of a gripper's frame, its axes renamed by a convention, in the tool frame.
+    """The pose in the tool frame of a gripper's frame, or of its origin with the axes that a convention says.
 
     ``frames`` are poses in the gripper's base. NoSuchFrame names those there are; ToolUnknown for any but
     ``tool`` where that is not among them.
@@ -68,7 +68,8 @@ def in_tool(frames: Mapping[str, Pose], frame: str, convention: Convention = "gr
         raise NoSuchFrame(f"the gripper has no frame {frame!r}; it has {there_are}")
     if TOOL not in frames:
         raise ToolUnknown(f"where the tool is in the gripper's base is not known, so {frame!r} can't be used")
-    return compose(compose(inverse(frames[TOOL]), frames[frame]), inner)
+    own = compose(inverse(frames[TOOL]), frames[frame])
+    return own if convention in OWN_AXES else _pose(own.position, inner.quaternion_xyzw)
 
 
 def compose(outer: Pose, inner: Pose) -> Pose:

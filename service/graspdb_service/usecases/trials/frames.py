@@ -50,7 +50,7 @@ class AskedFrame:
 def into_tool(tx: Tx, batch: TrialBatch, asked: AskedFrame) -> tuple[TrialBatch, list[int]]:
     """Trials of a request, each brought to the tool frame of its gripper, which is the version that it stands
     for now; 422 for trials that name no gripper, or none there is. Also those places of its provenances whose
-    frame is turned against the tool, where a convention renamed its axes.
+    frame is turned against the tool, where a convention says other axes than its own.
     """
     if asked.is_tool:
         return batch, []

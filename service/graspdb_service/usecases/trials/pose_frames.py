@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import Convention, GripperProfile, Pose
 from graspdb.wire.base import Quadruple
-from graspdb.wire.frames.conventions import APPROACH_AND_CLOSING
+from graspdb.wire.frames.conventions import OWN_AXES
 from graspdb.wire.frames.gripper_frames import (
     IDENTITY,
     TOOL,
@@ -41,8 +41,8 @@ NO_TWINS = (
 class PoseFrame:
     """A frame of a gripper with the axes of a convention; ``fixed`` is its pose in the tool frame, None where
     it is the tool frame itself. ``near`` is the rotation of it, in the object frame, that of two twins the
-    nearer one is wanted to; None where they are not chosen between. ``turned``: its axes, which the
-    convention renames, are turned against the tool's.
+    nearer one is wanted to; None where they are not chosen between. ``turned``: its axes are turned
+    against the tool's, and the convention says others than its own.
     """
 
     frame: str = TOOL
@@ -133,8 +133,7 @@ def pose_frame(
     else:
         try:
             fixed = profile.in_tool(named, axes)
-            renamed = APPROACH_AND_CLOSING[axes] != APPROACH_AND_CLOSING["graspdb"]
-            turned = named != TOOL and renamed and _angle(profile.in_tool(named)) > _ALIGNED
+            turned = named != TOOL and axes not in OWN_AXES and _turned(profile.in_tool(named), fixed)
         except NoSuchFrame as error:
             way_out = f"{error}: PUT /grippers/{_id(gripper)} with it in frames adds one"
             raise invalid("frame", way_out) from None
@@ -149,14 +148,21 @@ def pose_frame(
     warnings = []
     if turned:
         warnings = [
-            f"convention={axes} renames the axes of {named!r}, which are turned against the tool's: name a"
-            " frame with the tool's axes there (frames of the gripper) if those are meant"
+            f"convention={axes} says which axes approach and close, and the own axes of {named!r}, which are"
+            " turned against the tool's, are not used: leave it out if they are meant"
         ]
     return PoseFrame(named, axes, fixed, warnings, turned=turned)
 
 
 def _id(gripper: str | None) -> str:
     return "{gripper}" if gripper is None else gripper.partition("@")[0]
+
+
+def _turned(own: Pose, said: Pose) -> bool:
+    """Whether a frame, as it is in the tool frame, is turned against it, and against what is said instead."""
+    x, y, z, w = said.quaternion_xyzw
+    apart = Pose.model_construct(position=(0.0, 0.0, 0.0), quaternion_xyzw=(-x, -y, -z, w))
+    return _angle(own) > _ALIGNED and _angle(compose(apart, own)) > _ALIGNED
 
 
 def _angle(pose: Pose) -> float:

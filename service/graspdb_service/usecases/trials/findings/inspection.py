@@ -94,8 +94,8 @@ def inspect(
 
 
 def turned_frames(batch: TrialBatch, places: Iterable[int], convention: str | None) -> list[Concern]:
-    """What a convention may have meant otherwise: trials of these provenances came in a frame whose axes are
-    turned against the tool's.
+    """What a convention may have meant otherwise: trials of these provenances came in a frame whose own axes
+    are turned against the tool's and are not those of the convention.
     """
     found = []
     for place in places:

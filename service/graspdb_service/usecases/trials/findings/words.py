@@ -80,10 +80,10 @@ _WORDS = {
         "Check unit and frame of these trials. With a mesh the object's size tells what is possible",
     ),
     "turned-frame": _Words(
-        "{of} came in a frame that is turned against the tool, and convention={detail} renamed the axes of"
-        " that frame as it is",
-        "Leave the convention out if the poses are of the frame as the gripper's profile has it, or name a"
-        " frame with the tool's axes there (frames of the gripper) if those are meant",
+        "{of} came in a frame that is turned against the tool, and with convention={detail}, which says other"
+        " axes than that frame's own",
+        "Leave the convention out, delete the batch and post them again if the poses are of the frame as the"
+        " gripper's profile has it",
     ),
     "posted-before": _Words(
         "{of} equal rows that were posted before, in pose, outcome, width, quality and time",
