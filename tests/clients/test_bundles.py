@@ -75,7 +75,7 @@ def _fill(db: Client, count: int = 60) -> None:
         width_m=0.04,
         pose_covariance=np.eye(6) * 1e-6,
         metadata=[{"i": i} if i % 7 == 0 else None for i in range(count)],
-        achieved_poses=[poses[0] if i == 4 else None for i in range(count)],
+        achieved_poses=[poses[0] if i in (4, 7) else None for i in range(count)],
         licence="CC-BY-NC-4.0",
         citation="Doe 2020",
         origin={"file": "mug.h5", "format": "acronym", "sha256": "ab" * 32},
@@ -83,7 +83,8 @@ def _fill(db: Client, count: int = 60) -> None:
     db.grippers.update("mine", **{**MINE, "force_n": 20.0})
     mug.trials.add(poses + np.eye(7)[0] * 0.001, True, gripper="mine", quality=0.5, metadata={"run": 2})
     mug.trials.add(poses[:3], False)
-    mug.trials.withdraw(2, reason="seen on the video")
+    # One with an achieved pose and metadata of its own.
+    mug.trials.withdraw(8, reason="seen on the video")
     mug.trials.withdraw(2 * count + 3)
     db.kernels.fit("mug", gripper="mine", protocol="lift")
     db.objects.create("plain", name="without a mesh", friction=0.4)
@@ -113,6 +114,9 @@ def test_another_database_takes_it_in_whole(here: Client, there: Client, tmp_pat
     assert (made.trials, made.batches) == (123, 3)
 
     assert _trials(there, "mug") == _trials(here, "mug")
+    (withdrawn, _) = there.objects.get("mug").trials.list(withdrawn=True)
+    assert withdrawn.achieved_pose is not None
+    assert (withdrawn.withdrawn, withdrawn.metadata) == (True, {"i": 7})
     before, after = here.objects.get("mug").info, there.objects.get("mug").info
     kept = {
         "name",

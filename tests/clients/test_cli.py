@@ -10,12 +10,14 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
 import trimesh
+import typer
 
+from graspdb.cli import TABLE, app
 from graspdb.options import Corners
 from graspdb.resources.kernels import KernelOptions
 from graspdb.resources.objects import ObjectProperties
@@ -24,6 +26,26 @@ from graspdb.resources.sweeps import SweepOptions
 from graspdb.resources.trials import TrialFilters, Upload
 
 Run = Callable[..., tuple[int, str, str]]
+
+
+def test_the_help_of_all_says_of_each_what_it_says_itself(run: Run) -> None:
+    group: Any = typer.main.get_command(app)
+    assert list(group.commands) == list(TABLE)
+    for name, command in group.commands.items():
+        assert TABLE[name].help == command.get_short_help_str(1_000), name
+    _, out, _ = run("--help")
+    assert " ".join(TABLE["import"].help.split()) in " ".join(out.split())
+
+
+def test_a_command_imports_no_other() -> None:
+    program = "import sys; sys.argv = ['graspdb', '--help']; import atexit; from graspdb.cli import main\n"
+    program += (
+        "atexit.register(lambda: print([m for m in ('numpy', 'pydantic', 'httpx') if m in sys.modules]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\nmain()"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +15,9 @@ import trimesh
 
 import foreign_files as files
 from graspdb import Client, interop
+from graspdb.errors import Unreachable
 from graspdb.resources.objects import GraspObject
+from graspdb.transport import Transport
 
 Run = Callable[..., tuple[int, str, str]]
 RADIUS_M, HEIGHT_M = 0.03, 0.2
@@ -181,6 +184,71 @@ def test_files_are_one_import_and_pieces_are_batches(
     assert can.trials.list().arrays().matrices == pytest.approx(tools, abs=1e-9)
 
 
+def test_the_same_import_again_stores_nothing_twice(
+    db: Client, run: Run, fresh_id: str, acronym: str
+) -> None:
+    can = _can(db, fresh_id)
+    arguments = ("import", acronym, "--object", fresh_id, "--gripper", "panda")
+    assert run(*arguments, "--chunk", "25")[0] == 0
+    # Said at more length, it is the same.
+    code, out, err = run(*arguments, "--chunk", "25", "--format", "acronym", "--frame", "base")
+    assert code == 0, err
+    assert "0 trials stored, 60 were already stored, in batch" in out
+    for other in (("--chunk", "30"), ("--chunk", "25", "--licence", "BSD")):
+        code, _, err = run(*arguments, *other)
+        assert code == 1
+        assert "imported before" in err
+        assert "store all anew with --again" in " ".join(err.split())
+    assert can.refresh().info.trials == 60
+    # Read otherwise it is another import.
+    assert run(*arguments, "--unit", "m", "--scale", "1.001")[0] == 0
+    code, out, err = run(*arguments, "--chunk", "25", "--again")
+    assert code == 0, err
+    assert "60 trials stored, in batch" in out
+    assert can.refresh().info.trials == 180
+
+
+def test_a_named_key_holds_whatever_the_chunk_is(db: Client, run: Run, fresh_id: str, acronym: str) -> None:
+    can = _can(db, fresh_id)
+    arguments = ("import", acronym, "--object", fresh_id, "--gripper", "panda", "--idempotency-key", "mine")
+    assert run(*arguments)[0] == 0
+    code, _, err = run(*arguments, "--chunk", "7")
+    assert code == 1
+    assert "with another body" in err
+    assert can.refresh().info.trials == 60
+
+
+def test_an_import_that_is_broken_off_says_what_is_stored_and_goes_on(
+    db: Client, run: Run, fresh_id: str, acronym: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    can = _can(db, fresh_id)
+    arguments = ("import", acronym, "--object", fresh_id, "--gripper", "panda", "--chunk", "20")
+    sent = Transport.model
+    broken: list[BaseException] = [KeyboardInterrupt(), Unreachable("no answer")]
+    posted: list[str] = []
+
+    def breaks(self: Transport, model: Any, method: str, path: str, **options: Any) -> Any:
+        answer = sent(self, model, method, path, **options)
+        if method == "POST" and path.endswith("/trials"):
+            posted.append(path)
+            if len(posted) in (2, 4):
+                raise broken.pop(0)
+        return answer
+
+    monkeypatch.setattr(Transport, "model", breaks)
+    for code, of in ((130, "the second answer, by Ctrl-C"), (1, "the second answer, that was lost")):
+        ended, _, err = run(*arguments)
+        told = " ".join(err.split())
+        assert ended == code, (of, err)
+        assert f"The 20 trials before are stored, in batches {next(iter(can.batches)).batch}." in told
+        assert "Whether trials 20 to 39 are stored, too, is not known." in told
+        assert "run the same import again" in told
+    code, out, err = run(*arguments)
+    assert code == 0, err
+    assert "20 trials stored, 40 were already stored" in out
+    assert can.refresh().info.trials == 60
+
+
 def test_a_file_that_ends_badly_stores_nothing(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
     can = _can(db, fresh_id)
     row = {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1], "outcome": True}
@@ -191,6 +259,30 @@ def test_a_file_that_ends_badly_stores_nothing(db: Client, run: Run, fresh_id: s
     assert code == 1
     assert "grasp 50 has a position that is not finite" in err
     assert can.refresh().info.trials == 0
+
+
+def test_a_frame_id_of_the_object_or_its_frames_places_the_poses(
+    db: Client, run: Run, fresh_id: str, tmp_path: Path
+) -> None:
+    tools = _about_the_can(5)
+    marker = np.eye(4)
+    marker[:3, :3], marker[:3, 3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]], [0.1, 0.0, 0.02]
+    mesh = trimesh.creation.cylinder(RADIUS_M, HEIGHT_M)
+    can = db.objects.create(fresh_id, mesh=mesh, frames={"marker": marker})
+    told = ("--object", fresh_id, "--gripper", "panda", "--frame", "tool", "--outcome", "success")
+    seen = np.linalg.inv(marker) @ tools
+    for name, poses in {fresh_id: tools, "marker": seen}.items():
+        path = files.moveit(tmp_path / f"{name}.json", poses, [1] * 5, frame_id=name)
+        code, out, err = run("import", path, *told)
+        assert code == 0, err
+        assert f"poses in {name}, which is the object's" in out
+    found = can.trials.list().arrays().matrices
+    assert found == pytest.approx(np.concatenate([tools, tools]), abs=1e-9)
+    path = files.moveit(tmp_path / "other.json", tools, [1] * 5, frame_id="camera")
+    code, _, err = run("import", path, *told)
+    assert code == 1
+    assert "poses in camera" in err
+    assert "--object-pose" in err
 
 
 def test_without_a_mesh_there_is_nothing_to_compare(

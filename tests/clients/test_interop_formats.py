@@ -620,6 +620,15 @@ def test_joints_values_are_kept_and_tell_the_opening(
     interop.write(tmp_path / "b.yaml", found, format="isaac", gripper=sliding)
     again = interop.read(tmp_path / "b.yaml", gripper=sliding, **frame)
     assert again.more["metadata"] == found.more["metadata"]
+    # Closed, as it is written where no width is known, is what the jaw is told: its width stays unknown.
+    for name in ("c.yaml", "c.json"):
+        kind = "isaac" if name == "c.yaml" else "moveit"
+        interop.write(
+            tmp_path / name, tools, outcomes=[True] * len(tools), format=kind, gripper=sliding, frame="base"
+        )
+        closed = interop.read(tmp_path / name, format=kind, gripper=sliding, outcome="success", **frame)
+        assert "width_m" not in closed.more
+        assert any("closed is a command, not a width" in told for told in closed.report.dropped)
     # Where the profile has no joints, or swinging ones, an opening is not made up.
     swinging = panda.model_copy(update={"joints": {"panda_finger_joint1": JointValues(open=0.0, closed=0.8)}})
     for gripper in (panda, swinging):

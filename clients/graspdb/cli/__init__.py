@@ -2,36 +2,175 @@
 
 Data goes to standard output, progress and messages to standard error. Errors are one message and exit
 code 1; a wrong command line is exit code 2.
+
+Commands are in a table by the names of their modules, which are imported when a command is wanted: most of
+what a run of one command costs would otherwise be the import of all the others.
 """
 
 from __future__ import annotations
 
+import importlib
 import sys
-from typing import Annotated
+from collections.abc import Iterator, MutableMapping
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import typer
-from rich.markup import escape
+import typer.core
 
 from graspdb import __version__
-from graspdb.agents.command import mcp
-from graspdb.cli import access, answers, kernels, objects, queries, reports, sweeps, trials
-from graspdb.cli.common import ERRORS, State
-from graspdb.cli.drawing.frames import frames
-from graspdb.cli.drawing.view import view
-from graspdb.cli.exchange import bundle
-from graspdb.cli.exchange.exporting import export
-from graspdb.cli.exchange.importing import import_files
-from graspdb.cli.grippers import making
-from graspdb.cli.options import Commands
-from graspdb.cli.wording import in_commands
-from graspdb.demo import demo
-from graspdb.errors import GraspDBError
-from graspdb.processes import LIFELINE_HELP
 
-__all__ = ["app", "main"]
+__all__ = ["TABLE", "Entry", "app", "main"]
 
-app = Commands(
+
+@dataclass(frozen=True)
+class Entry:
+    """A command, or a group of them: what the help of all says of it, and where it is (``module:name``);
+    ``epilog`` is where the text is that ends its own help.
+    """
+
+    help: str
+    place: str
+    epilog: str | None = None
+
+
+#: By the words on the command line, in the order of the help.
+TABLE = {
+    "objects": Entry("Create, list, show and delete objects.", "graspdb.cli.objects:objects"),
+    "add-example": Entry(
+        "Add the paper's objects, with mesh and convex parts.", "graspdb.cli.objects:add_example"
+    ),
+    "grippers": Entry(
+        "Create, list, show and delete gripper profiles.", "graspdb.cli.grippers.making:grippers"
+    ),
+    "frames": Entry(
+        "Draw a gripper and its frames, and where a grasp of --frame in the object's frame puts it.",
+        "graspdb.cli.drawing.frames:frames",
+    ),
+    "trials": Entry("Add and list grasp trials.", "graspdb.cli.trials:trials"),
+    "batches": Entry("List and delete what arrived together.", "graspdb.cli.trials:batches"),
+    "import": Entry(
+        "Store the grasps of files in the formats of other projects, after a first look at them.",
+        "graspdb.cli.exchange.importing:import_files",
+    ),
+    "export": Entry(
+        "Write best grasps, samples of the density or trials in a format of the field.",
+        "graspdb.cli.exchange.exporting:export",
+    ),
+    "bundle": Entry(
+        "Save objects with mesh, parts, trials, grippers and kernels to one file, or take such a file in.",
+        "graspdb.cli.exchange.bundle:bundle",
+    ),
+    "keys": Entry("Make, list, rotate and revoke API keys.", "graspdb.cli.access:keys"),
+    "audit": Entry(
+        "Show what was changed and which key did it, the newest first.", "graspdb.cli.access:audit"
+    ),
+    "density": Entry(
+        "Show an object's grasp density: kernel, widths, counts, effective sample size.",
+        "graspdb.cli.queries:density",
+    ),
+    "best-grasp": Entry("Find the best grasp within constraints.", "graspdb.cli.queries:best_grasp"),
+    "likelihood": Entry("Say how likely grasps are.", "graspdb.cli.queries:likelihood"),
+    "samples": Entry("Draw grasps from an object's density.", "graspdb.cli.queries:samples"),
+    "proposals": Entry(
+        "Draw grasps to try next; their proposal_density goes back with the trials.",
+        "graspdb.cli.queries:proposals",
+    ),
+    "answers": Entry("Answers that the service keeps, by id or name.", "graspdb.cli.answers:answers"),
+    "report": Entry(
+        "Report on an object's trials: where grasps succeed, tolerances, enough of them, calibration,"
+        " sources.",
+        "graspdb.cli.reports:report",
+    ),
+    "kernels": Entry("Stored kernels.", "graspdb.cli.kernels:kernels"),
+    "sweep": Entry(
+        "Have workers simulate grasps of an object: the whole grid, or what the options say.",
+        "graspdb.cli.sweeps:sweep",
+    ),
+    "sweeps": Entry("List, show, cancel and retry sweeps.", "graspdb.cli.sweeps:sweeps"),
+    "workers": Entry("List the simulation workers.", "graspdb.cli.sweeps:workers"),
+    "info": Entry("Show the service's versions and limits.", "graspdb.cli.sweeps:info"),
+    "mcp": Entry(
+        "Let an agent ask: a server of the Model Context Protocol, with the key of --api-key.",
+        "graspdb.agents.command:mcp",
+    ),
+    "view": Entry(
+        "Look at an object, its grasps and trials in a browser, and drag constraints about (extra `view`).",
+        "graspdb.cli.drawing.view:view",
+        "graspdb.processes:LIFELINE_HELP",
+    ),
+    "demo": Entry(
+        "From nothing to a best grasp: service, worker, real physics, density, queries and a check of them.",
+        "graspdb.demo:demo",
+    ),
+}
+
+
+def _loaded(place: str) -> Any:
+    """What a module has under a name, ``module:name``."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+class _Loading(MutableMapping[str, Any]):
+    """The table's commands by name, each made when it is asked for."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._made:
+            self._made[name] = _made(name, TABLE[name])
+        return self._made[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._made[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(TABLE)
+
+    def __len__(self) -> int:
+        return len(TABLE)
+
+
+def _made(name: str, entry: Entry) -> Any:
+    commands = _loaded("graspdb.cli.options:Commands")(rich_markup_mode=None, pretty_exceptions_enable=False)
+    found = _loaded(entry.place)
+    if isinstance(found, typer.Typer):
+        commands.add_typer(found, name=name)
+    else:
+        commands.command(name, epilog=entry.epilog and _loaded(entry.epilog))(found)
+    return typer.main.get_group(commands).commands[name]
+
+
+class _Commands(typer.core.TyperGroup):
+    """The program: its help needs no command."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = _Loading()
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; one that is interrupted tells what it left, and how to go on."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stopped:
+            if hasattr(stopped, "__notes__") and _loaded("graspdb.cli.wording:tell_notes")(stopped):
+                raise typer.Exit(130) from None
+            raise
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the table's words of each."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, entry.help) for name, entry in TABLE.items()])
+
+
+app = typer.Typer(
     name="graspdb",
+    cls=_Commands,
     help="GraspDB: grasp trials in; densities, best grasps and their likelihood out.",
     no_args_is_help=True,
     add_completion=False,
@@ -65,48 +204,15 @@ def settings(
     ] = False,
 ) -> None:
     """GraspDB: grasp trials in; densities, best grasps and their likelihood out."""
-    context.obj = State(context, url, api_key, json)
-
-
-app.add_typer(objects.objects, name="objects")
-app.command("add-example")(objects.add_example)
-objects.grippers.command("from-urdf")(making.from_urdf)
-objects.grippers.command("explain")(making.explain)
-app.add_typer(objects.grippers, name="grippers")
-app.command("frames")(frames)
-app.add_typer(trials.trials, name="trials")
-app.add_typer(trials.batches, name="batches")
-app.command("import")(import_files)
-app.command("export")(export)
-app.add_typer(access.keys, name="keys")
-app.command("audit")(access.audit)
-app.command("density")(queries.density)
-app.command("best-grasp")(queries.best_grasp)
-app.command("likelihood")(queries.likelihood)
-app.command("samples")(queries.samples)
-app.command("proposals")(queries.proposals)
-app.add_typer(answers.answers, name="answers")
-app.command("report")(reports.report)
-app.add_typer(kernels.kernels, name="kernels")
-app.command("sweep")(sweeps.sweep)
-app.add_typer(sweeps.sweeps, name="sweeps")
-app.command("workers")(sweeps.workers)
-app.command("info")(sweeps.info)
-app.command("bundle")(bundle.bundle)
-app.command("mcp")(mcp)
-app.command("view", epilog=LIFELINE_HELP)(view)
-app.command("demo")(demo)
+    context.obj = _loaded("graspdb.cli.common:State")(context, url, api_key, json)
 
 
 def main() -> None:
     """Entry point of the ``graspdb`` command."""
     try:
         app(prog_name="graspdb")
-    except (GraspDBError, ValueError, ImportError, OSError) as error:
-        # TimeoutError is an OSError. Anything else is a bug, and a traceback is what helps then.
-        notes = getattr(error, "__notes__", [])
-        message = in_commands(str(error))
-        ERRORS.print(f"[bold red]Error:[/] {escape(message)}", highlight=False, soft_wrap=True)
-        for note in notes:
-            ERRORS.print(escape(in_commands(note)), highlight=False, soft_wrap=True)
+    except Exception as error:
+        if not _loaded("graspdb.cli.wording:told")(error):
+            # A bug: a traceback is what helps.
+            raise
         sys.exit(1)

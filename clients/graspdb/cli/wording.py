@@ -11,7 +11,11 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rich.markup import escape
+
+from graspdb.cli.common import ERRORS
 from graspdb.cli.options import option_names
+from graspdb.errors import GraspDBError
 from graspdb.reports import (
     AnisotropyOptions,
     ConvergenceOptions,
@@ -140,3 +144,22 @@ def _option(found: re.Match[str]) -> str:
 
 def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
+
+
+def told(error: Exception) -> bool:
+    """Whether an error is one to tell a person in words, which is done then; anything else is a bug."""
+    # TimeoutError is an OSError.
+    if not isinstance(error, (GraspDBError, ValueError, ImportError, OSError)):
+        return False
+    message = in_commands(str(error))
+    ERRORS.print(f"[bold red]Error:[/] {escape(message)}", highlight=False, soft_wrap=True)
+    tell_notes(error)
+    return True
+
+
+def tell_notes(error: BaseException) -> bool:
+    """Tell what an error notes besides; whether there is anything."""
+    notes = getattr(error, "__notes__", [])
+    for note in notes:
+        ERRORS.print(escape(in_commands(note)), highlight=False, soft_wrap=True)
+    return bool(notes)

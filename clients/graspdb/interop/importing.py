@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import uuid
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import Unpack
 
+from graspdb.errors import GraspDBError, add_note
 from graspdb.interop.first_look import FirstLook, first_look, gathered, target_of
 from graspdb.interop.grasps import FileGrasps, Report, joined, problem, together
 from graspdb.interop.reading import Reading, ReadOptions, opened
@@ -20,6 +23,20 @@ from graspdb.resources.trials import CHUNK_TRIALS, Receipt, Sending
 from graspdb.wire import GripperInfo
 
 _LOOKED_AT = 2_000
+_SAME_AGAIN = "To go on, run the same import again: what is stored already is not stored twice."
+#: What a refused key means of the key that an import has by itself.
+_NOT_THE_SAME = {
+    "idempotency-key-reused": (
+        "These files were imported before, read alike, about this object and gripper, but told otherwise:"
+        " another name, source, protocol, licence, citation or chunk, or by another version. Repeat it as it"
+        " was told then and nothing is stored twice, or store all anew with ?again=true (on the command line"
+        " --again)."
+    ),
+    "idempotency-key-revoked": (
+        "These files were imported before, and a batch of it was deleted: store all anew with ?again=true"
+        " (on the command line --again)."
+    ),
+}
 
 
 class Import:
@@ -38,7 +55,7 @@ class Import:
     ) -> None:
         if not files:
             raise ValueError("give at least one file")
-        self._item, self._gripper = item, gripper
+        self._item, self._gripper, self._options = item, gripper, options
         self._readings = [opened(file, gripper, _frames_of(item), **options) for file in files]
         reports = [_read_through(reading) for reading in self._readings]
         self.report = together(reports)
@@ -61,23 +78,60 @@ class Import:
         protocol: str | None = None,
         licence: str | None = None,
         citation: str | None = None,
+        again: bool = False,
         **upload: Unpack[Sending],
     ) -> Receipt:
         """Store all of it, in batches of ``chunk`` trials; ``source``, ``protocol``, ``licence`` and
         ``citation`` are of all of them.
+
+        The same import once more, of the same files, read alike, about the same object and gripper, stores
+        nothing twice, and so goes on where it broke off; what it is of (``source`` and the others) and
+        ``chunk`` must be the same then (InvalidInput). ``again`` stores all of it anew.
         """
         chunk = upload.pop("chunk", CHUNK_TRIALS)
+        if chunk < 1:
+            raise ValueError("chunk must be at least 1")
+        given = upload.pop("idempotency_key", None)
+        if given is not None and again:
+            raise ValueError("again stores all anew, idempotency_key nothing twice: give one of them")
+        own = given is None and not again
+        upload["idempotency_key"] = self._key() if own else given or str(uuid.uuid4())
         about = {"source": source, "protocol": protocol, "gripper": self._gripper_name()}
         about = {name: value for name, value in about.items() if value is not None}
-        return self._item.trials.add_columns(
-            (_columns(part) for part in self._pieces(chunk)),
-            self.report.grasps,
-            **about,
-            licence=licence,
-            citation=citation,
-            origin=_origin(self._readings),
-            **upload,
-        )
+        try:
+            return self._item.trials.add_columns(
+                (_columns(part) for part in self._pieces(chunk)),
+                self.report.grasps,
+                **about,
+                licence=licence,
+                citation=citation,
+                origin=_origin(self._readings),
+                known_revision=self._item.refresh().info.revision,
+                way_on=_SAME_AGAIN if own else None,
+                **upload,
+            )
+        except GraspDBError as error:
+            kind = "" if error.problem is None else error.problem.type.rpartition(":")[2]
+            if own and kind in _NOT_THE_SAME:
+                add_note(error, _NOT_THE_SAME[kind])
+            raise
+
+    def _key(self) -> str:
+        """What the same import has again: its files, how they are read, and about what."""
+        told = {
+            "files": [[_digest(path) for path in _parts(reading)] for reading in self._readings],
+            "format": [reading.kind.name for reading in self._readings],
+            "object": [self._item.info.id, self._item.info.created_at.isoformat()],
+            "gripper": f"{self._gripper.id}@{self._gripper.version}",
+            "frame": [[reading.placing.frame, reading.placing.convention] for reading in self._readings],
+            "options": {
+                name: value
+                for name, value in self._options.items()
+                if value is not None and name not in ("format", "frame", "convention")
+            },
+        }
+        text = json.dumps(told, sort_keys=True, default=lambda value: np.asarray(value).tolist())
+        return f"import-{hashlib.sha256(text.encode()).hexdigest()[:40]}"
 
     def _gripper_name(self) -> str:
         known = self._gripper
@@ -145,6 +199,14 @@ def _origin(readings: Sequence[Reading]) -> dict[str, str]:
     origin = {"file": name[-255:], "format": readings[0].kind.name}
     # Of a bag that is a folder no one file is all of it.
     return origin if first.bag not in (None, first.path) else origin | {"sha256": _digest(first.path)}
+
+
+def _parts(reading: Reading) -> list[Path]:
+    """The files that a file is: of a bag that is a folder all in it."""
+    source = reading.source
+    if source.bag is None or not source.bag.is_dir():
+        return [source.path]
+    return sorted(path for path in source.bag.rglob("*") if path.is_file())
 
 
 def _digest(path: Path) -> str:

@@ -22,6 +22,8 @@ KINDS = (AT, BEFORE)
 _FINGERS, _SAME = (1, 2), 0.01
 #: As a share of its travel, how far a joint's value may lie beyond it.
 _BEYOND = 0.02
+#: As a share of its travel, how far it may be open and counts as closed.
+_CLOSED = 1e-6
 
 
 def values_of(file: str, where: str, names: Any, values: Any) -> dict[str, float] | list[float] | None:
@@ -77,14 +79,18 @@ def kept(
         columns["width_m"] = widths
     if told < sum(values is not None for values in postures[AT]):
         why = "has no joints" if gripper is None or not gripper.joints else "does not say it of such values"
-        report.drop(f"how far the jaw is open in some grasps: the named gripper's profile {why}")
+        report.drop(
+            f"how far the jaw is open in some grasps: the named gripper's profile {why}"
+            + ("" if gripper is None or not gripper.joints else " (closed is a command, not a width)")
+        )
     return columns
 
 
 def opening_m(gripper: GripperProfile | None, values: Mapping[str, float] | Sequence[float]) -> float | None:
     """How far the jaw is open, metres, by values of its joints; None where these don't say it.
 
-    They do where the fingers slide by as much as the joints' values change, in metres; not where they swing.
+    They do where the fingers slide by as much as the joints' values change, in metres; not where they swing,
+    nor where they are closed: that is what a jaw is commanded, whatever it then holds.
     """
     if gripper is None or not _slide(gripper):
         return None
@@ -98,7 +104,8 @@ def opening_m(gripper: GripperProfile | None, values: Mapping[str, float] | Sequ
     ]
     if not shares or min(shares) < -_BEYOND or max(shares) > 1 + _BEYOND:
         return None
-    return float(np.clip(np.mean(shares), 0.0, 1.0)) * gripper.max_opening_m
+    share = float(np.clip(np.mean(shares), 0.0, 1.0))
+    return share * gripper.max_opening_m if share > _CLOSED else None
 
 
 def values_at(gripper: GripperProfile | None, opening: float) -> dict[str, float] | None:

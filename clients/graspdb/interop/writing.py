@@ -188,4 +188,9 @@ def _qualities(grasps: Any, given: Mapping[str, ArrayLike] | None, count: int) -
 
 
 def _more(grasps: Any) -> dict[str, list[Any]]:
-    return dict(grasps.more) if isinstance(grasps, FileGrasps) else {}
+    if isinstance(grasps, FileGrasps):
+        return dict(grasps.more)
+    # Grasps of an answer know the object's width between the fingers.
+    each = grasps if isinstance(grasps, (list, tuple)) else ()
+    widths = [getattr(grasp, "width_m", None) for grasp in each]
+    return {"width_m": widths} if any(width is not None for width in widths) else {}

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from typing_extensions import Unpack
 
 from graspdb import wire
-from graspdb.errors import GraspDBError, add_note
+from graspdb.errors import GraspDBError, InvalidInput, add_note
 from graspdb.files import arrow
 from graspdb.options import Option, known_keywords
 from graspdb.poses import as_poses, first_masked, listed, numbers, pose_frame
@@ -38,13 +38,15 @@ class Receipt:
     """What an upload stored: its batches (one a request), the number of trials, the object's revision.
 
     ``findings`` are what the service found doubtful about the trials, a batch's after the other's, their
-    ``first_indices`` counted from the upload's first trial.
+    ``first_indices`` counted from the upload's first trial. An import tells in ``already_stored`` how many of
+    ``inserted`` an earlier run of it had stored.
     """
 
     batches: tuple[str, ...]
     inserted: int
     revision: int
     findings: tuple[wire.Finding, ...] = ()
+    already_stored: int = 0
 
     @property
     def batch(self) -> str:
@@ -62,7 +64,8 @@ class Sending(TypedDict, total=False):
     """How trials are sent.
 
     They go ``chunk`` a request; each is stored wholly or not at all, as its own batch. Repeat a failed upload
-    with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice. Trials too far from a
+    with the same ``idempotency_key``, data and ``chunk``, and nothing is stored twice (another ``chunk`` is
+    refused); one that breaks off or is interrupted names the key in its notes. Trials too far from a
     known object to be grasps of it are refused, unless ``accept_implausible``. ``progress=True`` shows a bar;
     a function is called with trials stored and total.
     """
@@ -245,13 +248,16 @@ class Trials(Resource):
         idempotency_key: str | None = None,
         accept_implausible: bool = False,
         progress: bool | ProgressCallback = False,
+        known_revision: int | None = None,
+        way_on: str | None = None,
         **shared: Any,
     ) -> Receipt:
         """Store trials that come by pieces, each a batch: columns of the HTTP interface as arrays or lists.
 
         ``total`` is how many there are in all, for ``progress``; no more than one piece is held at a time.
         They go as Arrow where pyarrow is installed and the service takes it, else as JSON. ``shared`` stands
-        once for all, as in :meth:`add_records`.
+        once for all, as in :meth:`add_records`. By the object's ``known_revision`` before it the receipt
+        tells what was ``already_stored``; ``way_on`` is told where it breaks off, by default the key.
         """
         upload: Upload = {
             "chunk": max(1, total),
@@ -261,7 +267,13 @@ class Trials(Resource):
         }
         shared = {name: value for name, value in shared.items() if value is not None}
         return self._post(
-            ((len(part["outcome"]), {"columns": part}) for part in parts), shared, total, upload, {}
+            ((len(part["outcome"]), {"columns": part}) for part in parts),
+            shared,
+            total,
+            upload,
+            {},
+            known_revision,
+            way_on,
         )
 
     def _send(
@@ -288,32 +300,31 @@ class Trials(Resource):
         count: int,
         upload: Upload,
         framed: Mapping[str, str],
+        known_revision: int | None = None,
+        way_on: str | None = None,
     ) -> Receipt:
         """A request for each piece; warns of findings for whoever called the method that called this."""
-        key, chunk = upload.get("idempotency_key") or str(uuid.uuid4()), upload.get("chunk", CHUNK_TRIALS)
+        key = upload.get("idempotency_key") or str(uuid.uuid4())
         params = {**framed, **({"accept_implausible": "true"} if upload.get("accept_implausible") else {})}
         receipts: list[wire.BatchReceipt] = []
         findings: list[wire.Finding] = []
-        start = 0
+        start = stop = 0
         with _upload_bar(upload.get("progress", False)) as report:
-            for number, (size, piece) in enumerate(pieces):
-                stop = start + size
-                try:
-                    own = key if count <= chunk and size == count else f"{key}-{number}"
+            try:
+                for number, (size, piece) in enumerate(pieces):
+                    stop = start + size
+                    # The first piece's key says nothing of how many there are: cut otherwise, under the same
+                    # key, it has another body, and is refused.
+                    own = f"{key}-{number}" if number else key
                     receipt = self._sent(piece, shared, params=params, idempotency_key=own)
                     receipts.append(receipt)
                     findings += [_from_row(finding, start) for finding in receipt.findings]
-                except GraspDBError as error:
-                    if start:
-                        add_note(
-                            error,
-                            f"This was the request with trials {start} to {stop - 1}: indices above count"
-                            f" from {start}. The {start} trials before are stored, in batches"
-                            f" {', '.join(r.batch for r in receipts)}.",
-                        )
-                    raise
-                report(stop, count)
-                start = stop
+                    start = stop
+                    report(stop, count)
+            except (GraspDBError, KeyboardInterrupt) as error:
+                for note in _broken_off(error, receipts, (start, stop), key, way_on):
+                    add_note(error, note)
+                raise
         for finding in findings:
             # To whoever called add, which called what called this.
             warnings.warn(f"{finding.message}. {finding.remedy}", DoubtfulTrials, stacklevel=4)
@@ -322,6 +333,11 @@ class Trials(Resource):
             inserted=sum(receipt.inserted for receipt in receipts),
             revision=receipts[-1].revision,
             findings=tuple(findings),
+            already_stored=sum(
+                receipt.inserted
+                for receipt in receipts
+                if known_revision is not None and receipt.revision <= known_revision
+            ),
         )
 
     def _sent(self, piece: Mapping[str, Any], shared: Mapping[str, Any], **options: Any) -> wire.BatchReceipt:
@@ -421,6 +437,36 @@ class Batches(Resource):
     def delete(self, batch: str) -> None:
         """Delete a batch with all its trials (and, a sweep's, its packed outcomes)."""
         self._transport.request("DELETE", f"{self._path}/{segment(batch)}")
+
+
+def _broken_off(
+    error: BaseException,
+    receipts: Sequence[wire.BatchReceipt],
+    rows: tuple[int, int],
+    key: str,
+    way_on: str | None,
+) -> Iterator[str]:
+    """What is stored of an upload that broke off at a request with trials of these ``rows``, and how to go
+    on.
+    """
+    start, stop = rows
+    refused = isinstance(error, GraspDBError) and error.status is not None and error.status < 500
+    if receipts:
+        request = f"This was the request with trials {start} to {stop - 1}"
+        if isinstance(error, InvalidInput):
+            request += f": indices above count from {start}"
+        batches = ", ".join(receipt.batch for receipt in receipts)
+        yield (f"{request}. " if stop > start else "") + (
+            f"The {start} trials before are stored, in batches {batches}."
+        )
+    elif refused or stop == start:
+        return
+    if stop > start and not refused:
+        yield f"Whether trials {start} to {stop - 1} are stored, too, is not known."
+    yield way_on or (
+        f"To go on, send all of it again with idempotency_key={key} and the same chunk: nothing is stored"
+        " twice."
+    )
 
 
 def _plain(values: Any) -> Any:

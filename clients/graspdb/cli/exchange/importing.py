@@ -34,12 +34,16 @@ def import_files(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Look at the files and say what would be stored.")
     ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Store anew what the same import stored before.")
+    ] = False,
 ) -> None:
     """Store the grasps of files in the formats of other projects, after a first look at them.
 
     ACRONYM (.h5, .json), GraspGen (.json), isaac_grasp (.yaml), GraspNet (.npy, .npz), VGN (.csv),
     MultiGripperGrasp (.json), moveit_msgs/Grasp (.yaml, .json), GraspIt! and UIBK (.xml), and tables with any
-    columns (.csv, .jsonl, .parquet). Nothing is stored where a file can't be read or can't be right.
+    columns (.csv, .jsonl, .parquet). Nothing is stored where a file can't be read or can't be right. The same
+    import once more stores nothing twice: one that broke off goes on so.
     """
     item, chosen = state.db.objects.get(object), state.db.grippers.get(gripper)
     found = Import(item, chosen, files, **reading)
@@ -68,11 +72,15 @@ def import_files(
     with warnings.catch_warnings():
         # They are told below.
         warnings.simplefilter("ignore", DoubtfulTrials)
-        receipt = found.send(source=source, protocol=protocol, licence=licence, citation=citation, **upload)
+        receipt = found.send(
+            source=source, protocol=protocol, licence=licence, citation=citation, again=again, **upload
+        )
     told |= {"batches": receipt.batches, "inserted": receipt.inserted, "revision": receipt.revision}
     many = len(receipt.batches)
-    stored = f"{receipt.inserted:,} trials stored in "
-    stored += f"{many} batches" if many > 3 else f"batch {', '.join(receipt.batches)}"
+    kept, new = receipt.already_stored, receipt.inserted - receipt.already_stored
+    told["already_stored"] = kept
+    stored = f"{new:,} trials stored" + (f", {kept:,} were already stored" if kept else "")
+    stored += f", in {many} batches" if many > 3 else f", in batch {', '.join(receipt.batches)}"
     state.show(
         told | {"findings": receipt.findings}, f"{stored}; {object} is at revision {receipt.revision}."
     )

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from graspdb.cli.common import ERRORS, State, out, show_rows
-from graspdb.cli.objects import profile_in
+from graspdb.cli.objects import grippers, profile_in
 from graspdb.figures import FILE_FORMATS
 from graspdb.figures.grippers.explained import render_explained
 from graspdb.files.urdf import FoundGripper, read_gripper
@@ -21,6 +21,7 @@ from graspdb.wire.presets.grippers import PRESETS
 _EXAMPLE = "robotiq-2f-85"
 
 
+@grippers.command("from-urdf")
 def from_urdf(
     state: State,
     file: Annotated[Path, typer.Argument(help="The gripper's URDF, with its meshes beside it.", exists=True)],
@@ -60,6 +61,7 @@ def _show(state: State, found: FoundGripper) -> None:
         ERRORS.print(f"Assumed: {assumed}", highlight=False, markup=False, soft_wrap=True)
 
 
+@grippers.command("explain")
 def explain(
     state: State,
     output: Annotated[
