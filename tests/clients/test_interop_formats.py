@@ -571,6 +571,18 @@ def test_a_gripper_without_the_way_to_its_tool_is_refused(
         interop.read(path)
 
 
+def test_a_table_says_how_it_is_to_be_written(tmp_path: Path) -> None:
+    head, path = "x,y,z,qx,qy,qz,qw,outcome\n", tmp_path / "t.csv"
+    path.write_text(head + "0,0,0,0,0,0,1,OK\n")
+    _refused(path, "success, collision, .* yes, .* failed")
+    path.write_text(head.replace(",", ";") + "0,1;0;0;0;0;0;1;success\n")
+    _refused(path, "written with a point")
+    path.write_text(head + "0,0,0,0,0,0,1,gegl\u00fcckt\n", encoding="latin-1")
+    _refused(path, "Windows-1252: save it as UTF-8")
+    path.write_text(head + "0,0,0,0,0,0,1,success\n", encoding="utf-16")
+    _refused(path, "UTF-16: save it as UTF-8")
+
+
 def test_half_a_rule_is_none(tmp_path: Path, panda: GripperProfile, tools: np.ndarray) -> None:
     path = files.acronym_h5(tmp_path / "a.h5", tools, HELD)
     for half in (

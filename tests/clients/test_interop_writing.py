@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from graspdb import interop
 from graspdb.interop.grasps import FileGrasps
+from graspdb.resources.results import PoseArrays
 from graspdb.wire import OUTCOMES, GripperProfile
 
 ENDS = {
@@ -205,3 +206,15 @@ def test_bags_that_are_none_are_told_in_a_line(tmp_path: Path, gripper: GripperP
         with pytest.raises(ValueError, match="is no whole bag") as caught:
             interop.read(tmp_path / name, gripper=gripper, **SAID["rosbag"])
         assert "\n" not in str(caught.value)
+
+
+def test_poses_are_written_with_the_frame_that_they_say(tmp_path: Path, gripper: GripperProfile) -> None:
+    tools = _grasps(0, ["success"] * 3).poses
+    there = tools.followed_by(gripper.in_tool("base", "graspnet"))
+    framed = PoseArrays(there.position, there.quaternion_xyzw, frame="base", convention="graspnet")
+    for grasps, times in ((framed, 1), ([framed, framed], 2)):
+        interop.write(tmp_path / "t.jsonl", grasps, gripper=gripper)
+        read = interop.read(tmp_path / "t.jsonl", outcome="success")
+        assert read.matrices == pytest.approx(np.tile(tools.matrices, (times, 1, 1)), abs=1e-9)
+    with pytest.raises(ValueError, match="several frames"):
+        interop.write(tmp_path / "t.jsonl", [framed, PoseArrays(*tools)], gripper=gripper)

@@ -11,10 +11,11 @@ from graspdb.wire import OUTCOME_CODES, OUTCOMES
 
 SUCCESS, FAILURE, COLLISION = (OUTCOME_CODES[name] for name in ("success", "failure", "collision"))
 
-_WORDS = {
+WORDS = {
     **dict.fromkeys(("1", "1.0", "true", "t", "yes", "y", "passed"), SUCCESS),
     **dict.fromkeys(("0", "0.0", "false", "f", "no", "n", "failed"), FAILURE),
 }
+"""What else says an outcome."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def code_of(value: object) -> int | None:
     if isinstance(value, (int, float, np.integer, np.floating)):
         return {1.0: SUCCESS, 0.0: FAILURE}.get(float(value))
     text = str(value).strip().lower()
-    return OUTCOME_CODES.get(text, _WORDS.get(text))
+    return OUTCOME_CODES.get(text, WORDS.get(text))
 
 
 def named(outcome: str) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from os import PathLike
@@ -22,6 +22,7 @@ from graspdb.interop.writers.content import Content
 from graspdb.options import known_keywords
 from graspdb.poses import Poses, as_poses
 from graspdb.wire import OUTCOMES, GripperInfo, GripperProfile
+from graspdb.wire.frames.gripper_frames import TOOL
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,12 @@ def write(
 ) -> Report:
     """Write grasps to a file (:class:`Written`); the report says what was mapped, assumed, and dropped.
 
-    ``grasps`` are poses of the tool in the object's frame: what :func:`graspdb.interop.read` gave, trials,
-    samples, grasps, (N, 4, 4) or (N, 7). ``outcomes`` (N,) names and ``qualities`` (N,) numbers by name are
+    ``grasps`` are what :func:`graspdb.interop.read` gave, trials, samples or grasps, of whatever frame they
+    say (for any but the tool ``gripper`` is needed), or poses of the tool in the object's frame, (N, 4, 4) or
+    (N, 7). ``outcomes`` (N,) names and ``qualities`` (N,) numbers by name are
     those of the grasps where they have any, unless given.
     """
-    poses = as_poses(grasps)
+    poses = _of_tool(grasps, how.get("gripper"))
     count = len(poses.position)
     run = Run(poses, _outcomes(grasps, outcomes, count), _qualities(grasps, qualities, count), _more(grasps))
     return write_runs(path, [run], **how)
@@ -114,6 +116,8 @@ def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Wri
             " flange: say which of its frames that link is (--frame base, or another)"
         )
     report.frame, report.convention = chosen, axes
+    if (chosen, axes) != (writer.frame, writer.convention) and name != "rosbag":
+        report.drop(f"what its poses are of: when it is read, say --frame {chosen} --convention {axes}")
     way = to_tool(chosen, axes, profile)
     fixed = np.asarray(np.linalg.inv(way), dtype=np.float64)
     if writer.folder and target.exists():
@@ -148,6 +152,25 @@ def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Wri
         writer.write(whole, chain([first], found), report)
         os.replace(whole, target)
     return report
+
+
+def _of_tool(grasps: Any, gripper: GripperProfile | GripperInfo | None) -> Poses:
+    """Poses of the tool, of grasps that may say themselves what they are of instead; or of a list of such."""
+    several = isinstance(grasps, Sequence) and len(grasps) and hasattr(grasps[0], "quaternion_xyzw")
+    poses = as_poses(list(grasps) if several else grasps)
+    said = {
+        (getattr(each, "frame", None) or TOOL, getattr(each, "convention", None) or "graspdb")
+        for each in (grasps if several else [grasps])
+    }
+    if len(said) > 1:
+        raise ValueError("these grasps are of several frames: write those of one at a time")
+    frame, convention = said.pop()
+    profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
+    return (
+        poses
+        if frame == TOOL and convention == "graspdb"
+        else follow(poses, to_tool(frame, convention, profile))
+    )
 
 
 def _by_name(path: Path) -> str:

@@ -200,8 +200,7 @@ def _say(
             raise problem(name, f"the object's scale is {given}; expected a positive number")
         report.object_scale = given
         report.recognise(
-            f"poses of the mesh{f' {file}' if isinstance(file, str) else ''} at scale {given:.9g}:"
-            f" an object's mesh is to be of that size (graspdb objects set-mesh ... --scale {given:.9g})"
+            f"poses of the mesh{f' {file}' if isinstance(file, str) else ''} at scale {given:.9g}"
         )
     elif isinstance(file, str):
         report.recognise(f"poses of the mesh {file}")

@@ -14,8 +14,9 @@ import numpy as np
 from graspdb.interop.formats.columns import MORE, Plan, plan
 from graspdb.interop.formats.source import CHUNK, SourceFile, Wishes
 from graspdb.interop.grasps import Codes, Floats, Raw, Report, problem
-from graspdb.interop.outcomes import code_of
+from graspdb.interop.outcomes import WORDS, code_of
 from graspdb.interop.parsing.events import extra
+from graspdb.wire import OUTCOMES
 
 VGN_COLUMNS = ("scene_id", "qx", "qy", "qz", "qw", "x", "y", "z", "width", "label")
 VGN_TIP_M = 0.05
@@ -138,9 +139,10 @@ def _planned(file: str, names: Sequence[str], wishes: Wishes, report: Report) ->
         )
     if not (chosen.position or chosen.matrix):
         raise problem(file, "which columns are the position? Name them, as in --columns position=px:py:pz")
+    if chosen.outcome is not None:
+        report.map(f"{chosen.outcome} to the outcome")
     for name, column in chosen.more.items():
-        if name != column:
-            report.map(f"{column} to {name}")
+        report.map(f"{column} to {name}")
     for name, column in chosen.qualities.items():
         if name != column:
             report.map(f"{column} to the quality {name}")
@@ -228,7 +230,8 @@ def _codes(file: str, table: Table, name: str, first: int) -> Codes:
             told = "missing" if value in (None, "") else repr(value)[:60]
             raise problem(
                 file,
-                f"grasp {first + row}: {name} is {told}, no outcome; where it is a score, say what is a"
+                f"grasp {first + row}: {name} is {told}, no outcome. Outcomes are"
+                f" {', '.join(OUTCOMES)}, or {', '.join(WORDS)}; where it is a score, say what is a"
                 " success: --success-from QUALITY --success-above X",
             )
         codes[row] = code
@@ -264,6 +267,8 @@ class _Lists:
             return float(value)
         except (TypeError, ValueError, OverflowError):
             told = f"{name} is {str(value)[:60]!r}, which is no number"
+            if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+,\d+\s*", value):
+                told += ": decimals are written with a point"
             raise problem(self._file, f"grasp {self._first + row}: {told}") from None
 
     def vectors(self, names: tuple[str, ...]) -> Floats:
@@ -323,9 +328,19 @@ def _csv_tables(source: SourceFile, report: Report) -> Iterator[_Lists]:
                     raise problem(source.name, "has a header but no rows")
                 yield _Lists(source.name, _turned(header, rows), first)
     except UnicodeDecodeError as error:
-        raise problem(source.name, f"is not UTF-8 ({error.reason} at byte {error.start})") from None
+        raise problem(source.name, _no_utf8(source, error)) from None
     except csv.Error as error:
         raise problem(source.name, f"can't be read as CSV: {error}") from None
+
+
+def _no_utf8(source: SourceFile, error: UnicodeDecodeError) -> str:
+    """What a text is instead, as far as its first bytes tell, and the way out."""
+    wide = source.head.startswith((b"\xff\xfe", b"\xfe\xff"))
+    likely = "UTF-16" if wide else "Latin-1 or Windows-1252"
+    return (
+        f"is not UTF-8 ({error.reason} at byte {error.start}) but likely {likely}: save it as UTF-8 (iconv -f"
+        f" {'UTF-16' if wide else 'WINDOWS-1252'} -t UTF-8 OLD > NEW)"
+    )
 
 
 def _semicolons(source: SourceFile) -> bool:
@@ -368,7 +383,7 @@ def _records(source: SourceFile) -> Iterator[dict[str, Any]]:
                 if line.strip():
                     yield _record(source.name, f"line {number}", _loaded(source.name, number, line))
     except UnicodeDecodeError as error:
-        raise problem(source.name, f"is not UTF-8 ({error.reason} at byte {error.start})") from None
+        raise problem(source.name, _no_utf8(source, error)) from None
 
 
 def _loaded(name: str, number: int, line: str) -> Any:
