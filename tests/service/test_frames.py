@@ -459,16 +459,16 @@ def test_frames_of_an_object_are_changed_together(
 
 
 def test_frames_as_far_off_as_they_may_be(served: httpx.Client, thing: str) -> None:
-    far = {"position": [1000, -1000, 1000], "quaternion_xyzw": [1, 0, 0, 0]}
+    far = {"position": [1.1, -1.1, 1.1], "quaternion_xyzw": [1, 0, 0, 0]}
     made = {
         **MINE,
         "id": "far",
         "base_to_tool": far,
-        "frames": {"flange": {**far, "position": [-1000, 0, 0]}},
+        "frames": {"flange": {**far, "position": [-2, 0, 0]}},
     }
     assert served.post("/grippers", json=made).status_code == 201
     asked = {"gripper": "far", "prior": "false", "frame": "flange"}
     assert get(served, f"/objects/{thing}/best-grasp", **asked)["frame"] == "flange"
-    trial = {"position": [900, 900, 900], "quaternion_xyzw": [0, 0, 0, 1], "outcome": True, "gripper": "far"}
+    trial = {"position": [999, 999, 999], "quaternion_xyzw": [0, 0, 0, 1], "outcome": True, "gripper": "far"}
     refused = served.post(f"/objects/{thing}/trials", params={"frame": "base"}, json=trial)
     assert problem(refused)[0::2] == (422, ["position"])
