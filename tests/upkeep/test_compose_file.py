@@ -1,4 +1,4 @@
-"""compose.yaml by itself; ``make test-compose`` runs it."""
+"""compose.yaml by itself; no test runs it."""
 
 from __future__ import annotations
 
