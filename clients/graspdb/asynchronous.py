@@ -173,6 +173,7 @@ class AsyncTrialListing(AsyncListing[wire.TrialOut]):
 
     sync: TrialListing
 
+    documents = _iterated(TrialListing.documents, _same)
     arrays = _awaited(TrialListing.arrays)
     to_pandas = _awaited(TrialListing.to_pandas)
 

@@ -16,8 +16,8 @@ ASKED_FRAME = (
 )
 ASKED_CONVENTION = (
     "Along which of their axes these poses approach and close: ``acronym`` and ``graspgen`` along z and x,"
-    " ``graspnet`` along x and y, ``vgn`` along z and y; ``graspdb`` (the default) and ``moveit`` are the own"
-    " axes of ``frame``, in the tool frame z and y. It moves no origin."
+    " ``graspnet`` along x and y, ``vgn`` along z and y; ``graspdb`` and ``moveit`` are the own axes of"
+    " ``frame``, in the tool frame z and y; by default ``graspdb``. It moves no origin."
 )
 
 ASKED_NEAR = (
