@@ -10,7 +10,7 @@ KEEP ?=
 VIEW ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test chromium test-core test-long check format bench load openapi requirements clean
+.PHONY: help install demo test chromium test-core test-long test-compose check format bench load openapi requirements clean
 
 help:  ## What can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -39,6 +39,9 @@ test-long: chromium install  ## Also what takes many minutes
 	@sh .ci/faketime
 	@sh .ci/nginx
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+test-compose: install  ## compose.yaml for real, without a Docker engine: as root on Debian, with buildah and podman
+	$(BIN)/python tests/compose
 
 check: install  ## Format, lint, types, import rules, the rules of the house
 	$(BIN)/ruff format --check .

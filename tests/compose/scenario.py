@@ -1,0 +1,246 @@
+"""What a lab does with ``compose.yaml``, from the first start on; every command of the guide is run."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from graspdb import Client
+from lab import ROOT, Compose, command, say, wait_for
+
+URL = "http://127.0.0.1:8000"
+#: What URLs, shells, quotes and compose's own variables would each take for something else.
+STRANGE = "it's %41 p@ss:w/ö?r#d\\&$HOME ${X:-y} $$ `id` {}\"; -- "
+#: A grasp of the mug in seventy succeeds.
+POSES = 4_000
+#: What a lab gets by itself and tests have under another name.
+ELSEWHERE = ("git pull",)
+
+
+def guide() -> dict[str, list[str]]:
+    """The commands of the guide's section, by the bold words of the paragraph before."""
+    text = (ROOT / "docs/user-guide.md").read_text("utf-8")
+    section = re.search(r"^### With compose\n(.*?)^## ", text, re.MULTILINE | re.DOTALL)
+    assert section
+    found: dict[str, list[str]] = {}
+    paragraph = r"^\*\*([\w ]+)(?:(?!^\*\*).)*?^```sh\n(.*?)^```"
+    for name, block in re.findall(paragraph, section[1], re.MULTILINE | re.DOTALL):
+        lines = block.replace("\\\n", " ").splitlines()
+        found[name] = [line for line in lines if line.strip() and not line.startswith("#")]
+    return found
+
+
+class Scenario:
+    """The steps, in order; each leaves everything as a lab would have it."""
+
+    def __init__(self, newer: dict[str, str]) -> None:
+        # Each process of a worker compiles at its first start: two of them have enough to do here.
+        self.compose = Compose(GRASPDB_WORKER_PROCESSES="1")
+        self.newer = newer
+        self.guide = guide()
+        self.done: list[str] = []
+        self.sweep = ""
+        self.made = tempfile.TemporaryDirectory(prefix="graspdb-compose-")
+        self.folder = Path(self.made.name)
+
+    # --- the guide's commands
+
+    def follow(self, name: str, **variables: str) -> list[str]:
+        """Run the commands of a paragraph as they stand there; what each printed."""
+        said = []
+        for line in self.guide.pop(name):
+            say(f"  $ {line}")
+            said.append(self._type(line, variables))
+        return said
+
+    def _type(self, line: str, variables: dict[str, str]) -> str:
+        line = line.partition("  #")[0].strip()
+        if line in ELSEWHERE:
+            return ""
+        printed = subprocess.run(
+            ["sh", "-c", f"printf '%s\\0' {line}"],
+            cwd=self.folder,
+            env={**os.environ, "PWD": str(self.folder), **variables},
+            stdout=subprocess.PIPE,
+            check=True,
+        )
+        words = printed.stdout.decode().split("\0")[:-1]
+        assert words[:2] == ["docker", "compose"], line
+        verb, *rest = words[2:]
+        if verb == "up":
+            scale = dict(each.split("=") for each in _after(rest, "--scale"))
+            named = [w for w in rest if not w.startswith("-") and "=" not in w]
+            self.compose.up(*(named or DEFAULT), **{name: int(count) for name, count in scale.items()})
+            return ""
+        if verb == "build":  # they are ready
+            for image, id in self.newer.items():
+                command("podman", "tag", id, image)
+            return ""
+        if verb == "stop":
+            self.compose.stop(*rest)
+            return ""
+        if verb == "run":
+            first = next(w for w in rest if w in self.compose.config["services"])
+            place = rest.index(first)
+            self.compose.up(*self.compose.config["services"][first].get("depends_on", ()))
+            return self.compose.run("run", "--no-deps", "-T", *rest[:place], first, *rest[place + 1 :])
+        return self.compose.run(verb, *rest)
+
+    # --- what has to hold
+
+    def counts(self) -> dict[str, Any]:
+        with Client(URL) as db:
+            listed = [item.info for item in db.objects.list()]
+        return {info.id: (info.trials, dict(info.outcomes), info.revision) for info in listed}
+
+    def steps(self) -> None:
+        for step in (
+            self.first_start,
+            self.killed_worker,
+            self.answers_of_images,
+            self.password,
+            self.database_restarts,
+            self.update,
+            self.contained,
+            self.move,
+        ):
+            say(step.__name__.replace("_", " "))
+            step()
+            self.done.append(step.__name__.replace("_", " "))
+        assert not self.guide, f"commands that no step ran: {self.guide}"
+
+    def first_start(self) -> None:
+        """Nothing is prepared; an object, and a sweep in real physics through which a worker is killed."""
+        self.follow("Starting")
+        with Client(URL) as db:
+            self.sweep = db.add_example("mug").sweep(max_poses=POSES, chunk_poses=POSES // 8).id
+
+    def killed_worker(self) -> None:
+        """In the midst of a chunk, which is given out again: no pose is lost, and there is a best grasp."""
+        wait_for("the worker has a chunk", lambda: self.leased("simworker"))
+        self.crash("simworker")
+        with Client(URL) as db:
+            sweep = db.sweeps.get(self.sweep).wait()
+            told = sweep.info
+            assert (told.state, told.poses_done, told.chunks_failed) == ("done", POSES, 0), told
+            assert sum(told.outcomes.values()) == POSES, told
+            best = db.objects.get("mug").best_grasp()
+            say(f"  of {POSES} poses {told.outcomes}, the best grasp of the mug at {best.position}")
+
+    def leased(self, service: str) -> int:
+        """How many chunks the first container of a worker has in hand."""
+        host = command("podman", "inspect", "--format", "{{.Id}}", self.compose.container(service))[:12]
+        workers = httpx.get(f"{URL}/workers", timeout=60).json()["items"]
+        return sum(each["jobs_leased"] for each in workers if each["worker"].startswith(host))
+
+    def answers_of_images(self) -> None:
+        for path, kind, start in [
+            ("/objects/mug/reports/projection", "image/png", b"\x89PNG"),
+            ("/objects/mug/trials", "application/vnd.apache.arrow.stream", b"\xff\xff\xff\xff"),
+        ]:
+            answer = wait_for(path, lambda path=path, kind=kind: self.answer(path, kind))
+            assert answer.headers["content-type"] == kind
+            assert answer.content.startswith(start)
+
+    def answer(self, path: str, kind: str) -> httpx.Response | None:
+        """None while it is computed."""
+        found = httpx.get(f"{URL}{path}", headers={"Accept": kind}, timeout=120)
+        assert found.status_code in (200, 202), found.text
+        return found if found.status_code == 200 else None
+
+    def crash(self, service: str) -> None:
+        """kill -9 of a container's first process: the restart policy brings another."""
+        name = self.compose.container(service)
+        pid = int(command("podman", "inspect", "--format", "{{.State.Pid}}", name))
+        os.kill(pid, signal.SIGKILL)
+
+        def runs_again() -> bool:
+            now = command("podman", "inspect", "--format", "{{.State.Running}} {{.State.Pid}}", name).split()
+            return now[0] == "true" and int(now[1]) not in (0, pid)
+
+        wait_for(f"{service} runs again", runs_again)
+
+    def database_restarts(self) -> None:
+        """Stopped and started, and killed: the service connects anew, with the password of odd characters."""
+        before = self.counts()
+        self.compose.run("restart", "db")
+        self.ready()
+        assert self.counts() == before
+        self.crash("db")
+        self.ready()
+        assert self.counts() == before
+
+    def ready(self) -> None:
+        self.compose.wait_healthy("db")
+        wait_for("the service is ready", lambda: httpx.get(f"{URL}/readyz").is_success)
+
+    def password(self) -> None:
+        """Changed to one of odd characters, while the service goes on: it shows it when it connects anew."""
+        old = command("podman", "exec", self.compose.container("service"), "cat", "/run/graspdb/password")
+        before = self.counts()
+        self.follow("Passwords", NEW_PASSWORD=STRANGE)
+        now = command("podman", "exec", self.compose.container("service"), "cat", "/run/graspdb/password")
+        assert now == STRANGE, now
+        assert self.connects(STRANGE)
+        assert not self.connects(old)
+        assert self.counts() == before
+
+    def connects(self, password: str) -> bool:
+        words = ["psql", "-X", "-h", "db", "-U", "graspdb", "-d", "graspdb", "-c", "SELECT 1"]
+        done = subprocess.run(
+            ["podman", "exec", "--env", "PGPASSWORD", self.compose.container("db"), *words],
+            env={**os.environ, "PGPASSWORD": password},
+            capture_output=True,
+            check=False,
+        )
+        return done.returncode == 0
+
+    def update(self) -> None:
+        before, image = self.counts(), self.image()
+        self.follow("Updating")
+        self.ready()
+        assert self.image() != image
+        assert self.counts() == before
+
+    def image(self) -> str:
+        return command("podman", "inspect", "--format", "{{.Image}}", self.compose.container("service"))
+
+    def contained(self) -> None:
+        """No container runs as root, writes beside its volumes, or has capabilities."""
+        for service in ("db", "service", "simworker"):
+            name = self.compose.container(service)
+            pid = command("podman", "inspect", "--format", "{{.State.Pid}}", name).strip()
+            status = Path(f"/proc/{pid}/status").read_text()
+            assert re.search(r"^Uid:\s+(?!0\s)", status, re.MULTILINE), service
+            assert re.search(r"^CapBnd:\s+0+$", status, re.MULTILINE), service
+            assert re.search(r"^NoNewPrivs:\s+1$", status, re.MULTILINE), service
+            # As root, whose the folder is: nothing but the file system being read-only is in the way.
+            words = ["podman", "exec", "--user", "0", name, "sh", "-c", "echo > /opt/written"]
+            said = subprocess.run(words, capture_output=True, check=False).stderr.decode()
+            assert "read-only file system" in said.lower(), (service, said)
+
+    def move(self) -> None:
+        """To a host that has nothing but the backup."""
+        before = self.counts()
+        self.follow("Backing up")
+        assert (self.folder / "graspdb.backup").stat().st_size > 1000
+        self.compose.down()
+        self.follow("Moving to another host")
+        self.ready()
+        assert self.counts() == before
+        with Client(URL) as db:
+            assert db.objects.get("mug").best_grasp().density > 0
+
+
+DEFAULT = ("simworker",)
+
+
+def _after(words: list[str], option: str) -> list[str]:
+    return [words[n + 1] for n, word in enumerate(words[:-1]) if word == option]
