@@ -155,9 +155,19 @@ def test_what_writes_is_there_only_where_it_was_allowed(service_url: str, tried:
             "add_trials",
             "start_sweep",
         }
-        first, again = asking(writing, ("add_trials", batch), ("add_trials", batch))
+        first, again, flange = asking(
+            writing,
+            ("add_trials", batch),
+            ("add_trials", batch),
+            ("add_trials", {**batch, "key": "by-the-flange", "frame": "flange"}),
+        )
     assert value(first)["inserted"] == 1
     assert value(again)["batch"] == value(first)["batch"]
+    with Client(service_url) as db:
+        (stored,) = db.objects.get(tried).trials.list(batch=value(flange)["batch"])
+        (back,) = db.objects.get(tried).trials.list(batch=value(flange)["batch"], frame="flange")
+    assert stored.position != pytest.approx((0, 0, 0.1))
+    assert back.position == pytest.approx((0, 0, 0.1))
 
 
 def test_the_guide_and_pictures_are_read(server: Any, tried: str) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from graspdb import wire
-from graspdb.agents.asking import Object
+from graspdb.agents.asking import Axes, Object
 from graspdb.resources.pages import segment
 from graspdb.transport import Transport
 
@@ -35,14 +35,21 @@ class Changes:
                 " same, it is stored once.",
             ),
         ],
+        frame: Annotated[str, Field(description="The gripper's frame that the poses are of.")] = "tool",
+        convention: Axes = "graspdb",
     ) -> dict[str, Any]:
-        """Store what was tried as one batch: the tool's pose in the object, and what became of it.
+        """Store what was tried as one batch: the pose of the gripper's frame in the object, and its outcome.
 
-        Give `frame` beside the trials where poses are of another frame of the gripper. Read `findings` in the
-        answer: they tell what looks wrong. A batch that was a mistake is deleted by a person.
+        Read `findings` in the answer: they tell what looks wrong. A batch that was a mistake is deleted by a
+        person.
         """
         path = f"/objects/{segment(object)}/trials"
-        found: dict[str, Any] = self._transport.json("POST", path, body=trials, idempotency_key=key)
+        asked = (
+            {"frame": frame, "convention": convention} if (frame, convention) != ("tool", "graspdb") else {}
+        )
+        found: dict[str, Any] = self._transport.json(
+            "POST", path, params=asked, body=trials, idempotency_key=key
+        )
         return found
 
     def start_sweep(self, object: Object, sweep: wire.SweepCreate) -> dict[str, Any]:
