@@ -329,7 +329,14 @@ def test_outcomes_of_a_sweep(http: httpx.Client, make_object: Make, put_box: Cal
         ).raise_for_status()
     plain = http.get(f"/sweeps/{sweep}/outcomes?limit=100000").json()
     table, told = table_of(http.get(f"/sweeps/{sweep}/outcomes", headers=ASK))
-    assert told == {"sweep": sweep, "next": None, "frame": "tool", "convention": "graspdb"}
+    assert told == {
+        "sweep": sweep,
+        "frame": "tool",
+        "convention": "graspdb",
+        "tool_to_frame": None,
+        "warnings": [],
+        "next": None,
+    }
     for name in ("pose_index", "position", "quaternion_xyzw", "outcome"):
         assert table[name].to_pylist() == plain[name]
     first, told = table_of(http.get(f"/sweeps/{sweep}/outcomes?limit=150", headers=ASK))
