@@ -239,6 +239,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
     delete = _awaited(GraspObject.delete)
     upload_mesh = _awaited(GraspObject.upload_mesh)
     download_mesh = _awaited(GraspObject.download_mesh)
+    mesh_triangles = _awaited(GraspObject.mesh_triangles)
     upload_convex_parts = _awaited(GraspObject.upload_convex_parts)
     download_convex_parts = _awaited(GraspObject.download_convex_parts)
     density = _awaited(GraspObject.density)

@@ -24,7 +24,7 @@ from graspdb_viewer.panels.question import QuestionPanel
 from graspdb_viewer.panels.reports import ReportsPanel
 from graspdb_viewer.panels.sweeps import SweepsPanel
 from graspdb_viewer.panels.trials import TrialsPanel
-from graspdb_viewer.scene import colours, meshes
+from graspdb_viewer.scene import colours, shapes
 from graspdb_viewer.view import View
 
 _POLL_S = 3.0
@@ -207,7 +207,7 @@ class Session:
             if before is not None and before.mesh is not None and before.item.info.mesh == info.mesh:
                 mesh = before.mesh
             else:
-                mesh = meshes.triangles(item.download_mesh(), info.mesh)
+                mesh = shapes.of_triangles(item.mesh_triangles())
             lower, upper = np.array(info.mesh.bounding_box.lower), np.array(info.mesh.bounding_box.upper)
             centre, size = (lower + upper) / 2, float(np.linalg.norm(upper - lower))
         density = item.density(**selection) if info.trials or info.outcomes else None

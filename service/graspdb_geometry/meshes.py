@@ -260,6 +260,15 @@ def parts_to_glb(parts: Sequence[Part]) -> bytes:
     return write_glb([Geometry(np.asarray(v, dtype=np.float64), np.asarray(f)) for v, f in parts])
 
 
+def mesh_to_stl(mesh: Mesh) -> bytes:
+    """Write a mesh as binary STL in metres, rounded to float32, the normals left to the reader."""
+    records = np.zeros(
+        len(mesh.faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    )
+    records["corners"] = mesh.vertices[mesh.faces]
+    return bytes(80) + len(records).to_bytes(4, "little") + records.tobytes()
+
+
 def check_parts(parts: Sequence[Part]) -> list[Part]:
     """Check that each part is a closed convex solid; returns them merged and facing outwards.
 

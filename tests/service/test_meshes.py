@@ -92,6 +92,12 @@ def test_a_scale_beside_the_unit(box: httpx.Client, unit: str, scale: float) -> 
     back = box.get("/objects/box/mesh")
     assert back.content == stl
     assert (back.headers["mesh-unit"], float(back.headers["mesh-scale"])) == (unit, scale)
+    understood = box.get("/objects/box/mesh?triangles=true")
+    assert (understood.headers["content-type"], understood.headers["mesh-unit"]) == ("model/stl", "m")
+    assert meshes.load(understood.content, "model/stl").vertices.max(axis=0) == pytest.approx(
+        size / 2, rel=1e-6
+    )
+    assert understood.headers["etag"] != back.headers["etag"]
     # Its own convex part is in metres, whatever the mesh's coordinates were.
     (part,) = meshes.parts_from_glb(box.get("/objects/box/convex-parts").content)
     assert np.abs(part[0]).max(axis=0) == pytest.approx(size / 2, abs=1e-6)

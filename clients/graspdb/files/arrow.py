@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 MEDIA_TYPE = "application/vnd.apache.arrow.stream"
 
@@ -26,16 +27,17 @@ def encoded(columns: Mapping[str, Any], shared: Mapping[str, Any]) -> bytes:
         if name == "qualities":
             arrays |= {f"qualities.{key}": _numbers(pa, column) for key, column in values.items()}
         elif isinstance(values, np.ndarray) and values.ndim == 2:
-            flat = pa.array(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
-            arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+            arrays[name] = pa.FixedSizeListArray.from_arrays(
+                _numbers(pa, values.reshape(-1)), values.shape[1]
+            )
         elif name == "outcome":
             names, places = np.unique(np.asarray(values), return_inverse=True)
             arrays[name] = pa.DictionaryArray.from_arrays(
-                pa.array(places.astype(np.int32)), pa.array(names.tolist())
+                _array(pa, pa.int32(), places.astype(np.int32)), _texts(pa, names.tolist())
             )
         elif name == "metadata":
             texts = [None if value is None else json.dumps(value, allow_nan=False) for value in values]
-            arrays[name] = pa.array(texts, pa.string())
+            arrays[name] = _texts(pa, texts)
         elif isinstance(values, np.ndarray):
             arrays[name] = _numbers(pa, values)
         else:
@@ -52,5 +54,21 @@ def encoded(columns: Mapping[str, Any], shared: Mapping[str, Any]) -> bytes:
 
 def _numbers(pa: Any, values: Any) -> Any:
     """Numbers, NaN as null."""
-    array = np.asarray(values, dtype=np.float64)
-    return pa.array(array, mask=np.isnan(array))
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    return _array(pa, pa.float64(), array, missing=np.isnan(array))
+
+
+def _texts(pa: Any, texts: Sequence[str | None]) -> Any:
+    pieces = [(text or "").encode() for text in texts]
+    ends = np.concatenate([[0], np.cumsum([len(piece) for piece in pieces], dtype=np.int64)]).astype(np.int32)
+    missing = np.array([text is None for text in texts], dtype=bool)
+    return _array(pa, pa.string(), ends, b"".join(pieces), missing=missing)
+
+
+def _array(pa: Any, kind: Any, *buffers: Any, missing: NDArray[np.bool_] | None = None) -> Any:
+    """An array of these buffers: ``pyarrow.array`` imports all of pandas, where that is installed, to ask."""
+    length = len(buffers[0]) if missing is None else len(missing)
+    there = (
+        None if missing is None or not missing.any() else np.packbits(~missing, bitorder="little").tobytes()
+    )
+    return pa.Array.from_buffers(kind, length, [there and pa.py_buffer(there), *map(pa.py_buffer, buffers)])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspdb.files.trials import METRES
 from graspdb.interop.formats.known import TIPS
@@ -46,14 +46,14 @@ _AXES = (
 @dataclass(frozen=True)
 class Target:
     """What grasps are looked at against: the object's box (3,) and (3,), the gripper, and triangles
-    (F, 3, 3), None where they are not known; metres.
+    (F, 3, 3); metres.
     """
 
     lower: Floats
     upper: Floats
     gripper: GripperProfile
-    triangles: Floats | None = None
-    volume_m3: float | None = None
+    triangles: Floats
+    volume_m3: float | None
 
 
 @dataclass
@@ -81,37 +81,16 @@ class FirstLook:
                 f"between the fingertips, {self.fingertips_in_box:,} of {self.looked_at:,} lie within the"
                 " object's box"
             )
-            told.append(
-                "closings were not looked at (pip install 'graspdb[examples]')"
-                if self.closings_meet is None
-                else f"{self.closings_meet:,} of {self.closings_looked_at:,} closings meet the object"
-            )
+            told.append(f"{self.closings_meet:,} of {self.closings_looked_at:,} closings meet the object")
         return told
 
 
-def target_of(info: ObjectInfo, gripper: GripperProfile, mesh: bytes | None) -> Target | None:
-    """What is known of an object and a gripper, the object's mesh as it was uploaded; None without a mesh."""
-    if info.mesh is None:
+def target_of(info: ObjectInfo, gripper: GripperProfile, triangles: Floats | None) -> Target | None:
+    """What is known of an object, its triangles (F, 3, 3) in metres, and a gripper; None without a mesh."""
+    if info.mesh is None or triangles is None:
         return None
     lower, upper = np.array(info.mesh.bounding_box.lower), np.array(info.mesh.bounding_box.upper)
-    triangles = None if mesh is None else _triangles(mesh, info.mesh.media_type, lower, upper)
     return Target(lower, upper, gripper, triangles, info.mesh.volume_m3)
-
-
-def _triangles(mesh: bytes, media_type: str, lower: Floats, upper: Floats) -> Floats | None:
-    """A mesh's triangles (F, 3, 3) in metres, by the object's box whatever unit it came in; None without
-    trimesh.
-    """
-    try:
-        import trimesh
-    except ImportError:
-        return None
-    kind = {"model/stl": "stl", "model/obj": "obj", "model/ply": "ply"}.get(media_type, "glb")
-    loaded: Any = trimesh.load(io.BytesIO(mesh), file_type=kind, force="mesh", process=False)
-    found = np.asarray(loaded.triangles, dtype=np.float64)
-    extent = np.ptp(found.reshape(-1, 3), axis=0)
-    widest = int(np.argmax(extent))
-    return np.asarray(found * ((upper - lower)[widest] / extent[widest]))
 
 
 def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report) -> FirstLook:
@@ -121,9 +100,8 @@ def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report
         return seen
     now = _Placed(raw, placing, target)
     seen.fingertips_in_box = int(now.inside.sum())
-    closed = now.closings()
-    if closed is not None:
-        seen.closings_meet, seen.closings_looked_at = int(closed[0].sum()), len(closed[0])
+    closed = now.closings()[0]
+    seen.closings_meet, seen.closings_looked_at = int(closed.sum()), len(closed)
     best, flag = now, ""
     if now.score() <= _FAR_WORSE:
         others = (
@@ -197,7 +175,7 @@ class _Placed:
         centre = (target.lower + target.upper) / 2
         inward = np.linalg.norm(palm - centre, axis=1) >= np.linalg.norm(self.tips - centre, axis=1)
         self.fits = self.inside & inward
-        self._closed: tuple[Any, Any] | None = None
+        self._closed: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None
 
     def spread_out(self) -> bool:
         """Whether they are not all crammed into the object's middle, where a far too small unit puts any."""
@@ -205,13 +183,11 @@ class _Placed:
         apart = np.median(np.linalg.norm(self.position - centre, axis=1))
         return bool(apart >= _CRAMMED * np.linalg.norm(size))
 
-    def closings(self) -> tuple[Any, Any] | None:
+    def closings(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Of some grasps, evenly chosen, whether the jaw meets the object when it closes, and whether its
-        fingers and palm were clear of it before; None untold.
+        fingers and palm were clear of it before.
         """
         triangles = self._target.triangles
-        if triangles is None:
-            return None
         if self._closed is None:
             most = int(min(_CLOSINGS, max(8, _FACES // max(1, len(triangles)))))
             some = np.unique(np.linspace(0, len(self.tips) - 1, most).astype(int))
@@ -221,9 +197,8 @@ class _Placed:
         return self._closed
 
     def met(self) -> float:
-        """The share of grasps that close on the object; where that is not looked at, that are at it."""
-        closed = self.closings()
-        return float(self.inside.mean() if closed is None else closed[0].mean())
+        """The share of grasps that close on the object."""
+        return float(self.closings()[0].mean())
 
     def score(self) -> float:
         """The share of grasps that look like grasps of the object."""

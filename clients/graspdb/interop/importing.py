@@ -67,8 +67,8 @@ class Import:
         most = max(1, _LOOKED_AT // len(self._readings))
         firsts = [_first(reading) for reading in self._readings[:_LOOKED_AT]]
         raw = gathered(firsts, max(_LOOKED_AT, most))
-        mesh = None if self._item.info.mesh is None else self._item.download_mesh()
-        target = target_of(self._item.info, self._gripper.profile, mesh)
+        triangles = None if self._item.info.mesh is None else self._item.mesh_triangles()
+        target = target_of(self._item.info, self._gripper.profile, triangles)
         return first_look(raw, self._readings[0].placing_by(report), target, report)
 
     def send(

@@ -56,14 +56,15 @@ MAX_COMPONENT = 1e6
 """Numbers of a direction, a plane or a world pose beyond this are most likely a mistake."""
 
 
-_DESCRIBED = ConfigDict(use_attribute_docstrings=True)
-"""The docstring under a field is its description in the OpenAPI document: what it is, unit, frame, null."""
+_DEFERRED = ConfigDict(defer_build=True)
+"""A program builds the models that it uses, when it first does. The docstring under a field is what it is,
+unit, frame, null: the service, which alone writes the OpenAPI document, takes it as the description there."""
 
 
 class Request(BaseModel):
     """Base of what clients send: unknown fields and non-finite numbers are errors."""
 
-    model_config = _DESCRIBED | ConfigDict(
+    model_config = _DEFERRED | ConfigDict(
         extra="forbid", allow_inf_nan=False, frozen=True, validate_default=False
     )
 
@@ -71,7 +72,7 @@ class Request(BaseModel):
 class Response(BaseModel):
     """Base of what the service answers: clients ignore the fields that a newer service adds."""
 
-    model_config = _DESCRIBED | ConfigDict(extra="ignore", allow_inf_nan=False)
+    model_config = _DEFERRED | ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 def _split_commas(value: Any) -> Any:

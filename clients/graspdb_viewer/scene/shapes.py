@@ -30,6 +30,12 @@ class Shape(NamedTuple):
     faces: NDArray[np.int64]
 
 
+def of_triangles(corners: Floats) -> Shape:
+    """Triangles by their corners (F, 3, 3), those at one place being one vertex."""
+    vertices, places = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return Shape(vertices, places.reshape(-1, 3))
+
+
 def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
     """A box with edges along the axes."""
     return Shape(np.asarray(centre) + 0.5 * np.asarray(size) * _SIGNS, _BOX)

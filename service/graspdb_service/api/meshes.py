@@ -55,12 +55,25 @@ def put_mesh(
     },
     **scope("read", "jobs:work"),
 )
-def get_mesh(ctx: Ctx, id: ObjectId, request: Request) -> Response:
+def get_mesh(
+    ctx: Ctx,
+    id: ObjectId,
+    request: Request,
+    triangles: Annotated[
+        bool,
+        Query(description="What the service made of it instead, mended and in metres: binary STL."),
+    ] = False,
+) -> Response:
     """The mesh's bytes as they came, with unit and scale in headers: together they are metres."""
     content, form, sha256 = meshes.get_mesh(ctx, id)
-    tag = f'"{sha256}-{form.unit}-{form.scale!r}"'
+    tag = f'"{sha256}-{form.unit}-{form.scale!r}{"-triangles" if triangles else ""}"'
+    unchanged = not_modified(request, tag)
+    if unchanged is not None:
+        return unchanged
+    if triangles:
+        content, form = meshes.as_stl(ctx, content, form), MeshForm("model/stl")
     headers = {"ETag": tag, "Mesh-Unit": form.unit, "Mesh-Scale": repr(form.scale)}
-    return not_modified(request, tag) or Response(content, media_type=form.media_type, headers=headers)
+    return Response(content, media_type=form.media_type, headers=headers)
 
 
 @router.put(

@@ -142,6 +142,11 @@ def get_mesh(ctx: Runtime, slug: str) -> tuple[bytes, MeshForm, str]:
     return found[0], form_of(row), row.mesh_sha256
 
 
+def as_stl(ctx: Runtime, content: bytes, form: MeshForm) -> bytes:
+    """A stored mesh as it was understood: its triangles in metres, object frame, as binary STL."""
+    return ctx.compute.run(lambda: meshes.mesh_to_stl(form.read(content)))
+
+
 def get_parts(ctx: Runtime, slug: str) -> tuple[bytes, str, str]:
     """The convex parts: GLB bytes, media type, SHA-256."""
     with ctx.database.read() as tx:
