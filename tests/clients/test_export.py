@@ -103,3 +103,35 @@ def test_moveit_is_of_the_flange_where_the_gripper_has_one(
     code, out, err = run("export", tried.id, "--format", "moveit", "--what", "trials", "-o", path)
     assert code == 0, err
     assert "poses of flange" in out
+
+
+def test_of_two_twins_that_nearer_to_a_turn_is_written(
+    db: Client, run: Run, tried: GraspObject, tmp_path: Path
+) -> None:
+    """In the frame that is written, which for isaac is the base."""
+    gripper = db.grippers.get("panda")
+    for what in ("best", "samples"):
+        turns = {}
+        for near in ("0,0,0,1", "0,0,1,0"):
+            path = str(tmp_path / f"{what}-{near}.yaml")
+            arguments = (
+                ("--what", what, "--count", "3", "--seed", "1") if what == "samples" else ("--count", "3")
+            )
+            code, _, err = run(
+                *("export", tried.id, *arguments, "--format", "isaac", "-o", path),
+                *("--gripper", "panda", "--near", near),
+            )
+            assert code == 0, err
+            read = interop.read(path, gripper=gripper, frame="base", convention="graspdb")
+            # The Panda's base is turned as its tool is.
+            turns[near] = read.quaternion_xyzw
+            wanted = np.array([float(x) for x in near.split(",")])
+            twins = turns[near][:, [1, 0, 3, 2]] * [1, -1, 1, -1]
+            assert np.all(np.abs(turns[near] @ wanted) >= np.abs(twins @ wanted) - 1e-9)
+        first, second = turns.values()
+        assert not np.allclose(np.abs(np.sum(first * second, axis=1)), 1.0)
+    code, _, err = run(
+        "export", tried.id, "--what", "trials", "-o", str(tmp_path / "t.csv"), "--near", "0,0,0,1"
+    )
+    assert code == 2
+    assert "as they were posted" in err

@@ -257,7 +257,7 @@ def test_a_file_that_ends_badly_stores_nothing(db: Client, run: Run, fresh_id: s
     arguments = ("import", str(tmp_path / "t.jsonl"), "--object", fresh_id, "--gripper", "panda")
     code, _, err = run(*arguments, "--chunk", "10", "--accept-implausible")
     assert code == 1
-    assert "grasp 50 has a position that is not finite" in err
+    assert "grasp 50 (the first is 0) has a position that is not finite" in err
     assert can.refresh().info.trials == 0
 
 

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import foreign_files as files
 from graspdb import interop
@@ -514,15 +515,23 @@ def test_hdf5_stays_in_its_file(tmp_path: Path, panda: GripperProfile, tools: np
         ("a.jsonl", '{"position": [0, 0, 0]}\n', "which columns are the pose"),
         ("a.jsonl", '{"x": 1}\n{"x": ', "line 2 is no JSON"),
         ("a.jsonl", '{"position": [0, 0], "quaternion_xyzw": [0, 0, 0, 1], "outcome": 1}\n', "3 numbers"),
-        ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n0,0,0,0,0,0,1,maybe\n", "grasp 0: outcome is 'maybe'"),
+        (
+            "a.csv",
+            "x,y,z,qx,qy,qz,qw,outcome\n0,0,0,0,0,0,1,maybe\n",
+            r"grasp 0 \(the first is 0\): outcome is 'maybe'",
+        ),
         ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n0,0,0,0,0,0,1\n", "line 2 has 7 cells"),
         (
             "a.csv",
             "x,y,z,qx,qy,qz,qw,outcome\n0,0,nan,0,0,0,1,1\n",
-            "grasp 0 has a position that is not finite",
+            r"grasp 0 \(the first is 0\) has a position that is not finite",
         ),
-        ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n0,0,,0,0,0,1,1\n", "grasp 0 has a position that is not finite"),
-        ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n0,0,a,0,0,0,1,1\n", "grasp 0: z is 'a'"),
+        (
+            "a.csv",
+            "x,y,z,qx,qy,qz,qw,outcome\n0,0,,0,0,0,1,1\n",
+            r"grasp 0 \(the first is 0\) has a position that is not finite",
+        ),
+        ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n0,0,a,0,0,0,1,1\n", r"grasp 0 \(the first is 0\): z is 'a'"),
         ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n0,0,0,0,0,0,2,1\n", "unit quaternion"),
         ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n5000,0,0,0,0,0,1,1\n", "--unit"),
         ("a.csv", "x,y,z,qx,qy,qz,qw,outcome\n", "no rows"),
@@ -581,6 +590,59 @@ def test_a_table_says_how_it_is_to_be_written(tmp_path: Path) -> None:
     _refused(path, "Windows-1252: save it as UTF-8")
     path.write_text(head + "0,0,0,0,0,0,1,success\n", encoding="utf-16")
     _refused(path, "UTF-16: save it as UTF-8")
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_may_have_the_objects_pose_at_each_grasp(
+    tmp_path: Path, tools: np.ndarray, name: str
+) -> None:
+    """As a robot's log has it: both poses in the robot's base, the object now here, now there."""
+    turns = Rotation.random(len(tools), random_state=4)
+    places = np.random.default_rng(4).uniform(-0.5, 0.5, (len(tools), 3))
+    there = np.tile(np.eye(4), (len(tools), 1, 1))
+    there[:, :3, :3], there[:, :3, 3] = turns.as_matrix(), places
+    rows = there @ tools
+    columns: dict[str, Any] = {f"T_{i}{j}": rows[:, i, j] for i in range(4) for j in range(4)}
+    columns |= {f"o{letter}": 1000 * places[:, place] for place, letter in enumerate("xyz")}
+    columns |= {f"oq{letter}": turns.as_quat()[:, place] for place, letter in enumerate("xyzw")}
+    columns |= {f"T_{i}3": 1000 * rows[:, i, 3] for i in range(3)} | {"ok": np.ones(len(tools), dtype=int)}
+    path = _table(tmp_path / name, {key: values.tolist() for key, values in columns.items()})
+    said = "matrix=T,object_position=ox:oy:oz,object_quaternion_wxyz=oqw:oqx:oqy:oqz,outcome=ok"
+    found = interop.read(path, columns=said, unit="mm")
+    assert found.matrices == pytest.approx(tools, abs=1e-9)
+    assert found.report is not None
+    assert any("the object's pose at each grasp" in line for line in found.report.recognised)
+    with pytest.raises(ValueError, match="give one of them"):
+        interop.read(path, columns=said, unit="mm", object_pose=np.eye(4))
+    with pytest.raises(ValueError, match="name both"):
+        interop.read(path, columns="matrix=T,object_position=ox:oy:oz,outcome=ok")
+
+
+def test_unusable_grasps_are_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
+    header = "x,y,z,qx,qy,qz,qw,outcome\n"
+    rows = ["0,0,0.1,0,0,0,1,1", "nan,0,0,0,0,0,1,1", "0,0,0,0,0,0,2,0", ",0,0,0,0,0,1,0", "0,0,0.2,0,0,0,1,"]
+    (tmp_path / "log.csv").write_text(header + "\n".join([*rows, "0,0,0.3,0,0,0,1,0"]))
+    _refused(tmp_path / "log.csv", "--drop-unusable leaves such grasps out")
+    found = interop.read(tmp_path / "log.csv", drop_unusable=True)
+    assert found.position[:, 2].tolist() == [0.1, 0.3]
+    assert found.outcomes.tolist() == ["success", "failure"]
+    assert found.report is not None
+    assert found.report.left_out == {
+        "has a position that is not finite": 2,
+        "must have a unit quaternion, within 0.001": 1,
+        "has no outcome": 1,
+    }
+    (tmp_path / "word.csv").write_text(header + "0,0,0,0,0,0,1,perhaps")
+    with pytest.raises(ValueError, match="Outcomes are"):
+        interop.read(tmp_path / "word.csv", drop_unusable=True)
+
+
+def test_a_column_named_frame_may_count_a_videos(tmp_path: Path) -> None:
+    rows = ["x,y,z,qx,qy,qz,qw,outcome,frame", "0,0,0,0,0,0,1,1,17", "0,0,0,0,0,0,1,1,18"]
+    (tmp_path / "video.csv").write_text("\n".join(rows))
+    report = interop.read(tmp_path / "video.csv").report
+    assert report is not None
+    assert (report.frame, report.dropped[0].split(" (")[0]) == ("tool", "columns frame")
 
 
 def test_half_a_rule_is_none(tmp_path: Path, panda: GripperProfile, tools: np.ndarray) -> None:

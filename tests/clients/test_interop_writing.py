@@ -120,6 +120,69 @@ def test_tables_keep_all(
     assert times == grasps.more["measured_at"]
 
 
+#: Formats that have the joints' values of each grasp.
+POSTURES = ("isaac", "moveit", "rosbag", "csv", "jsonl")
+
+
+@settings(max_examples=3, deadline=None)
+@given(postures=st.lists(st.lists(st.floats(0.001, 0.04), min_size=4, max_size=4), min_size=1, max_size=4))
+@pytest.mark.parametrize(("first", "second"), list(itertools.product(POSTURES, POSTURES)))
+def test_postures_go_through_every_pair_that_has_them(
+    tmp_path_factory: pytest.TempPathFactory,
+    gripper: GripperProfile,
+    first: str,
+    second: str,
+    postures: list[list[float]],
+) -> None:
+    ends = {"open": 0.04, "closed": 0.0}
+    handed = GripperProfile.model_validate(gripper.model_dump() | {"joints": {"left": ends, "right": ends}})
+    bare = _grasps(7, ["success"] * len(postures))
+    told = [
+        {"joints": {"left": a, "right": b}, "joints_before": {"left": c, "right": d}}
+        for a, b, c, d in postures
+    ]
+    grasps = FileGrasps(bare.position, bare.quaternion_xyzw, bare.codes, bare.qualities, {"metadata": told})
+    folder = tmp_path_factory.mktemp("postures")
+    for format in (first, second):
+        grasps = _written(folder, grasps, format, handed)
+        for there, wanted in zip(grasps.more["metadata"], told, strict=True):
+            for kind, values in wanted.items():
+                assert there[kind] == pytest.approx(values, abs=1e-9)
+
+
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 2**31), convention=st.sampled_from(["graspdb", "acronym", "graspnet", "-z/x"]))
+@pytest.mark.parametrize("format", TABLES)
+def test_tables_say_of_which_frame_their_poses_are(
+    tmp_path_factory: pytest.TempPathFactory, gripper: GripperProfile, format: str, seed: int, convention: str
+) -> None:
+    grasps = _grasps(seed, ["success", "slipped", "failure"])
+    path = tmp_path_factory.mktemp("t") / f"g{ENDS[format]}"
+    report = interop.write(path, grasps, frame="base", convention=convention, gripper=gripper)
+    assert not report.dropped
+    back = interop.read(path, gripper=gripper)
+    assert back.matrices == pytest.approx(grasps.matrices, abs=1e-9)
+    assert back.report is not None
+    assert (back.report.frame, back.report.convention) == ("base", convention)
+    with pytest.raises(ValueError, match="gripper"):
+        interop.read(path)
+    # What somebody says counts more, and it is told that the file says otherwise.
+    said = interop.read(path, gripper=gripper, frame="tool").report
+    assert said is not None
+    assert any("though the file says base" in line for line in said.assumed)
+
+
+def test_a_table_of_several_frames_is_refused(tmp_path: Path, gripper: GripperProfile) -> None:
+    grasps = _grasps(1, ["success"])
+    lines = []
+    for frame in ("base", "tool"):
+        interop.write(tmp_path / "one.csv", grasps, frame=frame, convention="acronym", gripper=gripper)
+        lines += (tmp_path / "one.csv").read_text().splitlines()[bool(lines) :]
+    (tmp_path / "both.csv").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match="several frames"):
+        interop.read(tmp_path / "both.csv", gripper=gripper)
+
+
 def test_acronym_keeps_numbers_by_name(tmp_path: Path, gripper: GripperProfile) -> None:
     grasps = _grasps(3, ["success", "failure"])
     found = _written(tmp_path, grasps, "acronym", gripper)

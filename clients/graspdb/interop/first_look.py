@@ -34,6 +34,8 @@ _CRAMMED = 0.05
 _CLOSINGS = 128
 _FACES = 50_000_000
 """Triangles times grasps that closings are looked at for."""
+#: What of a file's grasps is looked at.
+_ARRAYS = ("position", "quaternion", "rotation", "ahead_m", "object_position", "object_quaternion")
 #: Where along the fingers, as shares of their length from the tips back, the jaw's lines of closing are.
 _DEPTHS = (0.05, 0.2, 0.4, 0.6)
 #: Approach and closing along every pair of axes that differ for a jaw, those of known conventions first.
@@ -330,7 +332,7 @@ def gathered(raws: Sequence[Raw], most: int) -> Raw:
         values = [getattr(part, name) for part in parts]
         return None if any(value is None for value in values) else np.concatenate(values)
 
-    arrays = {name: joined(name) for name in ("position", "quaternion", "rotation", "ahead_m")}
+    arrays = {name: joined(name) for name in _ARRAYS}
     return Raw(0, order=parts[0].order, **arrays)
 
 

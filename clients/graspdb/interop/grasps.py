@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,6 +17,9 @@ from graspdb.wire import OUTCOMES
 Floats = NDArray[np.float64]
 Codes = NDArray[np.uint8]
 
+NO_OUTCOME = 255
+"""The code of an outcome that is missing."""
+
 
 @dataclass(frozen=True)
 class Raw:
@@ -24,8 +28,10 @@ class Raw:
     ``first`` is the number of the first one in the file. A rotation is a ``quaternion`` xyzw (N, 4), read
     from numbers in this ``order`` where it might be the other (None: it can't), or a ``rotation`` (N, 3, 3).
     ``ahead_m`` (N,) is how far the fingertips lie ahead of the origin, in formats that say so instead of
-    naming a frame of the gripper. ``outcome`` are codes of :data:`graspdb.wire.OUTCOMES`, None where the file
-    has none. ``more`` are further columns of a trial.
+    naming a frame of the gripper. ``object_position`` (N, 3) and ``object_quaternion`` xyzw (N, 4) are the
+    object's pose at each grasp, in the frame that the poses are in, None where that is the object's.
+    ``outcome`` are codes of :data:`graspdb.wire.OUTCOMES`, :data:`NO_OUTCOME` where it is missing, None where
+    the file has none. ``more`` are further columns of a trial.
     """
 
     first: int
@@ -37,6 +43,8 @@ class Raw:
     qualities: Mapping[str, Floats] = field(default_factory=dict)
     ahead_m: Floats | None = None
     more: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    object_position: Floats | None = None
+    object_quaternion: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -57,6 +65,8 @@ class Raw:
             qualities={name: values[chosen] for name, values in self.qualities.items()},
             ahead_m=of(self.ahead_m),
             more={name: [values[i] for i in places] for name, values in self.more.items()},
+            object_position=of(self.object_position),
+            object_quaternion=of(self.object_quaternion),
         )
 
 
@@ -127,6 +137,7 @@ class Report:
     """What became of a file: its format, and in words what was recognised, assumed, mapped and dropped.
 
     ``grasps`` were taken, ``outcomes`` are theirs by name, ``rule`` says how an outcome was decided.
+    ``left_out`` says of how many grasps why they were not taken, where that was asked for.
     ``references`` are names that the file gives to the frame its poses are in, where that may not be the
     object's. ``object_scale`` is the factor that the file's mesh goes with, ``object_volume_m3`` the volume
     that it then has; None where the file says nothing.
@@ -146,6 +157,7 @@ class Report:
     object_scale: float | None = None
     object_volume_m3: float | None = None
     references: list[str] = field(default_factory=list)
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def recognise(self, told: str) -> None:
         """Say once what the file is or says."""
@@ -162,6 +174,11 @@ class Report:
     def drop(self, told: str) -> None:
         """Say once what of the file is in no trial."""
         _once(self.dropped, told)
+
+    def leave_out(self, why: str, number: int) -> None:
+        """Count grasps that are not taken."""
+        if number:
+            self.left_out[why] = self.left_out.get(why, 0) + number
 
     def count(self, grasps: FileGrasps) -> None:
         """Count grasps that were taken."""
@@ -189,6 +206,8 @@ def together(reports: Sequence[Report]) -> Report:
         whole.rule = whole.rule or report.rule
         for name, number in report.outcomes.items():
             whole.outcomes[name] = whole.outcomes.get(name, 0) + number
+        for why, number in report.left_out.items():
+            whole.leave_out(why, number)
         for kind in ("recognised", "assumed", "mapped", "dropped"):
             for told in getattr(report, kind):
                 _once(getattr(whole, kind), told)
@@ -201,4 +220,5 @@ def together(reports: Sequence[Report]) -> Report:
 
 def problem(file: str, told: str) -> FileProblem:
     """One line that names the file."""
+    told = re.sub(r"^(grasp \d+)\b", r"\1 (the first is 0)", told)
     return FileProblem(f"{file}: {' '.join(told.split())[:1_000]}")

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspdb.interop.formats.known import TIPS
 from graspdb.interop.frames import approach_of, follow, precede
 from graspdb.interop.grasps import Floats, Raw
-from graspdb.poses import Poses, quaternions_of
+from graspdb.poses import Poses, matrices, quaternions_of
 from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
 
 
@@ -34,11 +34,14 @@ class Placing:
 
     def place(self, raw: Raw) -> Poses:
         """Poses of the tool in the object's frame; ValueError names the first grasp that has none."""
-        position = raw.position * self.factor
-        _refuse(raw, ~np.isfinite(position).all(axis=1), "has a position that is not finite")
-        far = np.abs(position).max(axis=1, initial=0.0) > MAX_COORDINATE_M
-        _refuse(raw, far, "lies more than 1 km from the origin: is the unit right (--unit)?")
-        poses = Poses(position, self._quaternions(raw))
+        for bad, what in self.faults(raw):
+            if np.any(bad):
+                raise ValueError(f"grasp {raw.first + int(np.argmax(bad))} {what}")
+        poses = Poses(raw.position * self.factor, self._quaternions(raw))
+        if raw.object_position is not None:
+            assert raw.object_quaternion is not None
+            there = matrices(raw.object_position * self.factor, _unit(raw.object_quaternion))
+            poses = precede(np.asarray(np.linalg.inv(there), dtype=np.float64), poses)
         if self.into_object is not None:
             poses = precede(self.into_object, poses)
         poses = follow(poses, self.fixed)
@@ -49,25 +52,44 @@ class Placing:
         ahead = (raw.ahead_m * self.factor - self.tip_offset_m)[:, None]
         return Poses(poses.position + ahead * approach_of(poses), poses.quaternion_xyzw)
 
+    def faults(self, raw: Raw) -> Iterator[tuple[NDArray[np.bool_], str]]:
+        """Which grasps (N,) have no pose, and why, a reason after the other."""
+        yield from self._of_positions(raw.position, "a position")
+        if raw.rotation is not None:
+            yield _infinite(raw.rotation), "has a rotation that is not finite"
+            gram = np.einsum("nki,nkj->nij", raw.rotation, raw.rotation)
+            off = np.abs(gram - np.eye(3)).max(axis=(1, 2), initial=0.0) > 2 * UNIT_TOLERANCE
+            yield np.asarray(off), "must have a rotation: the columns of its matrix are not orthonormal"
+            yield np.linalg.det(raw.rotation) < 0, "must have a rotation, not a reflection"
+        elif raw.quaternion is not None:
+            yield _no_unit(raw.quaternion), f"must have a unit quaternion, within {UNIT_TOLERANCE:g}"
+        if raw.object_position is not None and raw.object_quaternion is not None:
+            yield from self._of_positions(raw.object_position, "an object's position")
+            told = f"must have a unit quaternion of the object, within {UNIT_TOLERANCE:g}"
+            yield _no_unit(raw.object_quaternion), told
+
+    def _of_positions(self, position: Floats, what: str) -> Iterator[tuple[NDArray[np.bool_], str]]:
+        yield _infinite(position), f"has {what} that is not finite"
+        far = np.abs(position * self.factor).max(axis=1, initial=0.0) > MAX_COORDINATE_M
+        yield np.asarray(far), f"has {what} more than 1 km from the origin: is the unit right (--unit)?"
+
     def _quaternions(self, raw: Raw) -> Floats:
         if raw.rotation is not None:
-            _refuse(raw, ~np.isfinite(raw.rotation).all(axis=(1, 2)), "has a rotation that is not finite")
-            try:
-                return quaternions_of(np.asarray(raw.rotation, dtype=np.float64))
-            except ValueError as error:
-                found = re.match(r"pose (\d+) (.*)", str(error))
-                assert found is not None
-                raise ValueError(f"grasp {raw.first + int(found[1])} {found[2]}") from None
+            return quaternions_of(np.asarray(raw.rotation, dtype=np.float64))
         assert raw.quaternion is not None
         quaternion = raw.quaternion
         if self.swapped:
             quaternion = quaternion[:, [1, 2, 3, 0] if raw.order == "xyzw" else [3, 0, 1, 2]]
-        norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-        off = ~(np.abs(norm[:, 0] - 1.0) <= UNIT_TOLERANCE)
-        _refuse(raw, off, f"must have a unit quaternion, within {UNIT_TOLERANCE:g}")
-        return np.asarray(quaternion / norm)
+        return _unit(quaternion)
 
 
-def _refuse(raw: Raw, bad: Any, what: str) -> None:
-    if np.any(bad):
-        raise ValueError(f"grasp {raw.first + int(np.argmax(bad))} {what}")
+def _infinite(numbers: Floats) -> NDArray[np.bool_]:
+    return np.asarray(~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1))
+
+
+def _no_unit(quaternion: Floats) -> NDArray[np.bool_]:
+    return np.asarray(~(np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) <= UNIT_TOLERANCE))
+
+
+def _unit(quaternion: Floats) -> Floats:
+    return np.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))

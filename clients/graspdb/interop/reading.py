@@ -14,11 +14,12 @@ from typing_extensions import Unpack
 
 from graspdb.files.trials import METRES
 from graspdb.interop import joints
+from graspdb.interop.formats import tables
 from graspdb.interop.formats.columns import parsed
 from graspdb.interop.formats.known import FORMATS, TIPS, Format, recognised
 from graspdb.interop.formats.source import SourceFile, Wishes
 from graspdb.interop.frames import frames_of, to_graspdb, to_tool
-from graspdb.interop.grasps import Codes, FileGrasps, Floats, Raw, Report, joined, problem
+from graspdb.interop.grasps import NO_OUTCOME, Codes, FileGrasps, Floats, Raw, Report, joined, problem
 from graspdb.interop.outcomes import Rule, named, rule_of
 from graspdb.interop.placing import Placing
 from graspdb.options import Option, Vector, known_keywords
@@ -69,10 +70,11 @@ class Reading:
         """The file's grasps as ours; the report says more with each piece. FileProblem in one line."""
         for raw in self.raws(report):
             placing = self.placing_by(report)
+            raw = self._usable(raw, placing, report)
             try:
                 poses = placing.place(raw)
             except ValueError as error:
-                raise problem(self.source.name, str(error)) from None
+                raise problem(self.source.name, f"{error}; --drop-unusable leaves such grasps out") from None
             codes, kept = self._outcomes(raw, report)
             more = joints.kept(raw.more, self.gripper, report)
             found = FileGrasps(*poses, codes, self._qualities(raw, report), more)
@@ -81,6 +83,19 @@ class Reading:
             report.count(found)
             if len(found):
                 yield found
+
+    def _usable(self, raw: Raw, placing: Placing, report: Report) -> Raw:
+        """The grasps that are taken: all of them, unless those without pose or outcome are to be left out."""
+        if not self.wishes.drop_unusable:
+            return raw
+        kept = np.ones(len(raw), dtype=bool)
+        faults = list(placing.faults(raw))
+        if raw.outcome is not None and self.rule is None:
+            faults.append((raw.outcome == NO_OUTCOME, "has no outcome"))
+        for bad, why in faults:
+            report.leave_out(why, int((bad & kept).sum()))
+            kept &= ~bad
+        return raw if kept.all() else raw.part(kept)
 
     def _qualities(self, raw: Raw, report: Report) -> dict[str, Floats]:
         """The qualities under names that are stored; one line names a number that can't be."""
@@ -139,8 +154,7 @@ class Reading:
                     )
                 report.assume(str(rule))
             report.rule = str(rule)
-            if not told.all():
-                report.drop(f"grasps without {rule.quality}")
+            report.leave_out(f"has no {rule.quality}", int((~told).sum()))
             return rule.codes(values), told
         if self.rule is not None:
             there = ", ".join(raw.qualities) or "none"
@@ -176,6 +190,8 @@ class ReadOptions(TypedDict, total=False):
     - ``object_pose``: the object in the frame that the file's poses are in: (4, 4) or x y z qx qy qz qw.
     - ``success_from`` with ``success_above`` or ``success_below``: the rule that makes outcomes of a quality.
     - ``outcome``: one outcome for all grasps of which the file says none.
+    - ``drop_unusable``: leave out grasps that have no pose (a number that is not finite, no rotation) or, in
+      a table, no outcome; without it they are refused, and the report says how many were left out.
     """
 
     format: Annotated[str | None, Option(f"auto, or one of {', '.join(FORMATS)}.")]
@@ -203,6 +219,7 @@ class ReadOptions(TypedDict, total=False):
     success_above: Annotated[float | None, Option("A success is above this.")]
     success_below: Annotated[float | None, Option("A success is below this, where a lower score is better.")]
     outcome: Annotated[str | None, Option("What became of all of which the file does not say it.")]
+    drop_unusable: Annotated[bool, Option("Leave out grasps without a pose or an outcome, and say how many.")]
 
 
 def opened(
@@ -228,6 +245,8 @@ def opened(
     kind = recognised(source, options.get("format") or "auto", only.get("topic"))
     if columns and not kind.table:
         raise ValueError(f"columns are named in tables; {source.name} is {kind.name}")
+    if place is not None and any(name.startswith("object_") for name in columns):
+        raise ValueError("the object's pose is in columns and in --object-pose: give one of them")
     if place is None and kind.reference != "object":
         raise problem(
             source.name,
@@ -236,8 +255,10 @@ def opened(
         )
     profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
     assumed: list[str] = []
-    placing = _placing(source, kind, profile, options, assumed)
-    wishes = Wishes(order, columns, only, () if rule is None else (rule.quality,))
+    stated = tables.stated(source, kind.name) if kind.table else {}
+    placing = _placing(source, kind, profile, options, assumed, stated)
+    dropping = bool(options.get("drop_unusable", False))
+    wishes = Wishes(order, columns, only, () if rule is None else (rule.quality,), dropping, stated)
     decided = None if outcome is None else named(outcome)
     return Reading(source, kind, placing, wishes, rule, decided, assumed, profile, frames or {})
 
@@ -248,6 +269,7 @@ def _placing(
     profile: GripperProfile | None,
     options: ReadOptions,
     assumed: list[str],
+    stated: Mapping[str, str],
 ) -> Placing:
     unit, scale, place = options.get("unit"), options.get("scale"), options.get("object_pose")
     scale = 1.0 if scale is None else scale
@@ -255,7 +277,17 @@ def _placing(
         raise ValueError(f"unit is {unit!r}; expected one of {', '.join(METRES)}")
     if not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"scale is {scale}; expected a positive number")
-    frame, axes = _settled(source, kind, options.get("frame"), options.get("convention"), profile, assumed)
+    for name, value in stated.items():
+        if options.get(name) not in (None, value):
+            assumed.append(f"{name} {options.get(name)}, as was said, though the file says {value}")
+    frame, axes = _settled(
+        source,
+        kind,
+        options.get("frame") or stated.get("frame"),
+        options.get("convention") or stated.get("convention"),
+        profile,
+        assumed,
+    )
     if unit is None:
         assumed.append(f"positions in {kind.unit}")
     if scale != 1.0:

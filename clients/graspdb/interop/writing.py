@@ -46,6 +46,8 @@ class _Writer:
     convention: str
     suffixes: tuple[str, ...]
     folder: bool = False
+    #: Whether a file says itself what its poses are of.
+    states_frame: bool = False
 
 
 _WRITERS = {
@@ -53,10 +55,10 @@ _WRITERS = {
     "graspgen": _Writer(matrices.graspgen, "base", "graspgen", (".json",)),
     "isaac": _Writer(messages.isaac, "base", "graspdb", (".yaml", ".yml")),
     "moveit": _Writer(messages.moveit, "flange", "graspdb", (".yaml", ".yml", ".json")),
-    "rosbag": _Writer(rosbags.bag, "flange", "graspdb", (), folder=True),
-    "csv": _Writer(tables.csv_file, "tool", "graspdb", (".csv",)),
-    "jsonl": _Writer(tables.json_lines, "tool", "graspdb", (".jsonl", ".ndjson")),
-    "parquet": _Writer(tables.parquet, "tool", "graspdb", (".parquet",)),
+    "rosbag": _Writer(rosbags.bag, "flange", "graspdb", (), folder=True, states_frame=True),
+    "csv": _Writer(tables.csv_file, "tool", "graspdb", (".csv",), states_frame=True),
+    "jsonl": _Writer(tables.json_lines, "tool", "graspdb", (".jsonl", ".ndjson"), states_frame=True),
+    "parquet": _Writer(tables.parquet, "tool", "graspdb", (".parquet",), states_frame=True),
 }
 
 WRITTEN = tuple(_WRITERS)
@@ -103,20 +105,17 @@ def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Wri
     """Write grasps that come by runs, of which one at a time is held, as :func:`write` does."""
     known_keywords(Written, how, "write")
     target, gripper = Path(path), how.get("gripper")
-    name = how.get("format") or _by_name(target)
-    if name not in _WRITERS:
-        raise ValueError(f"format is {name!r}; expected one of {', '.join(WRITTEN)}")
-    writer = _WRITERS[name]
+    name, writer = _writer(target, how.get("format"))
     profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
     report = Report(str(path), name)
-    chosen, axes = how.get("frame") or writer.frame, how.get("convention") or writer.convention
+    chosen, axes = written_of(target, name, how.get("frame"), how.get("convention"))
     if how.get("frame") is None and chosen == "flange" and "flange" not in frames_of(profile):
         raise ValueError(
             "moveit_msgs/Grasp has poses of the end effector's parent link, and the gripper has no frame"
             " flange: say which of its frames that link is (--frame base, or another)"
         )
     report.frame, report.convention = chosen, axes
-    if (chosen, axes) != (writer.frame, writer.convention) and name != "rosbag":
+    if (chosen, axes) != (writer.frame, writer.convention) and not writer.states_frame:
         report.drop(f"what its poses are of: when it is read, say --frame {chosen} --convention {axes}")
     way = to_tool(chosen, axes, profile)
     fixed = np.asarray(np.linalg.inv(way), dtype=np.float64)
@@ -152,6 +151,21 @@ def write_runs(path: str | PathLike[str], runs: Iterable[Run], **how: Unpack[Wri
         writer.write(whole, chain([first], found), report)
         os.replace(whole, target)
     return report
+
+
+def written_of(
+    path: str | PathLike[str], format: str | None, frame: str | None, convention: str | None
+) -> tuple[str, str]:
+    """The frame and the convention that a file's poses are written in: those given, else the format's own."""
+    writer = _writer(Path(path), format)[1]
+    return frame or writer.frame, convention or writer.convention
+
+
+def _writer(path: Path, format: str | None) -> tuple[str, _Writer]:
+    name = format or _by_name(path)
+    if name not in _WRITERS:
+        raise ValueError(f"format is {name!r}; expected one of {', '.join(WRITTEN)}")
+    return name, _WRITERS[name]
 
 
 def _of_tool(grasps: Any, gripper: GripperProfile | GripperInfo | None) -> Poses:

@@ -13,10 +13,10 @@ import typer
 from graspdb.cli.common import ObjectId, State
 from graspdb.interop import WRITTEN, write
 from graspdb.interop.grasps import Report
-from graspdb.interop.writing import Run, Written, write_runs
+from graspdb.interop.writing import Run, Written, write_runs, written_of
 from graspdb.poses import Poses
 from graspdb.resources.objects import GraspObject
-from graspdb.resources.selection import Selection
+from graspdb.resources.selection import AnswerFrame, PoseFrame, Selection
 from graspdb.resources.trials import TrialFilters
 from graspdb.wire import GripperInfo
 
@@ -52,19 +52,24 @@ def export(
     item = state.db.objects.get(id)
     # What is written is of this frame; what is asked for is the tool's.
     frame, convention = filters.pop("frame", None), filters.pop("convention", None)
-    if filters.pop("near", None) is not None:
-        raise typer.BadParameter("each grasp is written as it is kept: leave it out", param_hint="--near")
+    near = filters.pop("near", None)
+    asked: AnswerFrame = {}
+    if near is not None and what != "trials":
+        # The twin is that nearer in the frame that is written.
+        frame, convention = written_of(output, format, frame, convention)
+        asked = {"frame": frame, "convention": convention, "near": near}
     poses: Any
+    told: dict[str, Any] | None = None
     if what == "best":
-        best = item.best_grasps(count=count or _BEST, **selection)
-        poses, told = list(best), _chances(item, list(best), selection)
+        best = list(item.best_grasps(count=count or _BEST, **selection, **asked))
+        poses, told = best, _chances(item, best, selection, asked)
     elif what == "samples":
-        drawn = item.samples(count or _SAMPLES, seed=seed, **selection)
-        poses, told = drawn, _chances(item, drawn, selection)
-    elif what == "trials":
-        told = None
-    else:
+        drawn = item.samples(count or _SAMPLES, seed=seed, **selection, **asked)
+        poses, told = drawn, _chances(item, drawn, selection, asked)
+    elif what != "trials":
         raise typer.BadParameter(f"{what!r}; expected best, samples or trials")
+    elif near is not None:
+        raise typer.BadParameter("trials are written as they were posted: leave it out", param_hint="--near")
     how: Written = {
         "format": format,
         "frame": frame,
@@ -85,9 +90,10 @@ def export(
     state.show(report, "\n".join(lines))
 
 
-def _chances(item: GraspObject, poses: Any, selection: Selection) -> dict[str, Any]:
+def _chances(item: GraspObject, poses: Any, selection: Selection, asked: AnswerFrame) -> dict[str, Any]:
     """Success probabilities of poses, NaN where the service tells none."""
-    found = item.likelihood(poses, include=["success_probability"], **selection).success_probability
+    of = PoseFrame(frame=asked.get("frame"), convention=asked.get("convention"))
+    found = item.likelihood(poses, include=["success_probability"], **selection, **of).success_probability
     return {} if found is None else {"success_probability": np.asarray(found)}
 
 

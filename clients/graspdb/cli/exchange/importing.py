@@ -93,6 +93,8 @@ def _lines(report: Report, look: FirstLook) -> Any:
     for kind in ("recognised", "assumed", "mapped", "dropped"):
         for line in getattr(report, kind):
             yield f"  {kind}: {line}"
+    for why, number in report.left_out.items():
+        yield f"  left out: {number:,} grasps: {why}"
     outcomes = ", ".join(f"{number:,} {name}" for name, number in report.outcomes.items())
     yield f"  outcomes: {outcomes} ({report.rule})"
     for line in look.lines():

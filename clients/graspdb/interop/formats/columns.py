@@ -11,9 +11,12 @@ MORE = ("width_m", "gripper", "source", "protocol", "proposal_density", "measure
 _PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 KEYS = (
     *("position", "quaternion", "quaternion_xyzw", "quaternion_wxyz", "rotation", "matrix"),
+    *("object_position", "object_quaternion_xyzw", "object_quaternion_wxyz"),
     *(*_PARTS, "outcome", "quality", *MORE),
 )
 """What ``columns`` may name, beside ``quality.NAME``."""
+STATED = ("frame", "convention")
+"""Columns of our own tables: of which frame of the gripper the poses are, and in which convention."""
 
 _OUTCOMES = ("outcome", "success", "label", "result", "held", "object_in_gripper")
 _POSITIONS: tuple[str, ...] = (
@@ -50,6 +53,8 @@ class Plan:
     """The columns to read: one with all its numbers, or one for each.
 
     ``order`` is that of a quaternion's numbers, ``rotation`` holds 9 numbers, ``matrix`` 16 or 12.
+    ``object_position`` and ``object_quaternion`` (in ``object_order``) are the object's pose at each grasp.
+    ``stated`` are columns that say of which frame the poses are, and in which convention.
     """
 
     position: tuple[str, ...] = ()
@@ -61,12 +66,17 @@ class Plan:
     outcome: str | None = None
     qualities: Mapping[str, str] = field(default_factory=dict)
     more: Mapping[str, str] = field(default_factory=dict)
+    object_position: tuple[str, ...] = ()
+    object_quaternion: tuple[str, ...] = ()
+    object_order: str = "xyzw"
+    stated: tuple[str, ...] = ()
 
     @property
     def names(self) -> list[str]:
         """All columns to read, each once."""
         outcome = () if self.outcome is None else (self.outcome,)
         pose = (*self.position, *self.quaternion, *self.rotation, *self.matrix)
+        pose += (*self.object_position, *self.object_quaternion, *self.stated)
         return list(dict.fromkeys([*pose, *outcome, *self.qualities.values(), *self.more.values()]))
 
 
@@ -88,11 +98,16 @@ def parsed(text: str | Mapping[str, str]) -> dict[str, str]:
 
 
 def plan(
-    there: Sequence[str], given: Mapping[str, str], order: str | None, qualities: Sequence[str] = ()
+    there: Sequence[str],
+    given: Mapping[str, str],
+    order: str | None,
+    qualities: Sequence[str] = (),
+    stated: Sequence[str] = (),
 ) -> Plan:
     """Which of these columns are what; ValueError names what is missing and how to name it.
 
-    ``given`` is what somebody named (:func:`parsed`), ``qualities`` are needed for a rule.
+    ``given`` is what somebody named (:func:`parsed`), ``qualities`` are needed for a rule, ``stated`` some
+    of :data:`STATED`.
     """
     known = set(there)
     pose = _pose(there, known, given, order)
@@ -109,7 +124,29 @@ def plan(
     for name in (*scores.values(), *more.values()):
         if name not in known:
             raise ValueError(_lacks(name, there))
-    return Plan(**pose, outcome=outcome, qualities=scores, more=more)  # type: ignore[arg-type]
+    pose |= _object(there, known, given)
+    return Plan(
+        **pose,  # type: ignore[arg-type]
+        outcome=outcome,
+        qualities=scores,
+        more=more,
+        stated=tuple(stated),
+    )
+
+
+def _object(there: Sequence[str], known: set[str], given: Mapping[str, str]) -> dict[str, object]:
+    """The columns of the object's pose at each grasp, where they are named."""
+    orders = [order for order in ("xyzw", "wxyz") if f"object_quaternion_{order}" in given]
+    if not orders and "object_position" not in given:
+        return {}
+    if len(orders) != 1 or "object_position" not in given:
+        raise ValueError(
+            "the object's pose at each grasp is object_position and one of object_quaternion_xyzw and"
+            " object_quaternion_wxyz: name both"
+        )
+    turn = _expanded(given[f"object_quaternion_{orders[0]}"], known, there, (4,), orders[0])
+    place = _expanded(given["object_position"], known, there, (3,))
+    return {"object_position": place, "object_quaternion": turn, "object_order": orders[0]}
 
 
 def _pose(

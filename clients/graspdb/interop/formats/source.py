@@ -37,6 +37,8 @@ class Wishes:
     columns: Mapping[str, str] = field(default_factory=dict)
     only: Mapping[str, str] = field(default_factory=dict)
     qualities: tuple[str, ...] = ()
+    drop_unusable: bool = False
+    stated: Mapping[str, str] = field(default_factory=dict)
 
 
 class SourceFile:

@@ -11,9 +11,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from graspdb.interop.formats.columns import MORE, Plan, plan
+from graspdb.interop.formats.columns import MORE, STATED, Plan, plan
 from graspdb.interop.formats.source import CHUNK, SourceFile, Wishes
-from graspdb.interop.grasps import Codes, Floats, Raw, Report, problem
+from graspdb.interop.grasps import NO_OUTCOME, Codes, Floats, Raw, Report, problem
 from graspdb.interop.outcomes import WORDS, code_of
 from graspdb.interop.parsing.events import extra
 from graspdb.wire import OUTCOMES
@@ -41,6 +41,31 @@ class Table(Protocol):
         """One column of lists or several of numbers, as (N, k)."""
 
 
+def stated(source: SourceFile, kind: str) -> dict[str, str]:
+    """What a table says itself of its poses, by the columns :data:`STATED`, as our own tables do."""
+    if kind == "parquet":
+        found = _first_of_parquet(source)
+    elif kind == "csv":
+        text = source.head.decode("utf-8-sig", "replace").splitlines()[:2]
+        rows = csv.reader(text, delimiter=";" if _semicolons(source) else ",", skipinitialspace=True)
+        found = dict(zip(*rows, strict=False)) if len(text) == 2 else {}
+    else:
+        found = next(_records(source), {})
+    told = {name.strip(): value for name, value in found.items() if isinstance(value, str)}
+    # A number is a video's frame, not a gripper's.
+    return {name: told[name] for name in STATED if re.fullmatch(r"-?[A-Za-z][\w./-]*", told.get(name, ""))}
+
+
+def _first_of_parquet(source: SourceFile) -> dict[str, Any]:
+    pq, pa = extra("pyarrow.parquet", "Parquet"), extra("pyarrow", "Parquet")
+    with suppress(pa.ArrowException, OSError), pq.ParquetFile(source.path) as file:
+        names = [name for name in STATED if name in file.schema_arrow.names]
+        for batch in file.iter_batches(batch_size=1, columns=names) if names else ():
+            found: list[dict[str, Any]] = batch.to_pylist()
+            return found[0] if found else {}
+    return {}
+
+
 def read_csv(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
     """A header line and a grasp a line."""
     return _rows(source, _csv_tables(source, report), wishes, report)
@@ -61,7 +86,7 @@ def read_parquet(source: SourceFile, wishes: Wishes, report: Report) -> Iterator
             chosen = _planned(source.name, names, wishes, report)
             first = 0
             for batch in file.iter_batches(batch_size=CHUNK, columns=chosen.names):
-                yield _raw(source.name, _Arrow(source.name, batch), chosen, first)
+                yield _raw(source.name, _Arrow(source.name, batch), chosen, first, wishes)
                 first += len(batch)
     except (pa.ArrowException, OSError) as error:
         raise problem(source.name, f"can't be read as Parquet: {error}") from None
@@ -90,7 +115,7 @@ def read_vgn(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw
                 "has grasps in several scenes, in each of which the object lies elsewhere: name one with"
                 f" --only scene_id={sorted(scenes)[0]}",
             )
-        raw = _raw(source.name, table, chosen, first)
+        raw = _raw(source.name, table, chosen, first, wishes)
         first += len(table)
         raw = Raw(
             raw.first, raw.position, raw.quaternion, order=raw.order, outcome=raw.outcome, more=raw.more,
@@ -114,7 +139,7 @@ def _rows(source: SourceFile, tables: Iterator[_Lists], wishes: Wishes, report: 
     for table in tables:
         if chosen is None:
             chosen = _planned(source.name, table.names, wishes, report)
-        yield _raw(source.name, table, chosen, first)
+        yield _raw(source.name, table, chosen, first, wishes)
         first += len(table)
     if chosen is None:
         raise problem(source.name, "has no grasps")
@@ -122,7 +147,7 @@ def _rows(source: SourceFile, tables: Iterator[_Lists], wishes: Wishes, report: 
 
 def _planned(file: str, names: Sequence[str], wishes: Wishes, report: Report) -> Plan:
     try:
-        chosen = plan(names, wishes.columns, wishes.quaternion_order, wishes.qualities)
+        chosen = plan(names, wishes.columns, wishes.quaternion_order, wishes.qualities, list(wishes.stated))
     except ValueError as error:
         raise problem(file, str(error)) from None
     if chosen.quaternion:
@@ -139,6 +164,11 @@ def _planned(file: str, names: Sequence[str], wishes: Wishes, report: Report) ->
         )
     if not (chosen.position or chosen.matrix):
         raise problem(file, "which columns are the position? Name them, as in --columns position=px:py:pz")
+    for name in chosen.stated:
+        report.recognise(f"{name} {wishes.stated[name]}, by the column {name}")
+    if chosen.object_position:
+        where = f"{_told(chosen.object_position)} and {_told(chosen.object_quaternion)}"
+        report.recognise(f"the object's pose at each grasp in {where}")
     if chosen.outcome is not None:
         report.map(f"{chosen.outcome} to the outcome")
     for name, column in chosen.more.items():
@@ -157,7 +187,12 @@ def _told(names: tuple[str, ...]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
 
-def _raw(file: str, table: Table, chosen: Plan, first: int) -> Raw:
+def _raw(file: str, table: Table, chosen: Plan, first: int, wishes: Wishes) -> Raw:
+    for name in chosen.stated:
+        others = sorted({str(value) for value in table.values(name)} - {wishes.stated[name]})
+        if others:
+            several = f"{wishes.stated[name]!r} and {others[0]!r}"
+            raise problem(file, f"has poses of several {name}s ({several}): import those of one at a time")
     position: Floats
     quaternion = rotation = None
     if chosen.matrix:
@@ -184,10 +219,21 @@ def _raw(file: str, table: Table, chosen: Plan, first: int) -> Raw:
         quaternion,
         rotation,
         None if quaternion is None else chosen.order,
-        None if chosen.outcome is None else _codes(file, table, chosen.outcome, first),
+        None if chosen.outcome is None else _codes(file, table, chosen.outcome, first, wishes),
         {name: table.floats(column) for name, column in chosen.qualities.items()},
         more={name: _more(file, table, name, column, first) for name, column in chosen.more.items()},
+        **_object_poses(file, table, chosen),
     )
+
+
+def _object_poses(file: str, table: Table, chosen: Plan) -> dict[str, Floats]:
+    if not chosen.object_position:
+        return {}
+    turn = _wide(file, table, chosen.object_quaternion, 4)
+    return {
+        "object_position": _wide(file, table, chosen.object_position, 3),
+        "object_quaternion": turn if chosen.object_order == "xyzw" else turn[:, [1, 2, 3, 0]],
+    }
 
 
 def _wide(file: str, table: Table, names: tuple[str, ...], width: int) -> Floats:
@@ -217,7 +263,7 @@ def _object(file: str, row: int, value: Any) -> Any:
     return value
 
 
-def _codes(file: str, table: Table, name: str, first: int) -> Codes:
+def _codes(file: str, table: Table, name: str, first: int, wishes: Wishes) -> Codes:
     values = table.values(name)
     known: dict[Any, int | None] = {}
     codes = np.empty(len(values), dtype=np.uint8)
@@ -226,8 +272,11 @@ def _codes(file: str, table: Table, name: str, first: int) -> Codes:
         if key not in known:
             known[key] = code_of(value)
         code = known[key]
+        missing = value in (None, "") or value != value
+        if code is None and missing and wishes.drop_unusable:
+            code = NO_OUTCOME
         if code is None:
-            told = "missing" if value in (None, "") else repr(value)[:60]
+            told = "missing (--drop-unusable leaves such grasps out)" if missing else repr(value)[:60]
             raise problem(
                 file,
                 f"grasp {first + row}: {name} is {told}, no outcome. Outcomes are"

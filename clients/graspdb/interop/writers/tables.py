@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from graspdb.interop.formats.columns import STATED
 from graspdb.interop.grasps import Report
 from graspdb.interop.parsing.events import extra
 from graspdb.interop.writers.content import Content
 from graspdb.poses import POSE_COLUMNS
+from graspdb.wire.frames.gripper_frames import TOOL
 
 _NUMBERS = ("quality", "width_m", "proposal_density")
 
@@ -92,7 +94,10 @@ def _others(content: Content) -> dict[str, list[Any]]:
     for name, values in content.qualities.items():
         key = "quality" if name == "quality" else f"qualities.{name}"
         columns[key] = [None if x != x else x for x in values.tolist()]
-    return columns | {name: list(entries) for name, entries in content.more.items()}
+    columns |= {name: list(entries) for name, entries in content.more.items()}
+    if (content.frame, content.convention) != (TOOL, "graspdb"):
+        columns |= {name: [getattr(content, name)] * len(content) for name in STATED}
+    return columns
 
 
 def _cell(value: Any) -> Any:
