@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -15,8 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from graspdb import Client, wire
+from graspdb import AsyncClient, Client, wire
 from graspdb.poses import Poses, as_poses, matrices
+from graspdb.resources.objects import GraspObject
 from graspdb.wire import CONVENTIONS
 from graspdb.wire.frames.conventions import OWN_AXES, to_graspdb
 
@@ -27,6 +29,7 @@ SHAPE: dict[str, Any] = {
     "tip_offset_m": 0.01,
     "palm_size_m": [0.05, 0.08, 0.05],
 }
+WORLD = matrices([0.5, -0.3, 0.8], [0.3, -0.2, 0.5, np.sqrt(1 - 0.38)])
 TWIN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 _numbers = st.floats(-1.0, 1.0, allow_nan=False)
@@ -46,6 +49,17 @@ def db(serve_module: Callable[..., str], tmp_path_factory: pytest.TempPathFactor
         )
     ) as client:
         yield client
+
+
+@pytest.fixture(scope="module")
+def thing(db: Client) -> GraspObject:
+    """An object grasped with a gripper that nobody named, so that each new one may be asked of."""
+    rng = np.random.default_rng(0)
+    item = db.objects.create("thing")
+    poses = np.tile([0.0, 0.0, 0.06, 1.0, 0.0, 0.0, 0.0], (60, 1))
+    poses[:, :3] += rng.normal(scale=0.004, size=(60, 3))
+    item.trials.add(poses, np.arange(60) % 5 > 0, source="robot")
+    return item
 
 
 class Expected:
@@ -86,7 +100,7 @@ def _matrices(found: Any) -> Floats:
 
 
 def _text(near: Sequence[float]) -> str:
-    return ",".join(map(repr, near))
+    return ",".join(str(float(x)) for x in near)
 
 
 CASES = {
@@ -101,6 +115,60 @@ EVERYWHERE = settings(
 )
 
 
+@given(**CASES)
+@EVERYWHERE
+def test_answers_are_of_the_frame(
+    db: Client, thing: GraspObject, tool: Any, other: Any, frame: str, convention: str, near: list[float]
+) -> None:
+    expected = Expected(tool, other, frame, convention, near)
+    gripper = db.grippers.create(f"g-{uuid.uuid4().hex[:8]}", **expected.profile).id
+    chosen: dict[str, Any] = {"gripper": gripper, "prior": False}
+
+    async def asynchronous() -> Any:
+        async with AsyncClient(db.url) as client:
+            item = await client.objects.get(thing.id)
+            return (
+                await item.best_grasps(count=2, **chosen, **expected.asked),
+                await item.samples(9, seed=1, gripper=gripper, **expected.asked),
+                await item.proposals(9, seed=1, gripper=gripper, **expected.asked),
+            )
+
+    # Best grasps, in the object's frame and in the world's.
+    plain = thing.best_grasps(count=2, object_pose=WORLD, **chosen)
+    told = thing.best_grasps(count=2, object_pose=WORLD, **chosen, **expected.asked)
+    assert told.worlds is not None
+    expected.same(told.matrices, plain.matrices, WORLD)
+    np.testing.assert_allclose(told.worlds, WORLD @ told.matrices, atol=1e-9)
+    assert (told[0].frame, told[0].convention) == (frame, convention)
+    asked_again = db.answers.get(told.answer or "", now=True).result
+    np.testing.assert_allclose(asked_again.matrices, told.matrices, atol=0)
+    best, drawn, proposed = asyncio.run(asynchronous())
+    expected.same(best.matrices, plain.matrices)
+
+    # Draws; and these kept, and sent back.
+    samples = thing.samples(9, seed=1, gripper=gripper)
+    proposals = thing.proposals(9, seed=1, gripper=gripper)
+    for found, by_tool in ((drawn, samples), (proposed, proposals)):
+        expected.same(found.matrices, by_tool.matrices)
+        np.testing.assert_array_equal(found.proposal_density, by_tool.proposal_density)
+        kept = db.answers.get(found.answer)
+        np.testing.assert_array_equal(kept.result.matrices, found.matrices)
+        assert kept.question["near"] == pytest.approx(near)
+
+    # Poses that come in: likelihoods by either method, candidates and exclusions.
+    likely = thing.likelihood(samples, gripper=gripper).log_density
+    np.testing.assert_allclose(thing.likelihood(drawn, gripper=gripper).log_density, likely, rtol=1e-6)
+    first = {"position": drawn.position[0], "quaternion_xyzw": drawn.quaternion_xyzw[0]}
+    params = {name: _text(values) for name, values in first.items()} | expected.told | {"gripper": gripper}
+    one = httpx.get(f"{db.url}/objects/{thing.id}/likelihood", params=params)
+    np.testing.assert_allclose(one.json()["log_density"], likely[:1], rtol=1e-6)
+    ranked = thing.best_grasps(candidates=drawn, exclude=drawn.matrices[3:5], **expected.asked, **chosen)
+    plainly = thing.best_grasps(candidates=samples, exclude=samples.matrices[3:5], **chosen)
+    assert [grasp.candidate for grasp in ranked] == [grasp.candidate for grasp in plainly]
+    expected.same(ranked.matrices, plainly.matrices)
+
+
+@pytest.mark.filterwarnings("ignore::graspdb.resources.trials.DoubtfulTrials")
 @pytest.mark.filterwarnings("ignore::graspdb.resources.trials.DoubtfulTrials")
 @given(**CASES)
 @EVERYWHERE
