@@ -7,6 +7,7 @@ calibration score printed first.
 
 from __future__ import annotations
 
+import os
 import platform
 import statistics
 import subprocess
@@ -52,13 +53,16 @@ def main() -> None:
     flops, bandwidth = calibration()
     print(f"{processor()}, Python {platform.python_version()}, NumPy {np.__version__}")
     print(f"calibration, one core: {flops:.2f} GFLOP/s float32, copy {bandwidth:.1f} GB/s", flush=True)
+    # What benchmarks share with tests lies beside them.
+    support = [str(FOLDER.parent / "support"), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, support))}
     failed = False
     for path in sorted(FOLDER.glob("*.py")):
         if path.name.startswith("_") or (wanted and not any(name in path.stem for name in wanted)):
             continue
         print(f"\n== {path.stem.replace('_', ' ')}", flush=True)
         # A process of its own: nothing is warm or in memory because another one ran before.
-        failed |= subprocess.run([sys.executable, path], check=False).returncode != 0
+        failed |= subprocess.run([sys.executable, path], env=environment, check=False).returncode != 0
     sys.exit(failed)
 
 

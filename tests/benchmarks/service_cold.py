@@ -83,7 +83,7 @@ def write(folder: Path, total: int) -> None:
             row = objects.find(tx, SLUG)
             assert row is not None
             revision, first = objects.advance(tx, row.id, rows=len(columns), append=True)
-            columns.provenance[:] = provenances.ensure(tx, row.id, Provenance("pg70", None, None))
+            columns.provenance[:] = provenances.ensure(tx, row.id, Provenance("pg70@1", None, None))
             batch_id, key = batches.create(tx, row.id, revision=revision)
             audit.record(tx, "batch.create", object=SLUG, subject=key)
             rows.insert(tx, row.id, batch_id, columns, revision=revision, first_seq=first)
