@@ -26,6 +26,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from graspdb.wire.base import told_of
 from graspdb_service import __version__
 from graspdb_service.api import (
     grippers,
@@ -258,7 +259,8 @@ def _add_problems(app: FastAPI) -> None:
                 require_json(request)
             except ProblemError as problem:
                 return answer(request, problem)
-        return answer(request, problem_of_validation(errors))
+        body = getattr(request.scope.get("route"), "body_field", None)
+        return answer(request, problem_of_validation(told_of(errors, body and body.field_info.annotation)))
 
     @app.exception_handler(ObjectGone)
     def on_gone(request: Request, _: ObjectGone) -> Response:

@@ -191,3 +191,28 @@ def test_busy_database_is_503_and_stores_nothing(
         assert answer.headers["retry-after"]
         assert answer.json()["type"].endswith(":database-unavailable")
         assert http.post("/objects", json={"id": "cup"}, headers={"Idempotency-Key": "k"}).status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "field", "told"),
+    [
+        ("/objects", {"id": "m", "mass": 1.0}, "mass", "did you mean 'mass_kg'?"),
+        ("/objects/mug/best-grasp", {"object_pos": [0, 0, 0]}, "object_pos", "did you mean 'object_pose'?"),
+        ("/grippers", {"id": "g", "finger": {"length": 0.04}}, "finger.length", "did you mean 'length_m'?"),
+        (
+            "/grippers",
+            {"id": "hand", "fingers": 3},
+            "fingers",
+            "hands with more fingers can't be described yet",
+        ),
+        ("/grippers", {"id": "cup", "suction_cups": 4}, "suction_cups", "suction cups and hands"),
+        ("/objects/mug/trials", {"trials": [{"posiiton": [0, 0, 0]}]}, "trials.0.posiiton", "'position'?"),
+    ],
+)
+def test_an_unknown_field_is_told_what_was_meant(
+    sqlite_http: httpx.Client, path: str, body: Any, field: str, told: str
+) -> None:
+    sqlite_http.post("/objects", json={"id": "mug"})
+    answer = sqlite_http.post(path, json=body)
+    assert answer.status_code == 422
+    assert any(told in error["message"] for error in answer.json()["errors"] if error["field"] == field)

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from graspdb.errors import InvalidInput
 from graspdb.transport import Model, Transport
 from graspdb.wire import FieldError, Problem
+from graspdb.wire.base import told_of
 
 PAGE = 1_000
 """The most items the service puts on a page."""
@@ -33,7 +34,9 @@ def validate(model: type[Model], fields: Mapping[str, Any]) -> Model:
     except ValidationError as error:
         wrong = [
             FieldError(field=".".join(str(part) for part in e["loc"]) or "request", message=e["msg"])
-            for e in error.errors(include_url=False, include_context=False, include_input=False)
+            for e in told_of(
+                error.errors(include_url=False, include_context=False, include_input=False), model
+            )
         ]
         problem = Problem(type="about:blank", title="Invalid input", status=422, errors=wrong)
         text = "\n".join(["invalid input:", *(f"  {item.field}: {item.message}" for item in wrong)])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import re
 import sys
-from collections.abc import Mapping
-from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -67,6 +68,49 @@ class Request(BaseModel):
     model_config = _DEFERRED | ConfigDict(
         extra="forbid", allow_inf_nan=False, frozen=True, validate_default=False
     )
+
+    not_yet: ClassVar[Mapping[str, str]] = {}
+    """What is said of fields that people look for and that no schema has, by patterns of their names."""
+
+
+def told_of(errors: Iterable[Mapping[str, Any]], model: Any) -> list[dict[str, Any]]:
+    """Errors of pydantic, where an unknown field is told what was meant: ``model`` is a model, or an
+    annotation that names some, or None, which leaves them as they are.
+    """
+    models = set(_models(model))
+    return [
+        {**error, "msg": _no_such_field(models, error["loc"])}
+        if models and error["type"] == "extra_forbidden"
+        else dict(error)
+        for error in errors
+    ]
+
+
+def _no_such_field(models: set[type[BaseModel]], place: Sequence[str | int]) -> str:
+    name = str(place[-1])
+    for part in map(str, place[:-1]):
+        # What is no field is the number of an item, or a branch that pydantic tried.
+        fields = (each.model_fields[part] for each in models if part in each.model_fields)
+        models = {inner for field in fields for inner in _models(field.annotation)} or models
+    for pattern, told in ((p, t) for each in models for p, t in getattr(each, "not_yet", {}).items()):
+        if re.search(pattern, name, re.IGNORECASE):
+            return f"{told}"
+    return no_such_field(name, {field for each in models for field in each.model_fields})
+
+
+def no_such_field(name: str, there: Iterable[str]) -> str:
+    """What is said of a field that is not among those there are."""
+    near = difflib.get_close_matches(name, there := sorted(there), n=1)
+    if near:
+        return f"there is no such field; did you mean {near[0]!r}?"
+    return f"there is no such field; there are {', '.join(there)}"
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models(inner)
 
 
 class Response(BaseModel):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -57,6 +58,13 @@ class TipOffset(Request):
 
 class GripperProfile(Request):
     """A parallel-jaw gripper. Tool frame: origin midway between the fingers, z approach, y closing."""
+
+    not_yet: ClassVar[Mapping[str, str]] = {
+        r"suction|vacuum|\bcup|_cup|ejector|^fingers$|finger_count|num(ber)?_(of_)?fingers|thumb|^dofs?$": (
+            "a gripper is a jaw of two fingers that close on each other: suction cups and hands with more"
+            " fingers can't be described yet"
+        )
+    }
 
     max_opening_m: Length
     """Distance between the fingers' inner faces when wide open, metres."""

@@ -10,6 +10,7 @@ from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 
+from graspdb.wire.base import told_of
 from graspdb_service.formats.json_pieces import Allowed, LongArray, loads
 from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid
@@ -52,7 +53,7 @@ def validated(content: Any, model: type[Model], *, most: int = 0) -> Model:
     try:
         return model.model_validate(_as_lists(content, most))
     except ValidationError as error:
-        raise RequestValidationError(error.errors(include_input=False)) from None
+        raise RequestValidationError(told_of(error.errors(include_input=False), model)) from None
 
 
 def _as_lists(content: Any, most: int) -> Any:

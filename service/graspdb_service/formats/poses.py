@@ -12,7 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import TypeAdapter, ValidationError
 
 from graspdb.wire import Pose
-from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE
+from graspdb.wire.base import MAX_COORDINATE_M, UNIT_TOLERANCE, no_such_field
 from graspdb.wire.trials import ProposalDensity
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
@@ -95,7 +95,7 @@ def read_poses(value: Any) -> Poses:
     422 names the first bad field, as the wire's models would.
     """
     if isinstance(value, dict):
-        errors = [(f"poses.{name}", "unknown field") for name in value if name not in _FIELDS]
+        errors = [(f"poses.{name}", no_such_field(name, _FIELDS)) for name in value if name not in _FIELDS]
         errors += [(f"poses.{name}", "is missing") for name in _FIELDS if name not in value]
         if errors:
             raise invalid_fields(errors[:20])

@@ -10,7 +10,7 @@ import orjson
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOMES
-from graspdb.wire.base import MAX_QUALITIES, expand_matrix
+from graspdb.wire.base import MAX_QUALITIES, expand_matrix, no_such_field
 from graspdb.wire.trials import BatchDefaults
 from graspdb_service.formats.json_pieces import WHOLE, Allowed, LongArray, lenient, loads
 from graspdb_service.formats.trial_fields import (
@@ -139,7 +139,7 @@ def _from_columns(columns: Any, faults: Faults, limit: int) -> Iterator[Fields]:
         faults.raise_if_any()
     columns = _with_qualities(columns, faults)
     for name in sorted(name for name in columns if name not in NAMES and not name.startswith(QUALITIES)):
-        faults.add(f"columns.{name[:80]}", f"unknown column; there are {', '.join(sorted(NAMES))}")
+        faults.add(f"columns.{name[:80]}", no_such_field(name[:80], NAMES).replace("field", "column"))
     lists: dict[str, list[Any] | LongArray] = {}
     for name in columns:
         if isinstance(columns[name], list | LongArray):
@@ -223,9 +223,10 @@ def _from_rows(rows: list[Any], faults: Faults, place: Place) -> Fields:
         faults.raise_if_any()
         names = set().union(*rows)
     if not names <= NAMES:
+        told = {n: _OF_BATCH if n in DEFAULTS else no_such_field(str(n), NAMES) for n in names - NAMES}
         for i, row in enumerate(rows):
             for name in sorted(row.keys() - NAMES):
-                faults.add(place(i, str(name)), _OF_BATCH if name in DEFAULTS else "unknown field")
+                faults.add(place(i, str(name)), told[name])
     for name in REQUIRED:
         missing = [i for i, row in enumerate(rows) if row.get(name) is None]
         for i in missing:
