@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from graspdb import Client
 
@@ -67,7 +69,39 @@ def test_the_python_examples_run(service_url: str, tmp_path: Path) -> None:
     assert "'success'" in outputs[1]
     with Client(service_url) as db:
         assert db.objects.get("can").info.trials == 200
-        assert db.objects.get("mug").info.trials == 50_000
+        assert db.objects.get("mug").info.trials == 20_000
+
+
+@pytest.mark.usefixtures("worker")
+def test_the_command_lines_run(service_url: str, tmp_path: Path) -> None:
+    """Everything that is typed at ``graspdb``, in its order, on an object that is not there before."""
+    blocks = [block for block in _blocks("bash") if block.startswith("graspdb ")]
+    assert len(blocks) == 2
+    (tmp_path / "my-trials.csv").write_text(
+        "x,y,z,qx,qy,qz,qw,outcome\n0,0,0.08,1,0,0,0,success\n0.01,0,0.08,1,0,0,0,slipped\n"
+    )
+    (tmp_path / "bottle.stl").write_bytes(trimesh.creation.cylinder(30, 200).export(file_type="stl"))
+    (upload,) = re.findall(r"`(curl -T [^`]+)`", README)
+    with Client(service_url) as db:
+        for known in db.objects.list():
+            if known.id in ("mug", "bottle"):
+                known.delete()
+        db.objects.create("bottle")
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        for typed in (upload, *blocks):
+            done = subprocess.run(
+                ["sh", "-ec", typed.replace(URL, service_url)],
+                cwd=tmp_path,
+                env={**os.environ, "PATH": path, "GRASPDB_URL": service_url},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+        mug = db.objects.get("mug").info
+        assert mug.trials == 2 + 20_000
+        assert db.objects.get("bottle").info.mesh is not None
+    assert (tmp_path / "convergence.svg").stat().st_size > 1_000
 
 
 def test_the_commands_it_names_exist(help_of: Callable[..., str]) -> None:
