@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 import inspect
+import io
 import os
 import re
 import subprocess
@@ -19,9 +20,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspdb import Client
+from graspdb import Client, wire
 from graspdb.examples import example
+from graspdb.figures.frames.gripper import draw_gripper
+from graspdb.figures.grippers.explained import render_explained
 from graspdb.poses import as_poses, matrices
+from graspdb.wire.presets.grippers import PRESETS
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs" / "user-guide.md"
 URL = "http://127.0.0.1:8000"
@@ -140,3 +144,33 @@ def test_the_commands_it_names_take_what_it_gives_them(help_of: Callable[..., st
     assert len(named) >= 10
     for command in named:
         assert "usage" in help_of(*command.split()).lower(), command
+
+
+def _drawn(svg: bytes) -> tuple[list[str], np.ndarray]:
+    """A figure's words, and the points of its lines and faces."""
+    text = svg.decode()
+    words = re.findall(r"<!-- (.*?) -->|<text[^>]*>([^<]*)<", text)
+    paths = re.findall(r'<path d="([^"]*)" clip-path', text)
+    numbers = re.findall(r"-?\d+\.?\d*", " ".join(paths))
+    return ["".join(word) for word in words], np.array(numbers, dtype=np.float64)
+
+
+@pytest.mark.parametrize("name", ["frames", "frames-of-a-grasp", "gripper-profile"])
+def test_its_pictures_are_of_what_is_drawn_now(name: str) -> None:
+    """The commands that the guide names beside them draw the same, to a tenth of a point."""
+    panda = PRESETS["panda"].profile
+    camera = wire.Pose(position=(0.06, 0.0, 0.02), quaternion_xyzw=(0.0, 0.0, 0.0, 1.0))
+    if name == "gripper-profile":
+        preset = PRESETS["robotiq-2f-85"]
+        drawn = render_explained(preset.profile, preset.name, "svg")
+    else:
+        profile = panda.model_copy(update={"frames": panda.frames | {"camera": camera}})
+        at = wire.Pose(position=(0.03, 0.1, 0.25), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+        asked: dict[str, Any] = {"frame": "flange", "pose": at} if name == "frames-of-a-grasp" else {}
+        target = io.BytesIO()
+        draw_gripper("panda", profile, **asked).savefig(target, format="svg", metadata={"Date": None})
+        drawn = target.getvalue()
+    kept = (GUIDE.parent / "figures" / f"{name}.svg").read_bytes()
+    (words, points), (kept_words, kept_points) = _drawn(drawn), _drawn(kept)
+    assert words == kept_words
+    np.testing.assert_allclose(points, kept_points, atol=0.1)
