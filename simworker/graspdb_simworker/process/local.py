@@ -22,8 +22,8 @@ POSE_SECONDS = 10.0
 """A closing takes milliseconds; after so much of the processor's time it hangs."""
 SILENT = 6.0
 """A process that says nothing for this many times as long by the clock sleeps, however busy the machine."""
-START_SECONDS = 120.0
-"""Loading pybullet and, the first time on a machine, compiling the collision test."""
+START_SECONDS = 600.0
+"""Loading pybullet and, the first time on a machine, compiling the collision test; on a starved one, too."""
 RECYCLE_CHUNKS = 64
 """pybullet leaks: a child is replaced after this many chunks."""
 MAX_DEATHS = 50
