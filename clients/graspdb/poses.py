@@ -25,6 +25,7 @@ __all__ = [
     "matrices",
     "pose_documents",
     "pose_frame",
+    "pose_trials",
     "quaternions_of",
     "vector",
 ]
@@ -136,6 +137,24 @@ def pose_frame(poses: Any, frame: str | None, convention: str | None) -> dict[st
             raise ValueError(f"{name}: these poses are of {' and '.join(sorted(own))}; asked was {said}")
         value = said or next(iter(own), default)
         if value != default:
+            found[name] = value
+    return found
+
+
+def pose_trials(poses: Any, given: Mapping[str, Any]) -> dict[str, str]:
+    """The gripper and protocol that a question about poses is about besides those ``given``: of grasps and
+    samples those of the trials that they were chosen from.
+
+    Nothing where what is given contradicts them, or each is of another.
+    """
+    each = list(poses) if isinstance(poses, (list, tuple)) and len(poses) else [poses]
+    found: dict[str, str] = {}
+    for name in ("gripper", "protocol"):
+        own = {value if isinstance(value := getattr(item, name, None), str) else None for item in each}
+        said = given.get(name)
+        if said is not None and own != {said}:
+            return {}
+        if said is None and len(own) == 1 and (value := own.pop()) is not None:
             found[name] = value
     return found
 

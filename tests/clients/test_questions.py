@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from graspdb import Client, Infeasible, wire
-from graspdb.errors import Conflict, InvalidInput
+from graspdb.errors import AmbiguousSelection, Conflict, InvalidInput
 from graspdb.reports import Reports
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.selection import Constraints, Selection, TrialSelection
@@ -80,6 +80,22 @@ def test_selections_choose_trials_and_kernels_everywhere(grasped: GraspObject) -
         grasped.density(gripper="pg70", kernel={"sigma_position_m": -1})
     report = grasped.reports.projection(gripper="pg70", kernel=spec)
     assert report.raw.kernel.sigma_position_m == 0.011
+
+
+def test_poses_of_an_answer_are_asked_about_with_its_gripper(grasped: GraspObject) -> None:
+    best, drawn = grasped.best_grasp(gripper="panda"), grasped.samples(3, seed=1, gripper="panda")
+    assert (best.gripper, drawn.gripper) == ("panda", "panda")
+    for poses in (best, [best, best], drawn):
+        alone, told = grasped.likelihood(poses), grasped.likelihood(poses, gripper="panda")
+        assert alone.density == pytest.approx(told.density)
+    assert grasped.best_grasp(candidates=[best]).density == pytest.approx(best.density)
+    # What is named counts; of two that are not of one gripper nothing is guessed, nor of bare numbers.
+    other = grasped.likelihood(best, gripper="pg70")
+    assert other.selection is not None
+    assert other.selection.gripper == "pg70"
+    for mixed in ([best, grasped.best_grasp(gripper="pg70")], best.matrix):
+        with pytest.raises(AmbiguousSelection):
+            grasped.likelihood(mixed)
 
 
 def test_grasps_before_any_success_say_so(untried: GraspObject, run: Run) -> None:

@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
-from graspdb.poses import as_poses, pose_frame
+from graspdb.poses import as_poses, pose_frame, pose_trials
 from graspdb.resources.answers import report_grasp
 from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
@@ -68,7 +68,8 @@ class GraspQueries(Resource):
         """How likely these grasps are, as NumPy arrays in the poses' order.
 
         ``poses`` are (N, 4, 4), (N, 7) rows x y z qx qy qz qw, one pose, a grasp or samples, sent ``chunk`` a
-        request. ``include`` are the columns to compute: ``density``, ``log_density``, ``relative``,
+        request; where no gripper or protocol is named, grasps and samples are asked about with those that
+        they are of. ``include`` are the columns to compute: ``density``, ``log_density``, ``relative``,
         ``success_probability``, ``interval``, ``effective_trials``, ``collision_free``, ``support``,
         ``prior_success_probability``; by default all. ``name`` keeps the answer of at most 1,000 poses, and
         ``timeout_s`` bounds the time for every request, as in :class:`Constraints`.
@@ -76,6 +77,7 @@ class GraspQueries(Resource):
         options = known_keywords(LikelihoodSelection, selection, "likelihood")
         given = as_poses(poses)
         options |= pose_frame(poses, options.get("frame"), options.get("convention"))
+        options |= pose_trials(poses, options)
         options |= {
             "include": None if include is None else names(include),
             "name": name,

@@ -87,6 +87,7 @@ class Grasp:
     - ``opening_m``: opening to command before the approach, at which collisions were tested, metres.
     - ``nearest_trials``: ``seq`` of the trials nearest to it.
     - ``active_constraints``: those that hold it where it is.
+    - ``gripper``, ``protocol``: those of the trials that it was chosen from, None where they are of none.
     - ``answer``: id of the answer that it is of, for the trial that tries it; None where it is not kept.
     - ``warnings``: what to mind of that answer; printing the grasp says them, too.
     """
@@ -111,6 +112,8 @@ class Grasp:
     candidate: int | None = None
     simulated: str | None = None
     prior: bool = False
+    gripper: str | None = None
+    protocol: str | None = None
     answer: str | None = None
     frame: str = "tool"
     convention: str = "graspdb"
@@ -138,6 +141,8 @@ class Grasp:
             "tool_to_frame": None if fixed is None else matrices(fixed.position, fixed.quaternion_xyzw),
             "warnings": tuple(answer.warnings),
         }
+        if answer.selection is not None:
+            fields |= {"gripper": answer.selection.gripper, "protocol": answer.selection.protocol}
         return cls(**fields, answer=answer.answer, raw=grasp, reporter=reporter)
 
     def report(
@@ -659,6 +664,16 @@ class SampledPoses(PoseArrays):
             selection=answer.selection,
             opening_m=None if openings is None else np.array(openings, dtype=np.float64),
         )
+
+    @property
+    def gripper(self) -> str | None:
+        """The gripper of the trials that they are drawn from, None where they are of none."""
+        return None if self.selection is None else self.selection.gripper
+
+    @property
+    def protocol(self) -> str | None:
+        """The protocol of these trials, None where they are of none."""
+        return None if self.selection is None else self.selection.protocol
 
     def _columns(self) -> dict[str, Any]:
         columns = {**pose_columns(self), "proposal_density": self.proposal_density}

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from graspdb import wire
 from graspdb.options import Corners, Option, PoseFile, Vector
-from graspdb.poses import as_poses, as_vector7, pose_frame, vector
+from graspdb.poses import as_poses, as_vector7, pose_frame, pose_trials, vector
 from graspdb.resources.pages import validate
 from graspdb.wire.frames.gripper_frames import RESERVED
 
@@ -150,6 +150,7 @@ class Constraints(Selection, total=False):
     - ``calibrated_for``: the source of real trials, such as ``robot``, that success probabilities of
       simulated trials, which are then selected, are corrected for; ``calibration`` says whether that helped.
     - ``candidates``: rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is its place.
+      Of grasps and samples the gripper and protocol go along where none is named.
     - ``exclude``: poses to stay away from, by the separation; as candidates, of ``frame`` in ``reference``.
     - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``; of its mesh's frame, or of
       ``object_frame``, one of the object's ``frames``.
@@ -269,6 +270,7 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
         if name in fields:
             asked = None if fields.get("frame") in RESERVED else fields.get("frame")
             fields |= pose_frame(fields[name], asked, fields.get("convention"))
+            fields |= pose_trials(fields[name], fields) if name == "candidates" else {}
             fields[name] = as_poses(fields[name]).columns()
     if "object_pose" in fields:
         fields["object_pose"] = as_vector7(fields["object_pose"])
