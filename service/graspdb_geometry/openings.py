@@ -115,7 +115,7 @@ def _closer(
         return closer
     # Tips that are farther ahead then may meet what they did not: from there on the jaw opens again, by
     # halves of what is left up to where it is known to be free.
-    lower, upper = np.minimum(np.ceil(closer / STEP_M) * STEP_M, openings), openings.copy()
+    lower, upper = np.minimum(_whole_steps(closer), openings), openings.copy()
 
     def clear(rows: npt.NDArray[np.intp], at: FloatArray) -> BoolArray:
         some = _of(poses, rows)
@@ -125,7 +125,7 @@ def _closer(
     free = clear(rows, lower)
     upper[free], rows = lower[free], rows[~free]
     while len(rows := rows[upper[rows] - lower[rows] > 1.5 * STEP_M]):
-        middle = np.ceil((lower[rows] + upper[rows]) / 2 / STEP_M) * STEP_M
+        middle = _whole_steps((lower[rows] + upper[rows]) / 2)
         free = clear(rows, middle)
         upper[rows[free]], lower[rows[~free]] = middle[free], middle[~free]
     return upper
@@ -133,7 +133,7 @@ def _closer(
 
 def commanded(needed_m: FloatArray, clearance_m: float, shape: GripperShape) -> FloatArray:
     """What to open to, metres, (n,): what is needed and a clearance, in whole millimetres; wide for NaN."""
-    opening = np.ceil((needed_m + clearance_m) / STEP_M - 1e-6) * STEP_M
+    opening = _whole_steps(needed_m + clearance_m)
     return np.where(np.isnan(opening), shape.max_opening_m, np.minimum(opening, shape.max_opening_m))
 
 
@@ -153,6 +153,13 @@ def at_each(
     for i, value in enumerate(values):
         told[which == i] = value
     return told
+
+
+def _whole_steps(openings: FloatArray) -> FloatArray:
+    """Rounded up, but not by what floating point adds: 19 mm, the middle of 18 and 20, are 19 steps. Halving
+    would never end where they were 20.
+    """
+    return np.asarray(np.ceil(openings / STEP_M - 1e-6) * STEP_M)
 
 
 def _inside(box: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:

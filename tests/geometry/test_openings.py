@@ -158,6 +158,22 @@ def test_tips_on_arcs_open_no_farther_than_a_ledge_takes(ahead: float, width: fl
         assert less < width or solid.collides(HERE, ARC.at(less))[0]
 
 
+def test_the_least_opening_is_found_to_the_millimetre_wherever_it_is() -> None:
+    """A stem on a plate that the tips are clear of from half a millimetre below each opening on: halving what
+    is left ends, also where the middle of two whole millimetres is no whole one in floating point.
+    """
+    for name in ("robotiq-2f-85", "onrobot-rg2"):
+        shape = SHAPES[name]
+        for opening in np.arange(18, round(1e3 * shape.max_opening_m) - 2) * 1e-3:
+            near, width = shape.tip_at(opening - 0.5e-3), opening - 2.5e-3
+            stem, plate = (
+                box((0.01, width / 2, 0.02), (0, 0, near - 0.02)),
+                box((0.1, 0.1, 0.01), (0, 0, near + 0.01)),
+            )
+            (found,) = openings.needed(Scene([stem, plate]), HERE, shape)
+            assert found == pytest.approx(opening, abs=1e-9), (name, opening)
+
+
 def test_each_pose_is_tested_at_its_own_opening() -> None:
     rng = np.random.default_rng(5)
     poses = ToolPoses(rng.normal(size=(60, 3)) * 0.03, rng.normal(size=(60, 4)))
