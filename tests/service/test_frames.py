@@ -459,7 +459,7 @@ def test_frames_of_an_object_are_changed_together(
 
 
 def test_frames_as_far_off_as_they_may_be(served: httpx.Client, thing: str) -> None:
-    far = {"position": [1.1, -1.1, 1.1], "quaternion_xyzw": [1, 0, 0, 0]}
+    far = {"position": [1.1, -1.1, 1.1], "quaternion_xyzw": [0, 0, 1, 0]}
     made = {
         **MINE,
         "id": "far",

@@ -16,6 +16,15 @@ MINE: dict[str, Any] = {
 IDENTITY = {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}
 TOOL = {"position": [0, 0, 0.12], "quaternion_xyzw": [0, 0, 0, 1]}
 FLANGE = {"position": [0, 0, -0.02], "quaternion_xyzw": [0, 0, 0, 1]}
+BACK = {"position": [0, 0, 0.14], "quaternion_xyzw": [1, 0, 0, 0]}
+DOUBTFUL: list[tuple[dict[str, Any], str]] = [
+    ({"base_to_tool": BACK}, "base_to_tool puts the gripper's base 130 mm ahead of its fingertips"),
+    (
+        {"base_to_tool": TOOL, "frames": {"flange": {**TOOL, "position": [0, 0, 0.136]}}},
+        "frames.flange puts the gripper's flange 6 mm ahead of its fingertips",
+    ),
+    ({"joints": {"j": {"open": 40, "closed": 0}}}, "joints.j.open is 40, which no jaw's is"),
+]
 
 
 def test_frames_are_read_back_with_base_and_tool(http: httpx.Client) -> None:
@@ -59,10 +68,13 @@ def test_frames_that_contradict_name_the_field(sqlite_http: httpx.Client) -> Non
         ({"joints": {"j": {"open": 1}}}, "joints.j.closed"),
         ({"joints": {"j": {"open": 1e9, "closed": 0}}}, "joints.j.open"),
     ]
-    for change, field in cases:
+    for change, field in [*cases, *[(change, "body") for change, _ in DOUBTFUL]]:
         refused = sqlite_http.post("/grippers", json={**MINE, **change})
         assert refused.status_code == 422, change
         assert [error["field"] for error in refused.json()["errors"]] == [field]
     told = sqlite_http.post("/grippers", json={**MINE, **cases[0][0]}).json()["errors"][0]["message"]
     assert "base_to_tool" in told
+    for change, said in DOUBTFUL:
+        refused = sqlite_http.post("/grippers", json={**MINE, **change}).json()["errors"][0]["message"]
+        assert refused.startswith(said)
     assert "mine" not in [item["id"] for item in sqlite_http.get("/grippers").json()["items"]]

@@ -58,7 +58,7 @@ GRIPPER = {
     "max_acceleration_m_s2": 1.0,
     "force_n": 20.0,
     "friction": 0.5,
-    "base_to_tool": POSE,
+    "base_to_tool": {**POSE, "quaternion_xyzw": [0.0, 0.0, 1.0, 0.0]},
 }
 TRIAL = {
     **POSE,
@@ -73,7 +73,7 @@ BODIES: list[tuple[str, str, dict[str, Any]]] = [
     ("POST", "/objects", {"id": "cup", "mass_kg": 0.1, "density_kg_m3": 900.0, "friction": 0.4}),
     ("PATCH", "/objects/spare", {"mass_kg": 0.1, "density_kg_m3": 900.0, "friction": 0.4}),
     ("POST", "/grippers", GRIPPER),
-    ("POST", "/grippers", {**GRIPPER, "base_to_tool": MATRIX}),
+    ("POST", "/grippers", {**GRIPPER, "base_to_tool": {"matrix": np.eye(4).tolist()}}),
     ("POST", "/objects/spare/trials", TRIAL),
     ("POST", "/objects/spare/trials", {**MATRIX, "outcome": True}),
     ("POST", "/objects/spare/trials", {"trials": [TRIAL], "proposal_density": 2.0}),

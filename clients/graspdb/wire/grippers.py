@@ -152,6 +152,10 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 _FARTHEST_M = 2.0
+#: So far beyond the fingertips the base or the flange may seem to lie: nobody measures better.
+_AHEAD_M = 0.005
+#: No joint of a jaw turns or slides so far; radians or metres.
+_JOINT = 10.0
 
 
 class GivenProfile(GripperProfile):
@@ -167,6 +171,31 @@ class GivenProfile(GripperProfile):
                     f"{field} is {off:g} m from the gripper's base, which is no gripper's: positions are in"
                     " metres, so divide millimetres by 1,000"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _behind_the_fingertips(self) -> GivenProfile:
+        tips = max([self.tip_offset_m, *(at.tip_offset_m for at in self.tip_offsets)])
+        for name, field in ((BASE, "base_to_tool"), ("flange", "frames.flange")):
+            if TOOL not in self.frames or name not in self.frames:
+                continue
+            ahead = self.in_tool(name).position[2] - tips
+            if ahead > _AHEAD_M:
+                raise ValueError(
+                    f"{field} puts the gripper's {name} {1e3 * ahead:.0f} mm ahead of its fingertips, where"
+                    " the object is: is the quaternion x, y, z, w, and the pose not its inverse?"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _in_radians_or_metres(self) -> GivenProfile:
+        for name, at in self.joints.items():
+            for state, value in at:
+                if abs(value) > _JOINT:
+                    raise ValueError(
+                        f"joints.{name}.{state} is {value:g}, which no jaw's is: joints are in radians or"
+                        " metres, as the URDF has them, so divide millimetres by 1,000"
+                    )
         return self
 
 
