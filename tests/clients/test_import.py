@@ -16,6 +16,7 @@ import trimesh
 import foreign_files as files
 from graspdb import Client, interop
 from graspdb.errors import Unreachable
+from graspdb.poses import matrices
 from graspdb.resources.objects import GraspObject
 from graspdb.transport import Transport
 
@@ -39,6 +40,19 @@ def _about_the_can(count: int = 60) -> np.ndarray:
     poses[:, :3, 2], poses[:, :3, 1] = approach, closing
     poses[:, :3, 0], poses[:, 2, 3] = np.cross(closing, approach), height
     return poses
+
+
+def _from_above(count: int = 60) -> np.ndarray:
+    """Tools (N, 4, 4) that reach for the can's top: level ones would be as good with their quaternions in
+    the other order.
+    """
+    tools = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (count, 1, 1))
+    tools[:, 2, 3] = HEIGHT_M / 2 - 0.015
+    turn = np.linspace(0.1, 3, count)
+    spin = np.tile(np.eye(4), (count, 1, 1))
+    spin[:, 0, 0] = spin[:, 1, 1] = np.cos(turn)
+    spin[:, 1, 0], spin[:, 0, 1] = np.sin(turn), -np.sin(turn)
+    return np.asarray(spin @ tools)
 
 
 def _panda_bases(db: Client, tools: np.ndarray) -> np.ndarray:
@@ -127,14 +141,7 @@ def test_what_cannot_be_right_is_refused_with_the_flag_that_mends_it(
 
 def test_quaternions_in_the_other_order_are_seen(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
     can = _can(db, fresh_id)
-    # From above: level grasps would be as good with their quaternions in the other order.
-    tools = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (60, 1, 1))
-    tools[:, 2, 3] = HEIGHT_M / 2 - 0.015
-    turn = np.linspace(0.1, 3, 60)
-    spin = np.tile(np.eye(4), (60, 1, 1))
-    spin[:, 0, 0] = spin[:, 1, 1] = np.cos(turn)
-    spin[:, 1, 0], spin[:, 0, 1] = np.sin(turn), -np.sin(turn)
-    tools = spin @ tools
+    tools = _from_above()
     bases = _panda_bases(db, tools)
     turns = np.array([files.quaternion(pose[:3, :3])[[3, 0, 1, 2]] for pose in bases])
     columns = {"position": bases[:, :3, 3].tolist(), "q": turns.tolist(), "outcome": [True] * len(tools)}
@@ -319,3 +326,100 @@ def test_columns_go_as_json_where_arrow_is_not_installed(
     stored = list(can.trials)
     assert [trial.quality for trial in stored] == [1.0, None, 2.0, 3.0] * 2
     assert stored[0].quaternion_xyzw == stored[4].quaternion_xyzw
+
+
+def test_unusable_grasps_are_left_out_before_the_first_look(
+    db: Client, run: Run, fresh_id: str, tmp_path: Path
+) -> None:
+    """Also rows of nothing but zeros, as arrays that are too long are filled with."""
+    can = _can(db, fresh_id)
+    poses = files.turned(_panda_bases(db, _about_the_can()), files.TO_ZX)
+    poses[3], poses[7, 0, 3], poses[9, :3, :3] = 0.0, np.nan, np.inf
+    path = files.acronym_h5(tmp_path / "padded.h5", poses, [1] * len(poses))
+    arguments = ("import", path, "--object", fresh_id, "--gripper", "panda")
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert "the last row of its matrix" in err
+    code, out, err = run(*arguments, "--drop-unusable")
+    assert code == 0, err
+    assert "left out: 2 grasps: has a position that is not finite" in out
+    assert "left out: 1 grasps: has a rotation that is not finite" in out
+    assert can.refresh().info.trials == 57
+
+
+def test_the_fewest_flags_that_mend_are_told(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
+    """Poses of the tool in a file of the base's: other axes would fit a round can as well."""
+    can = _can(db, fresh_id)
+    path = files.acronym_h5(tmp_path / "tools.h5", files.turned(_about_the_can(), files.TO_ZX), [1] * 60)
+    arguments = ("import", path, "--object", fresh_id, "--gripper", "panda")
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert "with --frame tool " in err
+    assert "--convention" not in err
+    code, _, err = run(*arguments, "--frame", "tool")
+    assert code == 0, err
+    assert can.trials.list().arrays().matrices == pytest.approx(_about_the_can(), abs=1e-9)
+
+
+def test_grasps_of_another_object_get_no_other_axes(
+    db: Client, run: Run, fresh_id: str, tmp_path: Path
+) -> None:
+    """A format that says what approaches is not read with what does by chance."""
+    db.objects.create(fresh_id, mesh=trimesh.creation.annulus(0.07, 0.1, 0.02))
+    path = files.acronym_h5(
+        tmp_path / "can.h5", files.turned(_panda_bases(db, _about_the_can()), files.TO_ZX), [1] * 60
+    )
+    code, out, err = run("import", path, "--object", fresh_id, "--gripper", "panda", "--dry-run")
+    assert "--object" in err + out
+    assert "--convention" not in err
+    assert code == 1 or "doubtful: " in out
+
+
+def test_a_scene_is_no_object_in_another_unit(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
+    """Far smaller, any grasps would be in a can's middle."""
+    _can(db, fresh_id)
+    rng = np.random.default_rng(5)
+    poses = _about_the_can()
+    poses[:, :3, 3] += rng.uniform([0.1, -0.4, -0.1], [0.9, 0.4, 0.7], (len(poses), 3))
+    rows = [",".join(map(str, [*pose[:3, 3], *files.quaternion(pose[:3, :3]), 1])) for pose in poses]
+    (tmp_path / "scene.csv").write_text("\n".join(["x,y,z,qx,qy,qz,qw,success", *rows]))
+    code, _, err = run("import", str(tmp_path / "scene.csv"), "--object", fresh_id, "--gripper", "panda")
+    assert code == 1
+    assert "with --unit" not in err
+
+
+@pytest.mark.parametrize("format", ["moveit", "isaac"])
+def test_keys_may_hold_the_numbers_of_a_quaternion_in_the_other_order(
+    db: Client, run: Run, fresh_id: str, tmp_path: Path, format: str
+) -> None:
+    can = _can(db, fresh_id)
+    tools = _from_above()
+    wrong = [np.roll(files.quaternion(pose[:3, :3]), 1 if format == "moveit" else -1) for pose in tools]
+    poses = matrices(tools[:, :3, 3], np.array(wrong))
+    if format == "moveit":
+        path, order = files.moveit(tmp_path / "a.yaml", poses, [1.0] * 60), "wxyz"
+    else:
+        path, order = files.isaac(tmp_path / "a.yaml", poses, [1.0] * 60), "xyzw"
+    arguments = ("import", path, "--object", fresh_id, "--gripper", "panda", "--frame", "tool")
+    arguments += ("--convention", "graspdb", "--outcome", "success")
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert f"with --quaternion-order {order} " in err
+    code, _, err = run(*arguments, "--quaternion-order", order)
+    assert code == 0, err
+    assert can.trials.list().arrays().matrices == pytest.approx(tools, abs=1e-9)
+
+
+def test_what_only_would_choose_is_there(tmp_path: Path, db: Client) -> None:
+    rows = np.zeros((4, 17))
+    rows[:, [4, 8, 12]], rows[:, 16] = 1.0, [5, 5, 7, 7]
+    np.save(tmp_path / "a.npy", rows)
+    panda = db.grippers.get("panda")
+    with pytest.raises(ValueError, match="has no grasps of object 9; there are 5, 7"):
+        interop.read(
+            tmp_path / "a.npy",
+            gripper=panda,
+            object_pose=np.eye(4),
+            only={"object_id": "9"},
+            outcome="success",
+        )

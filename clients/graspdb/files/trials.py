@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 
 from graspdb.poses import POSE_COLUMNS, as_poses
 
+OUTCOME_COLUMNS = ("outcome", "success", "label", "result", "held", "object_in_gripper")
+"""What tables call the column of what became of a grasp; the first that is there counts."""
 _TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at", "answer"})
 _ACHIEVED_COLUMNS = tuple(f"achieved_{name}" for name in POSE_COLUMNS)
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
@@ -217,13 +219,17 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
     with io.StringIO(_text(path), newline="") as file:
         reader = csv.DictReader(file, skipinitialspace=True)
         names = set(reader.fieldnames or ())
+        told = next((name for name in OUTCOME_COLUMNS if name in names), "outcome") if trials else "outcome"
         known = _TEXT_COLUMNS | _NUMBER_COLUMNS | set(_ACHIEVED_COLUMNS)
-        wanted = {*POSE_COLUMNS, "outcome"} if trials else set(POSE_COLUMNS)
+        wanted = {*POSE_COLUMNS, told} if trials else set(POSE_COLUMNS)
         if missing := sorted(wanted - names):
-            raise FileProblem(f"{path} needs a header line with {','.join(POSE_COLUMNS)}; it lacks {missing}")
+            line = f"{path} needs a header line with {','.join(POSE_COLUMNS)}; it lacks {missing}"
+            raise FileProblem(f"{line}. `graspdb import` reads tables of other columns" if trials else line)
         scores = [name for name in reader.fieldnames or () if name.startswith(_QUALITIES)]
         if trials and (unknown := sorted(names - wanted - known - set(scores))):
-            raise FileProblem(f"{path} has unknown columns {unknown}")
+            raise FileProblem(
+                f"{path} has unknown columns {unknown}: leave them out, or use `graspdb import`"
+            )
         records = []
         for row in reader:
             where = f"{path}, line {reader.line_num}"
@@ -238,7 +244,7 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
                         record[name] = _number(where, name, text) if name in _NUMBER_COLUMNS else text
                 record |= {name: _number(where, name, row[name]) for name in scores if row[name].strip()}
                 record = _gathered(record)
-                record["outcome"] = _outcome(record.get("outcome"))
+                record["outcome"] = _outcome(row[told].strip() or None)
                 cells = [(row.get(name) or "").strip() for name in _ACHIEVED_COLUMNS]
                 if any(cells):
                     achieved = [_number(where, *cell) for cell in zip(_ACHIEVED_COLUMNS, cells, strict=True)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graspdb.files.trials import METRES
 from graspdb.interop.formats.known import TIPS
-from graspdb.interop.frames import approach_of, frames_of, to_tool
+from graspdb.interop.frames import approach_of, frames_of, to_graspdb, to_tool
 from graspdb.interop.grasps import Floats, Raw, Report
 from graspdb.interop.placing import Placing
 from graspdb.poses import Poses, matrices
@@ -31,6 +31,13 @@ _FAR_WORSE = 0.6
 """Grasps that fit so much less often than they would otherwise are taken for a mistake."""
 _CRAMMED = 0.05
 """A share of the object's size."""
+_SHRUNK = 0.15
+"""As such a share, what grasps extend over at least where another unit makes them fit."""
+_ALIKE = 0.03
+"""Shares of grasps that fit differ by no more than this by chance."""
+_DOUBTED = 0.5
+"""Where the jaw meets the object less often, it may be another one."""
+_OR_ELSE = "; or it is another object (--object) or gripper (--gripper)"
 _CLOSINGS = 128
 _FACES = 50_000_000
 """Triangles times grasps that closings are looked at for."""
@@ -64,7 +71,7 @@ class FirstLook:
 
     ``fingertips_in_box`` of them have the middle between their fingertips in the object's box or a centimetre
     about it; of ``closings_looked_at``, ``closings_meet`` close on the object; None where that can't be told.
-    ``refusals`` say what can't be right and what mends it.
+    ``refusals`` say what can't be right and what mends it, ``doubts`` what may not be.
     """
 
     looked_at: int = 0
@@ -72,6 +79,7 @@ class FirstLook:
     closings_meet: int | None = None
     closings_looked_at: int = 0
     refusals: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """In words."""
@@ -104,14 +112,10 @@ def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report
     seen.fingertips_in_box = int(now.inside.sum())
     closed = now.closings()[0]
     seen.closings_meet, seen.closings_looked_at = int(closed.sum()), len(closed)
-    best, flag = now, ""
+    best, flags = now, ""
     if now.score() <= _FAR_WORSE:
-        others = (
-            (_Placed(raw, other, target), flag) for flag, other in _others(raw, placing, target, report)
-        )
-        likely = [(placed, flag) for placed, flag in others if placed.spread_out()]
-        best, flag = max(likely, key=lambda item: item[0].score(), default=(now, ""))
-    mends = f"; with {flag} {_share(best)}" if best.score() >= 0.5 else ""
+        best, flags = _better(now, _others(raw, placing, target, report), target)
+    mends = f"; with {flags} {_share(best)}" if best.score() >= 0.5 else ""
     nearest = float(now.distance.min())
     if nearest > _REACH_M:
         seen.refusals.append(
@@ -120,17 +124,39 @@ def first_look(raw: Raw, placing: Placing, target: Target | None, report: Report
         )
     elif len(raw) >= _FEW and best.score() >= 0.5 and now.score() <= _FAR_WORSE * best.score():
         what = (
-            "quaternions fit the other order better" if "quaternion" in flag else "few grasps fit the object"
+            "quaternions fit the other order better" if "quaternion" in flags else "few grasps fit the object"
         )
-        seen.refusals.append(f"{what}: {_share(now)}{mends}")
+        seen.refusals.append(f"{what}: {_share(now)}{mends}{_OR_ELSE}")
     elif len(raw) >= _FEW and now.met() <= _NOTHING:
         seen.refusals.append(
             f"hardly a grasp is of the object: {'; '.join(seen.lines())}, and no other frame, axes, unit or"
-            " order of quaternions that was tried fits better: check the object's mesh and, where it is"
-            " given, --object-pose"
+            " order of quaternions that was tried fits better: check the object (--object), its mesh, the"
+            " gripper (--gripper) and, where it is given, --object-pose"
         )
+    elif len(raw) >= _FEW and now.met() < _DOUBTED:
+        seen.doubts.append(f"the jaw meets the object in {_closed(now)} only{_OR_ELSE}")
     seen.refusals += _of_size(now, target, report)
     return seen
+
+
+def _better(now: _Placed, others: Iterable[tuple[str, Placing]], target: Target) -> tuple[_Placed, str]:
+    """The placing that fits better with the fewest flags, and these; where several fit alike, all of them."""
+    found = []
+    for flags, placing in others:
+        placed = _Placed(now.raw, placing, target)
+        if placed.spread_out() and (not flags.startswith("--unit") or placed.extended()):
+            found.append((placed, flags))
+    top = max((placed.score() for placed, _ in found), default=0.0)
+    good = [item for item in found if item[0].score() >= top - _ALIKE]
+    if top <= now.score() or not good:
+        return now, ""
+    fewest = min(_count(flags) for _, flags in good)
+    likely = sorted((x for x in good if _count(x[1]) == fewest), key=lambda item: -item[0].score())
+    return likely[0][0], " or ".join(flags for _, flags in likely[:3])
+
+
+def _count(flags: str) -> int:
+    return flags.count("--")
 
 
 def _of_size(now: _Placed, target: Target, report: Report) -> Iterator[str]:
@@ -165,7 +191,7 @@ class _Placed:
     """Grasps as one placing has them."""
 
     def __init__(self, raw: Raw, placing: Placing, target: Target) -> None:
-        self._target = target
+        self.raw, self._target = raw, target
         gripper = target.gripper
         poses = placing.place(raw)
         self.position, self.quaternion = poses
@@ -181,9 +207,17 @@ class _Placed:
 
     def spread_out(self) -> bool:
         """Whether they are not all crammed into the object's middle, where a far too small unit puts any."""
-        centre, size = (self._target.lower + self._target.upper) / 2, self._target.upper - self._target.lower
+        centre = (self._target.lower + self._target.upper) / 2
         apart = np.median(np.linalg.norm(self.position - centre, axis=1))
-        return bool(apart >= _CRAMMED * np.linalg.norm(size))
+        return bool(apart >= _CRAMMED * self._size())
+
+    def extended(self) -> bool:
+        """Whether they extend over some of the object; those of a whole scene shrink into its middle, too."""
+        across = np.linalg.norm(np.ptp(np.quantile(self.position, (0.05, 0.95), axis=0), axis=0))
+        return len(self.position) < _FEW or bool(across >= _SHRUNK * self._size())
+
+    def _size(self) -> float:
+        return float(np.linalg.norm(self._target.upper - self._target.lower))
 
     def closings(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Of some grasps, evenly chosen, whether the jaw meets the object when it closes, and whether its
@@ -218,23 +252,29 @@ def _outside(points: Floats, target: Target) -> Floats:
 
 def _closing(pose: Floats, triangles: Floats, gripper: GripperProfile) -> tuple[bool, bool]:
     """Whether a line between the open fingers, at any of some depths, crosses a triangle (F, 3, 3); and
-    whether none crosses the fingers' middle lines nor the palm's.
+    whether none crosses lines along the fingers, in their middle and near their sides, nor along the palm.
     """
     local = (triangles - pose[:3, 3]) @ pose[:3, :3]
     half, length, tip = gripper.max_opening_m / 2, gripper.finger.length_m, gripper.tip_offset_m
     out = half + gripper.finger.thickness_m / 2
+    beside = (0.4 * gripper.finger.width_m, 0.4 * gripper.palm_size_m[0])
+    widest = max(beside)
     low, high = local.min(axis=1), local.max(axis=1)
-    near = np.all((low <= [0.0, out, tip]) & (high >= [0.0, -out, tip - length]), axis=1)
+    near = np.all((low <= [widest, out, tip]) & (high >= [-widest, -out, tip - length]), axis=1)
     if not near.any():
         return False, True
     local = local[near]
     met = any(
         bool(np.any(np.abs(_crossings(local, 1, 0.0, tip - depth * length)) <= half)) for depth in _DEPTHS
     )
-    palm = np.abs(_crossings(local, 1, 0.0, tip - length)) <= out
-    fingers = [_crossings(local, 2, 0.0, side) for side in (-out, out)]
-    hit = palm.any() or any(np.any((z <= tip) & (z >= tip - length)) for z in fingers)
-    return met, not hit
+    for aside in (-1.0, 0.0, 1.0):
+        for side in (-out, out):
+            at = _crossings(local, 2, aside * beside[0], side)
+            if np.any((at <= tip) & (at >= tip - length)):
+                return met, False
+        if np.any(np.abs(_crossings(local, 1, aside * beside[1], tip - length)) <= out):
+            return met, False
+    return met, True
 
 
 def _crossings(triangles: Floats, along: int, first: float, second: float) -> Floats:
@@ -257,6 +297,14 @@ def _others(raw: Raw, placing: Placing, target: Target, report: Report) -> Itera
     if raw.quaternion is not None and raw.order is not None:
         other = "wxyz" if raw.order == "xyzw" else "xyzw"
         yield f"--quaternion-order {other}", replace(placing, swapped=True)
+    if raw.object_quaternion is not None:
+        named = "wxyz" if raw.object_order == "xyzw" else "xyzw"
+        told = f"--columns ...,object_quaternion_{named}=..."
+        yield told, replace(placing, object_swapped=True)
+        if raw.order is not None:
+            other = "wxyz" if raw.order == "xyzw" else "xyzw"
+            both = replace(placing, swapped=True, object_swapped=True)
+            yield f"--quaternion-order {other} {told}", both
     if placing.frame != TIPS:
         yield from _turned(placing, target)
     for unit, metres in METRES.items():
@@ -293,6 +341,14 @@ def _turned(placing: Placing, target: Target) -> Iterator[tuple[str, Placing]]:
     seen: list[Floats] = [placing.fixed]
     for frame in dict.fromkeys(frames):
         for convention in (placing.convention, *_AXES):
+            # A format that says itself what approaches is written with that; the closing is mistaken.
+            other = convention != placing.convention
+            if (
+                placing.axes_told
+                and other
+                and (frame != placing.frame or not _same_approach(convention, placing.convention))
+            ):
+                continue
             fixed = to_tool(frame, convention, target.gripper)
             if any(np.allclose(fixed, other) for other in seen):
                 continue
@@ -301,6 +357,15 @@ def _turned(placing: Placing, target: Target) -> Iterator[tuple[str, Placing]]:
             if convention != placing.convention:
                 flags.append(f"--convention {convention}")
             yield " ".join(flags), replace(placing, frame=frame, convention=convention, fixed=fixed)
+
+
+def _same_approach(one: str, other: str) -> bool:
+    return np.allclose(to_graspdb(one)[:, 2], to_graspdb(other)[:, 2])
+
+
+def _closed(placed: _Placed) -> str:
+    met = placed.closings()[0]
+    return f"{int(met.sum()):,} of {len(met):,} closings"
 
 
 def _share(placed: _Placed) -> str:

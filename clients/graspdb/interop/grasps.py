@@ -29,7 +29,8 @@ class Raw:
     from numbers in this ``order`` where it might be the other (None: it can't), or a ``rotation`` (N, 3, 3).
     ``ahead_m`` (N,) is how far the fingertips lie ahead of the origin, in formats that say so instead of
     naming a frame of the gripper. ``object_position`` (N, 3) and ``object_quaternion`` xyzw (N, 4) are the
-    object's pose at each grasp, in the frame that the poses are in, None where that is the object's.
+    object's pose at each grasp, in the frame that the poses are in, read from numbers in ``object_order``;
+    None where that frame is the object's.
     ``outcome`` are codes of :data:`graspdb.wire.OUTCOMES`, :data:`NO_OUTCOME` where it is missing, None where
     the file has none. ``more`` are further columns of a trial.
     """
@@ -45,6 +46,7 @@ class Raw:
     more: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     object_position: Floats | None = None
     object_quaternion: Floats | None = None
+    object_order: str | None = None
 
     def __len__(self) -> int:
         return len(self.position)

@@ -57,7 +57,7 @@ class Import:
             raise ValueError("give at least one file")
         self._item, self._gripper, self._options = item, gripper, options
         self._readings = [opened(file, gripper, _frames_of(item), **options) for file in files]
-        reports = [_read_through(reading) for reading in self._readings]
+        reports = [_read_through(reading, gripper.id) for reading in self._readings]
         self.report = together(reports)
         if not self.report.grasps:
             raise problem(self.report.file, "no grasp of it is left")
@@ -162,11 +162,17 @@ def _frames_of(item: GraspObject) -> dict[str, Any]:
     return {item.info.id: np.eye(4), **frames}
 
 
-def _read_through(reading: Reading) -> Report:
+def _read_through(reading: Reading, gripper: str) -> Report:
     """The report of a whole file: what can't be read is found before anything is sent."""
-    report = reading.new_report()
-    for _ in reading.chunks(report):
-        pass
+    report, named = reading.new_report(), set[str]()
+    for found in reading.chunks(report):
+        named |= {name for name in found.more.get("gripper", ()) if name}
+    others = sorted(name for name in named if name.partition("@")[0] != gripper)
+    if others:
+        report.assume(
+            f"grasps of {', '.join(others[:8])} where the column gripper says so; frames and the first look"
+            f" take them for those of {gripper}"
+        )
     return report
 
 

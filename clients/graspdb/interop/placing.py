@@ -21,7 +21,8 @@ class Placing:
 
     ``fixed`` (4, 4) stands on the right; ``tip_offset_m`` is from the tool to the fingertips, where the file
     says where these are; ``into_object`` (4, 4) stands on the left, None where poses are in the object's.
-    ``swapped`` takes quaternions in the other order than they were read.
+    ``swapped`` takes quaternions in the other order than they were read, ``object_swapped`` the object's.
+    ``axes_told`` is whether the format itself, and not somebody, says which axes approach and close.
     """
 
     frame: str
@@ -31,6 +32,8 @@ class Placing:
     tip_offset_m: float = 0.0
     into_object: Floats | None = None
     swapped: bool = False
+    object_swapped: bool = False
+    axes_told: bool = False
 
     def place(self, raw: Raw) -> Poses:
         """Poses of the tool in the object's frame; ValueError names the first grasp that has none."""
@@ -40,7 +43,9 @@ class Placing:
         poses = Poses(raw.position * self.factor, self._quaternions(raw))
         if raw.object_position is not None:
             assert raw.object_quaternion is not None
-            there = matrices(raw.object_position * self.factor, _unit(raw.object_quaternion))
+            turn = raw.object_quaternion
+            turn = swapped_order(turn, raw.object_order) if self.object_swapped else turn
+            there = matrices(raw.object_position * self.factor, _unit(turn))
             poses = precede(np.asarray(np.linalg.inv(there), dtype=np.float64), poses)
         if self.into_object is not None:
             poses = precede(self.into_object, poses)
@@ -77,14 +82,16 @@ class Placing:
         if raw.rotation is not None:
             return quaternions_of(np.asarray(raw.rotation, dtype=np.float64))
         assert raw.quaternion is not None
-        quaternion = raw.quaternion
-        if self.swapped:
-            quaternion = quaternion[:, [1, 2, 3, 0] if raw.order == "xyzw" else [3, 0, 1, 2]]
-        return _unit(quaternion)
+        return _unit(swapped_order(raw.quaternion, raw.order) if self.swapped else raw.quaternion)
+
+
+def swapped_order(quaternion: Floats, order: str | None) -> Floats:
+    """Quaternions xyzw that were read in this order, read in the other one."""
+    return quaternion[:, [1, 2, 3, 0] if order == "xyzw" else [3, 0, 1, 2]]
 
 
 def _infinite(numbers: Floats) -> NDArray[np.bool_]:
-    return np.asarray(~np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1))
+    return np.asarray(~np.isfinite(numbers).all(axis=tuple(range(1, numbers.ndim))))
 
 
 def _no_unit(quaternion: Floats) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from graspdb.interop.formats.source import SourceFile, Wishes
 from graspdb.interop.frames import frames_of, to_graspdb, to_tool
 from graspdb.interop.grasps import NO_OUTCOME, Codes, FileGrasps, Floats, Raw, Report, joined, problem
 from graspdb.interop.outcomes import Rule, named, rule_of
-from graspdb.interop.placing import Placing
+from graspdb.interop.placing import Placing, swapped_order
 from graspdb.options import Option, Vector, known_keywords
 from graspdb.poses import as_vector7, matrices
 from graspdb.wire import CONVENTIONS, GripperInfo, GripperProfile
@@ -55,8 +55,15 @@ class Reading:
     frames: Mapping[str, Floats] = field(default_factory=dict)
 
     def raws(self, report: Report) -> Iterator[Raw]:
-        """The file's grasps as they stand in it."""
-        yield from self.kind.read(self.source, self.wishes, report)
+        """The file's grasps as they stand in it, without those that are to be left out."""
+        order = self.wishes.quaternion_order
+        for raw in self.kind.read(self.source, self.wishes, report):
+            if order is not None and (raw.quaternion is None or raw.order is None):
+                told = "has no quaternions that might be in another order: leave --quaternion-order out"
+                raise problem(self.source.name, told)
+            if order is not None and raw.quaternion is not None and raw.order != order:
+                raw = replace(raw, quaternion=swapped_order(raw.quaternion, raw.order), order=order)
+            yield self._usable(raw, self.placing_by(report), report)
 
     def new_report(self) -> Report:
         """A report of nothing read yet."""
@@ -70,7 +77,6 @@ class Reading:
         """The file's grasps as ours; the report says more with each piece. FileProblem in one line."""
         for raw in self.raws(report):
             placing = self.placing_by(report)
-            raw = self._usable(raw, placing, report)
             try:
                 poses = placing.place(raw)
             except ValueError as error:
@@ -311,6 +317,7 @@ def _placing(
         fixed,
         0.0 if profile is None else profile.tip_offset_m,
         None if place is None else np.asarray(np.linalg.inv(_pose_matrix(place)), dtype=np.float64),
+        axes_told=not kind.table and kind.convention is not None and options.get("convention") is None,
     )
 
 

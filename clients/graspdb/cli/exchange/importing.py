@@ -99,5 +99,7 @@ def _lines(report: Report, look: FirstLook) -> Any:
     yield f"  outcomes: {outcomes} ({report.rule})"
     for line in look.lines():
         yield f"  first look: {line}"
+    for doubt in look.doubts:
+        yield f"  doubtful: {doubt}"
     if look.fingertips_in_box is None and report.object_scale is not None:
         yield f"  the file's mesh goes with: graspdb objects set-mesh ... --scale {report.object_scale:.9g}"

@@ -50,7 +50,7 @@ def read_hdf5(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Ra
                 values = {
                     name: numbers(source.name, name, data[part], (None,)) for name, data in qualities.items()
                 }
-                yield _raw(source.name, np.asarray(transforms[part], dtype=np.float64), values, first)
+                yield _raw(source.name, np.asarray(transforms[part], dtype=np.float64), values, first, wishes)
     except (OSError, KeyError, RuntimeError) as error:
         raise problem(source.name, f"can't be read as HDF5: {error}") from None
 
@@ -136,7 +136,7 @@ def read_json(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Ra
         for key, values in data.items()
         if key.startswith("quality_")
     }
-    yield from _of_columns(source.name, data.get("transforms"), qualities)
+    yield from _of_columns(source.name, data.get("transforms"), qualities, wishes)
 
 
 def read_graspgen(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
@@ -162,10 +162,10 @@ def read_graspgen(source: SourceFile, wishes: Wishes, report: Report) -> Iterato
     }
     for key in grasps.keys() - qualities.keys() - {"transforms"}:
         report.drop(f"grasps.{key}")
-    yield from _of_columns(source.name, transforms, qualities)
+    yield from _of_columns(source.name, transforms, qualities, wishes)
 
 
-def _of_columns(name: str, transforms: Any, qualities: Mapping[str, Any]) -> Iterator[Raw]:
+def _of_columns(name: str, transforms: Any, qualities: Mapping[str, Any], wishes: Wishes) -> Iterator[Raw]:
     poses = column_of(name, "transforms", transforms, (4, 4))
     if not len(poses):
         raise problem(name, "has no grasps")
@@ -173,11 +173,11 @@ def _of_columns(name: str, transforms: Any, qualities: Mapping[str, Any]) -> Ite
     same_length(name, len(poses), columns)
     for first in range(0, len(poses), CHUNK):
         values = {key: column.take(first, first + CHUNK) for key, column in columns.items()}
-        yield _raw(name, poses.take(first, first + CHUNK), values, first)
+        yield _raw(name, poses.take(first, first + CHUNK), values, first, wishes)
 
 
-def _raw(name: str, transforms: Floats, qualities: dict[str, Floats], first: int) -> Raw:
-    position, rotation = split_matrices(name, transforms, first)
+def _raw(name: str, transforms: Floats, qualities: dict[str, Floats], first: int, wishes: Wishes) -> Raw:
+    position, rotation = split_matrices(name, transforms, first, drop=wishes.drop_unusable)
     held = qualities.get(HELD)
     outcome = None
     if held is not None:

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from graspdb.files.trials import OUTCOME_COLUMNS
+
 #: Further columns of a trial, by their names on the wire.
 MORE = ("width_m", "gripper", "source", "protocol", "proposal_density", "measured_at", "answer", "metadata")
 _PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -18,7 +20,6 @@ KEYS = (
 STATED = ("frame", "convention")
 """Columns of our own tables: of which frame of the gripper the poses are, and in which convention."""
 
-_OUTCOMES = ("outcome", "success", "label", "result", "held", "object_in_gripper")
 _POSITIONS: tuple[str, ...] = (
     "",
     "p",
@@ -111,7 +112,7 @@ def plan(
     """
     known = set(there)
     pose = _pose(there, known, given, order)
-    outcome = given.get("outcome") or next((name for name in _OUTCOMES if name in known), None)
+    outcome = given.get("outcome") or next((name for name in OUTCOME_COLUMNS if name in known), None)
     if outcome is not None and outcome not in known:
         raise ValueError(_lacks(outcome, there))
     scores = {key[8:]: name for key, name in given.items() if key.startswith("quality.")}

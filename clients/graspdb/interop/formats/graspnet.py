@@ -49,7 +49,7 @@ def read_array(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[R
         array = array[None]
     if array.ndim != 2 or array.shape[1] != 17 or array.dtype.kind not in "fiu":
         raise problem(source.name, f"has an array of shape {array.shape}; GraspNet's has N x 17 numbers")
-    report.drop("height and depth but for the fingertips' place: kept as qualities")
+    report.map("width, height and depth to qualities, depth to the fingertips' place")
     wanted = wishes.only.get("object_id")
     others: set[float] = set()
     for first in range(0, len(array), CHUNK):
@@ -69,8 +69,10 @@ def read_array(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[R
             qualities={"score": rows[:, 0], "width": rows[:, 1], "height": rows[:, 2], "depth": rows[:, 3]},
             ahead_m=rows[:, 3],
         )
+    if wanted is not None and float(wanted) not in others:
+        raise problem(source.name, f"has no grasps of object {wanted}; there are {_some(others)}")
     if wanted is not None and len(others) > 1:
-        report.drop(f"grasps of other objects than {wanted}: {_some(others - {float(wanted)})}")
+        report.drop(f"grasps of objects {_some(others - {float(wanted)})}: only those of {wanted} are taken")
 
 
 def read_labels(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:

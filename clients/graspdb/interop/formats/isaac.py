@@ -51,6 +51,7 @@ def read(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw]:
             first,
             poses[:, :3],
             quaternion=poses[:, 3:],
+            order="wxyz",
             qualities={} if np.isnan(scores).all() else {CONFIDENCE: scores},
             more={joints.AT: [row[2] for row in rows], joints.BEFORE: [row[3] for row in rows]},
         )

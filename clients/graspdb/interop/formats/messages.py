@@ -181,6 +181,7 @@ def read_moveit(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[
             first,
             poses[:, :3],
             quaternion=poses[:, 3:],
+            order="xyzw",
             qualities={QUALITY: np.array([row[1] for row in rows])},
             more={joints.AT: [row[2] for row in rows], joints.BEFORE: [row[3] for row in rows]},
         )

@@ -147,7 +147,8 @@ class _Rows:
         values = np.array(self.numbers, dtype=np.float64).reshape(-1, 7)
         qualities = {QUALITY: np.array(self.scores)} if self.scores else {}
         more = self._postures if self.scores else {}
-        return Raw(first, values[:, :3], quaternion=values[:, 3:], qualities=qualities, more=more)
+        turns = values[:, 3:]
+        return Raw(first, values[:, :3], turns, order="xyzw", qualities=qualities, more=more)
 
 
 def _said(value: Any) -> bool:

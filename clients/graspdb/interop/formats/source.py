@@ -160,11 +160,17 @@ def column_of(
     return value
 
 
-def split_matrices(file: str, transforms: Floats, first: int = 0) -> tuple[Floats, Floats]:
-    """Positions (N, 3) and rotations (N, 3, 3) of homogeneous matrices, whose last rows are checked."""
+def split_matrices(
+    file: str, transforms: Floats, first: int = 0, *, drop: bool = False
+) -> tuple[Floats, Floats]:
+    """Positions (N, 3) and rotations (N, 3, 3) of homogeneous matrices, whose last rows are checked; with
+    ``drop`` NaN where they are wrong.
+    """
     off = np.abs(transforms[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1, initial=0.0)
     wrong = np.flatnonzero(~(off <= 1e-6))
-    if wrong.size:
+    if wrong.size and drop:
+        transforms = np.where((off <= 1e-6)[:, None, None], transforms, np.nan)
+    elif wrong.size:
         row = int(wrong[0])
         turned = np.allclose(transforms[row, :3, 3], 0.0) and np.any(transforms[row, 3, :3])
         hint = ": it looks transposed" if turned else ""

@@ -122,6 +122,10 @@ def read_vgn(source: SourceFile, wishes: Wishes, report: Report) -> Iterator[Raw
             ahead_m=np.full(len(raw), VGN_TIP_M),
         )  # fmt: skip
         yield raw if wanted is None else raw.part(here == wanted)
+    if wanted is not None and wanted not in scenes:
+        raise problem(
+            source.name, f"has no grasps in scene {wanted}; there are {', '.join(sorted(scenes)[:8])}"
+        )
     if wanted is not None and len(scenes) > 1:
         report.drop(f"grasps in {len(scenes) - 1:,} other scenes")
 
@@ -201,7 +205,9 @@ def _raw(file: str, table: Table, chosen: Plan, first: int, wishes: Wishes) -> R
             raise problem(file, f"{_told(chosen.matrix)} must be matrices of 16 or 12 numbers")
         if rows.shape[1] == 16:
             wrong = np.flatnonzero(~(np.abs(rows[:, 12:] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= 1e-6))
-            if wrong.size:
+            if wrong.size and wishes.drop_unusable:
+                rows[wrong] = np.nan
+            elif wrong.size:
                 place = first + int(wrong[0])
                 raise problem(file, f"grasp {place}: the last row of its matrix must be 0, 0, 0, 1")
         matrix = rows[:, :12].reshape(-1, 3, 4)
@@ -226,12 +232,13 @@ def _raw(file: str, table: Table, chosen: Plan, first: int, wishes: Wishes) -> R
     )
 
 
-def _object_poses(file: str, table: Table, chosen: Plan) -> dict[str, Floats]:
+def _object_poses(file: str, table: Table, chosen: Plan) -> dict[str, Any]:
     if not chosen.object_position:
         return {}
     turn = _wide(file, table, chosen.object_quaternion, 4)
     return {
         "object_position": _wide(file, table, chosen.object_position, 3),
+        "object_order": chosen.object_order,
         "object_quaternion": turn if chosen.object_order == "xyzw" else turn[:, [1, 2, 3, 0]],
     }
 
