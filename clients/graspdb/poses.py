@@ -201,11 +201,19 @@ def _refuse(bad: ArrayLike, what: str) -> None:
         raise ValueError(f"pose {int(np.argmax(bad))} {what}")
 
 
-def as_vector7(pose: ArrayLike | Any) -> tuple[float, ...]:
-    """One pose as ``(x, y, z, qx, qy, qz, qw)``; see :func:`as_poses` for what is accepted."""
-    rows = as_poses(pose).rows
+def as_vector7(pose: ArrayLike | Any, name: str = "pose") -> tuple[float, ...]:
+    """One pose as ``(x, y, z, qx, qy, qz, qw)``; see :func:`as_poses` for what is accepted.
+
+    ``name`` is what a ValueError calls it.
+    """
+    try:
+        rows = as_poses(pose).rows
+    except ValueError as error:
+        said = str(error)
+        alone = said.removeprefix("pose 0 ")
+        raise ValueError(f"{name}: {said}" if alone == said else f"{name} {alone}") from None
     if len(rows) != 1:
-        raise ValueError(f"expected one pose, got {len(rows)}")
+        raise ValueError(f"{name}: expected one pose, got {len(rows)}")
     return tuple(rows[0].tolist())
 
 
@@ -218,7 +226,7 @@ def pose_documents(named: Mapping[str, Any]) -> dict[str, Any]:
         elif isinstance(pose, wire.Pose):
             documents[name] = pose.model_dump(mode="json")
         else:
-            x, y, z, *quaternion = as_vector7(pose)
+            x, y, z, *quaternion = as_vector7(pose, name)
             documents[name] = {"position": [x, y, z], "quaternion_xyzw": quaternion}
     return documents
 

@@ -329,6 +329,10 @@ def test_the_world_frame(grasped: GraspObject) -> None:
         object_pose=matrices(pose[:3], pose[3:]), frame="object", approach=(1, 0, 0), approach_cone_deg=30
     )
     assert np.allclose(same.position, best.position, atol=1e-4)
+    # What was measured in millimetres lies half a kilometre away.
+    (far,) = grasped.best_grasp(object_pose=[500, 0, 100, 0, 0, half, half]).warnings
+    assert "By object_pose the object lies 510 m" in far
+    assert best.warnings == ()
 
 
 def test_candidates_exclusions_and_half_spaces_as_arrays(grasped: GraspObject) -> None:

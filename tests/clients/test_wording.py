@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from graspdb.cli.wording import COMMANDS, in_commands
 
@@ -38,6 +39,17 @@ REQUEST = re.compile(r"(GET|POST|PUT|DELETE|PATCH) /")
             "post them with ?accept_implausible=true (on the command line --accept-implausible)",
             "post them with --accept-implausible",
         ),
+        (
+            "The trials are of several grippers: name one (gripper: panda, pg70; protocol: a, b)",
+            "The trials are of several grippers: name one (--gripper: panda, pg70; --protocol: a, b)",
+        ),
+        ("is not known: name one (gripper)", "is not known: name one (--gripper)"),
+        (
+            "invalid input:\n  near: four numbers\n  id: text",
+            "invalid input:\n  --near: four numbers\n  id: text",
+        ),
+        ("object_pose must have a unit quaternion", "--object-pose must have a unit quaternion"),
+        ("if the file is in millimetres, send unit=mm", "if the file is in millimetres, send --unit mm"),
         ("by 0.001 (on the command line --unit mm)", "by 0.001 (--unit mm)"),
         ("collision_free=false would do", "--any would do"),
         ("trials.1.quaternion_xyzw: norm 3", "trials.1.quaternion_xyzw: norm 3"),
@@ -91,3 +103,17 @@ def test_errors_speak_of_commands(run: Callable[..., tuple[int, str, str]], fres
     code, _, err = run("best-grasp", fresh_id, "--approach", "0,0,1")
     assert code == 1
     assert "--approach-cone-deg: " in err
+    for arguments, option in (
+        (("best-grasp", fresh_id, "--object-pose", "0,0,0,0,0,0,2"), "--object-pose must have a unit"),
+        (("likelihood", fresh_id, "--pose", "0,0,0,0,0,0,2"), "--pose must have a unit"),
+        (("best-grasp", fresh_id, "--near", "0,0,0,2"), "  --near: "),
+    ):
+        assert option in run(*arguments)[2]
+
+
+def test_a_mesh_in_another_unit_is_told_of_the_option(
+    run: Callable[..., tuple[int, str, str]], fresh_id: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "seven.stl"
+    file.write_bytes(bytes(trimesh.creation.box([7, 7, 7]).export(file_type="stl")))
+    assert "send --unit mm" in run("objects", "create", fresh_id, "--mesh", str(file))[1]

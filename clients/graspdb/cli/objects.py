@@ -10,6 +10,7 @@ import typer
 
 from graspdb.cli.common import ERRORS, ObjectId, State, Yes, out, show_rows
 from graspdb.cli.options import Commands
+from graspdb.cli.wording import in_commands
 from graspdb.errors import Conflict
 from graspdb.examples import EXAMPLES
 from graspdb.resources.objects import GraspObject, ObjectProperties
@@ -33,6 +34,11 @@ Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
 Scale = Annotated[float, typer.Option(help="Factor to the mesh's coordinates, beside their unit.")]
 
 
+def _told(item: GraspObject) -> dict[str, str]:
+    """An object's summary, with the ways out of its warnings as options."""
+    return {name: in_commands(text) if "warning" in name else text for name, text in item.summary().items()}
+
+
 @objects.command("list")
 def list_objects(state: State) -> None:
     """List all objects."""
@@ -54,7 +60,7 @@ def list_objects(state: State) -> None:
 def show_object(state: State, id: ObjectId) -> None:
     """Show one object."""
     item = state.db.objects.get(id)
-    state.show(item.info, item.summary())
+    state.show(item.info, _told(item))
 
 
 @objects.command("create")
@@ -76,7 +82,7 @@ def create_object(
     item = state.db.objects.create(
         id, mesh=mesh, unit=unit, scale=scale, convex_parts=convex_parts, **properties
     )
-    state.show(item.info, item.summary())
+    state.show(item.info, _told(item))
 
 
 @objects.command("change")
@@ -88,7 +94,7 @@ def change_object(
     if frame:
         properties["frames"] = {**item.info.frames, **_frames(frame)}
     item.patch(**properties)
-    state.show(item.info, item.summary())
+    state.show(item.info, _told(item))
 
 
 def _frames(given: list[str]) -> dict[str, list[float]]:
@@ -116,7 +122,7 @@ def set_mesh(
     """Upload an object's mesh."""
     item = state.db.objects.get(id)
     info = item.upload_mesh(mesh, unit=unit, scale=scale)
-    state.show(info, item.summary())
+    state.show(info, _told(item))
 
 
 @objects.command("set-convex-parts")
@@ -130,7 +136,7 @@ def set_convex_parts(
     """Upload an object's convex parts."""
     item = state.db.objects.get(id)
     info = item.upload_convex_parts(parts)
-    state.show(info, item.summary())
+    state.show(info, _told(item))
 
 
 @objects.command("copy")
@@ -142,7 +148,7 @@ def copy_object(
 ) -> None:
     """Copy an object; the copy takes one other mesh though it has trials."""
     item = state.db.objects.get(id).copy(copy, trials=trials)
-    state.show(item.info, item.summary())
+    state.show(item.info, _told(item))
 
 
 @objects.command("delete")
@@ -172,7 +178,7 @@ def add_example(
             ERRORS.print(f"{name} exists already.")
             continue
         if not state.json:
-            show_rows(added[-1].summary())
+            show_rows(_told(added[-1]))
     if state.json:
         out([item.info for item in added])
 

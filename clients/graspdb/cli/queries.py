@@ -27,7 +27,7 @@ from graspdb.cli.wording import in_commands
 from graspdb.errors import Infeasible
 from graspdb.figures.style import number, widths
 from graspdb.files.trials import read_poses
-from graspdb.poses import as_poses
+from graspdb.poses import as_poses, as_vector7
 from graspdb.resources.results import (
     Grasp,
     Grasps,
@@ -212,7 +212,7 @@ def likelihood(
     """Say how likely grasps are."""
     if (file is None) == (pose is None):
         raise typer.BadParameter("give a file or --pose")
-    poses = np.array([pose]) if file is None else read_poses(file)
+    poses = read_poses(file) if file is not None else np.array([as_vector7(pose, "--pose")])
     found = state.db.objects.get(id).likelihood(poses, **selection)
     if state.json:
         out(found)

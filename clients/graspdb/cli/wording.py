@@ -64,6 +64,11 @@ _PARAMETERS = option_names(
 _OPPOSITES = {"collision_free": "any"}
 _CALL = re.compile(r"\b(GET|POST|PUT|DELETE|PATCH) (/[\w{}./-]*[\w}])(?:\?([\w=]+)(?:=\.\.\.|\.\.\.)?)?")
 _FOR_BOTH = re.compile(r"(\?\w+=\w+)? \(on the command line (--[^()]+)\)")
+#: What several are named for to choose from, as in ``name one (gripper: panda, pg70)``, or none.
+_NAME_ONE = re.compile(r"(?<=name one )\([^()]*\)")
+#: A field of a question at the head of what is wrong with it, which need not look like a parameter.
+_QUESTIONED = option_names(Constraints)
+_FIELD = re.compile(r"(?m)(?<=^  )[a-z]+(?=: |\.\d)")
 _PARAMETER = re.compile(r"(?<![\w.\-])\??(?:\w+\([^()]*\)|([a-z_]+)=([\w.-]*)|([a-z]+(?:_[a-z]+)+))")
 
 
@@ -88,6 +93,8 @@ def in_commands(text: str) -> str:
 
 def in_options(text: str) -> str:
     """The text with options in the place of parameters: ``gripper=`` and ``max_poses`` are ours, too."""
+    text = _NAME_ONE.sub(lambda found: re.sub(r"\b(gripper|protocol)(?=[:)])", r"--\1", found[0]), text)
+    text = _FIELD.sub(lambda found: _flag(found[0]) if found[0] in _QUESTIONED else found[0], text)
     return _PARAMETER.sub(_option, text)
 
 

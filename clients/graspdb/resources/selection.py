@@ -273,7 +273,7 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
             fields |= pose_trials(fields[name], fields) if name == "candidates" else {}
             fields[name] = as_poses(fields[name]).columns()
     if "object_pose" in fields:
-        fields["object_pose"] = as_vector7(fields["object_pose"])
+        fields["object_pose"] = as_vector7(fields["object_pose"], "object_pose")
     if "include" in fields:
         fields["include"] = names(fields["include"])
     return validate(wire.BestGraspRequest, fields)

@@ -36,6 +36,8 @@ from graspdb_service.usecases.trials.pose_frames import NO_TWINS, frame_of
 from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
+#: From here on an object's pose in the world is doubted, metres.
+_FAR_M = 100.0
 
 
 def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, Selected]:
@@ -77,6 +79,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *ctx.evidence.warnings(built),
             *doubts(None if question is None else question.calibration),
             *frame.warnings,
+            *_far_off(limits),
             *([NO_TWINS] if request.near is not None and near is None else []),
         ],
     }
@@ -199,6 +202,17 @@ def _chances(estimates: Estimates, row: int, reach: ReachInfo | None) -> dict[st
     if math.isfinite(estimates.prior[row]):
         chances["prior_success_probability"] = float(estimates.prior[row])
     return chances
+
+
+def _far_off(limits: Constraints) -> list[str]:
+    """That the object lies where none does, which is most often a pose in millimetres."""
+    off = 0.0 if limits.object_pose is None else float(np.linalg.norm(limits.object_pose.positions))
+    if off < _FAR_M:
+        return []
+    return [
+        f"By object_pose the object lies {off:,.0f} m from the world's origin: positions are in metres, so"
+        " divide millimetres by 1,000"
+    ]
 
 
 def _world(limits: Constraints, pose: se3.Poses) -> WorldPose | None:
