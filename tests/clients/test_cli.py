@@ -168,6 +168,18 @@ def test_best_grasps_have_world_poses_in_the_frame_asked_for(run: Run, tried: st
         assert f"world {name}" in header
     assert "world" not in run("best-grasp", tried, *turned, "--frame", "object")[1]
 
+    # What poses are of stands with them.
+    _, header, told = run("best-grasp", tried, *turned, "--gripper", "panda", "--frame", "flange")
+    assert "flange world position [m]" in header
+    assert "Poses are of the flange in the world frame." in told
+    single = run("best-grasp", tried, *moved, "--gripper", "panda", "--frame", "flange")[1]
+    assert "flange, in the object frame" in single
+    assert "tool, in the object frame" in run("best-grasp", tried)[1]
+    pose = ("--pose", "0,0,0.1,1,0,0,0", "--gripper", "panda", "--frame", "flange")
+    _, header, told = run("likelihood", tried, *pose)
+    assert "flange position [m]" in header
+    assert "Poses are of the flange in the object frame." in told
+
     table = list(csv.DictReader(io.StringIO(run("best-grasp", tried, *turned, "--csv")[1])))
     assert len(table) == len(rows) == 2
     for row in table:

@@ -160,7 +160,10 @@ def test_a_grasp_knows_what_it_is_of_and_goes_back_so(
     np.testing.assert_allclose(best.matrix, tool.matrix @ _fixed(mine, "camera", "graspnet"), atol=1e-9)
     np.testing.assert_allclose(best.tool_matrix, tool.matrix, atol=1e-9)
     np.testing.assert_allclose(best.approach, tool.approach, atol=1e-9)
-    assert best.summary()["pose of"] == "camera, axes as graspnet"
+    assert best.summary()["pose of"] == "camera, axes as graspnet, in the object frame"
+    assert "of the camera, axes as graspnet in the object frame, density" in repr(best)
+    moved = grasped.best_grasp(frame="camera", object_pose=[1, 0, 0, 0, 0, 0, 1])
+    assert f"world position=[{moved.position[0] + 1:.4f}, " in repr(moved)
     # The flange is turned against the tool, and graspnet's axes are not its own: it says so.
     turned = grasped.best_grasp(frame="flange", convention="graspnet")
     assert turned.warnings

@@ -141,12 +141,12 @@ def _ranked_by(found: Grasps) -> dict[str, str]:
 
 
 def _show_grasps(found: Grasps, *, in_world: bool) -> None:
-    frame = "world " if in_world else ""
+    frame = f"{_head(found.frame)}{'world ' if in_world else ''}"
     columns: dict[str, Callable[[Grasp], Any]] = {
         "": lambda g: 1 + found.index(g),
         f"{frame}position [m]": lambda g: numbers(_matrix(g, in_world)[:3, 3]),
         f"{frame}quaternion xyzw": lambda g: numbers(as_poses(_matrix(g, in_world)).quaternion_xyzw[0]),
-        f"{frame}approach": lambda g: numbers(_approach(g, in_world), digits=2),
+        f"{'world ' if in_world else ''}approach": lambda g: numbers(_approach(g, in_world), digits=2),
         "density": lambda g: f"{g.density:.4g}",
         "relative": lambda g: f"{g.relative:.3f}",
         "success probability": lambda g: "unknown" if g.success_probability is None else g.chance(),
@@ -167,6 +167,7 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
     if all(g.prior_success_probability is None for g in found):
         del columns["by geometry"]
     show_table(found, columns, empty="No grasp.")
+    _tell_frame(found.frame, found.convention, "world" if in_world else "object")
     _tell_kept(found)
     if found.ranking is not None and ranked_by:
         ERRORS.print(f"The score that they are ranked by is the {found.ranking.score}.", soft_wrap=True)
@@ -176,6 +177,17 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
         ERRORS.print(f"Only {len(found)} distinct grasps exist.")
+
+
+def _head(frame: str) -> str:
+    """What stands before the names of a pose's columns."""
+    return "" if frame == "tool" else f"{frame} "
+
+
+def _tell_frame(frame: str, convention: str, reference: str = "object") -> None:
+    """What a table's poses are of, and in."""
+    axes = "" if convention == "graspdb" else f", with the axes of {convention},"
+    ERRORS.print(f"Poses are of the {frame}{axes} in the {reference} frame.", highlight=False, soft_wrap=True)
 
 
 def _matrix(grasp: Grasp, in_world: bool) -> NDArray[np.float64]:
@@ -221,7 +233,11 @@ def likelihood(
     if csv:
         out_csv(pose_columns(as_poses(poses)) | found.columns())
         return
-    columns: dict[str, Callable[[int], Any]] = {"": int, "position [m]": lambda row: numbers(poses[row, :3])}
+    frame, convention = selection.get("frame") or "tool", selection.get("convention") or "graspdb"
+    columns: dict[str, Callable[[int], Any]] = {
+        "": int,
+        f"{_head(frame)}position [m]": lambda row: numbers(poses[row, :3]),
+    }
     for name in ("density", "log_density", "relative", "collision_free", "prior_success_probability"):
         if (values := getattr(found, name)) is not None:
             columns[name.replace("_", " ")] = partial(_cell, values)
@@ -229,6 +245,7 @@ def likelihood(
         columns["success probability"] = partial(_chance, found)
         columns["nearest attempt"] = partial(_nearest_of, found.support)
     show_table(range(min(limit, len(poses))), columns, empty="No poses.")
+    _tell_frame(frame, convention)
     if found.reach is not None and found.support is not None and not found.support.enough.all():
         ERRORS.print(f"Success probabilities are told {found.reach.rule}.", soft_wrap=True)
     if len(poses) > limit:
@@ -299,8 +316,8 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
         out(found)
     else:
         columns: dict[str, Callable[[int], Any]] = {
-            "position [m]": lambda row: numbers(found.position[row]),
-            "quaternion xyzw": lambda row: numbers(found.quaternion_xyzw[row]),
+            f"{_head(found.frame)}position [m]": lambda row: numbers(found.position[row]),
+            f"{_head(found.frame)}quaternion xyzw": lambda row: numbers(found.quaternion_xyzw[row]),
             "density": lambda row: f"{found.proposal_density[row]:.4g}",
         }
         if found.support is not None:
@@ -309,3 +326,4 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
         if found.opening_m is not None:
             columns["opening [m]"] = partial(_cell, found.opening_m)
         show_table(range(len(found)), columns, empty="No samples.")
+        _tell_frame(found.frame, found.convention)

@@ -209,7 +209,7 @@ class Grasp:
     def summary(self) -> dict[str, str]:
         """What a person wants to know of it, in words."""
         rows = {
-            **({} if self.tool_to_frame is None else {"pose of": self._told_frame()}),
+            "pose of": f"{self._told_frame()}, in the object frame",
             "position [m]": _vector(self.position),
             "quaternion xyzw": _vector(self.quaternion_xyzw),
             "approach": _vector(self.approach, 2),
@@ -254,8 +254,10 @@ class Grasp:
 
     def line(self) -> str:
         """What it is in one line."""
+        world = "" if self.world is None else f"world position={_vector(self.world[:3, 3])}, "
         return (
-            f"Grasp(position={_vector(self.position)}, quaternion_xyzw={_vector(self.quaternion_xyzw)}, "
+            f"Grasp(position={_vector(self.position)}, quaternion_xyzw={_vector(self.quaternion_xyzw)} "
+            f"of the {self._told_frame()} in the object frame, {world}"
             f"density={self.density:.4g}, relative={self.relative:.3f}{', prior=True' if self.prior else ''})"
         )
 
@@ -682,7 +684,8 @@ class SampledPoses(PoseArrays):
         return columns if self.support is None else columns | self.support.columns()
 
     def __repr__(self) -> str:
-        return f"SampledPoses({len(self)} poses, seed={self.seed}, revision={self.revision})"
+        told = f"{len(self)} poses of the {self.frame} in the object frame"
+        return f"SampledPoses({told}, seed={self.seed}, revision={self.revision})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
