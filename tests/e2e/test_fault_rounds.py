@@ -34,7 +34,7 @@ from grid_truth import full_grid, matrices
 from postgres_server import PostgresServer
 from real_processes import Process, wait_for
 
-QUICK, ALL = 2, 50
+QUICK, ALL = 5, 50
 STEP_M, ROTATION_STEP_DEG, MARGIN_M = 0.02, 60.0, 0.02
 GRID = {"position_step_m": STEP_M, "rotation_step_deg": ROTATION_STEP_DEG, "margin_m": MARGIN_M}
 
