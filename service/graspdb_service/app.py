@@ -323,7 +323,7 @@ def problem_of_validation(errors: Any) -> ProblemError:
         # pydantic names the branch of a union it tried; that is no part of the user's document.
         place = [part for part in place if "[" not in part and not part[:1].isupper()]
         place = [part for part in place if part != "constrained-str"]
-        told = ".".join(place) or "body", str(item["msg"]).removeprefix("Value error, ")
+        told = ".".join(place) or "body", str(item["msg"])
         (of_type if item["type"].endswith("_type") else listed).append(told)
     # Of a union's branches the one that took the value says what is wrong with it, not those of other types.
     fields = [f"{name}." for name, _ in listed]

@@ -18,6 +18,7 @@ import trimesh
 import typer
 
 from graspdb.cli import TABLE, app
+from graspdb.cli.common import show_table
 from graspdb.options import Corners
 from graspdb.resources.kernels import KernelOptions
 from graspdb.resources.objects import ObjectProperties
@@ -360,6 +361,39 @@ def test_grippers(run: Run, fresh_id: str, tmp_path: Path) -> None:
     assert f"{fresh_id}@2" in run("grippers", "versions", fresh_id)[1]
     assert run("grippers", "delete", fresh_id)[0] == 0
     assert "no gripper" in run("grippers", "show", fresh_id)[2]
+
+
+def test_a_wrong_profile_names_its_file(run: Run, fresh_id: str, tmp_path: Path) -> None:
+    file = tmp_path / "gripper.json"
+    file.write_text("{")
+    assert f"{file} is no JSON" in run("grippers", "create", fresh_id, str(file))[2]
+    back = {"position": [0, 0, 0.14], "quaternion_xyzw": [1, 0, 0, 0]}
+    shape = {
+        "max_opening_m": 0.08,
+        "finger": {"width_m": 0.02, "thickness_m": 0.01, "length_m": 0.05},
+        "palm_size_m": [0.06, 0.2, 0.06],
+    }
+    file.write_text(json.dumps({**shape, "base_to_tool": back}))
+    told = run("grippers", "create", fresh_id, str(file))[2]
+    assert "  base_to_tool puts the gripper's base 140 mm ahead" in told
+    assert str(file) in told
+
+
+def test_who_can_not_be_asked_is_told_of_yes(run: Run, tried: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (batch,) = json.loads(run("--json", "batches", "list", tried)[1])
+    for answer, code, said in (("", 1, "--yes"), ("n\n", 1, "Aborted"), ("y\n", 0, "")):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(answer))
+        ended, _, told = run("batches", "delete", tried, batch["batch"])
+        assert ended == code
+        assert said in told
+
+
+def test_no_word_of_a_table_is_broken(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    word = "0f9b3a52-6e0d-4e86-9c1b-2d1f4c0a7e11"
+    show_table([word, word], {str(n): lambda item: f"{item} and {item}" for n in range(4)}, empty="")
+    for line in capsys.readouterr().out.splitlines()[1:]:
+        assert set(line.split()) <= {word, "and"}
 
 
 @pytest.mark.parametrize("as_json", [(), ("--json",)])

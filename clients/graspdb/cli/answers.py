@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ObjectId, State, Yes, out_csv, show_table
+from graspdb.cli.common import ObjectId, State, Yes, confirm, out_csv, show_table
 from graspdb.cli.options import Commands
 from graspdb.resources.results import Grasps
 
@@ -79,6 +79,6 @@ def delete_answer(state: State, answer: Reference, yes: Yes = False) -> None:
     """Delete an answer by its id; by a name: free the name, and the answer where nothing else keeps it."""
     if not yes:
         found = state.db.answers.get(answer)
-        typer.confirm(f"Delete {answer}, {found.kind} of {found.object}?", abort=True, err=True)
+        confirm(f"Delete {answer}, {found.kind} of {found.object}?")
     state.db.answers.delete(answer)
     state.show({"deleted": answer}, f"{answer} is deleted.")

@@ -15,6 +15,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import typer
 from pydantic import BaseModel
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -128,13 +129,46 @@ def show_table(items: Sequence[T], columns: Mapping[str, Callable[[T], Any]], *,
     if not body:
         console().print(empty)
         return
+    texts = [[f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in row] for row in body]
+    screen = console()
+    widths = _widths([[name, *column] for name, *column in zip(columns, *texts, strict=True)], screen.width)
+    # A line that is wider than the screen is still one line to who copies it.
+    screen.width = max(screen.width, sum(widths) + _GAP * len(widths))
     table = Table(header_style="bold", box=None, pad_edge=False)
-    for index, name in enumerate(columns):
+    for index, (name, width) in enumerate(zip(columns, widths, strict=True)):
         numeric = all(isinstance(row[index], (int, float)) or row[index] == "" for row in body)
-        table.add_column(escape(name), justify="right" if numeric else "left", overflow="fold")
-    for row in body:
-        table.add_row(*(f"{cell:,}" if isinstance(cell, int) else escape(str(cell)) for cell in row))
-    console().print(table)
+        table.add_column(escape(name), justify="right" if numeric else "left", overflow="fold", width=width)
+    for row in texts:
+        table.add_row(*map(escape, row))
+    screen.print(table)
+
+
+_GAP = 2
+
+
+def _widths(columns: Sequence[Sequence[str]], screen: int) -> list[int]:
+    """How wide columns are: as their texts; where the screen is too narrow as their longest words at least,
+    for an identifier over two lines can't be copied.
+    """
+    full = [max(map(cell_len, texts)) for texts in columns]
+    least = [max((cell_len(word) for text in texts for word in text.split()), default=0) for texts in columns]
+    give = sum(full) - sum(least)
+    spare = max(screen - _GAP * len(full) - sum(least), 0)
+    share = min(spare / give, 1.0) if give else 0.0
+    return [low + int((high - low) * share) for low, high in zip(least, full, strict=True)]
+
+
+def confirm(question: str) -> None:
+    """Ask, and end the command unless the answer is yes; told of --yes where nobody is there to answer."""
+    try:
+        agreed = typer.confirm(question, err=True)
+    except typer.Abort:
+        if sys.stdin.isatty():
+            raise
+        ERRORS.print()
+        raise ValueError("nobody is there to answer: --yes does it without asking") from None
+    if not agreed:
+        raise typer.Abort
 
 
 def show_findings(findings: Iterable[Finding]) -> None:

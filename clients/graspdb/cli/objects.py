@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from graspdb.cli.common import ERRORS, ObjectId, State, Yes, out, show_rows
+from graspdb.cli.common import ERRORS, ObjectId, State, Yes, confirm, out, show_rows
 from graspdb.cli.options import Commands
 from graspdb.cli.wording import in_commands
-from graspdb.errors import Conflict
+from graspdb.errors import Conflict, InvalidInput, add_note
 from graspdb.examples import EXAMPLES
 from graspdb.resources.objects import GraspObject, ObjectProperties
 
@@ -156,7 +158,7 @@ def delete_object(state: State, id: ObjectId, yes: Yes = False) -> None:
     """Delete an object with its trials and sweeps."""
     item = state.db.objects.get(id)
     if not yes:
-        typer.confirm(f"Delete {id} with its {item.info.trials:,} trials?", abort=True, err=True)
+        confirm(f"Delete {id} with its {item.info.trials:,} trials?")
     item.delete()
     state.show({"deleted": id}, f"{id} is deleted.")
 
@@ -211,11 +213,24 @@ def show_gripper(state: State, id: GripperId) -> None:
 
 def profile_in(file: Path) -> dict[str, Any]:
     """A profile and its name, as `grippers show` prints them."""
-    given = json.loads(file.read_text(encoding="utf-8"))
+    try:
+        given = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file} is no JSON: {error}") from None
     if not isinstance(given, dict):
         raise ValueError(f"{file} holds no JSON object")
     # With --json `grippers show` prints the service's answer, which has the profile in it.
     return {"name": given.get("name"), **given["profile"]} if "profile" in given else given
+
+
+@contextmanager
+def _of(file: Path) -> Iterator[None]:
+    """Name the file that an invalid profile is from."""
+    try:
+        yield
+    except InvalidInput as error:
+        add_note(error, f"The profile is that of {file}.")
+        raise
 
 
 @grippers.command("create")
@@ -227,7 +242,8 @@ def create_gripper(
 ) -> None:
     """Create a gripper profile from a JSON file."""
     fields = {**profile_in(file), **({"name": name} if name else {}), "id": id}
-    created = state.db.grippers.create(**fields)
+    with _of(file):
+        created = state.db.grippers.create(**fields)
     state.show(created, f"Gripper {created.id} is created.")
 
 
@@ -240,7 +256,8 @@ def update_gripper(
 ) -> None:
     """Make a new version of a gripper profile from a JSON file; what was tried keeps its version."""
     fields = {**profile_in(file), "id": id, **({"name": name} if name else {})}
-    updated = state.db.grippers.update(fields.pop("id"), **fields)
+    with _of(file):
+        updated = state.db.grippers.update(fields.pop("id"), **fields)
     changed = f": {', '.join(updated.changed)} changed" if updated.changed else ""
     state.show(updated, f"{updated.id} stands for {updated.id}@{updated.version} now{changed}.")
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from graspdb.cli.common import ObjectId, State, Yes, numbers, show_findings
+from graspdb.cli.common import ObjectId, State, Yes, confirm, numbers, show_findings
 from graspdb.cli.options import Commands
 from graspdb.files.trials import as_stated, read_trials
 from graspdb.resources.selection import AnswerFrame
@@ -179,6 +179,6 @@ def delete_batch(state: State, id: ObjectId, batch: BatchId, yes: Yes = False) -
     batches = state.db.objects.get(id).batches
     if not yes:
         found = batches.get(batch)
-        typer.confirm(f"Delete the {found.inserted:,} trials of {batch}?", abort=True, err=True)
+        confirm(f"Delete the {found.inserted:,} trials of {batch}?")
     batches.delete(batch)
     state.show({"deleted": batch}, f"{batch} is deleted.")

@@ -39,7 +39,9 @@ def validate(model: type[Model], fields: Mapping[str, Any]) -> Model:
             )
         ]
         problem = Problem(type="about:blank", title="Invalid input", status=422, errors=wrong)
-        text = "\n".join(["invalid input:", *(f"  {item.field}: {item.message}" for item in wrong)])
+        # What is wrong with all of it names its fields itself.
+        told = [(f"{item.field}: " if item.field != "request" else "") + item.message for item in wrong]
+        text = "\n".join(["invalid input:", *(f"  {line}" for line in told)])
         raise InvalidInput(text, problem=problem) from None
 
 

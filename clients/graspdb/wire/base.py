@@ -75,13 +75,13 @@ class Request(BaseModel):
 
 def told_of(errors: Iterable[Mapping[str, Any]], model: Any) -> list[dict[str, Any]]:
     """Errors of pydantic, where an unknown field is told what was meant: ``model`` is a model, or an
-    annotation that names some, or None, which leaves them as they are.
+    annotation that names some, or None, which leaves fields as they are. Our own rules come without a prefix.
     """
     models = set(_models(model))
     return [
         {**error, "msg": _no_such_field(models, error["loc"])}
         if models and error["type"] == "extra_forbidden"
-        else dict(error)
+        else {**error, "msg": str(error["msg"]).removeprefix("Value error, ")}
         for error in errors
     ]
 
