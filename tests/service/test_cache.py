@@ -22,6 +22,7 @@ from graspdb_service.problems import ProblemError
 from graspdb_service.settings import Settings
 from graspdb_service.usecases.densities import cache as densities_module
 from graspdb_service.usecases.densities.build import Built, KernelChoice
+from graspdb_service.usecases.runtime.asked import Asked, begin
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 
 Floats = NDArray[np.float64]
@@ -69,6 +70,29 @@ def test_single_flight() -> None:
         gate.set()
         assert {answer.result() for answer in answers} == {b"value"}
     assert len(made) == 1
+
+
+def test_who_waits_for_what_another_makes_may_leave() -> None:
+    cache = SingleFlightCache[str, bytes](1000, len)
+    begun, gate = threading.Event(), threading.Event()
+
+    def make(_: bytes | None) -> bytes:
+        begun.set()
+        gate.wait(60)
+        return b"value"
+
+    def late() -> bytes:
+        begin(Asked("other", seconds=0.0))
+        return cache.get("key", lambda _: True, make)
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(cache.get, "key", lambda _: True, make)
+        begun.wait(60)
+        with pytest.raises(ProblemError) as found:
+            pool.submit(late).result(30)
+        gate.set()
+        assert first.result() == b"value"
+    assert found.value.kind == "deadline"
 
 
 def test_a_failure_is_not_kept() -> None:

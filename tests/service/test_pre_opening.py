@@ -4,13 +4,27 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
+from contextvars import copy_context
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
+from graspdb.examples import example
 from graspdb.wire.presets.grippers import PRESETS
+from graspdb_density import IsotropicKernel
+from graspdb_geometry import openings
+from graspdb_geometry.collision import Part, Scene, box_part
+from graspdb_geometry.features.jaw_pairs import pairs_of_parts
+from graspdb_geometry.features.ridges import ridges_of_parts
+from graspdb_geometry.poses import ToolPoses
+from graspdb_service.problems import ProblemError
+from graspdb_service.usecases.densities.prior import density_on
+from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.runtime.asked import Asked, begin
+from graspdb_service.usecases.runtime.compute import Compute
+from known_jaws import SHAPES
 
 Poses = tuple[Any, Any]
 Make, Post, Clusters = Callable[..., str], Callable[..., Any], Callable[..., Poses]
@@ -187,3 +201,61 @@ def test_a_sweep_says_what_of_an_arc_is_not_simulated(
         assert len(made.json()["warnings"]) == told
     warned = http.get("/sweeps").json()["items"][1]["warnings"]
     assert "arcs" in warned[0]
+
+
+# -- an object that nobody tried yet
+
+
+def test_a_mug_has_a_prior_for_tips_on_arcs() -> None:
+    """As docs/grippers.md types it: each grasp of the mug at its own opening, before any trial."""
+    parts = [(np.asarray(v), np.asarray(f)) for v, f in example("mug").parts]
+    solid, shape = Scene(parts), SHAPES["robotiq-2f-85"]
+    pairs = pairs_of_parts(parts, ridges_of_parts(parts), opening_m=shape.max_opening_m)
+    test = CollisionTest(solid, shape, "auto")
+    density = density_on([pairs], test, IsotropicKernel(0.01, 0.25), True, threads=2)
+    assert density is not None
+    some = density.poses[:: max(1, density.size // 50)]
+    for opening, position, quaternion in zip(test.openings(some), *some, strict=True):
+        assert opening == pytest.approx(round(opening, 3), abs=1e-9)
+        pose = ToolPoses(position[None], quaternion[None])
+        assert not solid.collides(pose, shape.at(opening))[0]
+        assert openings.widths(solid, pose, shape.at(opening))[0] <= opening
+
+
+class Telling(Scene):
+    """A geometry that does something when it is first asked, and counts how often it is."""
+
+    def __init__(self, parts: Sequence[Part], then: Callable[[], None]) -> None:
+        super().__init__(parts)
+        self.then, self.asked = then, 0
+
+    def extents(self, *asked: Any) -> Any:
+        if not self.asked:
+            self.then()
+        self.asked += 1
+        return super().extents(*asked)
+
+
+@pytest.mark.parametrize("kind", ["deadline", "client-gone"])
+def test_a_prior_that_nobody_waits_for_ends(kind: str) -> None:
+    question = Asked("somebody")
+
+    def unwanted() -> None:
+        question.gone, question.seconds = kind == "client-gone", 0.0
+
+    parts = [box_part((0.02, 0.02, 0.05), (0, 0, 0), (0, 0, 0, 1))]
+    solid = Telling(parts, unwanted)
+    test = CollisionTest(solid, SHAPES["robotiq-2f-85"], "auto")
+    pairs = pairs_of_parts(parts, ridges_of_parts(parts), opening_m=0.085)
+    kernel = IsotropicKernel(0.01, 0.25)
+
+    def make() -> None:
+        begin(question)
+        Compute(2).run(lambda: density_on([pairs], test, kernel, True, threads=2))
+
+    with pytest.raises(ProblemError) as found:
+        copy_context().run(make)
+    assert found.value.kind == kind
+    assert question.step == "looking at where the jaw fits"
+    # Of all poses it saw only the first block's.
+    assert 0 < solid.asked < 1_000

@@ -23,6 +23,7 @@ from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.densities.build import KernelChoice
 from graspdb_service.usecases.geometry.collision import CollisionTest, Scenes
 from graspdb_service.usecases.geometry.mesh_form import form_of
+from graspdb_service.usecases.runtime.asked import asked
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected
@@ -140,6 +141,7 @@ def density_on(
         found = [pairs.grasps(count // len(opposed)) for pairs in opposed]
         p, q, weights = (np.concatenate(column) for column in zip(*found, strict=True))
         poses = se3.Poses.of(p, q)
+        asked().reached("looking at where the jaw fits", of=len(poses))
         held = test.holds(poses, threads=threads)
         if held.sum() >= _ENOUGH or count >= _MOST:
             break

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.geometry.mesh_form import MeshForm, form_of
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
-from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.runtime.compute import Compute, by_steps
 from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
@@ -39,6 +40,9 @@ _GROWTH = 10
 CLEARANCE_M = 0.01
 #: What reaches less far between the fingers is grazed: no gripper is placed more exactly.
 _GRAZED_M = 1e-3
+#: Poses tested between two breaths, with one jaw for all, or a jaw of each pose's own: that takes some ten
+#: times as long.
+_OF_ONE_JAW, _OF_OWN_JAWS = 16_384, 2_048
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,12 @@ class CollisionTest:
         open where nothing is needed.
         """
         if self.pre_opening_m == "auto":
-            needed = openings.needed(self.solid, poses, self.shape, threads)
-            return openings.commanded(needed, CLEARANCE_M, self.shape)
+
+            def own(some: Poses) -> Floats:
+                needed = openings.needed(self.solid, some, self.shape, threads)
+                return openings.commanded(needed, CLEARANCE_M, self.shape)
+
+            return by_steps(own, poses, _OF_OWN_JAWS)
         opening = self.shape.max_opening_m if self.pre_opening_m is None else self.pre_opening_m
         return np.full(len(poses), opening)
 
@@ -110,11 +118,18 @@ class CollisionTest:
         tested: Callable[[GripperShape, PoseArrays], Values],
         threads: int = 1,
     ) -> Values:
-        """What a test of some poses tells of each (n,), with the jaw as far open as it is there."""
+        """What a test of some poses tells of each (n,), with the jaw as far open as it is there.
+
+        It breathes between steps, as :meth:`openings` does: a computation ends there once nobody waits.
+        """
         if self.pre_opening_m == "auto":
-            return openings.at_each(self.openings(poses, threads), poses, self.shape, tested)
+
+            def at_own(some: Poses) -> Values:
+                return openings.at_each(self.openings(some, threads), some, self.shape, tested)
+
+            return by_steps(at_own, poses, _OF_OWN_JAWS)
         shape = self.shape if self.pre_opening_m is None else self.shape.at(self.pre_opening_m)
-        return tested(shape, poses)
+        return by_steps(partial(tested, shape), poses, _OF_ONE_JAW)
 
 
 class Scenes:

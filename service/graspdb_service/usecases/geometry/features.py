@@ -20,7 +20,7 @@ from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.geometry.mesh_form import MeshForm, form_of
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
-from graspdb_service.usecases.runtime.compute import Compute
+from graspdb_service.usecases.runtime.compute import Compute, breathe
 from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
@@ -117,11 +117,13 @@ class Features:
                 ridges = ridges_of_mesh(mesh.vertices, mesh.faces)
                 if not opening_m:
                     return _Prepared(ridges)
+                breathe()
                 pairs = pairs_of_mesh(
                     mesh.vertices, mesh.faces, ridges, watertight=closed, opening_m=opening_m
                 )
                 if not points:
                     return _Prepared(ridges, pairs)
+                breathe()
                 solid = Surface(mesh.vertices, mesh.faces, watertight=True).contains if closed else None
                 corners = mesh.vertices[mesh.faces]
                 return _Prepared(ridges, pairs, opposed_points(corners, solid, opening_m=opening_m))
@@ -139,9 +141,11 @@ class Features:
             ridges = ridges_of_parts(parts)
             if not opening_m:
                 return _Prepared(ridges)
+            breathe()
             pairs = pairs_of_parts(parts, ridges, opening_m=opening_m)
             if not points:
                 return _Prepared(ridges, pairs)
+            breathe()
             corners = np.concatenate([v[f] for v, f in parts])
             solid = parts_solid([v for v, _ in parts])
             return _Prepared(ridges, pairs, opposed_points(corners, solid, opening_m=opening_m))

@@ -9,10 +9,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Generic, TypeVar
 
-from graspdb_service.usecases.runtime.asked import or_kept
+from graspdb_service.usecases.runtime.asked import asked, or_kept
 
 K = TypeVar("K")
 V = TypeVar("V")
+
+#: Who waits for what another makes looks so often whether its own answer is still wanted.
+_LOOK_S = 0.25
 
 
 @dataclass(eq=False)
@@ -40,9 +43,10 @@ class SingleFlightCache(Generic[K, V]):
     def get(self, key: K, usable: Callable[[V], bool], make: Callable[[V | None], V]) -> V:
         """The value of ``key`` if ``usable``, else what ``make`` answers, given the value before (or None).
 
-        Of several callers one makes while the others wait; they then judge what it made for themselves.
-        If ``make`` raises, its caller gets the error and the next one tries anew; where that is for the
-        database, which does not answer, a question that it will do for gets the value before.
+        Of several callers one makes while the others wait, as long as their answers are wanted; they then
+        judge what it made for themselves. If ``make`` raises, its caller gets the error and the next one
+        tries anew; where that is for the database, which does not answer, a question that it will do for
+        gets the value before.
         """
         with self._lock:
             slot = self._slots.setdefault(key, _Slot())
@@ -53,12 +57,16 @@ class SingleFlightCache(Generic[K, V]):
             if value is not None and usable(value):
                 self.hits += 1
                 return value
-            with slot.lock:
+            while not slot.lock.acquire(timeout=_LOOK_S):
+                asked().check()
+            try:
                 value = slot.value
                 if value is None or not usable(value):
                     self.misses += 1
                     value = or_kept(partial(make, value), value)
                     slot.value = value
+            finally:
+                slot.lock.release()
             return value
         finally:
             with self._lock:

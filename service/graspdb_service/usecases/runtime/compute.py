@@ -115,16 +115,20 @@ def breathing(work: Callable[[Poses], NDArray[A]], step: str) -> Callable[[Poses
     """The same, a value a pose, in steps between which it breathes; ``step`` is what they are of."""
     question = asked()
 
-    def bounded(poses: Poses) -> NDArray[A]:
-        parts = []
-        for start in range(0, max(len(poses), 1), _STEP):
-            breathe()
-            part = poses[start : start + _STEP]
-            question.reached(step, len(part) + (question.done if question.step == step else 0))
-            parts.append(work(part))
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    def noted(part: Poses) -> NDArray[A]:
+        question.reached(step, len(part) + (question.done if question.step == step else 0))
+        return work(part)
 
-    return bounded
+    return partial(by_steps, noted)
+
+
+def by_steps(work: Callable[[Poses], NDArray[A]], poses: Poses, at_once: int = _STEP) -> NDArray[A]:
+    """What ``work`` says of each pose, of so many at once; it breathes before each step."""
+    parts = []
+    for start in range(0, max(len(poses), 1), at_once):
+        breathe()
+        parts.append(work(poses[start : start + at_once]))
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 class Compute:
