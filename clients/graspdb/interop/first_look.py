@@ -372,9 +372,7 @@ def _share(placed: _Placed) -> str:
     closed = placed.closings() if placed.fits.mean() >= 0.3 else None
     if closed is not None:
         good = closed[0] & closed[1]
-        return (
-            f"{int(good.sum()):,} of {len(good):,} close on it, fingers and palm clear of it"
-        )
+        return f"{int(good.sum()):,} of {len(good):,} close on it, fingers and palm clear of it"
     return f"{int(placed.fits.sum()):,} of {len(placed.fits):,} have their fingertips there and point at it"
 
 
