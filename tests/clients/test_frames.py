@@ -230,7 +230,11 @@ def test_a_sweep_takes_and_tells_poses_of_a_frame(db: Client, mine: wire.Gripper
 
 
 def test_frames_on_the_command_line(
-    run: Callable[..., tuple[int, str, str]], grasped: GraspObject, mine: wire.GripperInfo, tmp_path: Path
+    run: Callable[..., tuple[int, str, str]],
+    grasped: GraspObject,
+    mine: wire.GripperInfo,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = tmp_path / "frames.png"
     code, told, error = run("frames", mine.id, "--pose=0,0,0.1,1,0,0,0", "--frame", "flange", "-o", str(file))
@@ -238,6 +242,9 @@ def test_frames_on_the_command_line(
     assert "camera in the base" in told
     assert file.read_bytes().startswith(b"\x89PNG")
     assert run("frames", mine.id, "-o", str(tmp_path / "frames.gif"))[0] == 2
+    monkeypatch.chdir(tmp_path)
+    assert run("frames", mine.id)[0] == 0
+    assert (tmp_path / f"{mine.id}.svg").read_bytes().startswith(b"<?xml")
     assert run("frames", mine.id, "--frame", "wrist", "-o", str(file))[0] == 1
     code, told, _ = run("best-grasp", grasped.id, "--frame", "flange", "--near=1,0,0,0", "--prior")
     assert code == 0

@@ -21,13 +21,15 @@ def frames(
     id: Annotated[str, typer.Argument(metavar="GRIPPER", show_default=False)],
     pose_frame: PoseFrame,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="The .png or .svg file to write.", dir_okay=False)
-    ],
+        Path | None,
+        typer.Option("--output", "-o", help="The .png or .svg file to write [GRIPPER.svg].", dir_okay=False),
+    ] = None,
     pose: Annotated[
         Numbers | None, vector_option("A grasp to draw the gripper at.", "--pose", "x,y,z,qx,qy,qz,qw")
     ] = None,
 ) -> None:
     """Draw a gripper and its frames, and where a grasp of --frame in the object's frame puts it."""
+    output = output or Path(f"{id.partition('@')[0]}.svg")
     suffix = output.suffix.lower()
     if suffix not in FILE_FORMATS:
         raise typer.BadParameter("figures are .png or .svg files", param_hint="--output")
