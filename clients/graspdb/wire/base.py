@@ -8,6 +8,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 from pydantic import (
@@ -73,17 +74,26 @@ class Request(BaseModel):
     """What is said of fields that people look for and that no schema has, by patterns of their names."""
 
 
+MOST_TOLD = 20
+"""Errors of a request that are told."""
+
+
 def told_of(errors: Iterable[Mapping[str, Any]], model: Any) -> list[dict[str, Any]]:
     """Errors of pydantic, where an unknown field is told what was meant: ``model`` is a model, or an
     annotation that names some, or None, which leaves fields as they are. Our own rules come without a prefix.
+    At most :data:`MOST_TOLD` of them; what fields there are is said once.
     """
-    models = set(_models(model))
-    return [
-        {**error, "msg": _no_such_field(models, error["loc"])}
-        if models and error["type"] == "extra_forbidden"
-        else {**error, "msg": str(error["msg"]).removeprefix("Value error, ")}
-        for error in errors
-    ]
+    models, told = set(_models(model)), list[dict[str, Any]]()
+    listed = set[str]()
+    for error in islice(errors, MOST_TOLD):
+        message = str(error["msg"]).removeprefix("Value error, ")
+        if models and error["type"] == "extra_forbidden":
+            message = _no_such_field(models, error["loc"])
+            short, _, fields = message.partition("; there are ")
+            message = short if fields in listed else message
+            listed.add(fields or "-")
+        told.append({**error, "msg": message})
+    return told
 
 
 def _no_such_field(models: set[type[BaseModel]], place: Sequence[str | int]) -> str:

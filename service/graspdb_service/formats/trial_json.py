@@ -223,10 +223,10 @@ def _from_rows(rows: list[Any], faults: Faults, place: Place) -> Fields:
         faults.raise_if_any()
         names = set().union(*rows)
     if not names <= NAMES:
-        told = {n: _OF_BATCH if n in DEFAULTS else no_such_field(str(n), NAMES) for n in names - NAMES}
         for i, row in enumerate(rows):
             for name in sorted(row.keys() - NAMES):
-                faults.add(place(i, str(name)), told[name])
+                told = _OF_BATCH if name in DEFAULTS else no_such_field(str(name), NAMES)
+                faults.add(place(i, str(name)), told)
     for name in REQUIRED:
         missing = [i for i, row in enumerate(rows) if row.get(name) is None]
         for i in missing:
