@@ -6,9 +6,10 @@ import hashlib
 import json
 import uuid
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from typing_extensions import Unpack
@@ -22,6 +23,7 @@ from graspdb.resources.objects import GraspObject
 from graspdb.resources.trials import CHUNK_TRIALS, Receipt, Sending
 from graspdb.wire import GripperInfo
 
+T = TypeVar("T")
 _LOOKED_AT = 2_000
 _SAME_AGAIN = "To go on, run the same import again: what is stored already is not stored twice."
 #: What a refused key means of the key that an import has by itself.
@@ -100,7 +102,7 @@ class Import:
         about = {name: value for name, value in about.items() if value is not None}
         try:
             return self._item.trials.add_columns(
-                (_columns(part) for part in self._pieces(chunk)),
+                _ahead(_columns(part) for part in self._pieces(chunk)),
                 self.report.grasps,
                 **about,
                 licence=licence,
@@ -178,6 +180,15 @@ def _read_through(reading: Reading, gripper: str) -> Report:
 
 def _first(reading: Reading) -> Any:
     return next(raw for raw in reading.raws(reading.new_report()) if len(raw))
+
+
+def _ahead(items: Iterator[T]) -> Iterator[T]:
+    """The same items, each made while the one before it is sent."""
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = pool.submit(next, items, None)
+            yield item
 
 
 def _columns(grasps: FileGrasps) -> dict[str, Any]:

@@ -65,7 +65,9 @@ class Placing:
             gram = np.einsum("nki,nkj->nij", raw.rotation, raw.rotation)
             off = np.abs(gram - np.eye(3)).max(axis=(1, 2), initial=0.0) > 2 * UNIT_TOLERANCE
             yield np.asarray(off), "must have a rotation: the columns of its matrix are not orthonormal"
-            yield np.linalg.det(raw.rotation) < 0, "must have a rotation, not a reflection"
+            with np.errstate(invalid="ignore"):
+                mirrored = np.linalg.det(raw.rotation) < 0
+            yield mirrored, "must have a rotation, not a reflection"
         elif raw.quaternion is not None:
             yield _no_unit(raw.quaternion), f"must have a unit quaternion, within {UNIT_TOLERANCE:g}"
         if raw.object_position is not None and raw.object_quaternion is not None:
