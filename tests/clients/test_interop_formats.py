@@ -643,6 +643,21 @@ def test_a_column_named_frame_may_count_a_videos(tmp_path: Path) -> None:
     report = interop.read(tmp_path / "video.csv").report
     assert report is not None
     assert (report.frame, report.dropped[0].split(" (")[0]) == ("tool", "columns frame")
+    (tmp_path / "video.csv").write_text("\n".join(rows).replace(",17", ",img_17").replace(",18", ",img_18"))
+    with pytest.raises(ValueError, match="img_17"):
+        interop.read(tmp_path / "video.csv")
+    told = interop.read(tmp_path / "video.csv", frame="tool").report
+    assert told is not None
+    assert told.dropped[0].startswith("columns frame")
+
+
+def test_rows_of_a_frame_below_rows_of_none_are_refused(tmp_path: Path) -> None:
+    """As two of our own tables are, one after the other: that of the tool says no frame."""
+    row = {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1], "outcome": True}
+    rows = [row, {**row, "frame": "base", "convention": "graspdb"}]
+    (tmp_path / "both.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    _refused(tmp_path / "both.jsonl", "several frames")
+    assert len(interop.read(tmp_path / "both.jsonl", frame="tool", convention="graspdb")) == 2
 
 
 def test_half_a_rule_is_none(tmp_path: Path, panda: GripperProfile, tools: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 from graspdb.files.trials import METRES
 from graspdb.interop import joints
 from graspdb.interop.formats import tables
-from graspdb.interop.formats.columns import parsed
+from graspdb.interop.formats.columns import STATED, parsed
 from graspdb.interop.formats.known import FORMATS, TIPS, Format, recognised
 from graspdb.interop.formats.source import SourceFile, Wishes
 from graspdb.interop.frames import frames_of, to_graspdb, to_tool
@@ -263,8 +263,11 @@ def opened(
     assumed: list[str] = []
     stated = tables.stated(source, kind.name) if kind.table else {}
     placing = _placing(source, kind, profile, options, assumed, stated)
+    # Where somebody says it, a column of that name may be about anything.
+    said = tuple(name for name in STATED if options.get(name) is not None)
+    stated = {name: value for name, value in stated.items() if name not in said}
     dropping = bool(options.get("drop_unusable", False))
-    wishes = Wishes(order, columns, only, () if rule is None else (rule.quality,), dropping, stated)
+    wishes = Wishes(order, columns, only, () if rule is None else (rule.quality,), dropping, stated, said)
     decided = None if outcome is None else named(outcome)
     return Reading(source, kind, placing, wishes, rule, decided, assumed, profile, frames or {})
 

@@ -39,6 +39,7 @@ class Wishes:
     qualities: tuple[str, ...] = ()
     drop_unusable: bool = False
     stated: Mapping[str, str] = field(default_factory=dict)
+    said: tuple[str, ...] = ()
 
 
 class SourceFile:

@@ -52,8 +52,12 @@ def stated(source: SourceFile, kind: str) -> dict[str, str]:
     else:
         found = next(_records(source), {})
     told = {name.strip(): value for name, value in found.items() if isinstance(value, str)}
-    # A number is a video's frame, not a gripper's.
-    return {name: told[name] for name in STATED if re.fullmatch(r"-?[A-Za-z][\w./-]*", told.get(name, ""))}
+    return {name: told[name] for name in STATED if _is_word(told.get(name))}
+
+
+def _is_word(value: Any) -> bool:
+    """Whether a cell may name a frame or a convention; a number is a video's frame, not a gripper's."""
+    return isinstance(value, str) and re.fullmatch(r"-?[A-Za-z][\w./-]*", value) is not None
 
 
 def _first_of_parquet(source: SourceFile) -> dict[str, Any]:
@@ -192,11 +196,20 @@ def _told(names: tuple[str, ...]) -> str:
 
 
 def _raw(file: str, table: Table, chosen: Plan, first: int, wishes: Wishes) -> Raw:
-    for name in chosen.stated:
-        others = sorted({str(value) for value in table.values(name)} - {wishes.stated[name]})
+    for name in STATED:
+        if name not in chosen.stated and (name in wishes.said or name not in getattr(table, "names", ())):
+            continue
+        # Of rows that say nothing the poses are of the tool, with its own axes.
+        first_said = wishes.stated.get(name, "none")
+        words = {str(value) for value in table.values(name) if name in chosen.stated or _is_word(value)}
+        others = sorted(words - {first_said})
         if others:
-            several = f"{wishes.stated[name]!r} and {others[0]!r}"
-            raise problem(file, f"has poses of several {name}s ({several}): import those of one at a time")
+            several = f"{first_said!r} and {others[0]!r}"
+            raise problem(
+                file,
+                f"has poses of several {name}s ({several}) by the column {name}: import one's at a time,"
+                f" or say --{name} where the column is about something else",
+            )
     position: Floats
     quaternion = rotation = None
     if chosen.matrix:
