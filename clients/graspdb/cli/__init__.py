@@ -9,6 +9,7 @@ what a run of one command costs would otherwise be the import of all the others.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import sys
 from collections.abc import Iterator, MutableMapping
@@ -209,6 +210,9 @@ def settings(
 
 def main() -> None:
     """Entry point of the ``graspdb`` command."""
+    # A start makes tens of thousands of objects that stay: to look through them for garbage, again and again,
+    # took a tenth of a short command.
+    gc.set_threshold(100_000)
     try:
         app(prog_name="graspdb")
     except Exception as error:
