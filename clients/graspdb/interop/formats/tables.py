@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspdb.interop.formats.columns import MORE, STATED, Plan, plan
 from graspdb.interop.formats.source import CHUNK, SourceFile, Wishes
@@ -33,6 +34,9 @@ class Table(Protocol):
 
     def values(self, name: str) -> Sequence[Any]:
         """A column as Python's values, None where there is none."""
+
+    def distinct(self, name: str) -> tuple[list[Any], NDArray[np.intp]]:
+        """A column's different values, in the order in which they come, and the place of each row's."""
 
     def floats(self, name: str) -> Floats:
         """A column of numbers (N,), NaN where there is none."""
@@ -284,14 +288,10 @@ def _object(file: str, row: int, value: Any) -> Any:
 
 
 def _codes(file: str, table: Table, name: str, first: int, wishes: Wishes) -> Codes:
-    values = table.values(name)
-    known: dict[Any, int | None] = {}
-    codes = np.empty(len(values), dtype=np.uint8)
-    for row, value in enumerate(values):
-        key = value if isinstance(value, (str, bool, int, float)) else str(value)
-        if key not in known:
-            known[key] = code_of(value)
-        code = known[key]
+    values, places = table.distinct(name)
+    known = np.empty(len(values), dtype=np.uint8)
+    for place, value in enumerate(values):
+        code = code_of(value)
         missing = value in (None, "") or value != value
         if code is None and missing and wishes.drop_unusable:
             code = NO_OUTCOME
@@ -299,12 +299,22 @@ def _codes(file: str, table: Table, name: str, first: int, wishes: Wishes) -> Co
             told = "missing (--drop-unusable leaves such grasps out)" if missing else repr(value)[:60]
             raise problem(
                 file,
-                f"grasp {first + row}: {name} is {told}, no outcome. Outcomes are"
+                f"grasp {first + int(np.argmax(places == place))}: {name} is {told}, no outcome. Outcomes are"
                 f" {', '.join(OUTCOMES)}, or {', '.join(WORDS)}; where it is a score, say what is a"
                 " success: --success-from QUALITY --success-above X",
             )
-        codes[row] = code
-    return codes
+        known[place] = code
+    return known[places]
+
+
+def _distinct(values: Sequence[Any]) -> tuple[list[Any], NDArray[np.intp]]:
+    """The different values, in the order in which they come, and the place of each among them."""
+    found: dict[Any, tuple[int, Any]] = {}
+    places = np.empty(len(values), dtype=np.intp)
+    for row, value in enumerate(values):
+        key = value if isinstance(value, (str, bool, int, float)) else str(value)
+        places[row], _ = found.setdefault(key, (len(found), value))
+    return [value for _, value in found.values()], places
 
 
 class _Lists:
@@ -319,6 +329,9 @@ class _Lists:
 
     def values(self, name: str) -> Sequence[Any]:
         return self._columns.get(name) or [None] * len(self)
+
+    def distinct(self, name: str) -> tuple[list[Any], NDArray[np.intp]]:
+        return _distinct(self.values(name))
 
     def floats(self, name: str) -> Floats:
         values = self.values(name)
@@ -499,6 +512,13 @@ class _Arrow:
     def values(self, name: str) -> Sequence[Any]:
         found: list[Any] = self._column(name).to_pylist()
         return found
+
+    def distinct(self, name: str) -> tuple[list[Any], NDArray[np.intp]]:
+        column = self._column(name)
+        if hasattr(column.type, "num_fields") and column.type.num_fields:
+            return _distinct(column.to_pylist())
+        coded = column.dictionary_encode(null_encoding="encode")
+        return coded.dictionary.to_pylist(), coded.indices.to_numpy(zero_copy_only=False).astype(np.intp)
 
     def floats(self, name: str) -> Floats:
         column = self._column(name)
