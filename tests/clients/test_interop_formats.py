@@ -656,8 +656,12 @@ def test_rows_of_a_frame_below_rows_of_none_are_refused(tmp_path: Path) -> None:
     row = {"position": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1], "outcome": True}
     rows = [row, {**row, "frame": "base", "convention": "graspdb"}]
     (tmp_path / "both.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    _refused(tmp_path / "both.jsonl", "several frames")
-    assert len(interop.read(tmp_path / "both.jsonl", frame="tool", convention="graspdb")) == 2
+    pq.write_table(
+        pa.Table.from_pylist([{"frame": None, "convention": None, **row}, rows[1]]), tmp_path / "both.parquet"
+    )
+    for name in ("both.jsonl", "both.parquet"):
+        _refused(tmp_path / name, "several frames")
+        assert len(interop.read(tmp_path / name, frame="tool", convention="graspdb")) == 2
 
 
 def test_half_a_rule_is_none(tmp_path: Path, panda: GripperProfile, tools: np.ndarray) -> None:

@@ -28,7 +28,9 @@ _NUMBER_COLUMNS = ("width_m", "proposal_density")
 
 
 class Table(Protocol):
-    """A run of a table's rows."""
+    """A run of a table's rows; ``names`` are of its columns."""
+
+    names: Sequence[str]
 
     def __len__(self) -> int: ...
 
@@ -93,7 +95,8 @@ def read_parquet(source: SourceFile, wishes: Wishes, report: Report) -> Iterator
             names = list(file.schema_arrow.names)
             chosen = _planned(source.name, names, wishes, report)
             first = 0
-            for batch in file.iter_batches(batch_size=CHUNK, columns=chosen.names):
+            wanted = [name for name in names if name in chosen.names or name in STATED]
+            for batch in file.iter_batches(batch_size=CHUNK, columns=wanted):
                 yield _raw(source.name, _Arrow(source.name, batch), chosen, first, wishes)
                 first += len(batch)
     except (pa.ArrowException, OSError) as error:
@@ -201,7 +204,7 @@ def _told(names: tuple[str, ...]) -> str:
 
 def _raw(file: str, table: Table, chosen: Plan, first: int, wishes: Wishes) -> Raw:
     for name in STATED:
-        if name not in chosen.stated and (name in wishes.said or name not in getattr(table, "names", ())):
+        if name not in chosen.stated and (name in wishes.said or name not in table.names):
             continue
         # Of rows that say nothing the poses are of the tool, with its own axes.
         first_said = wishes.stated.get(name, "none")
@@ -322,7 +325,7 @@ class _Lists:
 
     def __init__(self, file: str, columns: Mapping[str, list[Any]], first: int) -> None:
         self._file, self._columns, self._first = file, columns, first
-        self.names = list(columns)
+        self.names: Sequence[str] = list(columns)
 
     def __len__(self) -> int:
         return len(next(iter(self._columns.values()), ()))
@@ -501,6 +504,7 @@ class _Arrow:
 
     def __init__(self, file: str, batch: Any) -> None:
         self._file, self._batch = file, batch
+        self.names: Sequence[str] = batch.schema.names
 
     def __len__(self) -> int:
         return int(self._batch.num_rows)
