@@ -139,6 +139,30 @@ def test_what_cannot_be_right_is_refused_with_the_flag_that_mends_it(
     assert can.refresh().info.trials == 0, out
 
 
+def test_what_is_doubted_afterwards_is_mended_by_flags(
+    db: Client, run: Run, fresh_id: str, acronym: str
+) -> None:
+    """The service speaks of poses that are sent; here there is a file."""
+    can = _can(db, fresh_id)
+    arguments = (
+        "--object",
+        fresh_id,
+        "--gripper",
+        "panda",
+        "--convention",
+        "graspdb",
+        "--accept-implausible",
+    )
+    code, out, err = run("import", acronym, *arguments)
+    assert code == 0, err
+    (batch,) = can.batches
+    assert "Doubtful (another-closing-axis)" in out
+    assert (
+        f"If so, graspdb batches delete {fresh_id} {batch.batch}, and import again with the --convention" in out
+    )
+    assert "Turn the poses" not in out
+
+
 def test_quaternions_in_the_other_order_are_seen(db: Client, run: Run, fresh_id: str, tmp_path: Path) -> None:
     can = _can(db, fresh_id)
     tools = _from_above()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -13,6 +14,20 @@ from graspdb.interop.first_look import FirstLook
 from graspdb.interop.grasps import Report
 from graspdb.interop.importing import Import
 from graspdb.resources.trials import DoubtfulTrials, Sending
+from graspdb.wire import Finding
+
+_AXES = "with the --convention whose axes the file's poses have"
+#: By a finding's code, how a file is imported where the finding is right.
+_FLAGS = {
+    "looks-like-millimetres": "with --unit mm",
+    "looks-like-centimetres": "with --unit cm",
+    "looks-like-wxyz": "with --quaternion-order wxyz",
+    "another-approach-axis": _AXES,
+    "another-closing-axis": _AXES,
+    "approaches-away": _AXES,
+    "out-of-reach": "with the --frame that the file's poses are of (base, flange)",
+    "turned-frame": "without --convention",
+}
 
 
 # long: most of it declares options.
@@ -85,7 +100,17 @@ def import_files(
         told | {"findings": receipt.findings}, f"{stored}; {object} is at revision {receipt.revision}."
     )
     if not state.json:
-        show_findings(receipt.findings)
+        show_findings(_in_flags(each, object, receipt.batches) for each in receipt.findings)
+
+
+def _in_flags(finding: Finding, object: str, batches: Sequence[str]) -> Finding:
+    """A finding whose remedy is what to type, where the service speaks of the poses that are sent."""
+    if finding.code not in _FLAGS:
+        return finding
+    several = f" for each of the {len(batches)} batches" if len(batches) > 1 else ""
+    gone = f"graspdb batches delete {object} {batches[0]}{several}"
+    told = f"If so, {gone}, and import again {_FLAGS[finding.code]}"
+    return finding.model_copy(update={"remedy": told})
 
 
 def _lines(report: Report, look: FirstLook) -> Any:
