@@ -10,7 +10,7 @@ KEEP ?=
 VIEW ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test chromium test-core test-long test-compose check format bench load openapi requirements clean
+.PHONY: help install docs demo test chromium test-core test-long test-compose check format bench load openapi requirements clean
 
 help:  ## What can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -60,6 +60,9 @@ bench: install  ## Measure speed: a table with medians and ratios taken in one r
 load: install  ## 200 clients and 50 workers at half of what the machine carries (SECONDS=600, on either database)
 	@sh .ci/nginx
 	$(BIN)/python tests/load --seconds $(or $(SECONDS),600)
+
+docs: install  ## The site of docs/, into site/index.html, readable offline; every link is checked
+	$(BIN)/python docs/make_site.py
 
 openapi: install  ## Write docs/openapi.json and docs/scopes.md anew
 	$(BIN)/graspdb-server openapi > docs/openapi.json

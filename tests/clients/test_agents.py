@@ -180,12 +180,12 @@ def test_the_guide_and_pictures_are_read(server: Any, tried: str) -> None:
     contents, guide, gripper, figure = anyio.run(
         read,
         "graspdb://guide",
-        "graspdb://guide/user-guide",
+        "graspdb://guide/frames",
         "graspdb://grippers/panda.png",
         f"graspdb://objects/{tried}/reports/projection.png",
     )
     assert all(name in contents.text for name in PAGES)
-    assert guide.text.startswith("# User guide")
+    assert guide.text.startswith("# Frames")
     for picture in (gripper, figure):
         assert picture.mime_type == "image/png"
         assert picture.blob.startswith("iVBORw0KGgo")

@@ -158,7 +158,8 @@ def test_what_is_doubted_afterwards_is_mended_by_flags(
     (batch,) = can.batches
     assert "Doubtful (another-closing-axis)" in out
     assert (
-        f"If so, graspdb batches delete {fresh_id} {batch.batch}, and import again with the --convention" in out
+        f"If so, graspdb batches delete {fresh_id} {batch.batch}, and import again with the --convention"
+        in out
     )
     assert "Turn the poses" not in out
 

@@ -114,9 +114,8 @@ def test_the_commands_it_names_exist(help_of: Callable[..., str]) -> None:
         help_of(program, *words)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/user-guide.md"])
-def test_links_lead_somewhere(page: str) -> None:
-    here = ROOT / page
+def test_links_lead_somewhere() -> None:
+    here = ROOT / "README.md"
     links = re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", here.read_text(encoding="utf-8"))
     assert links
     for target, anchor in links:

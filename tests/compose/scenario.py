@@ -25,13 +25,11 @@ ELSEWHERE = ("git pull",)
 
 
 def guide() -> dict[str, list[str]]:
-    """The commands of the guide's section, by the bold words of the paragraph before."""
-    text = (ROOT / "docs/user-guide.md").read_text("utf-8")
-    section = re.search(r"^### With compose\n(.*?)^## ", text, re.MULTILINE | re.DOTALL)
-    assert section
+    """The commands of the guide's page, by the bold words of the paragraph before."""
+    text = (ROOT / "docs/guide/compose.md").read_text("utf-8")
     found: dict[str, list[str]] = {}
     paragraph = r"^\*\*([\w ]+)(?:(?!^\*\*).)*?^```sh\n(.*?)^```"
-    for name, block in re.findall(paragraph, section[1], re.MULTILINE | re.DOTALL):
+    for name, block in re.findall(paragraph, text, re.MULTILINE | re.DOTALL):
         lines = block.replace("\\\n", " ").splitlines()
         found[name] = [line for line in lines if line.strip() and not line.startswith("#")]
     return found

@@ -207,7 +207,7 @@ def test_a_sweep_says_what_of_an_arc_is_not_simulated(
 
 
 def test_a_mug_has_a_prior_for_tips_on_arcs() -> None:
-    """As docs/grippers.md types it: each grasp of the mug at its own opening, before any trial."""
+    """As docs/guide/grippers.md types it: each grasp of the mug at its own opening, before any trial."""
     parts = [(np.asarray(v), np.asarray(f)) for v, f in example("mug").parts]
     solid, shape = Scene(parts), SHAPES["robotiq-2f-85"]
     pairs = pairs_of_parts(parts, ridges_of_parts(parts), opening_m=shape.max_opening_m)

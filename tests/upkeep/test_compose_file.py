@@ -69,7 +69,7 @@ def test_every_container_is_contained_and_bounded() -> None:
 
 
 def test_files_variables_and_settings_are_there() -> None:
-    guide = (ROOT / "docs/user-guide.md").read_text("utf-8")
+    guide = (ROOT / "docs/guide/compose.md").read_text("utf-8")
     for name in set(re.findall(r"\$\{(GRASPDB_\w+)", TEXT)) - {"GRASPDB_SERVICE_MEMORY"}:
         brief = name.replace("GRASPDB_", "...").replace("...WORKER_MEMORY", "..._WORKER_...")
         assert f"`{name}`" in guide or brief.replace("...DB_MEMORY", "..._DB_...") in guide, name

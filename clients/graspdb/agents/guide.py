@@ -20,17 +20,23 @@ if TYPE_CHECKING:
 _PNG = "image/png"
 
 
-PAGES = ("user-guide", "import", "grippers", "http", "glossary")
+_GUIDE = (
+    "frames", "densities", "scores", "objects", "grippers", "trials", "import", "best-grasp", "next-trials",
+    "reports", "kernels", "sweeps", "viewer", "agents", "errors", "deploying", "compose", "operations",
+)  # fmt: skip
+_BESIDE = ("http", "glossary")
+PAGES = _GUIDE + _BESIDE
 """What a user of the service reads: the pages that come with the package."""
 
 
 def pages() -> Mapping[str, Path]:
     """The guide's pages by name: inside an installed wheel, or in the checkout's ``docs``."""
     package = Path(__file__).resolve().parents[1]
-    for folder in (package / "guide", package.parents[1] / "docs"):
-        if (folder / f"{PAGES[0]}.md").is_file():
-            return {name: folder / f"{name}.md" for name in PAGES}
-    raise FileNotFoundError("the guide is missing from this installation of graspdb")
+    installed, docs = package / "guide", package.parents[1] / "docs"
+    guide, beside = (installed, installed) if installed.is_dir() else (docs / "guide", docs)
+    if not guide.is_dir():
+        raise FileNotFoundError("the guide is missing from this installation of graspdb")
+    return {name: (guide if name in _GUIDE else beside) / f"{name}.md" for name in PAGES}
 
 
 def add_resources(server: MCPServer[Any], transport: Transport) -> None:

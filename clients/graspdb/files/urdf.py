@@ -39,7 +39,7 @@ _TROUBLES = (
     *(SyntaxError, TypeError, ValueError, struct.error),
 )
 _MESHES = {".stl": "stl", ".obj": "obj", ".ply": "ply"}
-_OTHER = "graspdb knows parallel jaws with two fingers; see docs/grippers.md"
+_OTHER = "graspdb knows parallel jaws with two fingers; see docs/guide/grippers.md"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,273 @@
+"""The pages' code, block by block as it stands there, against the real service and a real worker."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import inspect
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import tomllib
+import trimesh
+
+import foreign_files as files
+from graspdb import Client, wire
+from graspdb.errors import NotFound
+from graspdb.examples import example
+from graspdb.figures.frames.gripper import draw_gripper
+from graspdb.figures.grippers.explained import render_explained
+from graspdb.interop.frames import to_tool
+from graspdb.poses import as_poses, matrices
+from graspdb.wire.presets.grippers import PRESETS
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+URL = "http://127.0.0.1:8000"
+DATABASE = "postgresql://user@host/graspdb"
+GRIPPER = """<robot name="mine"><link name="base"><visual><origin xyz="0 0 0.03"/>
+<geometry><box size="0.06 0.1 0.06"/></geometry></visual></link>{left}{right}</robot>"""
+FINGER = """<link name="{name}"><visual><origin xyz="0 {middle} 0.025"/>
+<geometry><box size="0.02 0.01 0.05"/></geometry></visual></link>
+<joint name="{name}_joint" type="prismatic"><parent link="base"/><child link="{name}"/>
+<origin xyz="0 0 0.06"/><axis xyz="0 {side} 0"/>
+<limit lower="0" upper="0.04" effort="60" velocity="0.1"/>{mimic}</joint>"""
+
+
+def pages() -> list[Path]:
+    """The site's pages that are written by hand, in its order."""
+    chapters = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))["project"]["nav"]
+    entries = [entry for chapter in chapters for entry in chapter.values()]
+    names = [name for entry in entries for name in (entry if isinstance(entry, list) else [entry])]
+    return [DOCS / name for name in names if not name.startswith("reference/")]
+
+
+#: The concepts speak of trials, which a how-to posts.
+GUIDE = sorted(
+    (page for page in pages() if page.parent.name == "guide"), key=lambda page: page.stem != "trials"
+)
+
+
+def blocks(page: Path, language: str) -> list[tuple[int, str]]:
+    """The blocks of a language with the line that each starts on."""
+    text = page.read_text(encoding="utf-8")
+    found = re.finditer(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return [(text[: match.start(1)].count("\n"), match.group(1)) for match in found]
+
+
+def execute(page: Path, line: int, block: str, names: dict[str, Any]) -> None:
+    """Run a block in a namespace; errors name the page's line."""
+    code = compile("\n" * line + block, str(page), "exec", ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+    if code.co_flags & inspect.CO_COROUTINE:
+        asyncio.run(types.FunctionType(code, names)())
+    else:
+        exec(code, names)  # noqa: S102 - the guide is ours
+
+
+def typed(block: str, folder: Path, **environment: str) -> str:
+    """What a shell says to a block of commands, all of which must work; what installs is left out."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        ["sh", "-ec", re.sub(r"^pip install .*$", "", block, flags=re.MULTILINE)],
+        cwd=folder,
+        env={**os.environ, "PATH": path, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, block + done.stdout + done.stderr
+    return done.stdout
+
+
+class Robot:
+    """What a reader has in place of it: takes a pose in the world."""
+
+    def __init__(self) -> None:
+        self.moved: list[np.ndarray] = []
+
+    def move(self, pose: np.ndarray) -> None:
+        self.moved.append(pose)
+
+
+@pytest.mark.timeout(600)
+def test_the_python_blocks_run(own_service_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    parts = [trimesh.Trimesh(v, f) for v, f in example("mug").parts]
+    cup = [trimesh.creation.box([40, 40, 60]), trimesh.creation.box([20, 20, 100])]
+    trimesh.util.concatenate(cup).export(tmp_path / "cup.stl")
+    for part in cup:
+        part.apply_scale(1e-3)
+    with Client(own_service_url) as db:
+        mug, other = (
+            db.objects.create(name, mesh=trimesh.util.concatenate(parts), convex_parts=parts, mass_kg=0.3)
+            for name in ("mug", "other")
+        )
+        tried = mug.proposals(3_000, strategy="edges", gripper="panda", seed=7, sigma_position_m=0.005)
+        mug.sweep(poses=tried, gripper="panda").wait()
+        held = mug.trials.list(outcome="success").arrays()
+        # Enough for every report that the guide asks for; a prior worth its name.
+        assert held.success.sum() >= 300
+        other.trials.add(held.matrices[:50], True, gripper="panda")
+        some = tried.poses[:50]
+        position, quaternion = as_poses(some)
+        robot = Robot()
+        names: dict[str, Any] = {
+            "db": db,
+            "mug": mug,
+            "other": other,
+            "part_1": cup[0],
+            "part_2": cup[1],
+            "poses": matrices(position, quaternion),
+            "outcomes": ["success", "slipped"] * 25,
+            "positions": position,
+            "quaternions": quaternion,
+            "held": [True, False] * 25,
+            "slips": np.linspace(0.0, 0.02, 50),
+            "T_world_mug": np.array([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]),
+            "robot": robot,
+        }
+        found = [(page, *block) for page in GUIDE for block in blocks(page, "python")]
+        assert len(found) >= 12
+        acronym(db, tmp_path / "Mug_10f6.h5", matrices(position, quaternion))
+        for page, line, block in found:
+            # A block about the asynchronous client has its own.
+            names |= {"db": db, "mug": mug}
+            execute(page, line, block.replace(URL, own_service_url), names)
+        assert names["cup"].info.convex_parts.parts == 2
+        assert names["above"].approach[2] < -0.8
+        assert names["beside"].approach[0] > 0.8
+        (pose,) = robot.moved
+        assert pose[2, 2] < -0.7
+        assert (pose[:3, 3] >= [0.3, -0.2, 0.02]).all()
+        assert 50 in {batch.inserted for batch in mug.batches}
+        sweeps = [(sweep.info.poses, sweep.info.purpose) for sweep in mug.sweeps()]
+        assert set(sweeps) >= {(3_000, "collect"), (200, "collect"), (10, "check")}
+        assert len(sweeps) == 3 + len(names["report"].calls)
+        assert names["report"].recommended[0] > 0
+
+
+def acronym(db: Client, path: Path, tools: np.ndarray) -> None:
+    """A file of ACRONYM's with these poses (N, 4, 4) of a Panda's tool, every other of which held."""
+    bases = tools @ np.linalg.inv(to_tool("base", "acronym", db.grippers.get("panda").profile))
+    files.acronym_h5(path, bases, [i % 2 for i in range(len(bases))])
+
+
+@pytest.mark.usefixtures("worker")
+def test_the_quick_start_runs(db: Client, tmp_path: Path) -> None:
+    """As a newcomer types it, on an object that is not there before."""
+    page = DOCS / "quick-start.md"
+    _without_mug(db)
+    said = [typed(block, tmp_path, GRASPDB_URL=db.url) for _, block in blocks(page, "bash")]
+    assert len(said) == 4
+    assert (tmp_path / "mug.png").stat().st_size > 10_000
+    assert "flange" in said[2]
+    ((line, block),) = blocks(page, "python")
+    names: dict[str, Any] = {}
+    execute(page, line, block.replace(URL, db.url), names)
+    # The flange's place by Python is the one that the command line says.
+    assert f"{names['best'].world[2, 3]:.4f}" in said[2]
+
+
+def test_what_is_typed_about_grippers_and_files_runs(db: Client, tmp_path: Path) -> None:
+    where = {"GRASPDB_URL": db.url}
+    parts = [trimesh.Trimesh(v, f) for v, f in example("mug").parts]
+    trimesh.util.concatenate(parts).export(tmp_path / "mug.obj")
+    left = FINGER.format(name="left", side=1, middle=0.005, mimic="")
+    right = FINGER.format(name="right", side=-1, middle=-0.005, mimic='<mimic joint="left_joint"/>')
+    (tmp_path / "gripper.urdf").write_text(GRIPPER.format(left=left, right=right))
+    _without_mug(db)
+    known = db.add_example("mug")
+    drawn = known.proposals(40, strategy="edges", gripper="panda", seed=1)
+    acronym(db, tmp_path / "Mug_10f6.h5", matrices(*as_poses(drawn.poses)))
+    for _, block in blocks(DOCS / "guide" / "grippers.md", "bash"):
+        # Each block of the page makes a gripper of one's own.
+        typed(block, tmp_path, **where)
+        with suppress(NotFound):
+            db.grippers.delete("mine")
+    known.delete()
+    first, *others = blocks(DOCS / "guide" / "import.md", "bash")
+    assert "40 trials would be stored" in typed(first[1], tmp_path, **where)
+    typed(first[1].replace(" --dry-run", "").replace("graspdb objects create", ": "), tmp_path, **where)
+    for _, block in others:
+        typed(block, tmp_path, **where)
+    assert pq.read_table(tmp_path / "mug.parquet").num_rows == 40
+
+
+def _without_mug(db: Client) -> None:
+    with suppress(NotFound):
+        db.objects.get("mug").delete()
+
+
+@pytest.mark.parametrize("name", ["deploying", "operations"])
+def test_what_is_typed_at_a_server_runs(name: str, empty_postgres_url: str, tmp_path: Path) -> None:
+    found = blocks(DOCS / "guide" / f"{name}.md", "bash")
+    assert found
+    typed(f"graspdb-server migrate --database-url {empty_postgres_url}", tmp_path)
+    for _, block in found:
+        assert DATABASE in block
+        typed(block.replace(DATABASE, empty_postgres_url), tmp_path)
+
+
+def commands() -> list[str]:
+    """What the pages tell to type: in blocks, in the text, and beside code."""
+    found: set[str] = set()
+    for page in pages():
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        blocks = re.findall(r"^```(?:bash|sh)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+        lines = [line.partition(" #")[0] for block in blocks for line in block.splitlines()]
+        inline = re.findall(r"`(graspdb(?:-[a-z]+)? [^`]+)`", text)
+        beside = re.findall(r"# (graspdb(?:-[a-z]+)? .+)$", text, re.MULTILINE)
+        typed = [line.strip().partition(" > ")[0].removesuffix("&") for line in lines]
+        found |= {" ".join(each.split()) for each in (*typed, *inline, *beside) if each.startswith("graspdb")}
+    return sorted(found)
+
+
+def test_the_commands_they_name_take_what_they_give_them(help_of: Callable[..., str]) -> None:
+    named = commands()
+    assert len(named) >= 40
+    for command in named:
+        assert "usage" in help_of(*shlex.split(command)).lower(), command
+
+
+def _drawn(svg: bytes) -> tuple[list[str], np.ndarray]:
+    """A figure's words, and the points of its lines and faces."""
+    text = svg.decode()
+    words = re.findall(r"<!-- (.*?) -->|<text[^>]*>([^<]*)<", text)
+    paths = re.findall(r'<path d="([^"]*)" clip-path', text)
+    numbers = re.findall(r"-?\d+\.?\d*", " ".join(paths))
+    return ["".join(word) for word in words], np.array(numbers, dtype=np.float64)
+
+
+@pytest.mark.parametrize("name", ["frames", "frames-of-a-grasp", "gripper-profile"])
+def test_its_pictures_are_of_what_is_drawn_now(name: str) -> None:
+    """The commands that the guide names beside them draw the same, to a tenth of a point."""
+    panda = PRESETS["panda"].profile
+    camera = wire.Pose(position=(0.06, 0.0, 0.02), quaternion_xyzw=(0.0, 0.0, 0.0, 1.0))
+    if name == "gripper-profile":
+        preset = PRESETS["robotiq-2f-85"]
+        drawn = render_explained(preset.profile, preset.name, "svg")
+    else:
+        profile = panda.model_copy(update={"frames": panda.frames | {"camera": camera}})
+        at = wire.Pose(position=(0.03, 0.1, 0.25), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+        asked: dict[str, Any] = {"frame": "flange", "pose": at} if name == "frames-of-a-grasp" else {}
+        target = io.BytesIO()
+        draw_gripper("panda", profile, **asked).savefig(target, format="svg", metadata={"Date": None})
+        drawn = target.getvalue()
+    kept = (DOCS / "figures" / f"{name}.svg").read_bytes()
+    (words, points), (kept_words, kept_points) = _drawn(drawn), _drawn(kept)
+    assert words == kept_words
+    np.testing.assert_allclose(points, kept_points, atol=0.1)
