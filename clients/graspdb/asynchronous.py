@@ -246,6 +246,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
     likelihood = _awaited(GraspObject.likelihood)
     best_grasp = _awaited(GraspObject.best_grasp)
     best_grasps = _awaited(GraspObject.best_grasps)
+    picture = _awaited(GraspObject.picture)
     samples = _awaited(GraspObject.samples)
     proposals = _awaited(GraspObject.proposals)
     answers = _at_once(GraspObject.answers, AsyncListing[wire.AnswerInfo])

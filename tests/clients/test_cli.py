@@ -157,6 +157,17 @@ def test_best_grasps_show_what_they_are_ranked_by(run: Run, tried: str) -> None:
     assert f"interval: {found[0]['score']:.4g}" in single
 
 
+def test_a_best_grasp_is_drawn(run: Run, fresh_id: str, tmp_path: Path, trials_file: str) -> None:
+    mesh, picture = tmp_path / "box.stl", tmp_path / "best.png"
+    trimesh.creation.box((0.03, 0.03, 0.1)).export(mesh)
+    assert run("objects", "create", fresh_id, "--mesh", str(mesh))[0] == 0
+    assert run("trials", "add", fresh_id, trials_file, "--gripper", "panda")[0] == 0
+    code, _, err = run("best-grasp", fresh_id, "--picture", str(picture))
+    assert code == 0, err
+    assert str(picture) in err
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
 def test_best_grasps_have_world_poses_in_the_frame_asked_for(run: Run, tried: str) -> None:
     """The object stands half a metre away and turned by a quarter about z, which takes x to y."""
     moved = ("--object-pose", "0.5,0,0.1,0,0,0.70710678,0.70710678")

@@ -490,11 +490,31 @@ def test_to_pandas_says_what_it_needs(grasped: GraspObject) -> None:
         assert len(listing.to_pandas()) == 300
 
 
+def test_objects_and_grasps_are_drawn(db: Client, fresh_id: str, clusters: Callable[..., np.ndarray]) -> None:
+    item = db.objects.create(fresh_id, mesh=_box((-0.02, -0.02, -0.05), (0.02, 0.02, 0.05)))
+    item.trials.add(clusters([([0, 0, 0.045], [1, 0, 0, 0])], 20), True, gripper="panda")
+    small = {"width": 32, "height": 24}
+    best = item.best_grasp(frame="base")
+    # In whatever frame it is told, the same grasp is drawn.
+    drawn = best.picture(**small)
+    assert drawn[:4] == b"\x89PNG"
+    assert item.picture(best.tool_matrix, gripper="panda", **small) == drawn
+    assert item.picture(**small) != drawn
+    assert all("<img" in shown._repr_html_() for shown in (item, best, best))
+    with pytest.raises(ValueError, match="shows one grasp"):
+        item.picture(clusters([([0, 0, 0], [1, 0, 0, 0])], 2))
+    with pytest.raises(InvalidInput, match="opens"):
+        best.picture(opening_m=0.5)
+
+
 def test_everything_shows_itself_in_words(db: Client, grasped: GraspObject) -> None:
     best = grasped.best_grasps(count=2)
     assert "trials=300" in repr(grasped)
     assert repr(best[0]).startswith("Grasp(position=[")
-    assert "density" in best[0]._repr_html_()
+    shown = best[0]._repr_html_()
+    assert "density" in shown
+    assert shown.count("object frame") == 1, "what the pose is of is said once"
+    assert "<img" not in shown, "without a mesh there is nothing to draw"
     assert "300 trials" in repr(grasped.trials.list().arrays())
     assert db.url in repr(db)
 

@@ -75,7 +75,7 @@ def plain(value: Any) -> Any:
         fields = {
             f.name: getattr(value, f.name)
             for f in dataclasses.fields(value)
-            if f.name not in ("raw", "reporter")
+            if f.name not in ("raw", "reporter", "drawer")
         }
         return {name: plain(item) for name, item in fields.items()}
     if isinstance(value, Mapping):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -87,6 +88,10 @@ def best_grasp(
         bool, typer.Option("--verify", help="Simulate the grasps at the fine step first (needs a worker).")
     ] = False,
     csv: Annotated[bool, typer.Option("--csv", help="CSV with all scores; poses in both frames.")] = False,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="Also write a PNG of the gripper at the best grasp.", show_default=False),
+    ] = None,
 ) -> None:
     """Find the best grasp within constraints.
 
@@ -101,6 +106,9 @@ def best_grasp(
             out({"status": "infeasible", "grasps": [], "nearest": error.nearest, **told})
             raise typer.Exit(1) from None
         raise
+    if picture is not None:
+        picture.write_bytes(found[0].picture(width=960, height=720))
+        ERRORS.print(f"The best grasp, drawn: {escape(str(picture))}", highlight=False, soft_wrap=True)
     if state.json:
         head = ("frame", "convention", "reference", "status", "ranking", "revision", "kernel", "selection")
         names = (*head, "calibration", "warnings", "answer", "newer_revision", "stale")

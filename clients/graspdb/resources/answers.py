@@ -9,6 +9,7 @@ from typing import Any
 
 from graspdb import wire
 from graspdb.resources.pages import Listing, Resource, segment
+from graspdb.resources.pictures.asking import picture
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses, table_html
 from graspdb.resources.trials import Receipt, Trials
 from graspdb.transport import Transport
@@ -119,7 +120,8 @@ def _result(answer: wire.Answer, transport: Transport) -> Result:
     """What the question's method gives."""
     if answer.kind == "best-grasp":
         reporter = partial(report_grasp, transport, answer.object)
-        return Grasps(wire.BestGrasps.model_validate(answer.result), reporter)
+        drawer = partial(picture, transport, answer.object)
+        return Grasps(wire.BestGrasps.model_validate(answer.result), reporter, drawer)
     if answer.kind == "likelihood":
         return LikelihoodArrays.from_wire([wire.Likelihoods.model_validate(answer.result)])
     model = wire.Samples if answer.kind == "samples" else wire.Proposals

@@ -16,6 +16,7 @@ from graspdb.options import known_keywords
 from graspdb.poses import as_poses, pose_frame, pose_trials
 from graspdb.resources.answers import report_grasp
 from graspdb.resources.pages import Resource, segment, validate
+from graspdb.resources.pictures.asking import PictureOptions, picture
 from graspdb.resources.results import Grasp, Grasps, LikelihoodArrays, SampledPoses
 from graspdb.resources.selection import (
     Constraints,
@@ -135,7 +136,11 @@ class GraspQueries(Resource):
             raise ValueError("verify simulates with the jaw wide open: leave it out, or pre_opening_m")
         request = best_grasp_request(count, given)
         answer = self._transport.model(wire.BestGrasps, "POST", f"{self._path}/best-grasp", body=request)
-        grasps = Grasps(answer, partial(report_grasp, self._transport, self.id))
+        grasps = Grasps(
+            answer,
+            partial(report_grasp, self._transport, self.id),
+            partial(picture, self._transport, self.id),
+        )
         if len(grasps):
             return self._simulated(grasps, given, verify_timeout_s) if verify else grasps
         if grasps.status == "no_successes":
@@ -166,6 +171,15 @@ class GraspQueries(Resource):
             raise TimeoutError(f"{error}{'' if hint is None else f': {hint}'}") from None
         outcomes = sweep.outcomes()
         return grasps.simulated(outcomes.outcome[np.argsort(outcomes.pose_index)].tolist())
+
+    def picture(self, grasp: ArrayLike | Any | None = None, **options: Unpack[PictureOptions]) -> bytes:
+        """A picture (PNG) of the object, and of the gripper at a grasp where one is given.
+
+        ``grasp`` is a grasp, a matrix (4, 4) or a row x y z qx qy qz qw; see :class:`PictureOptions`.
+        Conflict where the object has no mesh; the service needs the extra ``pictures``.
+        """
+        known = known_keywords(PictureOptions, options, "picture")
+        return picture(self._transport, self.id, grasp, **known)
 
     def samples(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, TypedDict
 
 import numpy as np
@@ -18,6 +19,7 @@ from graspdb.reports import Reports
 from graspdb.resources.answers import Answers
 from graspdb.resources.grasp_queries import GraspQueries
 from graspdb.resources.pages import Listing, Resource, segment, validate
+from graspdb.resources.pictures.asking import picture, with_picture
 from graspdb.resources.results import table_html
 from graspdb.resources.sweeps import Sweep, SweepOptions, Sweeps, create_sweep
 from graspdb.resources.trials import Batches, Trials
@@ -191,7 +193,9 @@ class GraspObject(GraspQueries):
         )
 
     def _repr_html_(self) -> str:
-        return table_html(f"Object {self.info.name or self.info.id}", self.summary())
+        table = table_html(f"Object {self.info.name or self.info.id}", self.summary())
+        drawn = self.info.mesh is not None
+        return with_picture(table, partial(picture, self._transport, self.id) if drawn else None)
 
 
 class Objects(Resource):

@@ -7,17 +7,23 @@ import html
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from graspdb import wire
+from graspdb.options import known_keywords
 from graspdb.poses import Poses, as_poses, matrices
+from graspdb.resources.pictures.asking import PictureOptions, with_picture
 
 Floats = NDArray[np.float64]
 Reporter = Callable[..., Any]
 """Posts a trial of a grasp: takes the grasp, its outcome, and what else ``trials.add`` takes."""
+Drawer = Callable[..., bytes]
+"""Has a picture of a grasp drawn: takes the grasp and what else ``GraspObject.picture`` takes."""
 
 
 def to_pandas(columns: Mapping[str, Any]) -> Any:
@@ -121,9 +127,16 @@ class Grasp:
     warnings: tuple[str, ...] = ()
     raw: wire.Grasp | None = field(default=None)
     reporter: Reporter | None = field(default=None)
+    drawer: Drawer | None = field(default=None)
 
     @classmethod
-    def from_wire(cls, grasp: wire.Grasp, answer: wire.BestGrasps, reporter: Reporter | None = None) -> Grasp:
+    def from_wire(
+        cls,
+        grasp: wire.Grasp,
+        answer: wire.BestGrasps,
+        reporter: Reporter | None = None,
+        drawer: Drawer | None = None,
+    ) -> Grasp:
         """From the service's answer that it is of; ``reporter`` posts what became of it."""
         fields = {name: getattr(grasp, name) for name in wire.Grasp.model_fields}
         world = grasp.world
@@ -143,7 +156,7 @@ class Grasp:
         }
         if answer.selection is not None:
             fields |= {"gripper": answer.selection.gripper, "protocol": answer.selection.protocol}
-        return cls(**fields, answer=answer.answer, raw=grasp, reporter=reporter)
+        return cls(**fields, answer=answer.answer, raw=grasp, reporter=reporter, drawer=drawer)
 
     def report(
         self, outcome: bool | str, *, achieved_pose: Any | None = None, source: str = "robot", **trial: Any
@@ -161,9 +174,18 @@ class Grasp:
         achieved = {} if achieved_pose is None else {"achieved_poses": achieved_pose}
         return self.reporter(self, outcome, source=source, **achieved, **trial)
 
+    def picture(self, **options: Unpack[PictureOptions]) -> bytes:
+        """A picture (PNG) of the gripper at the grasp, drawn by the service: see :class:`PictureOptions`.
+
+        It waits for the service, also in an asynchronous program: there call the object's ``picture``.
+        """
+        if self.drawer is None:
+            raise ValueError("this grasp is of no object's answer: use the object's picture(grasp)")
+        return self.drawer(self, **known_keywords(PictureOptions, options, "picture"))
+
     def __getstate__(self) -> dict[str, Any]:
         """A connection goes to no other process."""
-        return {**vars(self), "reporter": None}
+        return {**vars(self), "reporter": None, "drawer": None}
 
     @property
     def matrix(self) -> Floats:
@@ -263,7 +285,8 @@ class Grasp:
 
     def _repr_html_(self) -> str:
         mind = {"mind": "; ".join(self.warnings)} if self.warnings else {}
-        return table_html(f"Grasp ({self._told_frame()} frame in the object frame)", self.summary() | mind)
+        drawer = None if self.drawer is None else partial(self.drawer, self)
+        return with_picture(table_html("Grasp", self.summary() | mind), drawer)
 
 
 class Grasps(Sequence[Grasp]):
@@ -281,7 +304,9 @@ class Grasps(Sequence[Grasp]):
     Where they were simulated before they were answered (``verify=True``), those that held come first.
     """
 
-    def __init__(self, answer: wire.BestGrasps, reporter: Reporter | None = None) -> None:
+    def __init__(
+        self, answer: wire.BestGrasps, reporter: Reporter | None = None, drawer: Drawer | None = None
+    ) -> None:
         self.status = answer.status
         self.revision = answer.revision
         self.kernel = answer.kernel
@@ -297,10 +322,10 @@ class Grasps(Sequence[Grasp]):
         self.frame, self.convention = answer.frame, answer.convention
         self.reference = answer.reference
         nearest = answer.nearest
-        self.nearest = None if nearest is None else Grasp.from_wire(nearest, answer, reporter)
+        self.nearest = None if nearest is None else Grasp.from_wire(nearest, answer, reporter, drawer)
         self.conflict = tuple(answer.conflict)
         self.relax = dict(answer.relax)
-        self._grasps = tuple(Grasp.from_wire(grasp, answer, reporter) for grasp in answer.grasps)
+        self._grasps = tuple(Grasp.from_wire(grasp, answer, reporter, drawer) for grasp in answer.grasps)
 
     @overload
     def __getitem__(self, index: int) -> Grasp: ...

@@ -76,6 +76,7 @@ from graspdb.wire.queries import LikelihoodRequest as LikelihoodRequest
 from graspdb.wire.queries import Likelihoods as Likelihoods
 from graspdb.wire.queries import ObstacleBox as ObstacleBox
 from graspdb.wire.queries import Obstacles as Obstacles
+from graspdb.wire.queries import PictureQuery as PictureQuery
 from graspdb.wire.queries import PoseColumns as PoseColumns
 from graspdb.wire.queries import Proposals as Proposals
 from graspdb.wire.queries import ProposalsRequest as ProposalsRequest

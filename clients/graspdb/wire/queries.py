@@ -815,6 +815,43 @@ class LikelihoodQuery(SelectionQuery):
     timeout_s: TimeoutS = None
 
 
+class PictureQuery(TrialSelection):
+    """A picture of an object; with a pose, also of the gripper there."""
+
+    position: Position | None = None
+    """Origin of the tool frame, or of ``frame``, in the object frame: x,y,z in metres; null without a
+    gripper."""
+    quaternion_xyzw: Quaternion | None = None
+    """Rotation of the tool frame, or of ``frame``, in the object frame: a unit quaternion x,y,z,w; null
+    without a gripper."""
+    frame: AskedFrame = None
+    convention: AskedConvention = None
+    opening_m: Annotated[float, Field(ge=0, le=2)] | None = None
+    """How far open the jaw is, metres; by default closed as far as the object lets it, and wide open where
+    nothing is between the fingers or they collide."""
+    width: Annotated[int, Field(ge=16, le=1_600)] = 480
+    """Width of the picture in pixels."""
+    height: Annotated[int, Field(ge=16, le=1_200)] = 360
+    """Height of the picture in pixels."""
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    """Where it is seen from, degrees about the object's z axis from its x axis; by default from where the
+    fingers are seen best, of an object alone from -55."""
+    elevation_deg: Annotated[float, Field(ge=-85, le=85)] | None = None
+    """Where it is seen from, degrees above the object's x-y plane; by default from where the fingers are seen
+    best, of an object alone from 24."""
+    timeout_s: TimeoutS = None
+
+    @model_validator(mode="after")
+    def _one_grasp(self) -> PictureQuery:
+        if (self.position is None) != (self.quaternion_xyzw is None):
+            raise ValueError("a grasp is a position and a quaternion_xyzw: give both, or neither")
+        of_grasp = {"frame": self.frame, "convention": self.convention, "opening_m": self.opening_m}
+        said = [name for name, value in of_grasp.items() if value is not None]
+        if self.position is None and said:
+            raise ValueError(f"{said[0]} is of a grasp: give its position and quaternion_xyzw")
+        return self
+
+
 class BestGraspQuery(GraspConstraints):
     """The best grasp's constraints in a query string."""
 

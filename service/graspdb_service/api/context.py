@@ -16,6 +16,7 @@ from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.geometry.features import Features
+from graspdb_service.usecases.geometry.pictures import Pictures
 from graspdb_service.usecases.kernels import fit
 from graspdb_service.usecases.reports.registry import Reports
 from graspdb_service.usecases.runtime.compute import Compute
@@ -33,6 +34,7 @@ class Context(Asking):
     runs: Runs
     health: Health
     upkeep: Upkeep
+    pictures: Pictures
     keys: KeyRing
 
     @classmethod
@@ -53,6 +55,7 @@ class Context(Asking):
             database, Selections(database), compute, features, settings.max_density_cache_bytes
         )
         scenes = Scenes(database, compute, features)
+        pictures = Pictures(database, compute, scenes, densities.selections)
         reports = Reports(settings, database, densities, scenes)
         fits = fit.run_kind(densities, features, settings.threads)
         return cls(
@@ -65,6 +68,7 @@ class Context(Asking):
             priors=Priors(compute, scenes),
             successes=Successes(database, compute, settings.max_density_cache_bytes),
             answers=AnswerKeeper(database, most=settings.max_answers),
+            pictures=pictures,
             reports=reports,
             keys=KeyRing(database),
             health=health,

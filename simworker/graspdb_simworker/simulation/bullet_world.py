@@ -250,7 +250,7 @@ class BulletWorld:
             views = [v for v in camera.around(points) if all(v.aside(other) for other in self._views)]
             drawn = [self._draw(view, 96, 72)[1] for view in views]
             one, two, thing = (np.array([(d == kind).sum() for d in drawn]) for kind in self._kinds())
-            self._views.append(camera.best(views, one, two, thing))
+            self._views.append(camera.best(views, camera.ACROSS, one, two, thing))
 
     def _kinds(self) -> tuple[int, int, int]:
         """What pixels of the first finger, the second and the object are marked with."""

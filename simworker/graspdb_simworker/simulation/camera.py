@@ -6,75 +6,31 @@ Which side shows the fingers best depends on the object, so several are tried in
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-FIELD_OF_VIEW_DEG = 28.0
+from graspdb_geometry.picturing import views
+from graspdb_geometry.picturing.views import FIELD_OF_VIEW_DEG as FIELD_OF_VIEW_DEG
+from graspdb_geometry.picturing.views import View as View
+from graspdb_geometry.picturing.views import best as best
+
 ASPECT = 4.0 / 3.0
 UP = (0.0, 0.0, -1.0)
 """The approach points down."""
+ACROSS = np.array([1.0, 0.0, 0.0])
+"""Across the way that the fingers close."""
 _AZIMUTHS = 16
 _ELEVATIONS = (-0.45, 0.0, 0.45)
-_FILLED = 0.92
 _OUTLINE = np.array([48, 50, 56], dtype=np.uint8)
 _STEEP = 0.02
 """Neighbouring pixels whose distances differ by more than this share are on two surfaces."""
 
 
-@dataclass(frozen=True)
-class View:
-    """A camera at ``eye`` that looks at ``target``; both in the jaw's frame, metres."""
-
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-
-    @property
-    def distance_m(self) -> float:
-        return math.dist(self.eye, self.target)
-
-    @property
-    def towards(self) -> NDArray[np.float64]:
-        """Direction from what is looked at to the eye."""
-        return np.asarray(np.subtract(self.eye, self.target) / self.distance_m, dtype=np.float64)
-
-    def aside(self, other: View) -> bool:
-        """Whether it looks from another side, by 50 degrees at least."""
-        return float(self.towards @ other.towards) < math.cos(math.radians(50.0))
-
-
 def around(points: NDArray[np.float64]) -> Iterator[View]:
     """Views from all sides, as near as all of these points (n, 3) are in the picture."""
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    tangent = _FILLED * math.tan(math.radians(0.5 * FIELD_OF_VIEW_DEG))
-    for elevation in _ELEVATIONS:
-        for k in range(_AZIMUTHS):
-            azimuth = 2.0 * math.pi * (k + 0.5) / _AZIMUTHS
-            flat = math.cos(elevation)
-            towards = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
-            right = np.cross(UP, towards)
-            right /= np.linalg.norm(right)
-            across, along, near = (
-                (points - centre) @ axis for axis in (right, np.cross(towards, right), towards)
-            )
-            needed = near + np.maximum(np.abs(across) / ASPECT, np.abs(along)) / tangent
-            x, y, z = (float(v) for v in centre + float(needed.max()) * towards)
-            yield View((x, y, z), (float(centre[0]), float(centre[1]), float(centre[2])))
-
-
-def best(
-    views: Sequence[View], first: NDArray[np.int64], second: NDArray[np.int64], thing: NDArray[np.int64]
-) -> View:
-    """The view that shows most of both fingers and something of the object, and best how they close.
-
-    ``first``, ``second`` and ``thing`` are for each how many pixels show the fingers and the object.
-    """
-    sideways = np.abs([view.towards[0] for view in views])
-    scores = (np.minimum(first, second) + 0.25 * (first + second) + 0.02 * thing) * (0.4 + 0.6 * sideways)
-    return views[int(np.argmax(scores))]
+    return views.around(points, _ELEVATIONS, _AZIMUTHS, ASPECT, UP)
 
 
 def finished(
