@@ -23,8 +23,8 @@ _SIDE = math.radians(-55.0), math.radians(24.0)
 _SIDES = 16
 _ELEVATIONS = tuple(math.radians(angle) for angle in (12.0, 30.0))
 _PALM_SHOWN = 0.45
-"""So much of the palm is surely seen, in lengths of a finger and as wide as the open jaw: the whole would fill
-the picture."""
+"""So much of the palm is surely seen, in lengths of a finger and as wide as the open jaw: the whole would be
+all that is."""
 _SMALL = 64, 48
 _FROM_HEIGHT = 180
 """Axes are drawn in pictures from this many pixels high on: in smaller ones they can't be read."""
@@ -53,8 +53,9 @@ def png(
 ) -> bytes:
     """A picture (PNG) of a mesh, vertices (v, 3) in metres and faces (n, 3), and of a gripper at a grasp.
 
-    The object's z is upward; its axes are drawn in the corner of all but small ones. Seen from ``azimuth_deg``, about z from x, and
-    ``elevation_deg`` above the x-y plane; without either a grasp from where its fingers are seen best.
+    The object's z is upward; its axes are drawn in the corner of all but small ones. Seen from
+    ``azimuth_deg``, about z from x, and ``elevation_deg`` above the x-y plane; without either a grasp from
+    where its fingers are seen best.
     ``breathe`` is called every few milliseconds. The same arguments give the same bytes.
 
     ImportError without the extra ``pictures``.
