@@ -33,9 +33,9 @@ class ViewerServer:
     """
 
     def __init__(
-        self, db: Client, *, host: str, port: int, view: View, names: Collection[str], keyed: bool
+        self, db: Client, *, host: str, port: int, view: View, names: Collection[str], api_key: str | None
     ) -> None:
-        self._db, self._view, self._keyed, self._names = db, view, keyed, names
+        self._db, self._view, self._api_key, self._names = db, view, api_key, names
         self.sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._server = viser.ViserServer(host=host, port=port, label="GraspDB", verbose=False)
@@ -67,7 +67,7 @@ class ViewerServer:
             except ValueError:
                 stale = True
 
-        session = Session(client, self._db, view, partial(link_to, origin), keyed=self._keyed)
+        session = Session(client, self._db, view, partial(link_to, origin), api_key=self._api_key)
         if stale:
             session.page.client.add_notification("Link", _STALE, color="yellow")
         with self._lock:
@@ -106,10 +106,10 @@ def serving(
     port: int = 8080,
     view: View | None = None,
     names: Collection[str] = (),
-    keyed: bool = False,
+    api_key: str | None = None,
 ) -> Iterator[ViewerServer]:
     """A viewer of this service while the context lasts."""
-    server = ViewerServer(db, host=host, port=port, view=view or View(), names=names, keyed=keyed)
+    server = ViewerServer(db, host=host, port=port, view=view or View(), names=names, api_key=api_key)
     try:
         yield server
     finally:

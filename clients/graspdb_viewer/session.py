@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import viser
@@ -16,10 +17,12 @@ from graspdb.resources.objects import GraspObject
 from graspdb.resources.selection import TrialSelection
 from graspdb.wire import TrialOut
 from graspdb_viewer.latest import Latest
+from graspdb_viewer.motion import simulated
 from graspdb_viewer.page import OBJECT, Page, Subject, put, triple
 from graspdb_viewer.panels import words
 from graspdb_viewer.panels.closing import Closing
 from graspdb_viewer.panels.grasps import GraspsPanel
+from graspdb_viewer.panels.objects import ObjectsPanel
 from graspdb_viewer.panels.question import QuestionPanel
 from graspdb_viewer.panels.reports import ReportsPanel
 from graspdb_viewer.panels.sweeps import SweepsPanel
@@ -28,6 +31,8 @@ from graspdb_viewer.scene import colours, shapes
 from graspdb_viewer.view import View
 
 _POLL_S = 3.0
+_REPLAY_S = 3.0
+"""A replay lasts so long from the first touch on, or as long as it did."""
 _ANY = "any"
 _NONE = "(no object yet)"
 _MESH = (165, 170, 178)
@@ -49,12 +54,13 @@ class Session:
         view: View,
         link: Callable[[View], str],
         *,
-        keyed: bool = False,
+        api_key: str | None = None,
     ) -> None:
-        self._client, self._db, self._link, self._keyed = client, db, link, keyed
+        self._client, self._db, self._link, self._api_key = client, db, link, api_key
         self.page = Page(client, db, view, self._say)
         self._drawing, self._asking = Latest(self.page.failed), Latest(self.page.failed)
         self._linking = Latest(lambda _: None)
+        self._listing, self._replaying = Latest(self.page.failed), Latest(self.page.failed)
         self._closed = threading.Event()
         self._build()
         self._drawing.soon(self._load)
@@ -63,7 +69,8 @@ class Session:
     def close(self) -> None:
         """The tab is gone."""
         self._closed.set()
-        for worker in (self._drawing, self._asking, self._linking, self._reports):
+        workers = (self._drawing, self._asking, self._linking, self._listing, self._replaying)
+        for worker in (*workers, self._reports):
             worker.close()
 
     # The page
@@ -82,20 +89,23 @@ class Session:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Best grasp"):
             closing = Closing(self.page)
-            self.question = QuestionPanel(self.page, closing, self._changed, keyed=self._keyed)
+            self.question = QuestionPanel(self.page, closing, self._changed, keyed=self._api_key is not None)
         self._closing = closing
         with tabs.add_tab("Grasps"):
             self._grasps = GraspsPanel(self.page, self._redraw)
         with tabs.add_tab("Trials"):
-            self._trials = TrialsPanel(self.page, self._redraw, self._show_trial)
+            self._trials = TrialsPanel(self.page, self._redraw, self._show_trial, self._replay)
         with tabs.add_tab("Reports"):
             self._reports = ReportsPanel(self.page)
         with tabs.add_tab("Object"):
             self._about = gui.add_markdown("")
             self._sweeps = SweepsPanel(self.page)
+            self._list = ObjectsPanel(self.page, self._choose)
         self._address = gui.add_text("Link to this view", "", hint="Opens the same view again.")
         self._again.on_click(lambda _: self._drawing.soon(self._load))
-        self._objects.on_update(lambda event: self._choose(event.target.value, event.client_id))
+        self._objects.on_update(
+            lambda event: self._choose(event.target.value) if event.client_id is not None else None
+        )
         for control in (self._gripper, self._protocol):
             control.on_update(lambda event: self._select() if event.client_id is not None else None)
         self._client.camera.on_update(lambda _: self._linking.soon(self._tell_link))
@@ -130,9 +140,9 @@ class Session:
         if address != self._address.value:
             put(self._address, address)
 
-    def _choose(self, name: str, by: int | None) -> None:
+    def _choose(self, name: str) -> None:
         view = self.page.view
-        if by is None or name in (view.object, _NONE):
+        if name in (view.object, _NONE):
             return
         view.object, view.gripper, view.protocol = name, None, None
         view.box = view.cone = view.obstacle = view.object_pose = view.camera = None
@@ -153,12 +163,40 @@ class Session:
         red, green, blue = (int(value) for value in colours.of_names([trial.outcome])[0])
         self._closing.show(pose, end_m=trial.width_m, colour=(red, green, blue))
 
+    def _replay(self, trial: TrialOut) -> None:
+        """Have a simulated trial's motion simulated again, and show it."""
+        self._replaying.soon(partial(self._move, trial))
+
+    def _move(self, trial: TrialOut) -> None:
+        if trial.sweep is None:
+            return
+        self._trials.say("Simulating it again ...")
+        try:
+            moved = simulated(trial, self._db.sweeps.get(trial.sweep).info, self._db.url, self._api_key)
+        except ValueError as error:
+            self._trials.say(f"**No replay.** {words.plain(error)}")
+            return
+
+        def shown() -> bool:
+            return self._trials.told_of is trial and not self._closed.is_set()
+
+        if not shown():
+            return
+        slower = 1.0
+        if len(moved.times_s):
+            self._show_trial(trial)
+            moved, slower = moved.slowed(_REPLAY_S)
+        self._trials.say(words.replayed(moved, trial, slower))
+        if len(moved.times_s):
+            self._closing.replay(moved, shown)
+
     # The object
 
     def _load(self) -> None:
         """Read the object of the view, or the first there is, and draw it."""
         self._say(None)
-        names = [item.id for item in self._db.objects]
+        items = list(self._db.objects)
+        names = [item.id for item in items]
         view = self.page.view
         if not names:
             self._objects.options = (_NONE,)
@@ -176,6 +214,7 @@ class Session:
         if self._objects.options != tuple(names):
             self._objects.options = tuple(names)
         put(self._objects, view.object)
+        self._listing.soon(partial(self._list.draw, items))
         self._show(self._db.objects.get(view.object))
 
     def _show(self, item: GraspObject) -> None:

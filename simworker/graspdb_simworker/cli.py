@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import logging
 import math
 import os
@@ -238,22 +239,30 @@ def show(
     object_name: ObjectName,
     position: Numbers = "0,0,0",
     quaternion: Annotated[str, typer.Option(help="x,y,z,w of the tool in the object frame.")] = "0,0,0,1",
-    out: Annotated[Path, typer.Option(help="A .png of the end, or a .gif of the whole.")] = Path("grasp.png"),
+    out: Annotated[
+        Path, typer.Option(help="A .png of the end, a .gif of the whole, or a .json of its states.")
+    ] = Path("grasp.png"),
     gripper: GripperName = "pg70",
     protocol: Protocol = "wrench",
     fine: Annotated[bool, typer.Option(help="1/2000 s and 200 iterations.")] = False,
     url: ServiceUrl = None,
     api_key: ApiKey = None,
 ) -> None:
-    """Simulate one grasp and draw it from two sides, seen from the jaw."""
+    """Simulate one grasp and draw it from two sides, seen from the jaw, or write what moved how."""
+    end_with_parent()
     _require_pybullet()
-    from graspdb_simworker.inspection import inputs, pictures  # extra: sim
+    from graspdb_simworker.inspection import inputs, motions, pictures  # extra: sim
 
     with _explained():
         pose = Pose.model_validate({"position": position, "quaternion_xyzw": quaternion})
         payload, parts = inputs.load(
             object_name, gripper, protocol=protocol, fine=fine, url=url, api_key=api_key
         )
+        if out.suffix.lower() == ".json":
+            moved = motions.motion(payload, parts, pose)
+            out.write_text(json.dumps(moved), encoding="utf-8")
+            typer.echo(f"{moved['outcome']}: {len(moved['times_s'])} moments; {out}")
+            return
         film_every_s = pictures.FRAME_S if out.suffix.lower() == ".gif" else math.inf
         shown = pictures.simulate_one(payload, parts, pose, film_every_s=film_every_s)
         # The outcome's name and the object's: what a picture is worth that went astray.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from graspdb import Client
+from graspdb_viewer.motion import simulated
 from graspdb_viewer.serving import ViewerServer, link_to, serving
 from graspdb_viewer.view import View
 from viewer_tab import WIDTH, Tab, chromium
@@ -178,6 +181,63 @@ def test_words_where_there_is_nothing_to_show(
         opened = tab(link_to(viewer.url, prior))
         opened.says("By geometry alone")
         opened.shot("prior")
+
+
+def test_the_question_is_taken_elsewhere_and_another_object_is_chosen_by_its_picture(
+    tab: Callable[[str], Tab], viewer: ViewerServer, box_id: str, service_url: str
+) -> None:
+    other = f"beside-{os.getpid()}"
+    with Client(service_url, retries=1) as db:
+        db.objects.create(other, mesh=_box((0.05, 0.03, 0.08)), media_type="model/stl", mass_kg=0.2)
+    opened = tab(link_to(viewer.url, View(object=box_id, grasps="none")))
+    question = opened.session.question
+    opened.until(lambda: question.answered)
+    opened.push("Copy the question")
+    opened.says("write to your clipboard")
+    with opened.page.expect_download() as coming:
+        opened.push("Download best-grasp.sh")
+    assert Path(coming.value.path()).read_text() == question.spoken.curl  # type: ignore[union-attr]
+    opened.shot("elsewhere")
+    opened.push("Close")
+    opened.page.get_by_text("write to your clipboard").wait_for(state="detached")
+    opened.tab("Object")
+    opened.says(f"Show {other}")
+    opened.until(lambda: opened.page.locator("img").count() >= 2)
+    opened.shot("objects")
+    opened.push(f"Show {other}")
+    opened.until(lambda: opened.session.page.subject.item.id == other)  # type: ignore[union-attr]
+    opened.tab("Best grasp")
+    opened.says("By geometry alone")
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_simulated_trial_is_replayed_as_it_went(
+    tab: Callable[[str], Tab], viewer: ViewerServer, service_url: str
+) -> None:
+    name = f"replayed-{os.getpid()}"
+    with Client(service_url, retries=1) as db:
+        item = db.objects.create(name, mesh=_box((0.03, 0.03, 0.1)), media_type="model/stl", mass_kg=0.2)
+        # Off the middle, so that the object is moved as the jaw closes.
+        item.sweep(poses=[[0.0, 0.006, 0.045, 1, 0, 0, 0]], gripper="pg70").wait(timeout=120)
+        (trial,) = item.refresh().trials.list().first(2)
+        sweep = db.sweeps.get(str(trial.sweep)).info
+    camera = ((0.25, -0.05, 0.12), (0.0, 0.0, 0.05))
+    view = View(object=name, grasps="none", best=0, trials=True, camera=camera)
+    opened = tab(link_to(viewer.url, view))
+    opened.until(lambda: "trials" in opened.session.page.nodes)
+    opened.tab("Trials")
+    opened.page.wait_for_timeout(1_000)
+    opened.session._trials._clicked(SimpleNamespace(instance_index=0))
+    mesh = opened.session.page.nodes["mesh"]
+    opened.push("Replay its motion")
+    opened.says("Its worker's own states")
+    opened.until(lambda: abs(mesh.position[1] - 0.006) < 1e-3)  # the jaw has centred it
+    opened.shot("replay")
+    opened.until(lambda: mesh.position[1] == 0.0)
+    # Told as something else, it is not taken for the trial.
+    moved = simulated(trial, sweep, service_url, None)
+    assert moved.is_of(trial)
+    assert not moved.is_of(trial.model_copy(update={"width_m": 0.02}))
 
 
 def test_a_service_that_is_down_is_told(browser: Browser) -> None:

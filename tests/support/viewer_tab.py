@@ -83,7 +83,18 @@ class Tab:
 
     def tab(self, name: str) -> None:
         """Turn to a tab."""
-        box = self.page.get_by_role("tab", name=name, exact=True).bounding_box()
+        there = self.page.get_by_role("tab", name=name, exact=True)
+        there.scroll_into_view_if_needed()
+        box = there.bounding_box()
+        assert box is not None
+        self.press(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+    def push(self, name: str) -> None:
+        """Push a button."""
+        button = self.page.get_by_role("button", name=name, exact=True)
+        button.wait_for(state="visible")
+        button.scroll_into_view_if_needed()
+        box = button.bounding_box()
         assert box is not None
         self.press(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
 
@@ -127,6 +138,8 @@ class Tab:
     def shot(self, name: str) -> np.ndarray:
         """What is seen, kept for people to look at."""
         SCREENSHOTS.mkdir(exist_ok=True)
+        # What viser says of a browser that draws in software, which lies over the scene.
+        self.page.add_style_tag(content=".mantine-Notifications-root { visibility: hidden }")
         self.page.wait_for_timeout(300)
         picture = self.page.screenshot(timeout=PATIENCE_MS)
         (SCREENSHOTS / f"{name}.png").write_bytes(picture)

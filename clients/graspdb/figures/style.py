@@ -9,11 +9,18 @@ from typing import Any
 import numpy as np
 
 from graspdb.figures.canvas import Axes, Figure
+from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import ReportRange
 
 #: Okabe and Ito's, which colour-blind readers tell apart.
 BLUE, ORANGE, GREEN, YELLOW, GREY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#666666"
-COLOURS = (BLUE, ORANGE, GREEN, YELLOW, "#CC79A7", "#56B4E9", GREY)
+_PINK, _SKY = "#CC79A7", "#56B4E9"
+COLOURS = (BLUE, ORANGE, GREEN, YELLOW, _PINK, _SKY, GREY)
+#: Of outcomes, success the darkest, wherever they are drawn: here and in the viewer.
+OUTCOME_COLOURS = dict(
+    zip(OUTCOMES, (GREY, BLUE, ORANGE, _SKY, YELLOW, "#F0E442", GREEN, _PINK, "#BBBBBB"), strict=True)
+)
+SOURCE_COLOURS = {"simulation": BLUE, "robot": ORANGE, "human": GREEN, "import": _PINK}
 
 
 MARKERS = "osD^v"

@@ -8,18 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.figures.canvas import Axes, Figure, new_figure, show_grid
-from graspdb.figures.style import BLUE, COLOURS, GREEN, GREY, MARKERS, ORANGE, heading, show_ranges
+from graspdb.figures.style import COLOURS, MARKERS, OUTCOME_COLOURS, heading, show_ranges
 from graspdb.wire import OUTCOMES
 from graspdb.wire.reports import SummaryReport, SummaryRow
 
-#: Okabe and Ito's, success the darkest.
-_OUTCOME_COLOURS = dict(
-    zip(
-        OUTCOMES,
-        (GREY, BLUE, ORANGE, "#56B4E9", "#E69F00", "#F0E442", GREEN, "#CC79A7", "#BBBBBB"),
-        strict=True,
-    )
-)
 #: On which white is read best, and the share of trials from which it is written down.
 _DARK, _LEAST_WRITTEN = ("failure", "success", "collision", "dropped"), 0.06
 
@@ -48,7 +40,7 @@ def _outcomes(axes: Axes, rows: Sequence[SummaryRow], at: NDArray[np.float64]) -
         share = np.array([row.outcomes.get(name, 0) for row in rows], dtype=float) / total
         if not share.any():
             continue
-        axes.barh(at, share, left=start, color=_OUTCOME_COLOURS[name], edgecolor="white", linewidth=0.5,
+        axes.barh(at, share, left=start, color=OUTCOME_COLOURS[name], edgecolor="white", linewidth=0.5,
                   height=0.7, label=name.replace("_", " "))  # fmt: skip
         for y, part, begin in zip(at, share, start, strict=True):
             if part >= _LEAST_WRITTEN:

@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
+from graspdb.figures.style import BLUE, COLOURS, GREY
 from graspdb.reports import Bandwidth, Calibration, Convergence, Projection
-
-_BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#888888"
-_COLOURS = (_BLUE, _ORANGE, _GREEN, "#E69F00", "#CC79A7", "#56B4E9", _GREY)
 
 
 def convergence(report: Convergence) -> go.Figure:
     """Similarity and its target against the number of successes."""
     figure = _figure("successes", "similarity (eq 9)")
-    for curve, colour in zip(report.raw.curves, _COLOURS, strict=False):
+    for curve, colour in zip(report.raw.curves, COLOURS, strict=False):
         figure.add_scatter(
             x=[point.grasps for point in curve.points],
             y=[point.similarity for point in curve.points],
@@ -24,7 +22,7 @@ def convergence(report: Convergence) -> go.Figure:
             name=curve.label,
             line={"color": colour},
         )
-        figure.add_hline(curve.verdict.target, line={"color": _GREY, "dash": "dot"})
+        figure.add_hline(curve.verdict.target, line={"color": GREY, "dash": "dot"})
     figure.update_xaxes(type="log")
     return figure
 
@@ -36,14 +34,14 @@ def calibration(report: Calibration) -> go.Figure:
     observed = np.array([item.observed for item in bins], dtype=np.float64)
     high = np.array([item.high for item in bins], dtype=np.float64) - observed
     low = observed - np.array([item.low for item in bins], dtype=np.float64)
-    figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line={"color": _GREY, "dash": "dot"})
+    figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line={"color": GREY, "dash": "dot"})
     figure.add_scatter(
         x=[item.predicted for item in bins],
         y=observed.tolist(),
         error_y={"array": high.tolist(), "arrayminus": low.tolist()},
         text=[f"{item.count:,} attempts" for item in bins],
         mode="markers",
-        marker={"color": _BLUE, "size": 8},
+        marker={"color": BLUE, "size": 8},
     )
     figure.update_layout(showlegend=False)
     return figure
@@ -53,7 +51,7 @@ def widths(report: Bandwidth) -> go.Figure:
     """How likely left-out successes are by the kernel's widths."""
     figure = _figure("position width [mm]", "log density of left-out grasps")
     turns = sorted({point.sigma_rotation_deg for point in report.raw.grid})
-    for turn, colour in zip(turns, _COLOURS, strict=False):
+    for turn, colour in zip(turns, COLOURS, strict=False):
         points = [p for p in report.raw.grid if p.sigma_rotation_deg == turn and p.log_likelihood is not None]
         figure.add_scatter(
             x=[1e3 * point.sigma_position_m for point in points],
@@ -61,7 +59,7 @@ def widths(report: Bandwidth) -> go.Figure:
             name=f"{turn:.1f}°",
             line={"color": colour},
         )
-    figure.add_vline(1e3 * report.recommended[0], line={"color": _GREY, "dash": "dot"})
+    figure.add_vline(1e3 * report.recommended[0], line={"color": GREY, "dash": "dot"})
     figure.update_xaxes(type="log")
     return figure
 

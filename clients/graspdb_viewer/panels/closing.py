@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspdb.poses import Poses
+from graspdb.wire import GripperProfile
+from graspdb_viewer.motion import Motion
 from graspdb_viewer.page import OBJECT, Page, put, wxyz
 from graspdb_viewer.scene import colours, shapes
 
@@ -14,6 +20,11 @@ GRIPPER = f"{OBJECT}/gripper"
 _CLOSES_S = 1.2
 _FRAMES = 30
 _STEEL = (120, 135, 150)
+_SEEN_THROUGH = 0.45
+"""The palm is often between the eye and what the fingers hold."""
+_STAYS_S = 2.0
+"""The end of a replay is seen so long."""
+_PAUSE_S = 0.04
 
 
 class Closing:
@@ -56,16 +67,58 @@ class Closing:
             frame = self._page.client.scene.add_frame(GRIPPER, show_axes=False)
             self._page.replace("gripper", frame)
         frame.position, frame.wxyz, frame.visible = pose.position[0], wxyz(pose.quaternion_xyzw[0]), True
-        self._page.replace("palm", self._page.solid(f"{GRIPPER}/palm", shapes.palm(profile), _STEEL))
+        self._page.replace(
+            "palm", self._page.solid(f"{GRIPPER}/palm", shapes.palm(profile), _STEEL, opacity=_SEEN_THROUGH)
+        )
         self._draw()
+
+    def replay(self, motion: Motion, shown: Callable[[], bool]) -> None:
+        """Move the fingers and the object as they moved, while the jaw stands still, and put them back.
+
+        It ends early once ``shown`` says so.
+        """
+        page, at = self._page, self._pose
+        profile = None if page.subject is None else page.subject.profile
+        mesh: Any = page.nodes.get("mesh")
+        if at is None or profile is None or mesh is None or not self._moving.acquire(blocking=False):
+            return
+        try:
+            # The tool stands where the trial had it.
+            there = Poses.of(at.matrices @ motion.poses.matrices)
+            turns = _continuous(there.quaternion_xyzw)
+            began, end = time.monotonic(), float(motion.times_s[-1])
+            while shown():
+                now = min(time.monotonic() - began, end)
+                left, right, *pose = (
+                    float(np.interp(now, motion.times_s, column))
+                    for column in (*motion.fingers_m.T, *there.position.T, *turns.T)
+                )
+                self._fingers(profile, 2 * left, 2 * right)
+                put(self._slider, 1e3 * min(max(left + right, 0.0), profile.max_opening_m))
+                turn = np.array(pose[3:])
+                mesh.position, mesh.wxyz = np.array(pose[:3]), wxyz(turn / np.linalg.norm(turn))
+                if now >= end:
+                    break
+                time.sleep(_PAUSE_S)
+            until = time.monotonic() + _STAYS_S
+            while shown() and time.monotonic() < until:
+                time.sleep(_PAUSE_S)
+        finally:
+            if page.nodes.get("mesh") is mesh is not None:
+                mesh.position, mesh.wxyz = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+            self._moving.release()
 
     def _draw(self) -> None:
         subject = self._page.subject
         if self._pose is None or subject is None or subject.profile is None:
             return
         opening = 1e-3 * self._slider.value
-        for part, side in (("left", 1.0), ("right", -1.0)):
-            shape = shapes.finger(subject.profile, side, opening)
+        self._fingers(subject.profile, opening, opening)
+
+    def _fingers(self, profile: GripperProfile, left: float, right: float) -> None:
+        """Either finger as far from the middle as with the jaw so far open, metres."""
+        for part, side, opening in (("left", 1.0, left), ("right", -1.0, right)):
+            shape = shapes.finger(profile, side, opening)
             self._page.replace(part, self._page.solid(f"{GRIPPER}/{part}", shape, self._colour))
 
     def _move(self, _: Any) -> None:
@@ -85,3 +138,11 @@ class Closing:
             self._button.label = "Open the jaw" if closing else "Close the jaw"
         finally:
             self._moving.release()
+
+
+def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same rotations (n, 4), each of the sign that is nearer to the one before."""
+    signs = np.ones(len(quaternions))
+    along = np.einsum("nc,nc->n", quaternions[1:], quaternions[:-1])
+    signs[1:] = np.cumprod(np.where(along < 0, -1.0, 1.0))
+    return quaternions * signs[:, None]

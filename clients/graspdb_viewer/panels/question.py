@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -11,11 +12,11 @@ import numpy as np
 from graspdb.errors import Infeasible
 from graspdb.poses import Poses
 from graspdb.resources.results import Grasp, Grasps
-from graspdb_viewer.page import OBJECT, Page, Subject, put
+from graspdb_viewer.page import OBJECT, Page, Subject
 from graspdb_viewer.panels import words
 from graspdb_viewer.panels.closing import Closing
 from graspdb_viewer.panels.gizmos import Gizmos
-from graspdb_viewer.panels.spoken import constraints, spoken
+from graspdb_viewer.panels.spoken import Spoken, constraints, spoken
 from graspdb_viewer.scene import colours, shapes
 
 _OBJECTIVES: dict[str, Literal["density", "success_probability"]] = {
@@ -23,6 +24,11 @@ _OBJECTIVES: dict[str, Literal["density", "success_probability"]] = {
     "success probability": "success_probability",
 }
 _NEAREST = (140, 140, 140)
+_LANGUAGES = ("curl", "Python", "Command line")
+_FILES = ("best-grasp.sh", "best-grasp.py", "best-grasp-command.sh")
+_COPYING = (
+    "This page can't write to your clipboard: click into a text, press Ctrl+A and Ctrl+C, or download it."
+)
 
 
 class QuestionPanel:
@@ -38,11 +44,11 @@ class QuestionPanel:
         self.gizmos = Gizmos(page, changed)
         self._answer = gui.add_markdown("")
         self._latency = gui.add_markdown("")
-        with gui.add_folder("Ask it elsewhere", expand_by_default=False):
-            gui.add_markdown("The same question, to select and copy:")
-            self._spoken = [
-                gui.add_text(label, "", multiline=True) for label in ("curl", "Python", "Command line")
-            ]
+        self._elsewhere = gui.add_button(
+            "Copy the question", hint="As curl, Python and a command line.", disabled=True
+        )
+        self._elsewhere.on_click(lambda _: self._tell_elsewhere())
+        self.spoken: Spoken | None = None
         self.answered: Grasps | None = None
         self.questions = 0
 
@@ -57,6 +63,7 @@ class QuestionPanel:
     def ask(self) -> None:
         """Ask for the best grasps of the view, and show them or why there are none."""
         page, view, subject = self._page, self._page.view, self._page.subject
+        self.spoken = None
         if subject is None or view.best == 0:
             self._nothing("")
             return
@@ -66,9 +73,8 @@ class QuestionPanel:
                 self._nothing("**No best grasp yet**: nothing has succeeded.")
                 return
             given["gripper"] = subject.gripper
-        said = spoken(page.db.url, subject.item.id, view.best, given, keyed=self._keyed)
-        for control, text in zip(self._spoken, said, strict=True):
-            put(control, text)
+        self.spoken = spoken(page.db.url, subject.item.id, view.best, given, keyed=self._keyed)
+        self._elsewhere.disabled = False
         began = time.perf_counter()
         try:
             found = subject.item.best_grasps(count=view.best, **given)
@@ -100,6 +106,22 @@ class QuestionPanel:
         minded = "".join(f"\n\n*Mind:* {words.plain(warning)}" for warning in found.warnings)
         self._answer.content = f"**Best grasp.**{prior}{fewer}\n\n{words.table(best.summary())}{minded}"
 
+    def _tell_elsewhere(self) -> None:
+        """The question of this moment in three languages, to be copied or downloaded."""
+        told, client = self.spoken, self._page.client
+        if told is None:
+            return
+        with client.gui.add_modal("Ask the same elsewhere") as modal:
+            client.gui.add_markdown(_COPYING)
+            for label, name, text in zip(_LANGUAGES, _FILES, told, strict=True):
+                client.gui.add_text(label, text, multiline=True)
+                download = client.gui.add_button(f"Download {name}")
+                download.on_click(partial(self._download, name, text.encode()))
+            client.gui.add_button("Close").on_click(lambda _: modal.close())
+
+    def _download(self, name: str, content: bytes, _: Any) -> None:
+        self._page.client.send_file_download(name, content, save_immediately=True)
+
     def _infeasible(self, error: Infeasible) -> None:
         nearest = error.nearest if isinstance(error.nearest, Grasp) else None
         self._nothing(_why_none(error))
@@ -113,6 +135,7 @@ class QuestionPanel:
 
     def _nothing(self, why: str) -> None:
         self.answered = None
+        self._elsewhere.disabled = self.spoken is None
         self._closing.show(None)
         self._page.replace("best", None)
         self._page.replace("nearest", None)

@@ -19,9 +19,17 @@ ALL = "all"
 
 
 class TrialsPanel:
-    """Which trials are shown; ``changed`` is called when the user changes that, ``chosen`` at a click."""
+    """Which trials are shown; ``changed`` is called when the user changes that, ``chosen`` at a click on one,
+    and ``replay`` where its motion is wanted.
+    """
 
-    def __init__(self, page: Page, changed: Callable[[], None], chosen: Callable[[TrialOut], None]) -> None:
+    def __init__(
+        self,
+        page: Page,
+        changed: Callable[[], None],
+        chosen: Callable[[TrialOut], None],
+        replay: Callable[[TrialOut], None],
+    ) -> None:
         self._page, self._chosen = page, chosen
         gui, view = page.client.gui, page.view
         self._shown = gui.add_checkbox("Show trials", initial_value=view.trials)
@@ -32,6 +40,10 @@ class TrialsPanel:
         self._outcome = gui.add_dropdown("Only", (ALL,))
         self._legend = gui.add_html("")
         self._story = gui.add_markdown("")
+        self._replay = gui.add_button("Replay its motion", visible=False)
+        self._told = gui.add_markdown("")
+        self._told_of: TrialOut | None = None
+        self._replay.on_click(lambda _: None if self._told_of is None else replay(self._told_of))
         self._trials: list[TrialOut] = []
 
         def on_change(_: Any) -> None:
@@ -46,7 +58,8 @@ class TrialsPanel:
     def draw(self) -> None:
         """Read the trials of the view and draw them."""
         page, view, subject = self._page, self._page.view, self._page.subject
-        self._trials = []
+        self._trials, self._told_of = [], None
+        self._replay.visible, self._told.content = False, ""
         if subject is None or not view.trials:
             page.replace("trials", None)
             self._legend.content, self._story.content = "", ""
@@ -86,6 +99,17 @@ class TrialsPanel:
     def tell(self, trial: TrialOut) -> None:
         """A trial's story."""
         self._story.content = words.story(trial)
+        self._told_of = trial
+        self._replay.visible, self._told.content = trial.sweep is not None, ""
+
+    @property
+    def told_of(self) -> TrialOut | None:
+        """The trial whose story is told."""
+        return self._told_of
+
+    def say(self, text: str) -> None:
+        """Something about the replay of the trial that is told of."""
+        self._told.content = text
 
     def _clicked(self, event: Any) -> None:
         if event.instance_index is not None and event.instance_index < len(self._trials):

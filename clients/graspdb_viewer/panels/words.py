@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 
 from graspdb.wire import TrialOut
+from graspdb_viewer.motion import Motion
 
 _MARKS = frozenset("\\`*_{}[]<>#|!~&$")
 
@@ -54,3 +55,25 @@ def story(trial: TrialOut) -> str:
     for name, value in (trial.metadata or {}).items():
         rows[f"metadata {name}"] = value if isinstance(value, str) else json.dumps(value)[:300]
     return table(rows)
+
+
+def replayed(motion: Motion, trial: TrialOut, slower: float) -> str:
+    """What a replay showed, and whether that was how the trial went."""
+    outcome = motion.outcome.replace("_", " ")
+    if motion.is_of(trial):
+        how = f", {slower:.0f} times slower from the first touch on" if slower > 1.5 else ""
+        return (
+            f"**Its worker's own states**, simulated again{how}: {outcome}, as it was, with the fingers as"
+            " far apart. The jaw stands still, and the object moves in it."
+        )
+    return (
+        f"**Not as it went**: simulated again it came out as {outcome}, and the trial as"
+        f" {trial.outcome.replace('_', ' ')}{_apart(motion, trial)}. Mass, friction, convex parts or the"
+        " worker are others than in its sweep."
+    )
+
+
+def _apart(motion: Motion, trial: TrialOut) -> str:
+    if motion.width_m is None or trial.width_m is None or motion.outcome != trial.outcome:
+        return ""
+    return f", with the jaw {1e3 * motion.width_m:.3f} mm open and not {1e3 * trial.width_m:.3f} mm"

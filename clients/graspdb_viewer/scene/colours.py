@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graspdb.figures.style import OUTCOME_COLOURS, SOURCE_COLOURS
+
 Bytes = NDArray[np.uint8]
 UNKNOWN = (150, 150, 150)
 BEST, SECOND = (213, 94, 0), (240, 170, 110)
@@ -18,21 +20,8 @@ _VIRIDIS = np.array(
     ],
     dtype=np.float64,
 )
-#: Okabe and Ito's.
 _NAMED = {
-    "success": (0, 158, 115),
-    "failure": (213, 94, 0),
-    "collision": (230, 159, 0),
-    "missed": (86, 180, 233),
-    "slipped": (204, 121, 167),
-    "dropped": (0, 114, 178),
-    "wrench_insufficient": (160, 60, 60),
-    "timeout": (110, 110, 110),
-    "simulation_error": (40, 40, 40),
-    "simulation": (0, 114, 178),
-    "robot": (213, 94, 0),
-    "human": (0, 158, 115),
-    "import": (204, 121, 167),
+    name: tuple(bytes.fromhex(colour[1:])) for name, colour in (OUTCOME_COLOURS | SOURCE_COLOURS).items()
 }
 
 

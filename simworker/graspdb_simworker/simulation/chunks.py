@@ -70,8 +70,10 @@ def prepare(
     *,
     visible: bool = False,
     film_every_s: float = math.inf,
+    moments_every_s: float = math.inf,
 ) -> Workpiece:
     """Build what the payload's chunks are simulated with; visible for pictures of the end, or at intervals.
+    Moments of each closing are kept at such intervals, too.
 
     UnsupportedProtocol, or ValueError for parts or a gripper that no physics can be done with.
     """
@@ -90,6 +92,7 @@ def prepare(
         lifts=payload.protocol == "lift",
         visible=visible,
         film_every_s=film_every_s,
+        moments_every_s=moments_every_s,
     )
     return Workpiece(collision.Scene(parts), world, gripper)
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pybullet
@@ -97,6 +98,18 @@ def stepping_for(fidelity: Fidelity, mass_kg: float, *, lifts: bool = False) -> 
     return _HEAVY if mass_kg >= HEAVY_KG else _LIGHT
 
 
+class Moment(NamedTuple):
+    """A moment of a closing: how far each finger is from the middle, and the object frame in the tool frame.
+
+    ``fingers_m`` are of the finger at +y and that at -y, metres; the jaw stands still throughout.
+    """
+
+    time_s: float
+    fingers_m: tuple[float, float]
+    position: Vector
+    quaternion_xyzw: Quaternion
+
+
 class GraspWorld(BulletWorld):
     """One object and one gripper in a headless Bullet world.
 
@@ -104,6 +117,7 @@ class GraspWorld(BulletWorld):
     Coulomb's coefficient between object and gripper; ``fidelity`` is ``standard`` or ``fine``. ``lifts``:
     lift and shake what is held after every closing, see :mod:`graspdb_simworker.simulation.lifting`.
     ``visible``: build what can be seen, for :attr:`pictures`, one at the end and one every ``film_every_s``.
+    ``moments_every_s``: keep :attr:`moments` that far apart, which changes nothing about what comes out.
     """
 
     def __init__(
@@ -117,6 +131,7 @@ class GraspWorld(BulletWorld):
         lifts: bool = False,
         visible: bool = False,
         film_every_s: float = math.inf,
+        moments_every_s: float = math.inf,
     ) -> None:
         stepping = stepping_for(fidelity, mass_kg, lifts=lifts)
         # What is lifted must not turn where faces hold it.
@@ -134,6 +149,11 @@ class GraspWorld(BulletWorld):
         self._lifts = lifts
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
+        self._moments_every_s = moments_every_s
+        self._watched = visible or moments_every_s < math.inf
+        self._time_s = 0.0
+        self.moments: list[Moment] = []
+        """What the last closing came through, from just before the first contact; empty unless kept."""
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
         the end is last. Empty unless the world is visible."""
@@ -153,20 +173,37 @@ class GraspWorld(BulletWorld):
         """
         try:
             self.pictures.clear()
-            self._filmed_s = 0.0
+            self.moments.clear()
+            self._filmed_s = self._time_s = 0.0
             closing = self._close(position, quaternion_xyzw, travel_m)
+            if self._moments_every_s < math.inf and self.moments[-1].time_s < self._time_s:
+                self.moments.append(self._moment())
             if self._visible:
                 self.pictures.append(self._render())
             return closing
         finally:
             self._park()
 
-    def _film(self, dt: float) -> None:
-        """Take a picture when it is time for the next."""
+    def _watch(self, dt: float) -> None:
+        """Keep a moment, and take a picture, when it is time for the next."""
+        self._time_s += dt
+        if self._time_s > len(self.moments) * self._moments_every_s:
+            self.moments.append(self._moment())
         self._filmed_s += dt
         if self._visible and self._filmed_s >= self._film_every_s:
             self._filmed_s = 0.0
             self.pictures.append(self._render())
+
+    def _moment(self) -> Moment:
+        (first, *_), (second, *_) = self._bullet.getJointStates(self._jaw, (0, 1))
+        return Moment(self._time_s, (first, second), *self._object_pose())
+
+    def _object_pose(self) -> tuple[Vector, Quaternion]:
+        """Pose of the object frame in the tool frame."""
+        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
+        quaternion = multiply(orientation, self._to_body)
+        shift = rotate(quaternion, self.mass.centre)
+        return (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2]), quaternion
 
     # long: one step after the other, with every name looked up once: it runs ten thousand times a second
     def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
@@ -196,13 +233,13 @@ class GraspWorld(BulletWorld):
         # What is done at every step costs as much as the physics of a light one: names looked up once, and
         # arguments without their names.
         step, states, touching = pybullet.stepSimulation, pybullet.getJointStates, pybullet.getContactPoints
-        visible, joints = self._visible, (0, 1)
+        watched, joints = self._watched, (0, 1)
         while elapsed < limit:
             step(client)
             steps += 1
             elapsed += dt
-            if visible:
-                self._film(dt)
+            if watched:
+                self._watch(dt)
             first, second = states(jaw, joints, client)
             opening = first[0] + second[0]
             if not 0.0 < opening < math.inf:
@@ -308,8 +345,8 @@ class GraspWorld(BulletWorld):
                 body, -1, [scale * f for f in torque], pybullet.WORLD_FRAME, physicsClientId=client
             )
             pybullet.stepSimulation(physicsClientId=client)
-            if self._visible:
-                self._film(dt)
+            if self._watched:
+                self._watch(dt)
             where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
             if step % _EMPTY_CHECK_STEPS:
                 continue
@@ -351,16 +388,13 @@ class GraspWorld(BulletWorld):
         ratings: Sequence[float],
         steps: int,
     ) -> Closing:
-        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
-        if not all(map(math.isfinite, (*where, *orientation))):
+        position, quaternion = self._object_pose()
+        if not all(map(math.isfinite, (*position, *quaternion))):
             end = End.UNSTABLE
         elif end is End.STALLED:
             # Bullet's hulls are inflated by the margin on both sides, but for contact by faces; the
             # object is not.
             opening -= 0.0 if self._lifts else 2.0 * COLLISION_MARGIN_M
-        quaternion = multiply(orientation, self._to_body)
-        shift = rotate(quaternion, self.mass.centre)
-        position = (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2])
         held, rated = (tuple(contacts), tuple(ratings)) if end is End.STALLED else ((), ())
         return Closing(end, touched, opening, held, position, quaternion, steps, ratings=rated)
 

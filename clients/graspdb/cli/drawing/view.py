@@ -39,9 +39,9 @@ def view(
         viewer = importlib.import_module("graspdb_viewer.serving")
     except ImportError as error:
         raise ImportError(f"the viewer needs {error.name}: pip install 'graspdb[view]'") from error
-    keyed = bool(state.api_key or os.environ.get("GRASPDB_API_KEY"))
+    key = state.api_key or os.environ.get("GRASPDB_API_KEY") or None
     start = importlib.import_module("graspdb_viewer.view").View(object=id)
-    with viewer.serving(state.db, host=host, port=port, view=start, names=name or (), keyed=keyed) as server:
+    with viewer.serving(state.db, host=host, port=port, view=start, names=name or (), api_key=key) as server:
         typer.echo(f"Look at {server.url} (Ctrl-C ends it)")
         if browser:
             webbrowser.open(server.url)
