@@ -8,6 +8,7 @@ import inspect
 import io
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -271,3 +272,16 @@ def test_its_pictures_are_of_what_is_drawn_now(name: str) -> None:
     (words, points), (kept_words, kept_points) = _drawn(drawn), _drawn(kept)
     assert words == kept_words
     np.testing.assert_allclose(points, kept_points, atol=0.1)
+
+
+def test_the_picture_of_a_density_is_what_the_service_says_now(db: Client, fresh_id: str) -> None:
+    script = DOCS / "figures" / "density_and_probability.py"
+    target = io.BytesIO()
+    drawn = runpy.run_path(str(script))["draw"](db, fresh_id)
+    drawn.savefig(target, format="svg", metadata={"Date": None})
+    (words, points), (kept_words, kept_points) = (
+        _drawn(svg)
+        for svg in (target.getvalue(), script.with_name("density-and-probability.svg").read_bytes())
+    )
+    assert words == kept_words
+    np.testing.assert_allclose(points, kept_points, atol=0.5)
