@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 import pytest
 import tomllib
 import trimesh
+import yaml
 
 import foreign_files as files
 from graspdb import Client, wire
@@ -242,6 +243,44 @@ def test_the_commands_they_name_take_what_they_give_them(help_of: Callable[..., 
     assert len(named) >= 40
     for command in named:
         assert "usage" in help_of(*shlex.split(command)).lower(), command
+
+
+def test_the_compose_commands_name_what_there_is(help_of: Callable[..., str]) -> None:
+    """``make test-compose`` runs them; here they are read."""
+    told = [
+        yaml.load((ROOT / name).read_text(encoding="utf-8"), _Compose)["services"]
+        for name in ("compose.yaml", "deploy/replicas.yaml")
+    ]
+    services = {**told[0], **told[1]}
+    profiles = {name for service in told[0].values() for name in service.get("profiles", [])}
+    lines = [
+        line
+        for _, block in blocks(DOCS / "guide" / "compose.md", "sh")
+        for line in block.splitlines()
+        if "docker compose" in line
+    ]
+    assert len(lines) >= 15
+    for line in lines:
+        words = shlex.split(line, comments=True)[2:]
+        while words[0] in ("--profile", "-f"):
+            _, value, *words = words
+            assert value in profiles or (ROOT / value).is_file(), line
+        verb, *rest = words
+        assert verb in ("up", "run", "build", "stop", "exec"), line
+        scaled = [word.partition("=")[0] for word in rest if re.fullmatch(r"[a-z-]+=\d+", word)]
+        assert set(scaled) <= services.keys(), line
+        named = [word for word in rest if word in services]
+        assert named or verb in ("up", "build"), line
+        if "graspdb-server" in rest:
+            command = rest[rest.index("graspdb-server") :]
+            assert "usage" in help_of(*command).lower(), line
+
+
+class _Compose(yaml.SafeLoader):
+    """What compose adds to YAML."""
+
+
+_Compose.add_constructor("!reset", lambda loader, node: None)
 
 
 def _drawn(svg: bytes) -> tuple[list[str], np.ndarray]:

@@ -16,6 +16,24 @@ import httpx
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = "graspdb"
+PROFILES = [word for name in ("viewer", "sqlite", "dask", "monitoring") for word in ("--profile", name)]
+
+#: Hands each question on to another name server, and its answer back.
+NAME_SERVER = """
+import socket, sys
+here = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+here.bind(("127.0.0.11", 53))
+while True:
+    question, asker = here.recvfrom(4096)
+    there = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    there.settimeout(2)
+    there.sendto(question, (sys.argv[1], 53))
+    try:
+        here.sendto(there.recv(4096), asker)
+    except OSError:
+        pass
+    there.close()
+"""
 
 
 def say(what: str) -> None:
@@ -57,28 +75,33 @@ def wait_for(what: str, condition: Callable[[], Any], seconds: float = 600.0) ->
 
 
 class Compose:
-    """The project of ``compose.yaml``, with variables of its own.
+    """The project of ``compose.yaml`` and what is laid over it, with variables of its own.
 
     podman here has neither systemd, which would look at health, nor the waiting for it: conditions of
     ``depends_on`` are waited for by :meth:`up`, as they are written in the file.
     """
 
-    def __init__(self, **variables: str) -> None:
+    def __init__(self, *files: str, **variables: str) -> None:
         self.variables = variables
-        self.config: dict[str, Any] = {}
-        self.read()
+        self.files = [word for file in files for word in ("-f", file)]
+        import yaml  # brought by podman-compose
+
+        self.config: dict[str, Any] = yaml.safe_load(self.run(*PROFILES, "config"))
 
     def run(self, *words: str, inputs: bytes | None = None, **variables: str) -> str:
         told = {**self.variables, **variables, "COMPOSE_PROJECT_NAME": PROJECT}
-        return command(sys.executable, "-m", "podman_compose", *words, inputs=inputs, **told)
+        return command(sys.executable, "-m", "podman_compose", *self.files, *words, inputs=inputs, **told)
 
-    def read(self) -> None:
-        import yaml  # brought by podman-compose
+    def builds(self) -> dict[str, str]:
+        """The Dockerfile of each image that the files have built."""
+        built = (each for each in self.config["services"].values() if "build" in each)
+        return {each["image"]: each["build"]["dockerfile"] for each in built}
 
-        profiles = [
-            word for name in ("viewer", "sqlite", "dask", "monitoring") for word in ("--profile", name)
-        ]
-        self.config = yaml.safe_load(self.run(*profiles, "config"))
+    def default(self, *profiles: str) -> list[str]:
+        """The services that ``up`` starts when it names none."""
+        listed = self.config["services"].items()
+        wanted = {None, *profiles}
+        return [name for name, told in listed if wanted & set(told.get("profiles") or [None])]
 
     def container(self, service: str, number: int = 1) -> str:
         return f"{PROJECT}_{service}_{number}"
@@ -98,7 +121,8 @@ class Compose:
                 for w in ("--profile", name)
             ]
             self.run(*profiles, "up", "-d", "--no-deps", "--no-build", *words, service)
-            self._wait(service)
+            for number in range(1, count + 1):
+                self._wait(service, number)
 
     def stop(self, *services: str) -> None:
         """All containers of these, of which podman-compose knows the first alone."""
@@ -109,7 +133,7 @@ class Compose:
         """Containers, networks and volumes of the project are gone afterwards."""
         for service in self.config["services"]:
             self._remove_surplus(service, 1)
-        self.run("down", "-v")
+        self.run(*PROFILES, "down", "-v")
         for kind in ("container", "volume"):
             words = ["ls", "-q", "--filter", f"label=io.podman.compose.project={PROJECT}"]
             left = command("podman", kind, *words, *(["-a"] if kind == "container" else []))
@@ -150,7 +174,7 @@ class Compose:
             add(name)
         return order
 
-    def _wait(self, service: str) -> None:
+    def _wait(self, service: str, number: int) -> None:
         """Until it has ended well, if it is one that ends, or is healthy."""
         told = self.config["services"][service]
         if told.get("restart") == "no":
@@ -158,13 +182,30 @@ class Compose:
             if self._state(service)["ExitCode"]:
                 raise Failed(f"{service}: {self.logs(service)}")
         elif "healthcheck" in told:
-            self.wait_healthy(service)
+            self.wait_healthy(service, number)
 
-    def wait_healthy(self, service: str) -> None:
+    def wait_healthy(self, service: str, number: int = 1) -> None:
         wait_for(
             f"{service} is healthy",
-            lambda: command("podman", "healthcheck", "run", self.container(service)) is not None,
+            lambda: command("podman", "healthcheck", "run", self.container(service, number)) is not None,
         )
+
+    def address(self, service: str, number: int = 1) -> str:
+        """Of a container in the project's network, from which this process is reached, and reaches it."""
+        form = "{{range .NetworkSettings.Networks}}{{.IPAddress}}{{end}}"
+        return command("podman", "inspect", "--format", form, self.container(service, number)).strip()
+
+    def name_server(self, service: str, number: int = 1) -> subprocess.Popen[bytes]:
+        """Docker's name server at 127.0.0.11 of a container: podman has one at another address."""
+        name = self.container(service, number)
+        pid = command("podman", "inspect", "--format", "{{.State.Pid}}", name).strip()
+        told = re.search(
+            r"^nameserver (\S+)", command("podman", "exec", name, "cat", "/etc/resolv.conf"), re.M
+        )
+        if not told:
+            raise Failed(f"{name} has no name server")
+        words = ("nsenter", "--target", pid, "--net", sys.executable, "-c", NAME_SERVER, told[1])
+        return subprocess.Popen(words)
 
     def _state(self, service: str) -> dict[str, Any]:
         try:

@@ -14,6 +14,7 @@ import httpx
 
 from graspdb import Client
 from lab import ROOT, Compose, command, say, wait_for
+from monitoring import Prometheus
 
 URL = "http://127.0.0.1:8000"
 #: What URLs, shells, quotes and compose's own variables would each take for something else.
@@ -22,6 +23,8 @@ STRANGE = "it's %41 p@ss:w/ö?r#d\\&$HOME ${X:-y} $$ `id` {}\"; -- "
 POSES = 4_000
 #: What a lab gets by itself and tests have under another name.
 ELSEWHERE = ("git pull",)
+#: Services of whose image nothing can be made from packages.
+LACKING = {"grafana"}
 
 
 def guide() -> dict[str, list[str]]:
@@ -71,11 +74,25 @@ class Scenario:
         )
         words = printed.stdout.decode().split("\0")[:-1]
         assert words[:2] == ["docker", "compose"], line
-        verb, *rest = words[2:]
+        return self._compose(words[2:])
+
+    def _compose(self, words: list[str]) -> str:
+        """What the engine does at a command, by podman-compose."""
+        options: dict[str, list[str]] = {"-f": [], "--profile": []}
+        while words[0] in options:
+            option, value, *words = words
+            options[option].append(value)
+        if options["-f"]:
+            self.compose = Compose(*options["-f"], **self.compose.variables)
+        verb, *rest = words
         if verb == "up":
             scale = dict(each.split("=") for each in _after(rest, "--scale"))
             named = [w for w in rest if not w.startswith("-") and "=" not in w]
-            self.compose.up(*(named or DEFAULT), **{name: int(count) for name, count in scale.items()})
+            wanted = named or self.compose.default(*options["--profile"])
+            for lacking in sorted(LACKING & {*wanted}):
+                say(f"  (not {lacking}, whose image only a registry has)")
+            wanted = [name for name in wanted if name not in LACKING]
+            self.compose.up(*wanted, **{name: int(count) for name, count in scale.items()})
             return ""
         if verb == "build":  # they are ready
             for image, id in self.newer.items():
@@ -84,6 +101,8 @@ class Scenario:
         if verb == "stop":
             self.compose.stop(*rest)
             return ""
+        if verb == "exec":
+            return self.compose.run("exec", "-T", *rest)
         if verb == "run":
             first = next(w for w in rest if w in self.compose.config["services"])
             place = rest.index(first)
@@ -107,7 +126,12 @@ class Scenario:
             self.database_restarts,
             self.update,
             self.contained,
+            self.monitoring,
+            self.viewer,
+            self.dask,
             self.move,
+            self.replicas,
+            self.one_container,
         ):
             say(step.__name__.replace("_", " "))
             step()
@@ -202,6 +226,10 @@ class Scenario:
 
     def update(self) -> None:
         before, image = self.counts(), self.image()
+        self.follow("Backing up")
+        backup = self.folder / "graspdb.backup"
+        assert backup.stat().st_size > 1000
+        backup.unlink()
         self.follow("Updating")
         self.ready()
         assert self.image() != image
@@ -227,17 +255,83 @@ class Scenario:
     def move(self) -> None:
         """To a host that has nothing but the backup."""
         before = self.counts()
-        self.follow("Backing up")
+        self.follow("Moving to another host")
         assert (self.folder / "graspdb.backup").stat().st_size > 1000
         self.compose.down()
-        self.follow("Moving to another host")
+        self.follow("On the new host")
         self.ready()
         assert self.counts() == before
         with Client(URL) as db:
             assert db.objects.get("mug").best_grasp().density > 0
 
+    # --- profiles, replicas, and the one container
 
-DEFAULT = ("simworker",)
+    def monitoring(self) -> None:
+        """Rules in force, every replica scraped, and every panel of the dashboard has its numbers."""
+        password = self.follow("Monitoring")[-1]
+        assert len(password) > 20, password
+        found = Prometheus(self.compose)
+        found.check_files()
+        found.wait_scraped(replicas=1)
+        httpx.get(f"{URL}/objects/none")  # so that there is an answer that is no success
+        found.ask_rules()
+        found.ask_dashboard()
+        found.reached_as_grafana_would()
+        self.compose.stop("prometheus")
+
+    def viewer(self) -> None:
+        self.follow("Viewer")
+        page = httpx.get("http://127.0.0.1:8080", timeout=60)
+        assert page.is_success
+        assert "<html" in page.text.lower()
+        self.compose.stop("viewer")
+
+    def dask(self) -> None:
+        """Chunks are simulated by the cluster's workers while no worker of the lab's own runs."""
+        self.follow("Dask")
+        self.compose.stop("simworker")
+        with Client(URL) as db:
+            told = db.objects.get("mug").sweep(max_poses=200, chunk_poses=50).wait().info
+        assert (told.state, told.poses_done, told.chunks_failed) == ("done", 200, 0), told
+        self.compose.stop("dask-simworker", "dask-worker", "dask-scheduler")
+
+    def replicas(self) -> None:
+        """Any of them answers what another was told, at once; one that is killed is not missed."""
+        before = self.counts()
+        self.follow("Replicas")
+        servers = self.compose.name_server("nginx")
+        try:
+            wait_for("nginx passes on", lambda: httpx.get(f"{URL}/readyz").is_success)
+            assert self.counts() == before
+            every = [f"http://{self.compose.address('service', n)}:8000" for n in (1, 2, 3)]
+            named = {"Host": "service:8000"}
+            for number in range(12):
+                told = {"id": f"box-{number}", "mass_kg": 0.1}
+                httpx.post(f"{URL}/objects", json=told, timeout=60).raise_for_status()
+                for each in every:
+                    assert httpx.get(f"{each}/objects/box-{number}", headers=named, timeout=60).is_success
+            counted = [httpx.get(f"{each}/metrics", headers=named).text for each in every]
+            assert all('route="/objects",status="201"' in text for text in counted)
+            command("podman", "kill", self.compose.container("service", 2))
+            for number in range(12):
+                assert httpx.get(f"{URL}/objects/box-{number}", timeout=60).is_success
+        finally:
+            servers.kill()
+            servers.wait()
+
+    def one_container(self) -> None:
+        """The service on a SQLite file; a container that is made anew finds what the one before stored."""
+        self.compose.down()
+        self.compose = Compose(**self.compose.variables)
+        self.follow("One container")
+        with Client(URL) as db:
+            made = db.add_example("mug")
+            made.trials.add([[0, 0, 0.05, 1, 0, 0, 0]], [True], gripper="pg70", source="robot")
+            assert made.best_grasp().density > 0
+        before = self.counts()
+        command("podman", "rm", "-f", "-t", "20", self.compose.container("sqlite"))
+        self.compose.up("sqlite")
+        assert self.counts() == before
 
 
 def _after(words: list[str], option: str) -> list[str]:

@@ -1,13 +1,15 @@
-"""Several replicas over one PostgreSQL, behind the nginx of ``deploy``: one service, whichever is killed."""
+"""Several replicas over one PostgreSQL: one service, whichever is asked, and, behind nginx, killed."""
 
 from __future__ import annotations
 
 import json
+import random
 import tempfile
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +20,79 @@ from postgres_server import PostgresPrograms
 from replica_set import ReplicaSet
 from small_disk import Guard
 
-pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.timeout(600)
 
 DOWN = {"quaternion_xyzw": [1.0, 0.0, 0.0, 0.0], "gripper": "pg70", "source": "robot"}
+
+
+@pytest.fixture
+def pair(postgres_url: str, serve: Callable[..., str]) -> Iterator[list[httpx.Client]]:
+    """Clients of two replicas, each with caches of its own."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(httpx.Client(base_url=serve(postgres_url), timeout=60)) for _ in range(2)]
+
+
+def asked_of(replica: httpx.Client) -> dict[str, Any]:
+    """What a replica says of the object now."""
+    question = {"poses": {"position": [[0, 0, 0.05]], "quaternion_xyzw": [[1, 0, 0, 0]]}}
+    answers = {
+        "object": replica.get("/objects/box"),
+        "trials": replica.get("/objects/box/trials"),
+        "batches": replica.get("/objects/box/batches"),
+        "density": replica.get("/objects/box/density"),
+        "likelihood": replica.post("/objects/box/likelihood", json=question),
+        "best-grasp": replica.get("/objects/box/best-grasp"),
+        "objects": replica.get("/objects"),
+    }
+    assert {name: answer.status_code for name, answer in answers.items()} == dict.fromkeys(answers, 200)
+    return {name: answer.json() for name, answer in answers.items()}
+
+
+def write(replica: httpx.Client, chance: random.Random, number: int) -> httpx.Response:
+    """Some change of the object, through one replica."""
+    batches = [batch["batch"] for batch in replica.get("/objects/box/batches").json()["items"]]
+    rows = replica.get("/objects/box/trials").json()["items"]
+    kind = chance.choice(["post", "post", "delete", "withdraw", "correct", "patch"])
+    if kind == "delete" and len(batches) > 1:
+        return replica.delete(f"/objects/box/batches/{chance.choice(batches)}")
+    if kind == "withdraw":
+        return replica.delete(f"/objects/box/trials/{chance.choice(rows)['seq']}")
+    if kind == "correct":
+        told = {"outcome": chance.choice(["success", "slipped"])}
+        return replica.patch(f"/objects/box/trials/{chance.choice(rows)['seq']}", json=told)
+    if kind == "patch":
+        return replica.patch("/objects/box", json={"mass_kg": 0.1 + number / 1_000})
+    trials = [
+        {"position": [0.0, number * 1e-4, 0.05 + n * 1e-3], "outcome": n % 3 > 0, **DOWN} for n in range(9)
+    ]
+    return replica.post("/objects/box/trials", json={"trials": trials})
+
+
+def assert_alike(one: Any, other: Any) -> None:
+    """Equal, numbers but for rounding: one may have extended what the other built anew."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for name in one:
+            assert_alike(one[name], other[name])
+    elif isinstance(one, list):
+        assert len(one) == len(other)
+        for each, its in zip(one, other, strict=True):
+            assert_alike(each, its)
+    else:
+        assert one == (pytest.approx(other, rel=1e-4, abs=1e-6) if isinstance(other, float) else other)
+
+
+def test_what_one_replica_was_told_another_answers_from_at_once(pair: list[httpx.Client]) -> None:
+    chance = random.Random(7)
+    assert pair[0].post("/objects", json={"id": "box", "mass_kg": 0.1}).status_code == 201
+    for replica in pair:
+        told = {"position": [0.0, 0.0, 0.04], "outcome": True, **DOWN}
+        assert replica.post("/objects/box/trials", json=told).status_code == 201
+    for number in range(12):
+        here, there = chance.sample(pair, 2)
+        done = write(here, chance, number)
+        assert done.is_success, done.text
+        assert_alike(asked_of(there), asked_of(here))
 
 
 @pytest.fixture(scope="module")
@@ -40,12 +112,14 @@ def proxy(replicas: ReplicaSet, tmp_path_factory: pytest.TempPathFactory) -> str
     return replicas.begin_proxy(folder)
 
 
+@pytest.mark.long
 def test_replicas_that_start_at_once_migrate_and_seed_once(replicas: ReplicaSet) -> None:
     told = [httpx.get(f"{url}/grippers", params={"limit": 1_000}).json()["items"] for url in replicas.urls]
     assert len({gripper["id"] for gripper in told[0]}) == len(told[0]) >= 2
     assert told[0] == told[1] == told[2]
 
 
+@pytest.mark.long
 def test_the_proxy_reaches_every_replica_and_passes_problems_on(replicas: ReplicaSet, proxy: str) -> None:
     with httpx.Client(base_url=proxy) as http:
         for _ in range(9):
@@ -92,6 +166,7 @@ def post_batch(http: httpx.Client, number: int, acknowledged: dict[int, dict[str
     return answer
 
 
+@pytest.mark.long
 def test_a_killed_replica_costs_no_acknowledged_trial_and_fails_no_request(
     replicas: ReplicaSet, proxy: str
 ) -> None:
