@@ -78,6 +78,7 @@ class Context(Asking):
 
     def close(self) -> None:
         self.answers.close()
+        self.densities.widths.close()
         self.health.close()
         self.upkeep.close()
         self.runs.close()

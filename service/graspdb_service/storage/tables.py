@@ -392,6 +392,21 @@ kernels = Table(
     info=WHOLLY_AUDITED,
 )
 
+# Widths that the first rows of a selection have chosen, by the SHA-256 of what those rows are.
+width_choices = Table(
+    "width_choices",
+    metadata,
+    # In the order they were chosen: the newest stay.
+    Column("number", BigId, primary_key=True, autoincrement=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False),
+    Column("digest", String(64), nullable=False),
+    Column("sigma_position_m", Double, nullable=False),
+    # Radians.
+    Column("sigma_rotation", Double, nullable=False),
+    Column("rule", String(32), nullable=False),
+    UniqueConstraint("object_id", "digest"),
+)
+
 # Reports that are computed or have been: one row for an object, revision and set of parameters, leased to
 # the process that computes it.
 report_runs = Table(

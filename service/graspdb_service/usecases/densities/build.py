@@ -15,10 +15,10 @@ from graspdb_density import (
     DEFAULT_KERNEL,
     DiagonalKernel,
     GraspDensity,
+    IsotropicKernel,
     MixtureDensity,
     ModeSearch,
     SampledKernel,
-    choose_widths,
     importance_weights,
     se3,
     widths_prefix,
@@ -29,9 +29,11 @@ from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
 from graspdb_service.problems import ProblemError
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.width_choices import ChosenWidths
 from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.weighing import Weighing, weighed
+from graspdb_service.usecases.densities.widths.choosing import WidthChoosing
 from graspdb_service.usecases.geometry.features import Axes
 from graspdb_service.usecases.trials.attempts import Stored
 from graspdb_service.usecases.trials.selection import Selected
@@ -153,9 +155,12 @@ def build(
     selected: Selected,
     fresh: Fresh,
     before: Built | None,
+    widths: WidthChoosing,
     threads: int,
 ) -> Built:
-    """The density of the rows there were and those that came since; ``axes`` are those of a stored kernel.
+    """The density of the rows there were and those that came since.
+
+    ``axes`` are those of a stored kernel, ``widths`` tells what rows choose by default.
 
     413 for more components than a density may have.
     """
@@ -184,10 +189,11 @@ def build(
     if before is not None and same_widths:
         built = replace(built, kernel=before.kernel)
     elif built.chosen_from:
-        chosen = _choose(everything, built.weighing.proposal, built.chosen_from, threads)
+        first = _choosing(everything, built.weighing.proposal, built.chosen_from)
+        chosen = _told(widths.choose(selected.row.id, first, threads=threads), built.chosen_from)
         built = replace(built, kernel=chosen if stored is None else stored_kernel.info_of(stored, chosen))
-    widths = stored_kernel.isotropic(built.kernel)
-    weighing = weighed(built.weighing, widths, selected, fresh.attempts, everything.poses, threads)
+    isotropic = stored_kernel.isotropic(built.kernel)
+    weighing = weighed(built.weighing, isotropic, selected, fresh.attempts, everything.poses, threads)
     built = replace(built, weighing=weighing)
     weights = weighing.weights(*everything)
     shaping = None if for_success else stored
@@ -311,8 +317,8 @@ def _in_units_of(old: GraspDensity, weights: Floats | None, count: int) -> _InUn
     return _InUnit(np.asarray(found), same) if usable else None
 
 
-def _choose(grasps: Grasps, proposal: Floats, count: int, threads: int) -> KernelInfo:
-    """Widths chosen from the first rows.
+def _choosing(grasps: Grasps, proposal: Floats, count: int) -> Rows:
+    """The first rows, which choose the widths.
 
     By their own proposal densities: how much else was tried since must not change what they choose.
     """
@@ -321,12 +327,15 @@ def _choose(grasps: Grasps, proposal: Floats, count: int, threads: int) -> Kerne
     if not np.isnan(proposal[first]).all():
         weights = importance_weights(proposal[first])
         weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
-    rows = Rows.of(grasps.poses[first], weights, grasps.symmetric[first])
-    found = choose_widths(rows, threads=threads)
-    rule = f"default: {found.rule} likelihood of the first {found.rows} successes"
+    return Rows.of(grasps.poses[first], weights, grasps.symmetric[first])
+
+
+def _told(found: ChosenWidths, count: int) -> KernelInfo:
+    """Widths that the first ``count`` rows have chosen."""
+    rule = f"default: {found.rule} likelihood of the first {count} successes"
     if found.rule == "default":
-        rule = f"default: the first {found.rows} successes lie in one block, so that none can be left out"
-    return stored_kernel.isotropic_info(found.kernel, rule)
+        rule = f"default: the first {count} successes lie in one block, so that none can be left out"
+    return stored_kernel.isotropic_info(IsotropicKernel(found.sigma_position_m, found.sigma_rotation), rule)
 
 
 def _info(choice: KernelChoice) -> KernelInfo:

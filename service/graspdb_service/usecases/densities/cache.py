@@ -22,6 +22,7 @@ from graspdb_service.trial_columns import gripper_parts
 from graspdb_service.usecases.densities import build, proposal_density, stored_kernel
 from graspdb_service.usecases.densities.build import Built, Fresh, KernelChoice
 from graspdb_service.usecases.densities.weighing import Weighing, codes_of, fetch_tried, mixes
+from graspdb_service.usecases.densities.widths.choosing import WidthChoosing
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.runtime.asked import or_kept
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
@@ -77,6 +78,7 @@ class Densities:
         self.selections = selections
         self._compute = compute
         self._features = features
+        self.widths = WidthChoosing(database)
         self.kept: SingleFlightCache[tuple[tuple[int, TrialSelection, int | None], KernelChoice], Built]
         self.kept = SingleFlightCache(max_bytes, lambda built: built.nbytes)
         self._found: OrderedDict[tuple[int, str | None, str], KernelRow] = OrderedDict()
@@ -186,4 +188,6 @@ class Densities:
         threads = self._compute.threads
         axes = None if stored is None else stored_kernel.axes(stored.alignment, selected, self._features)
         fresh = Fresh(rows, weighing, attempts)
-        return self._compute.run(lambda: build.build(kernel, stored, axes, selected, fresh, before, threads))
+        return self._compute.run(
+            lambda: build.build(kernel, stored, axes, selected, fresh, before, self.widths, threads)
+        )

@@ -1,0 +1,1 @@
+"""Widths that the rows themselves choose, once for all replicas."""
