@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import NormalDist
 from types import FrameType
@@ -24,11 +24,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 
 from graspdb.client import Client
 from graspdb.errors import Conflict, GraspDBError, Infeasible
+from graspdb.poses import matrices
 from graspdb.processes import ChildProcess
 from graspdb.resources.objects import GraspObject
 from graspdb.resources.results import Grasp
@@ -45,6 +47,8 @@ LOG_LINES = 15
 START_S = 120.0
 STOP_S = 10.0
 VIEWER_PORT = 8080
+PICTURES = Path("demo")
+"""Where pictures are left, if no folder is named."""
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 # The workspace: the mug stands on a table half a metre in front of the robot, turned by 30 degrees, and
@@ -178,7 +182,10 @@ def demo(
     ] = None,
     port: Annotated[int | None, typer.Option(help="Of the service; by default 8000 or a free one.")] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="Keep database and logs there; by default they are scratch.")
+        Path | None,
+        typer.Option(
+            help="Keep database, logs and pictures there; by default they are scratch, pictures in demo/."
+        ),
     ] = None,
 ) -> None:
     """From nothing to a best grasp: service, worker, real physics, density, queries and a check of them."""
@@ -193,7 +200,8 @@ def demo(
             _folder(folder) as place,
             _running(place, port, processes or _cores(), console) as (db, children),
         ):
-            lines = [_grasp_example(db, children, name, max_poses, console) for name in names]
+            pictures = PICTURES if folder is None else place
+            lines = [_grasp_example(db, children, name, max_poses, console, pictures) for name in names]
             console.rule("Summary")
             for line in lines:
                 console.print(line)
@@ -277,7 +285,9 @@ def _wait(sweep: Sweep, children: Children, title: str) -> Sweep:
         return sweep.wait(progress=report)
 
 
-def _grasp_example(db: Client, children: Children, name: str, max_poses: int, console: Console) -> str:
+def _grasp_example(
+    db: Client, children: Children, name: str, max_poses: int, console: Console, pictures: Path
+) -> str:
     """Sweep, density, queries and check of one object; the line for the summary."""
     console.rule(name)
     item = db.add_example(name)
@@ -301,8 +311,11 @@ def _grasp_example(db: Client, children: Children, name: str, max_poses: int, co
         f" {kernel.sigma_position_m * 1000:.1f} mm and {kernel.sigma_rotation_deg:.1f}°"
         f" ({kernel.rule}), effective sample size {density.effective_sample_size:,.0f}."
     )
-    console.print(f"\n[bold]Best grasp overall[/]\n{_grasp(item.best_grasp())}")
-    console.print(f"\n{_in_workspace(item)}\n")
+    overall = item.best_grasp()
+    console.print(f"\n[bold]Best grasp overall[/]\n{_grasp(overall)}")
+    said, within = _in_workspace(item, overall)
+    console.print(f"\n{said}\n")
+    _picture({"overall": overall, "workspace": within}, item.id, pictures, console)
     console.print(f"{_reports(item)}\n")
     shares = _check(item, children, console)
     return (
@@ -321,8 +334,10 @@ def _grasp(grasp: Grasp) -> str:
     return "\n".join(f"  {escape(name)}: {escape(value)}" for name, value in grasp.summary().items())
 
 
-def _in_workspace(item: GraspObject) -> str:
-    """The best grasp of the object as it stands on a table, within the box that the gripper reaches."""
+def _in_workspace(item: GraspObject, overall: Grasp) -> tuple[str, Grasp | None]:
+    """The best grasp of the object as it stands on a table, within the box that the gripper reaches, in words
+    that say why it is not the best one ``overall``.
+    """
     mesh = item.info.mesh
     height = 0.0 if mesh is None else -mesh.bounding_box.lower[2]
     half = math.radians(TURN_DEG) / 2
@@ -340,8 +355,36 @@ def _in_workspace(item: GraspObject) -> str:
             approach_cone_deg=WORKSPACE_CONE_DEG,
         )
     except Infeasible as error:
-        return f"{title}\n  {escape(str(error))}"
-    return f"{title}\n{_grasp(best)}"
+        return f"{title}\n  {escape(str(error))}", None
+    place = matrices(pose[:3], pose[3:]) @ overall.tool_matrix
+    return f"{title}\n{_grasp(best)}\n  {_why_not(place)}", best
+
+
+def _why_not(place: NDArray[np.float64]) -> str:
+    """What of the workspace the tool (4, 4), in the world, is outside of."""
+    away = math.degrees(math.acos(np.clip(place[:3, 2] @ np.array(WORKSPACE_APPROACH), -1.0, 1.0)))
+    lower, upper = np.array(WORKSPACE_BOX)
+    out = np.maximum(lower - place[:3, 3], place[:3, 3] - upper).max()
+    broken = []
+    if away > WORKSPACE_CONE_DEG:
+        broken.append(f"approaches at {away:.0f}° to straight down ({WORKSPACE_CONE_DEG:g}° is allowed)")
+    if out > 0.0:
+        broken.append(f"has the tool {1000 * out:.0f} mm outside of the box")
+    return f"The best grasp overall {' and '.join(broken)}." if broken else "It is the best grasp overall."
+
+
+def _picture(grasps: Mapping[str, Grasp | None], name: str, folder: Path, console: Console) -> None:
+    """Pictures of grasps, seen alike, where the service draws any."""
+    drawn = []
+    for title, grasp in grasps.items():
+        target = folder / f"{name}-{title}.png"
+        with contextlib.suppress(GraspDBError):
+            if grasp is not None:
+                folder.mkdir(exist_ok=True)
+                target.write_bytes(grasp.picture(width=960, height=720, azimuth_deg=-60.0, elevation_deg=8.0))
+                drawn.append(str(target))
+    if drawn:
+        console.print(f"Pictures of {'both' if len(drawn) == 2 else 'it'}: {escape(', '.join(drawn))}\n")
 
 
 def _reports(item: GraspObject) -> str:

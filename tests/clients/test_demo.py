@@ -66,6 +66,11 @@ def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(
     assert process.poll() is None, out
     assert "Simulated 20,000 poses" in out
     assert out.index("Best grasp overall") < out.index("Best grasp in a workspace")
+    # From below, where the table is.
+    assert re.search(r"The best grasp overall approaches at 1\d\d° to straight down \(60° is allowed\)", out)
+    pictures = [tmp_path / f"mug-{name}.png" for name in ("overall", "workspace")]
+    assert f"Pictures of both: {pictures[0]}, {pictures[1]}" in out
+    assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
     assert re.search(r"Tolerance: A good grasp forgives .*\d+ (mm|deg)", out)
     assert re.search(r"Convergence: \d+ successful grasps are ", out)
     assert re.search(
