@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,11 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from graspdb.wire import Pose
 from graspdb.wire.presets.grippers import PRESETS
 from graspdb_simworker import cli
-from graspdb_simworker.inspection import inputs, pictures
+from graspdb_simworker.inspection import inputs, motions, pictures
+from graspdb_simworker.simulation import chunks
 
 
 def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -86,6 +90,40 @@ def test_a_film_shows_the_object_swing(tmp_path: Path, monkeypatch: pytest.Monke
         frames.seek(frames.n_frames - 1)  # type: ignore[attr-defined]
         last = np.asarray(frames.convert("RGB"), dtype=int)
     assert (np.abs(first - last).max(axis=2) > 60).mean() > 0.05
+
+
+@pytest.mark.parametrize("protocol", ["wrench", "lift"])
+def test_a_motion_is_that_of_the_label(tmp_path: Path, protocol: str) -> None:
+    payload, parts = inputs.load("mug", "pg70", protocol=protocol)
+    pose = Pose(position=(0.0, 0.028, 0.035), quaternion_xyzw=(1.0, 0.0, 0.0, 0.0))
+    with closing(chunks.prepare(payload, parts)) as unwatched:
+        position, quaternion = np.array([pose.position]), np.array([pose.quaternion_xyzw])
+        _, travel = unwatched.classify(position, quaternion)
+        label = unwatched.simulate(position[0], quaternion[0], float(travel[0]))
+    moved = motions.motion(payload, parts, pose)
+    # To the last bit: watching changes nothing.
+    assert (moved["outcome"], moved["width_m"]) == (label.outcome.name.lower(), label.width_m)
+    times, fingers = np.array(moved["times_s"]), np.array(moved["fingers_m"])
+    assert times[0] == 0.0
+    assert (np.diff(times) > 0).all()
+    assert fingers[0].tolist() == [0.035, 0.035]
+    # The way there is as fast as the fingers are; then the mug, held off its middle, moves in the jaw.
+    assert times[1] == pytest.approx(
+        (fingers[0, 0] - fingers[1, 0]) / payload.gripper.max_speed_m_s, rel=0.05
+    )
+    places = np.array(moved["position"])
+    assert np.linalg.norm(places[1] - places[0]) < 2e-4
+    assert np.linalg.norm(places[-1] - places[0]) > 1e-3
+    assert np.linalg.norm(moved["quaternion_xyzw"], axis=1) == pytest.approx(1.0)
+
+
+def test_a_motion_is_written_and_none_where_geometry_decides(tmp_path: Path) -> None:
+    out = tmp_path / "motion.json"
+    far = ["show", "mug", "--position", "0,0,1", "--out", str(out)]
+    done = CliRunner().invoke(cli.app, far)
+    assert done.exit_code == 0, done.output
+    assert json.loads(out.read_text())["outcome"] == "missed"
+    assert json.loads(out.read_text())["times_s"] == []
 
 
 def test_pictures_are_written_as_they_are(tmp_path: Path) -> None:
