@@ -21,6 +21,7 @@ from graspdb.wire import SweepInfo, TrialOut
 _WORKER = "graspdb-simworker"
 _PATIENCE_S = 120.0
 _ALIKE_M = 1e-7
+"""Rows of sweeps have widths to this."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,8 @@ _POINT = 0.006
 """Size of a cloud's points, of the object's diagonal."""
 _SEED = 1
 """Of the draws, so that a link shows the same ones."""
-_OPACITY = 0.2
-"""So that the object is seen through thousands of them."""
+_OPACITY, _OF_FEW, _FEW = 0.2, 0.8, 100
+"""So that the object is seen through thousands of them, and few of them are seen themselves."""
 _DARK = -3.0
 """Common logarithm of the relative density that is as dark as none."""
 
@@ -92,7 +92,8 @@ class GraspsPanel:
         else:
             whole = view.drawn == "gripper"
             shape = shapes.gripper(subject.profile) if whole else shapes.jaw(subject.profile)
-            node = page.instances(f"{OBJECT}/grasps", shape, there, painted, lod="off", opacity=_OPACITY)
+            opacity = max(_OPACITY, _OF_FEW * min(1.0, _FEW / len(painted)))
+            node = page.instances(f"{OBJECT}/grasps", shape, there, painted, lod="off", opacity=opacity)
         page.replace("grasps", node)
         unknown = int(np.sum(~np.isfinite(values)))
         grey = f" Grey: unknown, too far from every attempt ({unknown:,})." if unknown else ""

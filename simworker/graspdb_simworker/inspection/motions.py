@@ -23,7 +23,8 @@ def motion(payload: SimulatePayload, parts: Sequence[Part], pose: Pose) -> dict[
     ``times_s`` begin where the fingers start from wide open; ``fingers_m`` is how far the finger at +y and
     that at -y are from the middle; ``position`` and ``quaternion_xyzw`` are of the object frame in the tool
     frame, which stands still. Labels do not depend on what ran before, so the same pose, object and gripper
-    have the same motion as in a sweep. No moments where the geometry decides.
+    have the same motion as in a sweep. No moments where the geometry decides. ``width_m`` is less than the
+    fingers' last distance by Bullet's margins, which inflate the hulls that it lets touch.
     """
     with closing(chunks.prepare(payload, parts, moments_every_s=MOMENTS_EVERY_S)) as workpiece:
         position, quaternion = np.array([pose.position]), np.array([pose.quaternion_xyzw])
