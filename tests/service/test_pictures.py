@@ -80,7 +80,7 @@ def test_what_cannot_be_drawn_is_refused(
         ({"position": "0,0,0"}, "give both"),
         ({"opening_m": 0.01}, "opening_m is of a grasp"),
         ({**GRASP, "gripper": "pg70", "opening_m": 0.5}, "pg70 opens"),
-        ({"width": 5_000}, "1600"),
+        ({"width": 5_000}, "1280"),
         ({"elevation_deg": 90}, "85"),
     ):
         answer = _picture(sqlite_http, slug, **params)

@@ -829,9 +829,9 @@ class PictureQuery(TrialSelection):
     opening_m: Annotated[float, Field(ge=0, le=2)] | None = None
     """How far open the jaw is, metres; by default closed as far as the object lets it, and wide open where
     nothing is between the fingers or they collide."""
-    width: Annotated[int, Field(ge=16, le=1_600)] = 480
+    width: Annotated[int, Field(ge=16, le=1_280)] = 480
     """Width of the picture in pixels."""
-    height: Annotated[int, Field(ge=16, le=1_200)] = 360
+    height: Annotated[int, Field(ge=16, le=960)] = 360
     """Height of the picture in pixels."""
     azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     """Where it is seen from, degrees about the object's z axis from its x axis; by default from where the

@@ -37,7 +37,8 @@ _GAMMA = 2.2
 _LIFTED = 2e-4
 """Light is looked for from so far above the surface, in sizes of the scene: else it would shade itself."""
 _RAYS = 65_536
-"""Rays between two breaths."""
+"""Rays at a time, between two breaths."""
+_FAR = 1e6
 
 
 class Seen(NamedTuple):
@@ -77,63 +78,58 @@ class Stage:
 
     def counted(self, view: View, width: int, height: int) -> Ints:
         """How many pixels of a picture of this size each body would have."""
-        triangle = self._seen(view, width, height).triangle
+        triangle = self._seen(view, width, height, np.arange(width * height)).triangle
         return np.bincount(self._body[triangle[triangle >= 0]], minlength=len(self._colours))
 
     def draw(self, view: View, width: int, height: int) -> Bytes:
         """A picture (height, width, 3)."""
         wide, high = _SAMPLES * width, _SAMPLES * height
-        seen = self._seen(view, wide, high)
-        hit = np.flatnonzero(seen.triangle >= 0)
-        shade = np.linspace(0.0, 1.0, high)[:, None, None] ** 1.5
-        light = np.broadcast_to((1 - shade) * _TOP**_GAMMA + shade * _BOTTOM**_GAMMA, (high, wide, 3)).copy()
-        flat = light.reshape(-1, 3)
-        flat[hit] = self._shaded(view, seen, hit, wide)
+        shade = np.linspace(0.0, 1.0, high)[:, None] ** 1.5
+        rows = (1 - shade) * _TOP**_GAMMA + shade * _BOTTOM**_GAMMA
+        light = np.repeat(rows.astype(np.float32), wide, axis=0)
         bodies = np.full(wide * high, -1)
-        bodies[hit] = self._body[seen.triangle[hit]]
-        flat[_edges(bodies, seen.far, (high, wide))] = _OUTLINE
+        far = np.full(wide * high, _FAR, dtype=np.float32)
+        # By parts, so that a large picture takes little memory beside its own.
+        for start in range(0, wide * high, _RAYS):
+            places = np.arange(start, min(start + _RAYS, wide * high))
+            seen = self._seen(view, wide, high, places)
+            hit = np.flatnonzero(seen.triangle >= 0)
+            row, column = np.divmod(places[hit], wide)
+            share = (row % _SAMPLES) * _SAMPLES + column % _SAMPLES
+            light[places[hit]] = self._shaded(view, seen, hit, share)
+            bodies[places[hit]], far[places[hit]] = self._body[seen.triangle[hit]], seen.far[hit]
+        light[_edges(bodies, far, (high, wide))] = _OUTLINE
         smooth = light.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
         return np.asarray(np.rint(255.0 * np.clip(smooth, 0.0, 1.0) ** (1 / _GAMMA)), dtype=np.uint8)
 
     def _scaled(self, points: Floats) -> Singles:
         return np.ascontiguousarray((points - self._middle) / self._size, dtype=np.float32)
 
-    def _seen(self, view: View, width: int, height: int) -> Seen:
-        """What rays through the middles of all pixels meet, (height * width,) each."""
+    def _seen(self, view: View, width: int, height: int, places: Ints) -> Seen:
+        """What rays through the middles of some pixels (n,) meet, counted row by row from above."""
+        self._breathe()
         tangent = math.tan(math.radians(0.5 * FIELD_OF_VIEW_DEG))
-        x = (2 * np.arange(width) + 1 - width) / height * tangent
-        y = (height - 1 - 2 * np.arange(height)) / height * tangent
-        across, along = np.meshgrid(x, y)
+        row, column = np.divmod(places[:, None], width)
+        across = (2 * column + 1 - width) / height * tangent
+        along = (height - 1 - 2 * row) / height * tangent
         right, up, towards = view.axes
-        ways = across[..., None] * right + along[..., None] * up - towards
-        ways = _unit(ways.reshape(-1, 3)).astype(np.float32)
-        eye = np.broadcast_to(self._scaled(np.asarray(view.eye)), ways.shape)
-        parts = []
-        for start in range(0, len(ways), _RAYS):
-            self._breathe()
-            some = slice(start, start + _RAYS)
-            found = self._scene.run(
-                np.ascontiguousarray(eye[some]), ways[some], query="INTERSECT", output=True
-            )
-            parts.append(found)
-        columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return Seen(columns["primID"], columns["tfar"], columns["u"], columns["v"], ways)
+        ways = _unit(across * right + along * up - towards).astype(np.float32)
+        eyes = np.tile(self._scaled(np.asarray(view.eye)), (len(ways), 1))
+        found = self._scene.run(eyes, ways, query="INTERSECT", output=True)
+        return Seen(found["primID"], found["tfar"], found["u"], found["v"], ways)
 
-    def _shaded(self, view: View, seen: Seen, hit: Ints, wide: int) -> Singles:
-        """Light (n, 3) of the samples that hit something, linear."""
+    def _shaded(self, view: View, seen: Seen, hit: Ints, share: Ints) -> Singles:
+        """Light (n, 3) of the samples that hit something, linear; ``share`` is each one's of the directions."""
         triangle = seen.triangle[hit]
         u, v, ways = seen.u[hit, None], seen.v[hit, None], seen.ways[hit]
-        shares = (1 - u - v, u, v)
-        points = sum(share * self._corners[triangle, k] for k, share in enumerate(shares))
-        normal = _unit(sum(share * self._normals[triangle, k] for k, share in enumerate(shares)))
+        within = (1 - u - v, u, v)
+        points = sum(part * self._corners[triangle, k] for k, part in enumerate(within))
+        normal = _unit(sum(part * self._normals[triangle, k] for k, part in enumerate(within)))
         face = self._flat[triangle]
         # Both sides of an open surface are seen.
         back = np.einsum("nc,nc->n", face, ways) > 0
         normal[back], face[back] = -normal[back], -face[back]
         start = points + _LIFTED * face
-        # Samples in a pixel are told apart by their place: each has its own share of the directions.
-        row, column = np.divmod(hit, wide)
-        share = (row % _SAMPLES) * _SAMPLES + column % _SAMPLES
         sky, lamp = self._directions(view)
         lit = np.empty((len(hit), 1), dtype=np.float32)
         for k in range(_SAMPLES**2):
@@ -173,19 +169,16 @@ class Stage:
             way = np.array([x, y, z])
             cosine = np.where(face @ way > 0, normal @ way, 0.0)
             facing = np.flatnonzero(cosine > 0)
-            for first in range(0, len(facing), _RAYS):
-                self._breathe()
-                some = facing[first : first + _RAYS]
-                ways = np.tile(way, (len(some), 1))
-                free = self._scene.run(start[some], ways, query="OCCLUDED") < 0
-                found[some] += np.where(free, strength * cosine[some], 0.0)
+            self._breathe()
+            ways = np.tile(way, (len(facing), 1))
+            free = self._scene.run(start[facing], ways, query="OCCLUDED") < 0
+            found[facing] += np.where(free, strength * cosine[facing], 0.0)
         return found
 
 
 def _edges(bodies: Ints, far: Singles, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Where one surface ends and another begins, (n,)."""
-    far = np.where(bodies < 0, 1e6, far).reshape(shape)
-    bodies = bodies.reshape(shape)
+    far, bodies = far.reshape(shape), bodies.reshape(shape)
     edge = np.zeros(shape, dtype=bool)
     for axis in (0, 1):
         inner = tuple(slice(1, None) if k == axis else slice(None) for k in (0, 1))

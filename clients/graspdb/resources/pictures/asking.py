@@ -18,7 +18,7 @@ _IN_NOTEBOOKS: dict[str, Any] = {"width": 320, "height": 240, "timeout_s": 10.0}
 class PictureOptions(TypedDict, total=False):
     """What a picture shows, and from where.
 
-    - ``width``, ``height``: pixels, by default 480 and 360; at most 1,600 and 1,200.
+    - ``width``, ``height``: pixels, by default 480 and 360; at most 1,280 and 960.
     - ``azimuth_deg``, ``elevation_deg``: from where it is seen, about the object's z from its x, and above
       its x-y plane; by default from where the fingers are seen best.
     - ``opening_m``: how far open the jaw is; by default closed on the object.
