@@ -119,7 +119,7 @@ class Stage:
         return Seen(found["primID"], found["tfar"], found["u"], found["v"], ways)
 
     def _shaded(self, view: View, seen: Seen, hit: Ints, share: Ints) -> Singles:
-        """Light (n, 3) of the samples that hit something, each with its ``share`` of the directions, linear."""
+        """Linear light (n, 3) of samples that hit something, each with its ``share`` of the directions."""
         triangle = seen.triangle[hit]
         u, v, ways = seen.u[hit, None], seen.v[hit, None], seen.ways[hit]
         within = (1 - u - v, u, v)
