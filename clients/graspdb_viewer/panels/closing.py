@@ -15,6 +15,7 @@ from graspdb.wire import GripperProfile
 from graspdb_viewer.motion import Motion
 from graspdb_viewer.page import OBJECT, Page, put, wxyz
 from graspdb_viewer.scene import colours, shapes
+from graspdb_viewer.scene.shapes import Shape
 
 GRIPPER = f"{OBJECT}/gripper"
 _CLOSES_S = 1.2
@@ -38,6 +39,7 @@ class Closing:
         self._end_m: float | None = None
         self._pose: Poses | None = None
         self._moving = threading.Lock()
+        self._parts: dict[str, object] = {}
         self._slider.on_update(lambda event: self._draw() if event.client_id is not None else None)
         self._button.on_click(self._move)
 
@@ -67,9 +69,7 @@ class Closing:
             frame = self._page.client.scene.add_frame(GRIPPER, show_axes=False)
             self._page.replace("gripper", frame)
         frame.position, frame.wxyz, frame.visible = pose.position[0], wxyz(pose.quaternion_xyzw[0]), True
-        self._page.replace(
-            "palm", self._page.solid(f"{GRIPPER}/palm", shapes.palm(profile), _STEEL, opacity=_SEEN_THROUGH)
-        )
+        self._put("palm", shapes.palm(profile), _STEEL, opacity=_SEEN_THROUGH)
         self._draw()
 
     def replay(self, motion: Motion, shown: Callable[[], bool]) -> None:
@@ -118,8 +118,15 @@ class Closing:
     def _fingers(self, profile: GripperProfile, left: float, right: float) -> None:
         """Either finger as far from the middle as with the jaw so far open, metres."""
         for part, side, opening in (("left", 1.0, left), ("right", -1.0, right)):
-            shape = shapes.finger(profile, side, opening)
-            self._page.replace(part, self._page.solid(f"{GRIPPER}/{part}", shape, self._colour))
+            self._put(part, shapes.finger(profile, side, opening), self._colour)
+
+    def _put(self, part: str, shape: Shape, colour: tuple[int, int, int], **options: Any) -> None:
+        """Show a part of the gripper; the same one stays: a drag moves the whole ten times a second."""
+        key = (shape.vertices.tobytes(), colour)
+        if part in self._page.nodes and self._parts.get(part) == key:
+            return
+        self._page.replace(part, self._page.solid(f"{GRIPPER}/{part}", shape, colour, **options))
+        self._parts[part] = key
 
     def _move(self, _: Any) -> None:
         """Close until the fingers touch, as far as that is known, or open again."""
