@@ -87,7 +87,7 @@ class Page:
             shape.faces,
             batched_wxyzs=wxyz(poses.quaternion_xyzw),
             batched_positions=poses.position,
-            batched_colors=colours,
+            batched_colors=_linear(colours),
             flat_shading=True,
             cast_shadow=False,
             receive_shadow=False,
@@ -98,6 +98,11 @@ class Page:
         """One shape."""
         options = {"flat_shading": True, "cast_shadow": False, "receive_shadow": False, **options}
         return self.client.scene.add_mesh_simple(path, shape.vertices, shape.faces, color=colour, **options)
+
+
+def _linear(colours: Any) -> NDArray[np.uint8]:
+    """Colours (n, 3) or (3,) by their light, as viser takes those of instances, and those alone."""
+    return np.rint(255.0 * (np.asarray(colours) / 255.0) ** 2.2).astype(np.uint8)
 
 
 def put(control: Any, value: Any) -> None:
