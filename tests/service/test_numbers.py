@@ -216,6 +216,7 @@ def test_no_number_breaks_an_answer(asked: httpx.Client) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1_800)
 def test_not_one_number_breaks_an_answer(
     http: httpx.Client, post: Post, put_box: Put, two_clusters: Poses
 ) -> None:
