@@ -257,7 +257,7 @@ def opened(
         raise problem(
             source.name,
             f"is {kind.name}, whose poses are in the {kind.reference}'s frame: give the object's pose in it"
-            f" {_WHERE_OBJECT}",
+            f" {_WHERE_OBJECT}{kind.also}",
         )
     profile = gripper.profile if isinstance(gripper, GripperInfo) else gripper
     assumed: list[str] = []

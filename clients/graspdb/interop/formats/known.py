@@ -19,7 +19,8 @@ TIPS = "tips"
 class Format:
     """A format: who reads it, and what its poses are of; None where the format does not say.
 
-    ``reference`` is what the poses are in, ``rule`` how its score becomes an outcome where nobody says.
+    ``reference`` is what the poses are in, ``rule`` how its score becomes an outcome where nobody says,
+    ``also`` what else such a file is asked for.
     """
 
     name: str
@@ -31,15 +32,23 @@ class Format:
     rule: Rule | None = None
     assumed: str | None = None
     table: bool = False
+    also: str = ""
 
 
 _HDF5 = Format("acronym", acronym.read_hdf5, "base", "acronym")
 _ACRONYM_JSON = Format("acronym", acronym.read_json, "base", "acronym")
 _GRASPGEN = Format("graspgen", acronym.read_graspgen, "base", "graspgen")
 _ISAAC = Format("isaac", isaac.read, None, None, rule=Rule(isaac.CONFIDENCE, 0.5))
-_GRASPNET = Format("graspnet", graspnet.read_array, TIPS, "graspnet", reference="camera")
+_GRASPNET = Format(
+    "graspnet", graspnet.read_array, TIPS, "graspnet", reference="camera",
+    also="; its scores are no outcomes: --success-from score --success-above X, too; and of several objects"
+    " it takes one: --only object_id=N",
+)  # fmt: skip
 _LABELS = Format("graspnet", graspnet.read_labels, TIPS, "graspnet")
-_VGN = Format("vgn", tables.read_vgn, TIPS, "vgn", reference="scene")
+_VGN = Format(
+    "vgn", tables.read_vgn, TIPS, "vgn", reference="scene",
+    also="; and of several scenes it takes one: --only scene_id=ID",
+)  # fmt: skip
 _MULTIGRIPPER = Format("multigrippergrasp", messages.read_multigripper, "base", None)
 _MOVEIT = Format("moveit", messages.read_moveit, "flange", "graspdb")
 _BAG_GRASPS = Format("rosbag", rosbags.read_grasps, "flange", "graspdb")
