@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -168,11 +168,19 @@ def acronym(db: Client, path: Path, tools: np.ndarray) -> None:
     files.acronym_h5(path, bases, [i % 2 for i in range(len(bases))])
 
 
-@pytest.mark.usefixtures("worker")
+@pytest.fixture
+def without_mug(db: Client) -> Iterator[None]:
+    """The service has none, before and after: other tests type what makes one, too."""
+    with suppress(NotFound):
+        db.objects.get("mug").delete()
+    yield
+    db.objects.get("mug").delete()
+
+
+@pytest.mark.usefixtures("worker", "without_mug")
 def test_the_quick_start_runs(db: Client, tmp_path: Path) -> None:
     """As a newcomer types it, on an object that is not there before."""
     page = DOCS / "quick-start.md"
-    _without_mug(db)
     said = [typed(block, tmp_path, GRASPDB_URL=db.url) for _, block in blocks(page, "bash")]
     assert len(said) == 4
     assert (tmp_path / "mug.png").stat().st_size > 10_000
@@ -184,6 +192,7 @@ def test_the_quick_start_runs(db: Client, tmp_path: Path) -> None:
     assert f"{names['best'].world[2, 3]:.4f}" in said[2]
 
 
+@pytest.mark.usefixtures("without_mug")
 def test_what_is_typed_about_grippers_and_files_runs(db: Client, tmp_path: Path) -> None:
     where = {"GRASPDB_URL": db.url}
     parts = [trimesh.Trimesh(v, f) for v, f in example("mug").parts]
@@ -191,7 +200,6 @@ def test_what_is_typed_about_grippers_and_files_runs(db: Client, tmp_path: Path)
     left = FINGER.format(name="left", side=1, middle=0.005, mimic="")
     right = FINGER.format(name="right", side=-1, middle=-0.005, mimic='<mimic joint="left_joint"/>')
     (tmp_path / "gripper.urdf").write_text(GRIPPER.format(left=left, right=right))
-    _without_mug(db)
     known = db.add_example("mug")
     drawn = known.proposals(40, strategy="edges", gripper="panda", seed=1)
     acronym(db, tmp_path / "Mug_10f6.h5", matrices(*as_poses(drawn.poses)))
@@ -207,11 +215,6 @@ def test_what_is_typed_about_grippers_and_files_runs(db: Client, tmp_path: Path)
     for _, block in others:
         typed(block, tmp_path, **where)
     assert pq.read_table(tmp_path / "mug.parquet").num_rows == 40
-
-
-def _without_mug(db: Client) -> None:
-    with suppress(NotFound):
-        db.objects.get("mug").delete()
 
 
 @pytest.mark.parametrize("name", ["deploying", "operations"])
