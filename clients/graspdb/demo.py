@@ -370,15 +370,19 @@ def _why_not(place: NDArray[np.float64]) -> str:
         broken.append(f"approaches at {away:.0f}° to straight down ({WORKSPACE_CONE_DEG:g}° is allowed)")
     if out > 0.0:
         broken.append(f"has the tool {1000 * out:.0f} mm outside of the box")
-    return f"The best grasp overall {' and '.join(broken)}." if broken else "It is the best grasp overall."
+    return (
+        f"The best grasp overall {' and '.join(broken)}."
+        if broken
+        else "The best grasp overall lies within it, too."
+    )
 
 
 def _picture(grasps: Mapping[str, Grasp | None], name: str, folder: Path, console: Console) -> None:
-    """Pictures of grasps, seen alike, where the service draws any."""
+    """Pictures of grasps, seen alike, where the service draws any and they can be kept."""
     drawn = []
     for title, grasp in grasps.items():
         target = folder / f"{name}-{title}.png"
-        with contextlib.suppress(GraspDBError):
+        with contextlib.suppress(GraspDBError, OSError):
             if grasp is not None:
                 folder.mkdir(exist_ok=True)
                 target.write_bytes(grasp.picture(width=960, height=720, azimuth_deg=-60.0, elevation_deg=8.0))

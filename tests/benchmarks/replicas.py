@@ -14,7 +14,6 @@ that is built to the database, and to read it there.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import pickle
 import statistics
 import sys
@@ -28,6 +27,7 @@ from typing import Any
 import httpx
 import numpy as np
 import psycopg
+import service_queries as queries
 
 from graspdb.wire import Selection
 from graspdb_density import choose_widths
@@ -46,18 +46,6 @@ from small_disk import Guard
 SIZES = (2_000, 20_000, 160_000)
 ROUNDS = 25
 BOX = {"box_min": "-0.1,-0.1,0.0", "box_max": "0.2,0.2,0.2"}
-
-
-def _neighbour(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-queries = _neighbour("service_queries")
 
 
 class Follow:

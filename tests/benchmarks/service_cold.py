@@ -12,7 +12,6 @@ own figure for the density.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import statistics
 import tempfile
 import time
@@ -21,6 +20,7 @@ from typing import Any
 
 import httpx
 import numpy as np
+import service_queries as queries
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb_density import se3
@@ -34,18 +34,6 @@ TRIALS, SUCCESSES = 3_500_000, 167_000
 BATCH = 250_000
 ROUNDS = 5
 SLUG = "cold"
-
-
-def _neighbour(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(f"benchmark_{name}", Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-queries = _neighbour("service_queries")
 
 
 def attempts(count: int, rng: np.random.Generator) -> TrialColumns:
