@@ -67,7 +67,7 @@ def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(
     assert "Simulated 20,000 poses" in out
     assert out.index("Best grasp overall") < out.index("Best grasp in a workspace")
     # From below, where the table is.
-    assert re.search(r"The best grasp overall approaches at 1\d\d° to straight down \(60° is allowed\)", out)
+    assert re.search(r"The best grasp overall approaches at 1\d\d° to straight down \(30° is allowed\)", out)
     pictures = [tmp_path / f"mug-{name}.png" for name in ("overall", "workspace")]
     assert f"Pictures of both: {pictures[0]}, {pictures[1]}" in out
     assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
