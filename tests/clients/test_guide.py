@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import ast
-import asyncio
-import inspect
 import io
-import os
 import re
 import runpy
 import shlex
-import subprocess
-import sys
-import types
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +15,6 @@ import matplotlib
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import tomllib
 import trimesh
 import yaml
 
@@ -35,9 +27,8 @@ from graspdb.figures.grippers.explained import render_explained
 from graspdb.interop.frames import to_tool
 from graspdb.poses import as_poses, matrices
 from graspdb.wire.presets.grippers import PRESETS
+from pages import DOCS, ROOT, blocks, execute, pages, typed
 
-ROOT = Path(__file__).resolve().parents[2]
-DOCS = ROOT / "docs"
 URL = "http://127.0.0.1:8000"
 DATABASE = "postgresql://user@host/graspdb"
 GRIPPER = """<robot name="mine"><link name="base"><visual><origin xyz="0 0 0.03"/>
@@ -49,49 +40,10 @@ FINGER = """<link name="{name}"><visual><origin xyz="0 {middle} 0.025"/>
 <limit lower="0" upper="0.04" effort="60" velocity="0.1"/>{mimic}</joint>"""
 
 
-def pages() -> list[Path]:
-    """The site's pages that are written by hand, in its order."""
-    chapters = tomllib.loads((ROOT / "zensical.toml").read_text(encoding="utf-8"))["project"]["nav"]
-    entries = [entry for chapter in chapters for entry in chapter.values()]
-    names = [name for entry in entries for name in (entry if isinstance(entry, list) else [entry])]
-    return [DOCS / name for name in names if not name.startswith("reference/")]
-
-
 #: The concepts speak of trials, which a how-to posts.
 GUIDE = sorted(
     (page for page in pages() if page.parent.name == "guide"), key=lambda page: page.stem != "trials"
 )
-
-
-def blocks(page: Path, language: str) -> list[tuple[int, str]]:
-    """The blocks of a language with the line that each starts on."""
-    text = page.read_text(encoding="utf-8")
-    found = re.finditer(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    return [(text[: match.start(1)].count("\n"), match.group(1)) for match in found]
-
-
-def execute(page: Path, line: int, block: str, names: dict[str, Any]) -> None:
-    """Run a block in a namespace; errors name the page's line."""
-    code = compile("\n" * line + block, str(page), "exec", ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
-    if code.co_flags & inspect.CO_COROUTINE:
-        asyncio.run(types.FunctionType(code, names)())
-    else:
-        exec(code, names)  # noqa: S102 - the guide is ours
-
-
-def typed(block: str, folder: Path, **environment: str) -> str:
-    """What a shell says to a block of commands, all of which must work; what installs is left out."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    done = subprocess.run(
-        ["sh", "-ec", re.sub(r"^pip install .*$", "", block, flags=re.MULTILINE)],
-        cwd=folder,
-        env={**os.environ, "PATH": path, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, block + done.stdout + done.stderr
-    return done.stdout
 
 
 class Robot:

@@ -193,13 +193,16 @@ def test_the_question_is_taken_elsewhere_and_another_object_is_chosen_by_its_pic
     question = opened.session.question
     opened.until(lambda: question.answered)
     opened.push("Copy the question")
-    opened.says("write to your clipboard")
+    for name, text in zip(("curl", "Python", "Command line"), question.spoken, strict=True):  # type: ignore[arg-type]
+        opened.push(f"Copy {name}")
+        opened.page.get_by_role("button", name="Copied").first.wait_for()
+        assert opened.page.evaluate("navigator.clipboard.readText()") == text
     with opened.page.expect_download() as coming:
         opened.push("Download best-grasp.sh")
     assert Path(coming.value.path()).read_text() == question.spoken.curl  # type: ignore[union-attr]
     opened.shot("elsewhere")
     opened.push("Close")
-    opened.page.get_by_text("write to your clipboard").wait_for(state="detached")
+    opened.page.get_by_text("Copied").first.wait_for(state="detached")
     opened.tab("Object")
     opened.says(f"Show {other}")
     opened.until(lambda: opened.page.locator("img").count() >= 2)

@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 
 from graspdb import Client
-from lab import ROOT, Compose, command, say, wait_for
+from lab import ROOT, Compose, Failed, command, say, wait_for
 from monitoring import Prometheus
 
 URL = "http://127.0.0.1:8000"
@@ -47,6 +47,7 @@ class Scenario:
         self.newer = newer
         self.guide = guide()
         self.done: list[str] = []
+        self.url = URL
         self.sweep = ""
         self.made = tempfile.TemporaryDirectory(prefix="graspdb-compose-")
         self.folder = Path(self.made.name)
@@ -113,7 +114,7 @@ class Scenario:
     # --- what has to hold
 
     def counts(self) -> dict[str, Any]:
-        with Client(URL) as db:
+        with Client(self.url) as db:
             listed = [item.info for item in db.objects.list()]
         return {info.id: (info.trials, dict(info.outcomes), info.revision) for info in listed}
 
@@ -322,9 +323,20 @@ class Scenario:
     def one_container(self) -> None:
         """The service on a SQLite file; a container that is made anew finds what the one before stored."""
         self.compose.down()
-        self.compose = Compose(**self.compose.variables)
+        kept = self.compose.variables
+        # Nothing starts where anybody is let in without a word of it; then at another address and port.
+        self.compose = Compose(**kept, GRASPDB_ADDRESS="0.0.0.0")
+        said = ""
+        try:
+            self.compose.up("secrets")
+        except Failed as error:
+            said = str(error)
+        assert "lets others in: say GRASPDB_AUTH" in said, said
+        self.compose.down()
+        self.compose = Compose(**kept, GRASPDB_ADDRESS="127.0.0.2", GRASPDB_PORT="8123")
+        self.url = "http://127.0.0.2:8123"
         self.follow("One container")
-        with Client(URL) as db:
+        with Client(self.url) as db:
             made = db.add_example("mug")
             made.trials.add([[0, 0, 0.05, 1, 0, 0, 0]], [True], gripper="pg70", source="robot")
             assert made.best_grasp().density > 0

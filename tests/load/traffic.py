@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import math
 import random
 import time
 import uuid
@@ -25,6 +26,8 @@ from graspdb.wire import OUTCOME_CODES
 OBJECTS = [f"object-{n}" for n in range(10)]
 SWEPT = "swept"
 CHUNK, CHUNKS = 20, 100
+#: A worker renews its leases so often at least, of those that jobs have by default.
+_PACE_S = 20.0
 #: The share of each kind among a client's requests.
 MIX = {"best-grasp": 0.55, "likelihood": 0.2, "density": 0.1, "trials": 0.1, "objects": 0.05}
 
@@ -87,8 +90,19 @@ class Traffic:
             await asyncio.gather(*actors)
         return self.seen
 
-    async def _ask(self, http: httpx.AsyncClient, kind: str, method: str, path: str, **sent: Any) -> Any:
-        """A request, noted; the answer's JSON, or None for an error. Then time to think."""
+    async def _ask(
+        self,
+        http: httpx.AsyncClient,
+        kind: str,
+        method: str,
+        path: str,
+        *,
+        longest_s: float = math.inf,
+        **sent: Any,
+    ) -> Any:
+        """A request, noted; the answer's JSON, or None for an error. Then time to think, ``longest_s`` at
+        most.
+        """
         started = time.monotonic()
         try:
             answer = await http.request(method, path, **sent)
@@ -99,12 +113,12 @@ class Traffic:
             self.seen.seconds.setdefault(kind, []).append(time.monotonic() - started)
         else:
             self.seen.errors[f"{kind}: {answer.status_code} {answer.text[:120]}"] += 1
-        await self._think(started)
+        await self._think(longest_s)
         return answer.json() if answer.is_success and answer.content else None
 
-    async def _think(self, started: float) -> None:
+    async def _think(self, longest_s: float) -> None:
         pause = random.expovariate(1.0 / self._think_s) if self._think_s else 0.0
-        await asyncio.sleep(max(0.0, min(pause, self._end - time.monotonic())))
+        await asyncio.sleep(max(0.0, min(pause, longest_s, self._end - time.monotonic())))
 
     async def _client(self, http: httpx.AsyncClient, number: int) -> None:
         rng = np.random.default_rng(number)
@@ -129,10 +143,12 @@ class Traffic:
                 await self._ask(http, kind, "GET", f"{at}/density" if kind == "density" else "/objects")
 
     async def _worker(self, http: httpx.AsyncClient, number: int) -> None:
-        """Claims, simulates nothing for a while, and hands in outcomes and rows."""
+        """Claims, simulates nothing for a while, and hands in outcomes and rows. Like a real worker it never
+        thinks so long that its lease ends.
+        """
         wish = {"worker": f"load-{number}", "capabilities": ["simulate"], "limit": 1}
         while time.monotonic() < self._end:
-            found = await self._ask(http, "claim", "POST", "/jobs/claim", json=wish)
+            found = await self._ask(http, "claim", "POST", "/jobs/claim", json=wish, longest_s=_PACE_S)
             for job in (found or {}).get("jobs", ()):
                 lease = {"lease_id": job["lease_id"]}
                 index = list(range(job["payload"]["start"], job["payload"]["stop"]))
@@ -140,7 +156,7 @@ class Traffic:
                 rows = {"pose_index": index, "width_m": [0.04] * len(index), "quality": [None] * len(index)}
                 result = {"outcomes": base64.b64encode(bytes(codes)).decode(), "rows": rows}
                 path = f"/jobs/{job['id']}"
-                await self._ask(http, "renew", "PUT", f"{path}/lease", params=lease)
+                await self._ask(http, "renew", "PUT", f"{path}/lease", params=lease, longest_s=_PACE_S)
                 await self._ask(http, "result", "PUT", f"{path}/result", params=lease, json=result)
             if not (found or {}).get("jobs"):
                 await asyncio.sleep(max(0.0, min(0.5, self._end - time.monotonic())))

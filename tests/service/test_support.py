@@ -209,6 +209,32 @@ def test_one_taught_pose_is_known_and_what_lies_beside_is_not(
     assert later["reach"]["attempts"] == 425
 
 
+def test_a_reach_is_judged_anew_once_a_quarter_of_the_attempts_are_others(
+    http: httpx.Client, make_object: Make, post: Post
+) -> None:
+    make_object(http)
+    rng = np.random.default_rng(0)
+
+    def posted(count: int) -> str:
+        p = rng.uniform(-1.0, 1.0, (count, 3)) * 0.05
+        won = ["success" if w else "slipped" for w in rng.random(count) < 0.5]
+        return str(post(http, "thing", (p, np.tile(DOWN, (count, 1))), won)["batch"])
+
+    def judged() -> int:
+        found = likelihood(http, (np.zeros((1, 3)), np.array([DOWN])))
+        return int(found["reach"]["attempts"])
+
+    first, _ = posted(300), posted(2_100)
+    assert judged() == 2_400
+    # Fewer, more, and both at once: what counts is how many of them it was not judged by.
+    http.delete(f"/objects/thing/batches/{first}").raise_for_status()
+    assert judged() == 2_400
+    posted(200)
+    assert judged() == 2_400
+    posted(150)
+    assert judged() == 2_450
+
+
 def test_draws_know_how_far_they_are(http: httpx.Client, tried: tuple[Poses, NDArray[np.bool_]]) -> None:
     rows, _ = tried
     for call in ("samples", "proposals"):

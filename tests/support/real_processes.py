@@ -111,9 +111,11 @@ def running(process: Process) -> Iterator[Process]:
         process.clean_up()
 
 
-def wait_for(what: str, condition: Callable[[], Any], *, every: float = 0.02) -> Any:
+def wait_for(
+    what: str, condition: Callable[[], Any], *, every: float = 0.02, seconds: float = PATIENCE_S
+) -> Any:
     """What a condition comes to; while no service answers it does not hold."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         try:
             found = condition()
@@ -122,4 +124,4 @@ def wait_for(what: str, condition: Callable[[], Any], *, every: float = 0.02) ->
         if found:
             return found
         time.sleep(every)
-    raise AssertionError(f"{what}: not within {PATIENCE_S:g} s")
+    raise AssertionError(f"{what}: not within {seconds:g} s")

@@ -50,7 +50,11 @@ class Tab:
     """A page of the viewer, and what its browser did."""
 
     def __init__(self, browser: Browser, viewer: ViewerServer, address: str) -> None:
-        self.page: Page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, device_scale_factor=1)
+        self.page: Page = browser.new_page(
+            viewport={"width": WIDTH, "height": HEIGHT},
+            device_scale_factor=1,
+            permissions=["clipboard-read", "clipboard-write"],
+        )
         self.page.set_default_timeout(PATIENCE_MS)
         self.complaints: list[str] = []
         self.hosts: set[str] = set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import time
 from collections.abc import Callable
 from functools import partial
@@ -26,8 +27,18 @@ _OBJECTIVES: dict[str, Literal["density", "success_probability"]] = {
 _NEAREST = (140, 140, 140)
 _LANGUAGES = ("curl", "Python", "Command line")
 _FILES = ("best-grasp.sh", "best-grasp.py", "best-grasp-command.sh")
-_COPYING = (
-    "This page can't write to your clipboard: click into a text, press Ctrl+A and Ctrl+C, or download it."
+#: Viser has nothing that writes to a clipboard. A page on a plain HTTP address has no ``navigator.clipboard``
+#: either, so what is selected is copied.
+_COPYABLE = """<div><textarea readonly rows="{rows}" aria-label="{label}" style="{style}">{text}</textarea>
+<button type="button" style="{button}" onclick="this.previousElementSibling.select();
+this.textContent = document.execCommand('copy') ? 'Copied' : 'Press Ctrl+C'">Copy {label}</button></div>"""
+_TEXT_STYLE = (
+    "width: 100%; box-sizing: border-box; font: 0.75em monospace; padding: 0.5em; resize: vertical;"
+    " color: inherit; background: transparent; border: 1px solid #8888; border-radius: 4px"
+)
+_BUTTON_STYLE = (
+    "width: 100%; font: inherit; font-size: 0.85em; padding: 0.35em; cursor: pointer;"
+    " color: #fff; background: #228be6; border: 0; border-radius: 4px"
 )
 
 
@@ -112,9 +123,9 @@ class QuestionPanel:
         if told is None:
             return
         with client.gui.add_modal("Ask the same elsewhere") as modal:
-            client.gui.add_markdown(_COPYING)
             for label, name, text in zip(_LANGUAGES, _FILES, told, strict=True):
-                client.gui.add_text(label, text, multiline=True)
+                client.gui.add_markdown(f"**{label}**")
+                client.gui.add_html(_copyable(label, text))
                 download = client.gui.add_button(f"Download {name}")
                 download.on_click(partial(self._download, name, text.encode()))
             client.gui.add_button("Close").on_click(lambda _: modal.close())
@@ -141,6 +152,17 @@ class QuestionPanel:
         self._page.replace("nearest", None)
         self._answer.content, self._latency.content = why, ""
         self.questions += 1
+
+
+def _copyable(label: str, text: str) -> str:
+    """A text with a button that copies it."""
+    return _COPYABLE.format(
+        label=label,
+        rows=min(14, 1 + text.count("\n")),
+        text=html.escape(text),
+        style=_TEXT_STYLE,
+        button=_BUTTON_STYLE,
+    )
 
 
 def _pose(grasp: Grasp) -> Poses:

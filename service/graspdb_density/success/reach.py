@@ -43,13 +43,13 @@ Bools = NDArray[np.bool_]
 _STEP = 0.25
 _SHELLS = round(SUCCESS_CUTOFF / _STEP)
 #: Attempts judged at most, half of them successes, and pairs looked at: of more, every so many'th.
-_JUDGED, _PAIRS = 800, 2_000_000
+_JUDGED, _PAIRS = 800, 1_000_000
 #: Fewer judged attempts, or blocks of space that hold them, tell nothing. Blocks are this many widths long.
 _LEAST_JUDGED, _LEAST_BLOCKS, _BLOCK_WIDTHS = 20, 5, 3.0
 #: Chance that a distance is validated at which predictions are no better than the share.
 _CHANCE = 0.05
 #: Pairs whose displacements are looked at, and the fewest within the cut-off that tell of an axis.
-_DISPLACED, _LEAST_PAIRS = 200_000, 20
+_DISPLACED, _LEAST_PAIRS = 100_000, 20
 #: Within the distance that this share of attempts keep from the nearest other one a pose counts as tried
 #: itself; the distance is bounded, in widths.
 _NEARLY_ALL, _NEAREST, _FARTHEST = 0.95, 0.2, 1.0

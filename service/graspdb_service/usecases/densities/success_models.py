@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graspdb.wire.queries import TrialSelection
 from graspdb_density import (
@@ -30,7 +31,7 @@ from graspdb_density import (
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.trial_columns import Bools, Floats
+from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
@@ -44,8 +45,8 @@ LEVEL = 0.9
 _SAMPLE, _LARGE = 100_000, 400_000
 #: Attempts of either outcome by which geometry is judged.
 _HELD = 256
-#: A reach is validated anew once there are this many times as many attempts; of few ones, every time.
-_GROWN, _FEW = 1.1, 2_000
+#: A reach is validated anew once so large a share of the attempts are others; of few ones, every time.
+_CHANGED, _FEW = 0.25, 2_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +100,44 @@ class Estimates:
 
 
 @dataclass(frozen=True, eq=False)
+class _Members:
+    """Which attempts there are: posted rows (N,) by sequence number, ascending, with their outcome codes, and
+    how many are of each chunk of a sweep.
+    """
+
+    seq: Ints
+    outcome: NDArray[np.uint8]
+    chunks: Mapping[tuple[str, int], int]
+
+    @classmethod
+    def of(cls, stored: Stored) -> _Members:
+        chunks = {(each.chunk.sweep_id, each.chunk.number): len(each.chunk.outcomes) for each in stored.swept}
+        return cls(stored.rows.seq, stored.rows.outcome, chunks)
+
+    def followed_by(self, later: _Members) -> _Members:
+        return _Members(
+            np.concatenate([self.seq, later.seq]),
+            np.concatenate([self.outcome, later.outcome]),
+            {**self.chunks, **later.chunks},
+        )
+
+    def others(self, than: _Members) -> int:
+        """How many attempts only one of both has, or has with another outcome."""
+        _, mine, theirs = np.intersect1d(self.seq, than.seq, assume_unique=True, return_indices=True)
+        alike = int((self.outcome[mine] == than.outcome[theirs]).sum())
+        chunks = dict(self.chunks.items() ^ than.chunks.items())
+        return len(self.seq) + len(than.seq) - 2 * alike + sum(chunks.values())
+
+    @property
+    def nbytes(self) -> int:
+        return self.seq.nbytes + self.outcome.nbytes + 200 * len(self.chunks)
+
+
+@dataclass(frozen=True, eq=False)
 class _Attempts:
-    """A model as of a revision, and the repeat key of every sweep in it; ``sample`` of a large one."""
+    """A model as of a revision, and the repeat key of every sweep in it; ``sample`` of a large one. Its
+    ``reach`` was validated when the attempts were ``judged``.
+    """
 
     revision: int
     epoch: int
@@ -109,14 +146,18 @@ class _Attempts:
     sweeps: Mapping[str, str]
     model: SuccessModel | None
     sample: SuccessModel | None
+    members: _Members
     reach: Reach | None
+    judged: _Members | None
 
     @property
     def nbytes(self) -> int:
-        return 4_096 + sum(part.nbytes for part in (self.model, self.sample) if part is not None)
+        parts = (self.model, self.sample, self.members, self.judged)
+        return 4_096 + sum(part.nbytes for part in parts if part is not None)
 
 
-_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None, None)
+_NOBODY = _Members(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.uint8), {})
+_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None, _NOBODY, None, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,13 +259,18 @@ class Successes:
         held = np.concatenate(self._compute.blocks(poses[rows], partial(test.holds, threads=threads)))
         estimates.prior[rows[held]] = share
 
-    def _refresh(self, key: _Key, selected: Selected, before: _Attempts | None) -> _Attempts:
+    def _refresh(
+        self, key: _Key, selected: Selected, known: _Attempts | None, *, anew: bool = False
+    ) -> _Attempts:
+        """What there is now, beside what was ``known``: an extension of it, unless the past has changed."""
+        known = known or _NONE
+        before = _NONE if anew else known
         without = [attempts.NO_ATTEMPT, *([attempts.COLLISION] if key.collisions_known else [])]
         with self._database.read() as tx:
             selected = as_of(tx, selected)
             row = selected.row
             # A source whose first failure has come counts from now on with all it has posted.
-            if before is None or before.epoch != row.epoch or before.tried != selected.tried:
+            if before.epoch != row.epoch or before.tried != selected.tried:
                 before = _NONE
             stored = _fetch(tx, selected, without, before)
             names = {**before.sweeps, **stored.repeat_keys}
@@ -239,25 +285,31 @@ class Successes:
         size = len(new) + (0 if old is None else old.size)
         if old is not None and sample is None and size > _LARGE:
             # It has outgrown being searched itself: a sample needs what came before, too.
-            return self._refresh(key, selected, None)
+            return self._refresh(key, selected, known, anew=True)
         every = np.ones(len(new), dtype=np.bool_)
         model = self._compute.run(lambda: _extended(old, new, every, kernel))
         if size > _LARGE:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
             chosen = np.random.default_rng(row.revision).random(len(new)) < share
             sample = self._compute.run(lambda: _extended(sample, new, chosen, kernel))
-        reach = self._reach(model, before.reach)
-        return _Attempts(row.revision, row.epoch, row.last_seq, selected.tried, names, model, sample, reach)
+        members = before.members.followed_by(_Members.of(stored))
+        reach, judged = self._reach(model, members, known)
+        revision, epoch, last_seq = row.revision, row.epoch, row.last_seq
+        return _Attempts(
+            revision, epoch, last_seq, selected.tried, names, model, sample, members, reach, judged
+        )
 
-    def _reach(self, model: SuccessModel | None, before: Reach | None) -> Reach | None:
-        """How far a model tells: validated anew where it has grown enough since."""
+    def _reach(
+        self, model: SuccessModel | None, members: _Members, known: _Attempts
+    ) -> tuple[Reach | None, _Members | None]:
+        """How far a model tells, and of which attempts that was found out: anew where enough are others."""
         if model is None:
-            return None
-        if before is not None:
-            due = _GROWN * before.attempts if model.size > _FEW else before.attempts + 1
-            if model.size < due:
-                return before
-        return self._compute.run(lambda: validate_reach(model, threads=self._compute.threads))
+            return None, None
+        if known.judged is not None and known.reach is not None:
+            others = members.others(known.judged)
+            if others == 0 or (model.size > _FEW and others < _CHANGED * known.reach.attempts):
+                return known.reach, known.judged
+        return self._compute.run(lambda: validate_reach(model, threads=self._compute.threads)), members
 
 
 def _share_of_held(model: Model | None, test: CollisionTest, threads: int) -> float:
