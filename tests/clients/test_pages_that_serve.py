@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -57,10 +58,10 @@ def _nginx(folder: Path, location: str) -> Iterator[str]:
     assert program, "nginx is missing: sudo apt-get install nginx-light"
     port = free_port()
     kept = " ".join(
-        f"{kind}_temp_path {folder};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        f"{kind}_temp_path {folder}/{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
     )
     (folder / "nginx.conf").write_text(
-        f"pid {folder}/pid; daemon off; events {{}}\n"
+        f"{'user root; ' if os.geteuid() == 0 else ''}pid {folder}/pid; daemon off; events {{}}\n"
         f"http {{ access_log off; {kept} server {{ listen 127.0.0.1:{port};\n{location}}} }}\n"
     )
     command = [program, "-p", str(folder), "-e", str(folder / "log"), "-c", str(folder / "nginx.conf")]

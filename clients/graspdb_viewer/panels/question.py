@@ -29,16 +29,17 @@ _LANGUAGES = ("curl", "Python", "Command line")
 _FILES = ("best-grasp.sh", "best-grasp.py", "best-grasp-command.sh")
 #: Viser has nothing that writes to a clipboard. A page on a plain HTTP address has no ``navigator.clipboard``
 #: either, so what is selected is copied.
-_COPYABLE = """<div><textarea readonly rows="{rows}" aria-label="{label}" style="{style}">{text}</textarea>
+_COPYABLE = """<div style="margin: 0 10px 6px">
+<textarea readonly rows="{rows}" aria-label="{label}" style="{style}">{text}</textarea>
 <button type="button" style="{button}" onclick="this.previousElementSibling.select();
 this.textContent = document.execCommand('copy') ? 'Copied' : 'Press Ctrl+C'">Copy {label}</button></div>"""
 _TEXT_STYLE = (
     "width: 100%; box-sizing: border-box; font: 0.75em monospace; padding: 0.5em; resize: vertical;"
-    " color: inherit; background: transparent; border: 1px solid #8888; border-radius: 4px"
+    " white-space: pre; color: inherit; background: transparent; border: 1px solid #8888; border-radius: 4px"
 )
 _BUTTON_STYLE = (
-    "width: 100%; font: inherit; font-size: 0.85em; padding: 0.35em; cursor: pointer;"
-    " color: #fff; background: #228be6; border: 0; border-radius: 4px"
+    "width: 100%; font: inherit; font-size: 0.85em; padding: 0.4em; cursor: pointer;"
+    " color: #fff; background: #228be6; border: 0; border-radius: 2px"
 )
 
 
