@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from graspdb_geometry._compiled import convex, surface
+from graspdb_geometry._compiled import convex, surface, tree
 from graspdb_geometry._compiled.widths import surface_extents
 from graspdb_geometry.grippers import GripperShape
 from graspdb_geometry.poses import PoseArrays, ToolPoses, checked
@@ -73,6 +73,11 @@ class Scene:
             np.stack([s.centre for s in solids]),
             np.array([s.radius for s in solids]),
         )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it keeps."""
+        return sum(array.nbytes for array in self._model)
 
     def classify(
         self, poses: PoseArrays, shape: GripperShape, threads: int = 1
@@ -166,6 +171,25 @@ class Scene:
             held[met] = ~self.collides(ToolPoses(p[met], q[met]), shape, threads=threads)
         return held
 
+    def contains_centres(
+        self, poses: PoseArrays, boxes: FloatArray, threads: int = 1
+    ) -> npt.NDArray[np.bool_]:
+        """Whether the object contains the centre of one of up to three boxes (B, 2, 3: centre, half extents;
+        tool frame) at each pose, (n,).
+        """
+        p, q = checked(poses)
+        points = np.stack([np.stack([box[0], np.zeros(3)]) for box in boxes])
+        points = np.concatenate([points, np.broadcast_to(_NOWHERE, (4 - len(points), 2, 3))])
+        codes = np.empty(len(p), dtype=np.uint8)
+        unused = np.empty((len(p), 2))
+
+        def run(block: slice) -> None:
+            convex.classify(p[block], q[block], points, self._model, False, codes[block], unused[block])
+
+        _in_blocks(run, len(p), threads)
+        held: npt.NDArray[np.bool_] = codes == COLLIDES
+        return held
+
     def widths(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> FloatArray:
         """How far apart the fingers are once both touch the object, metres, (n,).
 
@@ -193,7 +217,7 @@ class Scene:
 
 
 class Surface:
-    """An object as triangles, for queries before it has convex parts; immutable, thread-safe.
+    """An object as triangles, the exact geometry of its mesh; immutable, thread-safe.
 
     Parameters
     ----------
@@ -203,6 +227,12 @@ class Surface:
         Triangles, counterclockwise seen from outside.
     watertight : bool
         The triangles close a solid: then a gripper wholly inside of it collides too.
+    inside : Scene, optional
+        Convex parts of the object, which tell what lies inside where the triangles do not: a box of the
+        gripper that meets none of them collides if its centre is in a part.
+    inside_off_m : float
+        How far the parts' surface and the triangles lie apart at most. Parts are not believed about boxes
+        thinner than twice that, which may be in a room that the parts fill.
 
     Raises
     ------
@@ -213,7 +243,15 @@ class Surface:
     #: Triangles in a leaf of the tree.
     _LEAF = 4
 
-    def __init__(self, vertices: npt.ArrayLike, faces: npt.ArrayLike, *, watertight: bool) -> None:
+    def __init__(
+        self,
+        vertices: npt.ArrayLike,
+        faces: npt.ArrayLike,
+        *,
+        watertight: bool,
+        inside: Scene | None = None,
+        inside_off_m: float = 0.0,
+    ) -> None:
         points = np.asarray(vertices, dtype=np.float64)
         index = np.asarray(faces, dtype=np.int64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
@@ -224,7 +262,17 @@ class Surface:
             raise ValueError("faces must refer to existing vertices")
         self.watertight = watertight
         self.triangle_count = len(index)
-        self._tree = self._build(points[index])
+        corners = points[index]
+        nodes, links, order = tree.build(corners, self._LEAF)
+        self._tree: surface.Tree = (nodes, links, corners[order])
+        self._inside = inside
+        self._inside_off_m = inside_off_m
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it keeps."""
+        own = sum(array.nbytes for array in self._tree)
+        return own if self._inside is None else own + self._inside.nbytes
 
     def collides(
         self,
@@ -243,6 +291,12 @@ class Surface:
             surface.collides(p[block], q[block], boxes, self._tree, self.watertight, hits[block])
 
         _in_blocks(run, len(p), threads)
+        if self._inside is not None and not self.watertight:
+            # What meets no triangle is wholly inside or outside, its centre half as far off as it is thick.
+            known = boxes[boxes[:, 1].min(axis=1) > self._inside_off_m]
+            rows = np.flatnonzero(~hits)
+            if len(known) and rows.size:
+                hits[rows] = self._inside.contains_centres(ToolPoses(p[rows], q[rows]), known, threads)
         return hits
 
     def holds(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> npt.NDArray[np.bool_]:
@@ -284,36 +338,6 @@ class Surface:
         found = np.empty(len(x), dtype=np.bool_)
         surface.contains(x, self._tree, found)
         return found
-
-    @classmethod
-    def _build(cls, corners: FloatArray) -> surface.Tree:
-        """Tree over triangles (F, 3, 3), halved at the median of the longest side of their centres."""
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        middle = (low + high) / 2
-        order = np.arange(len(corners))
-        nodes: list[FloatArray] = []
-        links: list[tuple[int, int]] = []
-        pending = [(0, len(corners), -1, 0)]  # begin, end, parent, which child
-        while pending:
-            begin, end, parent, side = pending.pop()
-            number = len(nodes)
-            if parent >= 0:
-                first, second = links[parent]
-                links[parent] = (number, second) if side == 0 else (first, number)
-            members = order[begin:end]
-            lower, upper = low[members].min(axis=0), high[members].max(axis=0)
-            nodes.append(np.stack([(lower + upper) / 2, (upper - lower) / 2 * (1 + 1e-12) + 1e-15]))
-            if end - begin <= cls._LEAF:
-                links.append((-1 - begin, end))
-                continue
-            links.append((0, 0))
-            centres = middle[members]
-            axis = int(np.argmax(np.ptp(centres, axis=0)))
-            half = (end - begin) // 2
-            order[begin:end] = members[np.argpartition(centres[:, axis], half)]
-            pending.append((begin + half, end, number, 1))
-            pending.append((begin, begin + half, number, 0))
-        return np.stack(nodes), np.array(links, dtype=np.int64), np.ascontiguousarray(corners[order])
 
 
 class PointCloud:

@@ -14,10 +14,20 @@ from scipy.spatial.distance import cdist
 from graspdb_geometry.mesh_reading.content import FaceArray, FloatArray
 from graspdb_geometry.meshes import Mesh, Part
 
+#: Parts stand for their mesh if they lie at most as far off it as the larger of these, metres and a share of
+#: its longest side ...
+ACCEPTED_M, ACCEPTED_SHARE = 1e-3, 0.01
+#: ... and have its volume, but for this share of it.
+ACCEPTED_VOLUME = 0.05
+#: Parts are the mesh but for rounding up to these shares of its longest side and of its volume.
+_SAME_SHARE, _SAME_VOLUME = 1e-4, 1e-3
 #: Points on each surface that are compared, and points that find the nearest triangles of the other one.
 SAMPLES = 3_000
 DENSE_SAMPLES = 40_000
 _NEAREST = 8
+#: Cracks between parts that are thinner than this share of what is accepted are none: hulls of fewer vertices
+#: do not quite meet.
+_CRACK = 0.25
 #: More triangles than this are so small that the nearest samples find the nearest ones.
 _MAX_EXACT = 100_000
 
@@ -47,8 +57,9 @@ class Deviation:
 def deviation(mesh: Mesh, parts: Sequence[Part], *, seed: int = 0) -> Deviation:
     """Compare the surface of a mesh with that of the union of its convex parts.
 
-    Parts meet in faces inside the object, which belong to no surface: points that another part covers are
-    left out, and so are faces of the mesh inside the parts (meshes are often put together from solids).
+    Parts meet in faces inside the object, which belong to no surface: points that another part covers, or
+    that have one before them across a crack of a quarter of what is accepted, are left out, and so are faces
+    of the mesh inside the parts (meshes are often put together from solids).
 
     Parameters
     ----------
@@ -60,13 +71,16 @@ def deviation(mesh: Mesh, parts: Sequence[Part], *, seed: int = 0) -> Deviation:
     """
     rng = np.random.default_rng(seed)
     extent = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    tolerance = 1e-4 * extent
+    crack = _CRACK * accepted_m(float(np.ptp(mesh.vertices, axis=0).max()))
     planes = [_planes(vertices, faces) for vertices, faces in parts]
     corners = [vertices[faces] for vertices, faces in parts]
     triangles = np.concatenate(corners)
     owner = np.repeat(np.arange(len(parts)), [len(own) for own in corners])
     face, points = _samples(triangles, DENSE_SAMPLES, rng)
-    outer = ~_covered(points, owner[face], parts, planes, tolerance)
+    outer = ~_covered(points, owner[face], parts, planes, 1e-4 * extent)
+    left = np.flatnonzero(outer)
+    before = points[left] + crack * _normals(triangles)[face[left]]
+    outer[left] = ~_covered(before, owner[face[left]], parts, planes, 0.0)
     if not np.any(outer):
         return Deviation(extent, extent)
     skin = mesh.vertices[mesh.faces]
@@ -78,6 +92,74 @@ def deviation(mesh: Mesh, parts: Sequence[Part], *, seed: int = 0) -> Deviation:
     out = skin_points[some][~_covered(skin_points[some], nobody, parts, planes, 0.0)]
     gap = _distances(out, triangles, face[outer], points[outer])
     return Deviation(float(np.max(bulge)), float(np.max(gap, initial=0.0)))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How far convex parts stand for the mesh that they are of.
+
+    Attributes
+    ----------
+    deviation_m
+        The larger of the distances in :class:`Deviation`, metres.
+    accepted_m
+        Up to where they stand for a mesh of this size, metres.
+    same_m
+        Up to where they are the mesh itself, metres.
+    volume
+        That of the parts' union as a share of the mesh's; None where the mesh encloses none.
+    """
+
+    deviation_m: float
+    accepted_m: float
+    same_m: float
+    volume: float | None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether what is simulated with the parts holds for the mesh."""
+        same = self.volume is None or abs(self.volume - 1.0) <= ACCEPTED_VOLUME
+        return same and self.deviation_m <= self.accepted_m
+
+    @property
+    def same(self) -> bool:
+        """Whether the parts are the mesh but for rounding."""
+        same = self.volume is None or abs(self.volume - 1.0) <= _SAME_VOLUME
+        return same and self.deviation_m <= self.same_m
+
+    def __str__(self) -> str:
+        told = f"up to {1000 * self.deviation_m:.3g} mm off the mesh's ({1000 * self.accepted_m:.3g} mm do)"
+        if self.volume is None:
+            return told
+        least, most = 1.0 - ACCEPTED_VOLUME, 1.0 + ACCEPTED_VOLUME
+        return f"{told}, their volume is {self.volume:.1%} of its ({least:.0%} to {most:.0%} do)"
+
+
+def fit(mesh: Mesh, parts: Sequence[Part], volume_m3: float | None) -> Fit:
+    """Compare convex parts with the solids of a mesh, or its surface where it encloses none.
+
+    ``volume_m3`` is the mesh's, None where it encloses none. Sheets beside the solids are left out: no part
+    can follow them.
+    """
+    side = float(np.ptp(mesh.vertices, axis=0).max())
+    solid = of_bodies(mesh) if mesh.sound and mesh.bodies else mesh
+    share = None if volume_m3 is None else united_volume(parts) / volume_m3
+    return Fit(deviation(solid, parts).largest_m, accepted_m(side), _SAME_SHARE * side, share)
+
+
+def accepted_m(longest_side_m: float) -> float:
+    """How far parts may lie off a mesh of this size, metres."""
+    return max(ACCEPTED_M, ACCEPTED_SHARE * longest_side_m)
+
+
+def of_bodies(mesh: Mesh) -> Mesh:
+    """The mesh of its bodies alone."""
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in mesh.bodies[:-1]])
+    return Mesh(
+        np.concatenate([vertices for vertices, _ in mesh.bodies]),
+        np.concatenate([faces + offset for (_, faces), offset in zip(mesh.bodies, offsets, strict=True)]),
+        bodies=mesh.bodies,
+    )
 
 
 def united_volume(parts: Sequence[Part]) -> float:
@@ -130,6 +212,12 @@ def _to_triangles(p: FloatArray, triangles: FloatArray) -> FloatArray:
         edges = np.minimum(edges, np.linalg.norm(p - foot, axis=-1))
         inside = inside & (np.einsum("...i,...i->...", np.cross(along, p - start), normal) >= 0.0)
     return np.asarray(np.where(inside, np.abs(height), edges))
+
+
+def _normals(corners: FloatArray) -> FloatArray:
+    """Unit normals (F, 3) of triangles; zero for those without area."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None])
 
 
 def _areas(corners: FloatArray) -> FloatArray:

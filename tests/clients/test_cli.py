@@ -445,6 +445,20 @@ def test_parts_are_set_after_the_mesh(run: Run, fresh_id: str, tmp_path: Path) -
     assert code == 0, err
     assert json.loads(run("--json", "objects", "show", fresh_id)[1])["convex_parts"]["parts"] == 2
     assert "convex parts" in out
+    # Against a mesh that they do not follow they are refused, in words of the command line.
+    tube = trimesh.creation.annulus(r_min=0.03, r_max=0.035, height=0.1)
+    tube.export(tmp_path / "tube.stl")
+    run("objects", "set-mesh", fresh_id, str(tmp_path / "tube.stl"))
+    trimesh.Scene([tube.convex_hull]).export(tmp_path / "hull.glb")
+    code, _, err = run("objects", "set-convex-parts", fresh_id, str(tmp_path / "hull.glb"))
+    assert code != 0
+    assert "--accept-deviation" in err
+    assert "accept_deviation" not in err
+    code, out, err = run(
+        "objects", "set-convex-parts", fresh_id, str(tmp_path / "hull.glb"), "--accept-deviation"
+    )
+    assert code == 0, err
+    assert "mm off the mesh" in out
 
 
 @pytest.mark.parametrize(

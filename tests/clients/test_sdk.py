@@ -121,6 +121,16 @@ def test_convex_parts_from_meshes(db: Client, fresh_id: str) -> None:
     assert made.download_convex_parts()[:4] == b"glTF"
 
 
+def test_parts_that_fill_a_room_are_taken_on_request_alone(db: Client, fresh_id: str) -> None:
+    tube = trimesh.creation.annulus(r_min=0.03, r_max=0.035, height=0.1)
+    with pytest.raises(InvalidInput, match="accept_deviation"):
+        db.objects.create(fresh_id, mesh=tube, convex_parts=[tube.convex_hull])
+    made = db.objects.create(fresh_id, mesh=tube, convex_parts=[tube.convex_hull], accept_deviation=True)
+    assert made.info.convex_parts is not None
+    assert made.info.convex_parts.deviates
+    assert "mm off the mesh" in made.summary()["convex parts warning 1"]
+
+
 def test_examples_come_with_mesh_parts_and_mass(db: Client) -> None:
     made = db.add_example("cone")
     assert made.info.mesh is not None

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from graspdb.examples import EXAMPLES, example
 from graspdb_geometry import collision, grids
 from graspdb_geometry._compiled import surface as compiled
+from graspdb_geometry._compiled import tree
 from graspdb_geometry.poses import ToolPoses
 from known_jaws import PG70
 
@@ -76,6 +78,72 @@ def test_a_gripper_wholly_inside_collides_with_solids_only() -> None:
     pose = [[0.1, 0.2, 0.3]], [[0.0, 0.0, 0.0, 1.0]]
     assert collision.Surface(corners, faces, watertight=True).collides(ToolPoses(*pose), PG70).all()
     assert not collision.Surface(corners, faces, watertight=False).collides(ToolPoses(*pose), PG70).any()
+
+
+def _box(half: float, *, without: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A cube's corners and triangles, some of which are missing."""
+    corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return corners, np.array([[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)])[without:]
+
+
+def test_parts_tell_what_is_inside_of_an_open_mesh() -> None:
+    corners, faces = _box(1.0, without=2)
+    inside, crossing, outside = [0.1, 0.2, 0.3], [0.1, 0.2, -0.98], [0.1, 0.2, 1.5]
+    poses = ToolPoses([inside, crossing, outside], [[0.0, 0.0, 0.0, 1.0]] * 3)
+    parts = collision.Scene([(corners, [])])
+
+    def hits(**options: Any) -> list[bool]:
+        return collision.Surface(corners, faces, watertight=False, **options).collides(poses, PG70).tolist()
+
+    assert hits() == [False, True, False]
+    assert hits(inside=parts, inside_off_m=0.001) == [True, True, False]
+    # Parts so far off may fill a room: nothing is known, and what is not known does not collide.
+    assert hits(inside=parts, inside_off_m=0.1) == [False, True, False]
+    far = collision.Surface(corners, faces, watertight=False, inside=parts)
+    assert far.nbytes > collision.Surface(corners, faces, watertight=False).nbytes > 0
+
+
+def test_a_cup_of_one_sheet_stays_open_though_its_parts_fill_it() -> None:
+    side = trimesh.creation.cylinder(radius=0.04, height=0.1, sections=64)
+    sheet = side.submesh([np.flatnonzero(side.face_normals[:, 2] < 0.5)], append=True)
+    filled = collision.Scene([(side.vertices, [])])
+    # Straight down onto the rim, one finger in the cup.
+    pose = ToolPoses(
+        [[0.04, 0.0, 0.05]], Rotation.from_matrix([[[0, 1, 0], [1, 0, 0], [0, 0, -1]]]).as_quat()
+    )
+    assert filled.collides(pose, PG70).all()
+    cup = collision.Surface(sheet.vertices, sheet.faces, watertight=False, inside=filled, inside_off_m=0.04)
+    assert not cup.collides(pose, PG70).any()
+    assert cup.holds(pose, PG70).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 64, 1_001])
+@pytest.mark.parametrize("alike", [False, True])
+def test_every_triangle_stands_once_in_a_leaf_whose_boxes_hold_it(count: int, alike: bool) -> None:
+    rng = np.random.default_rng(count)
+    corners = rng.normal(size=(count, 3, 3))
+    corners[:, :, 1] = np.round(corners[:, :, 1])
+    if alike:
+        corners[:] = corners[0]
+    nodes, links, order = tree.build(corners, 4)
+    assert np.array_equal(np.sort(order), np.arange(count))
+    seen = np.zeros(count, dtype=int)
+    pending = [(0, np.full(3, -np.inf), np.full(3, np.inf))]
+    while pending:
+        number, low, high = pending.pop()
+        low = np.maximum(low, nodes[number, 0] - nodes[number, 1])
+        high = np.minimum(high, nodes[number, 0] + nodes[number, 1])
+        first, second = links[number]
+        if first >= 0:
+            pending += [(int(first), low, high), (int(second), low, high)]
+            continue
+        assert 0 < second - (-1 - first) <= 4
+        seen[-1 - first : second] += 1
+        held = corners[order[-1 - first : second]]
+        assert np.all(held >= low - 1e-12)
+        assert np.all(held <= high + 1e-12)
+    assert np.all(seen == 1)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from graspdb_geometry.collision import Scene, Surface, box_part
 from graspdb_geometry.poses import ToolPoses
@@ -23,6 +25,18 @@ def test_a_box_by_hand() -> None:
     for solid in (Scene([BOX]), Surface(*BOX, watertight=True)):
         np.testing.assert_allclose(solid.widths(ToolPoses(poses, quaternions), PG70), expected, atol=2e-7)
         np.testing.assert_array_equal(solid.holds(ToolPoses(poses, quaternions), PG70), np.isfinite(expected))
+
+
+def test_a_ball_of_many_triangles_is_as_wide_as_its_diameter() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.03)
+    surface = Surface(ball.vertices, ball.faces, watertight=True)
+    rng = np.random.default_rng(4)
+    quaternions = rng.normal(size=(200, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
+    depths = rng.uniform(-0.01, 0.01, 200)
+    positions = depths[:, None] * Rotation.from_quat(quaternions).apply([0.0, 0.0, 1.0])
+    # Fingers 20 mm wide reach across the ball's middle wherever the tool is along its approach.
+    np.testing.assert_allclose(surface.widths(ToolPoses(positions, quaternions), PG70), 0.06, atol=2e-4)
 
 
 @pytest.mark.parametrize("seed", range(5))

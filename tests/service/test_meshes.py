@@ -195,12 +195,41 @@ def test_given_parts_are_checked_and_read_back(box: httpx.Client) -> None:
     assert box.get("/objects/box").json()["convex_parts"] == info
 
 
-def test_parts_of_another_size_are_warned_of(box: httpx.Client) -> None:
+def test_parts_of_another_size_are_refused_with_the_ways_out(box: httpx.Client) -> None:
     box.put("/objects/box/mesh", content=_stl(*DENTED), headers=STL)
     wrong = meshes.parts_to_glb([(vertices * 1.1, faces) for vertices, faces in DUMBBELL])
-    warnings = box.put("/objects/box/convex-parts", content=wrong, headers=GLB).json()["warnings"]
-    assert len(warnings) == 1
-    assert "bounding box" in warnings[0]
+    refused = box.put("/objects/box/convex-parts", content=wrong, headers=GLB)
+    assert refused.status_code == 422
+    problem = refused.json()
+    assert problem["type"].endswith(":convex-parts-deviate")
+    for said in ("133.1% of its", "bounding box", "in metres?", "finer", "worker", "?accept_deviation=true"):
+        assert said in problem["title"], said
+    # 1 % of 140 mm; the corners are 2.2, 2.2 and 7 mm off.
+    assert problem["accepted_m"] == pytest.approx(0.0014)
+    assert problem["deviation_m"] == pytest.approx(0.0075, abs=0.001)
+    assert problem["volume_share"] == pytest.approx(1.331, rel=1e-4)
+    assert box.get("/objects/box").json()["convex_parts"] is None
+    taken = box.put("/objects/box/convex-parts?accept_deviation=true", content=wrong, headers=GLB)
+    assert taken.status_code == 200, taken.text
+    info = taken.json()
+    assert info["deviates"]
+    assert info["volume_share"] == pytest.approx(1.331, rel=1e-4)
+    assert ["bounding box" in info["warnings"][0], "133.1%" in info["warnings"][1]] == [True, True]
+    # And every sweep says so.
+    box.patch("/objects/box", json={"mass_kg": 0.2})
+    sweep = box.post("/objects/box/sweeps", json={"grid": {"max_poses": 10}}).json()
+    assert any("133.1% of its volume" in warning for warning in sweep["warnings"])
+
+
+def test_parts_that_came_before_their_mesh_are_measured_with_it(box: httpx.Client) -> None:
+    swollen = meshes.parts_to_glb([(vertices * 1.1, faces) for vertices, faces in DUMBBELL])
+    first = box.put("/objects/box/convex-parts", content=swollen, headers=GLB).json()
+    assert (first["deviation_m"], first["warnings"]) == (None, [])
+    assert box.put("/objects/box/mesh", content=_stl(*DENTED), headers=STL).status_code == 200
+    parts = box.get("/objects/box").json()["convex_parts"]
+    assert parts["sha256"] == first["sha256"]
+    assert parts["deviates"]
+    assert parts["deviation_m"] == pytest.approx(0.0075, abs=0.001)
 
 
 def test_hollow_part_is_refused_by_number(box: httpx.Client) -> None:

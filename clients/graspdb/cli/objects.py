@@ -34,6 +34,9 @@ ObjectFrames = Annotated[
 ]
 Unit = Annotated[str, typer.Option(help="Unit of the mesh: m, mm, cm or in.")]
 Scale = Annotated[float, typer.Option(help="Factor to the mesh's coordinates, beside their unit.")]
+AcceptDeviation = Annotated[
+    bool, typer.Option("--accept-deviation", help="Take convex parts that do not follow the mesh, too.")
+]
 
 
 def _told(item: GraspObject) -> dict[str, str]:
@@ -76,13 +79,20 @@ def create_object(
     convex_parts: Annotated[
         Path | None, typer.Option(help="GLB with one convex geometry a part, metres.")
     ] = None,
+    accept_deviation: AcceptDeviation = False,
     frame: ObjectFrames = None,
 ) -> None:
     """Create an object, with its mesh if given."""
     if frame:
         properties["frames"] = _frames(frame)
     item = state.db.objects.create(
-        id, mesh=mesh, unit=unit, scale=scale, convex_parts=convex_parts, **properties
+        id,
+        mesh=mesh,
+        unit=unit,
+        scale=scale,
+        convex_parts=convex_parts,
+        accept_deviation=accept_deviation,
+        **properties,
     )
     state.show(item.info, _told(item))
 
@@ -134,10 +144,11 @@ def set_convex_parts(
     parts: Annotated[
         Path, typer.Argument(help="GLB with one convex geometry a part, metres.", show_default=False)
     ],
+    accept_deviation: AcceptDeviation = False,
 ) -> None:
     """Upload an object's convex parts."""
     item = state.db.objects.get(id)
-    info = item.upload_convex_parts(parts)
+    info = item.upload_convex_parts(parts, accept_deviation=accept_deviation)
     state.show(info, _told(item))
 
 

@@ -112,17 +112,22 @@ class GraspObject(GraspQueries):
         record = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
         return np.frombuffer(content, dtype=record, offset=84)["corners"].astype(np.float64)
 
-    def upload_convex_parts(self, parts: MeshLike | Sequence[Any]) -> wire.PartsInfo:
+    def upload_convex_parts(
+        self, parts: MeshLike | Sequence[Any], *, accept_deviation: bool = False
+    ) -> wire.PartsInfo:
         """Store the convex parts the object is made of, in metres.
 
-        A GLB file or its bytes with one geometry a part, a trimesh scene, or a sequence of meshes.
+        A GLB file or its bytes with one geometry a part, a trimesh scene, or a sequence of meshes. Those that
+        do not follow a closed mesh are refused, unless ``accept_deviation``.
         """
         if isinstance(parts, Sequence) and not isinstance(parts, (str, bytes)):
             parts = scene_of(parts)
         content, kind = read_mesh(parts, None, prefer="glb")
         if kind != GLB:
             raise ValueError(f"convex parts come as GLB, one geometry a part; this is {kind}")
-        return self._upload(wire.PartsInfo, "convex-parts", content, GLB)
+        # Not told to a service that does not know it unless it is asked for.
+        params = {"accept_deviation": accept_deviation or None}
+        return self._upload(wire.PartsInfo, "convex-parts", content, GLB, params=params)
 
     def _upload(self, model: type[Model], what: str, content: bytes, kind: str, **options: Any) -> Model:
         headers = {"Content-Type": kind}
@@ -174,6 +179,8 @@ class GraspObject(GraspQueries):
                 rows[f"mesh warning {number}"] = warning
         if info.convex_parts is not None:
             rows["convex parts"] = f"{info.convex_parts.parts}"
+            for number, warning in enumerate(info.convex_parts.warnings, start=1):
+                rows[f"convex parts warning {number}"] = warning
         if info.copied_from is not None:
             origin = info.copied_from
             rows["copied from"] = f"{origin.object}, revision {origin.revision}" + (
@@ -210,13 +217,14 @@ class Objects(Resource):
         scale: float = 1.0,
         media_type: str | None = None,
         convex_parts: MeshLike | Sequence[Any] | None = None,
+        accept_deviation: bool = False,
         **properties: Unpack[ObjectProperties],
     ) -> GraspObject:
         """Create an object, with its mesh and convex parts if given: all of it or nothing.
 
         ``id`` is a slug; ``mesh``, ``unit``, ``scale`` and ``media_type`` as in
-        :meth:`GraspObject.upload_mesh`, ``convex_parts`` as in :meth:`GraspObject.upload_convex_parts`, the
-        rest :class:`ObjectProperties`.
+        :meth:`GraspObject.upload_mesh`, ``convex_parts`` and ``accept_deviation`` as in
+        :meth:`GraspObject.upload_convex_parts`, the rest :class:`ObjectProperties`.
         """
         fields = _plain(known_keywords(ObjectProperties, properties, "create"))
         request = validate(wire.ObjectCreate, {"id": id, **fields})
@@ -227,7 +235,7 @@ class Objects(Resource):
             if loaded is not None:
                 created.upload_mesh(loaded[0], unit=unit, scale=scale, media_type=loaded[1])
             if convex_parts is not None:
-                created.upload_convex_parts(convex_parts)
+                created.upload_convex_parts(convex_parts, accept_deviation=accept_deviation)
         except (GraspDBError, OSError, ValueError, TypeError, ImportError):
             created.delete()
             raise

@@ -109,7 +109,10 @@ class MeshInfo(Response):
 
 
 class PartsInfo(Response):
-    """Convex bodies whose union is the object in collision tests and physics."""
+    """Convex bodies whose union is the object in physics, and in the collision test of sweeps.
+
+    Questions test collisions against the mesh itself; where it is not watertight, the parts tell what lies
+    inside of it, and where there is none, they are the object."""
 
     sha256: str
     """SHA-256 of the GLB's bytes, in hexadecimal digits."""
@@ -122,6 +125,11 @@ class PartsInfo(Response):
     deviation_m: float | None = None
     """How far the parts' surface and the mesh's lie apart at most, metres, over points sampled on both; null
     without a mesh."""
+    volume_share: float | None = None
+    """Volume of the parts' union as a share of the mesh's, without a unit; null where that encloses none."""
+    deviates: bool = False
+    """Whether they lie farther off the mesh than 1 mm and 1 % of its longest side, or differ from its volume
+    by more than 5 %: what sweeps tell may not hold for the mesh there, and they say so."""
     warnings: Warnings = Field(default_factory=list)
 
 

@@ -390,7 +390,8 @@ class Likelihoods(Response):
     effective_trials: list[float] | None = None
     """How many attempts the success probability rests on, weighted by nearness; null if not asked for."""
     collision_free: list[bool | None] | None = None
-    """Whether the open gripper clears the object; null until mesh and gripper are known."""
+    """Whether the open gripper clears the object's mesh, or its convex parts where it has no mesh; null until
+    mesh and gripper are known."""
     opening_m: list[float] | None = None
     """Opening to command at each pose, metres, at which collisions were tested; null without
     ``pre_opening_m``, and where mesh or gripper are not known."""
@@ -552,7 +553,8 @@ class GraspConstraints(Selection):
     closing_cone_deg: Angle | None = None
     """Half angle of the cone about ``closing``, degrees; null without ``closing``, which needs it."""
     collision_free: bool | None = None
-    """Whether the open gripper must clear the object; by default it must where mesh and gripper are known."""
+    """Whether the open gripper must clear the object's mesh, or its convex parts where it has no mesh; by
+    default it must where mesh and gripper are known."""
     pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far back along the approach the open gripper's straight way must be free, metres; by default not at
     all."""
@@ -654,7 +656,8 @@ class Grasp(Response):
     """How far the grasp is from what was tried; null where no chance was asked for."""
     prior_success_probability: PriorProbability = None
     collision_free: bool | None = None
-    """Whether the open gripper clears the object; null until mesh and gripper are known."""
+    """Whether the open gripper clears the object's mesh, or its convex parts where it has no mesh; null until
+    mesh and gripper are known."""
     prior: bool = False
     """Whether it was chosen by the object's edges, before any success."""
     candidate: int | None = None

@@ -59,6 +59,11 @@ def surface_extents(
             node = stack[depth]
             if _boxes_apart(c, h, nodes[node], p, r, scratch):
                 continue
+            # What lies between the extremes found so far is worth no look: all but a few of many triangles.
+            n = nodes[node, 1]
+            reach = n[0] * abs(r[0, 1]) + n[1] * abs(r[1, 1]) + n[2] * abs(r[2, 1])
+            if max(scratch[1] - reach, c[1] - h[1]) >= low and min(scratch[1] + reach, c[1] + h[1]) <= high:
+                continue
             if links[node, 0] >= 0:
                 stack[depth] = links[node, 0]
                 stack[depth + 1] = links[node, 1]

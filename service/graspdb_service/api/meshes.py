@@ -79,10 +79,22 @@ def get_mesh(
 @router.put(
     "/objects/{id}/convex-parts", **scope("objects:write", body={GLB: BINARY}, work="meshes", large=True)
 )
-def put_convex_parts(ctx: Ctx, id: ObjectId, request: Request, body: RawBody) -> PartsInfo:
-    """Store the convex parts: a GLB in metres with one geometry a part, object frame."""
+def put_convex_parts(
+    ctx: Ctx,
+    id: ObjectId,
+    request: Request,
+    body: RawBody,
+    accept_deviation: Annotated[
+        bool, Query(description="Store parts, too, that lie too far from the mesh to stand for it.")
+    ] = False,
+) -> PartsInfo:
+    """Store the convex parts: a GLB in metres with one geometry a part, object frame.
+
+    They are what sweeps simulate. Parts more than 1 mm and 1 % of the longest side off a closed mesh, or with
+    another volume by more than 5 %, are refused (`convex-parts-deviate`).
+    """
     one_of(request, GLB)
-    return meshes.put_parts(ctx, id, body)
+    return meshes.put_parts(ctx, id, body, accept_deviation=accept_deviation)
 
 
 @router.get(

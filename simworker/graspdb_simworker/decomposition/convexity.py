@@ -18,21 +18,22 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from graspdb_geometry import meshes
-from graspdb_geometry.deviation import deviation, united_volume
+from graspdb_geometry.deviation import ACCEPTED_VOLUME, Fit, fit, of_bodies
 from graspdb_geometry.mass import mass_properties
 from graspdb_geometry.meshes import Mesh, MeshError, Part
 from graspdb_simworker.decomposition import cutting
-from graspdb_simworker.decomposition.cutting import Search
+from graspdb_simworker.decomposition.cutting import Goal, Search
 
 #: Parts are good enough when they are as near to the mesh as the larger of these.
 TARGET_M, TARGET_SHARE = 5e-4, 0.01
-#: Processor time that cutting may take, seconds, and its share of the limit where that is tighter: what is
-#: left is for measuring the parts.
-CUTTING_SECONDS, CUTTING_SHARE = 25.0, 0.6
-#: When time is over, parts farther off than this share of the mesh's longest side are none.
-_USABLE_SHARE = 0.05
-#: Simplifying may move the surface by this share of what the parts may.
-_SIMPLIFYING_SHARE = 0.2
+#: The share of the time allowed that cutting may take: what is left is for measuring the parts.
+CUTTING_SHARE = 0.6
+#: Simplifying may move the surface by this share of what the parts may, and by this of a body's thickness.
+_SIMPLIFYING_SHARE, _OF_THICKNESS = 0.2, 0.04
+#: The search gives up where pieces as shallow as this share of the target still do not do.
+_SHALLOWEST = 1 / 64
+#: The pieces' hulls may add this share of the volume that parts may add or lack.
+_EXCESS_SHARE = 0.8
 #: How often a person is told, seconds.
 _TOLD_EVERY_S = 1.0
 #: Concavity that a part may keep, in CoACD's measure (the mesh's longest side is 2), from coarse to fine.
@@ -55,20 +56,21 @@ class Undecomposable(Exception):
 
 @dataclass(frozen=True)
 class Candidate:
-    """Parts that the service would accept, and how well they follow the mesh.
-
-    ``glb`` holds ``parts`` of them; their surface lies up to ``deviation_m`` metres off the mesh's; their
-    union has ``added_volume`` times the mesh's volume more than it, None where that is unknown.
-    """
+    """Parts of the mesh, ``glb`` with ``parts`` of them, and how far they stand for it."""
 
     glb: bytes
     parts: int
-    deviation_m: float
-    added_volume: float | None
+    fit: Fit
 
     def __str__(self) -> str:
-        volume = "" if self.added_volume is None else f", {self.added_volume:+.1%} volume"
-        return f"{self.parts} parts, at most {1000 * self.deviation_m:.2g} mm off{volume}"
+        volume = "" if self.fit.volume is None else f", {self.fit.volume - 1.0:+.1%} volume"
+        return f"{self.parts} parts, at most {1000 * self.fit.deviation_m:.2g} mm off{volume}"
+
+    def better_than(self, other: Candidate | None) -> bool:
+        """Whether they stand for it sooner than the others."""
+        if other is None or self.fit.accepted != other.fit.accepted:
+            return other is None or self.fit.accepted
+        return self.fit.deviation_m < other.fit.deviation_m
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ def decompose(
     """Split a mesh into convex parts; the same input gives the same parts unless time runs out.
 
     ``tell`` hears how far it is, with an estimate and the limit; ``give`` gets candidates, each better than
-    the one before. Undecomposable if there is none.
+    the one before. Those of solids stand for the mesh; what an open surface is taken for may be farther off.
+    Undecomposable if there is none.
     """
     if mesh.sound and mesh.bodies:
         _cut(mesh, limits, tell, give)
@@ -115,11 +118,10 @@ def _cut(
 ) -> None:
     volume = mass_properties(mesh.vertices[mesh.faces]).volume
     # Without sheets, which no part can follow.
-    mesh = _of_bodies(mesh)
+    mesh = of_bodies(mesh)
     target = target_m(mesh)
-    usable = max(target, _USABLE_SHARE * float(np.ptp(mesh.vertices, axis=0).max()))
     began = time.process_time()
-    search = Search(deadline=began + min(CUTTING_SECONDS, CUTTING_SHARE * limits.seconds))
+    search = Search(deadline=began + CUTTING_SHARE * limits.seconds)
     whole: list[Part] = []
     faces = 0
     for vertices, triangles in _largest(mesh.bodies, limits.max_parts // 2):
@@ -131,7 +133,8 @@ def _cut(
         if made is None:
             _remesh(mesh, limits, tell, give)
             return
-        solid = cutting.simplified(made, _SIMPLIFYING_SHARE * target)
+        thickness = 2.0 * made.volume() / made.surface_area()
+        solid = cutting.simplified(made, min(_SIMPLIFYING_SHARE * target, _OF_THICKNESS * thickness))
         faces += solid.num_tri()
         cutting.add(search, solid)
     bodies = "a body" if len(mesh.bodies) == 1 else f"{len(mesh.bodies)} bodies, {len(whole)} convex"
@@ -139,37 +142,41 @@ def _cut(
     if faces and faces < len(mesh.faces):
         about += f", simplified to {faces:,}"
     report = _Report(about, began, limits.seconds, tell)
-    goal = target
+    goal = Goal(target, _EXCESS_SHARE * ACCEPTED_VOLUME * volume)
     best: Candidate | None = None
     while True:
-        report(search, goal)
+        report(search, goal.depth_m)
         cutting.refine(search, goal, limits.max_parts - len(whole), report)
         cutting.merge(search, goal)
         parts = whole + [part for hull in cutting.hulls(search, target) if (part := _part(hull)) is not None]
         found = _candidate(mesh, parts, limits.max_parts, volume)
-        if best is None or found.deviation_m < best.deviation_m:
+        if found.better_than(best):
             best = found
-            if found.deviation_m <= usable:
+            if found.fit.accepted:
                 give(found)
             tell(f"{about}: {found}")
-        if found.deviation_m <= target or search.over() or goal < target / 8:
+        done = found.fit.accepted and found.fit.deviation_m <= target
+        if done or search.over() or goal.depth_m < _SHALLOWEST * target:
             break
-        goal *= min(0.8, max(0.5, target / found.deviation_m))
-    if best.deviation_m > usable:
-        raise Undecomposable(
-            f"it takes more than {limits.seconds:g} s (the worker's --decompose-seconds): its parts are still"
-            f" {1000 * best.deviation_m:.2g} mm off"
-        )
+        goal = _nearer(goal, found.fit, target)
+    assert best is not None
+    if not best.fit.accepted:
+        late = f"it takes more than {limits.seconds:g} s (the worker's --decompose-seconds)"
+        why = late if search.over() else "finer cuts bring them no nearer"
+        raise Undecomposable(f"{why}: the surface of the best {best.parts} parts is {best.fit}")
 
 
-def _of_bodies(mesh: Mesh) -> Mesh:
-    """The mesh of its bodies alone."""
-    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in mesh.bodies[:-1]])
-    return Mesh(
-        np.concatenate([vertices for vertices, _ in mesh.bodies]),
-        np.concatenate([faces + offset for (_, faces), offset in zip(mesh.bodies, offsets, strict=True)]),
-        bodies=mesh.bodies,
-    )
+def _nearer(goal: Goal, found: Fit, target_m: float) -> Goal:
+    """What to aim at where what was found for a goal is too far off, in distance, volume or both."""
+    depth, excess = goal.depth_m, goal.excess_m3
+    if found.deviation_m > target_m:
+        depth *= min(0.8, max(0.5, target_m / found.deviation_m))
+    swelled = abs((found.volume or 1.0) - 1.0)
+    if swelled > ACCEPTED_VOLUME:
+        excess *= min(0.8, max(0.5, ACCEPTED_VOLUME / swelled))
+        # It need not be an excess: simplified, a thin wall may have lost as much.
+        depth *= 0.9
+    return Goal(depth, excess)
 
 
 def _largest(bodies: Sequence[Part], most: int) -> list[Part]:
@@ -210,19 +217,19 @@ def _remesh(
     mesh: Mesh, limits: CuttingLimits, tell: Callable[[str], None], give: Callable[[Candidate], None]
 ) -> None:
     began = time.process_time()
-    best = float("inf")
+    best: Candidate | None = None
     for threshold in _THRESHOLDS:
         tell(
             f"{len(mesh.faces):,} faces that enclose no solid: CoACD remeshes them, threshold {threshold:g};"
             f" {time.process_time() - began:.0f} s, at most {limits.seconds:.0f} s"
         )
         found = _candidate(mesh, _by_coacd(mesh, threshold, limits.seed), limits.max_parts, None)
-        if found.deviation_m < best:
-            best = found.deviation_m
+        if found.better_than(best):
+            best = found
             give(found)
         tell(str(found))
         # A finer one takes longer; what there is by now is worth more than nothing at the end.
-        if found.deviation_m <= target_m(mesh) or time.process_time() - began > limits.seconds / 3:
+        if found.fit.deviation_m <= target_m(mesh) or time.process_time() - began > limits.seconds / 3:
             return
 
 
@@ -262,8 +269,7 @@ def _candidate(mesh: Mesh, parts: list[Part], max_parts: int, volume: float | No
         parts = meshes.parts_from_glb(glb)
     except MeshError as error:
         raise Undecomposable(f"its parts are not usable: {error}") from None
-    added = None if volume is None else united_volume(parts) / volume - 1.0
-    return Candidate(glb, len(parts), deviation(mesh, parts).largest_m, added)
+    return Candidate(glb, len(parts), fit(mesh, parts, volume))
 
 
 def _part(vertices: npt.NDArray[np.float64], crumb_m3: float = 0.0) -> Part | None:

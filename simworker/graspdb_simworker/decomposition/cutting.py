@@ -31,10 +31,15 @@ FACES = 3_000
 MAX_PART_VERTICES = 128
 #: Planes along faces at concave edges that are tried, those of the longest edges.
 _CREASES = 24
+#: Planes that are tried for any piece.
+_FEWEST = 9
 #: So far outside of a face, as a share of the piece's extent, lies the plane along it.
 _OUTSIDE_SHARE = 1e-6
-#: Where planes across each axis are tried, as shares of the piece's extent.
-_SHARES = (0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85)
+#: Where planes across each axis are tried, as shares of the piece's extent; fewer of them for many triangles.
+_SHARES = ((0.15, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85), (0.3, 0.5, 0.7), (0.5,))
+#: Triangles that all planes tried for one cut may have to split: a piece with many is cut again and again, so
+#: that no single cut of it matters much.
+_WORK = 60_000
 #: A piece with less than this share of the solid's box is a crumb of the cutting.
 _CRUMB = 1e-7
 #: A cut is worth it that saves this share of what a hull adds.
@@ -107,16 +112,25 @@ def add(search: Search, solid: manifold3d.Manifold) -> None:
     search.pieces += _pieces(solid, 0.0)
 
 
-def refine(
-    search: Search, target_m: float, max_pieces: int, progress: Callable[[Search, float], None]
-) -> None:
-    """Cut the deepest piece, again and again, until none is deeper than ``target_m`` or the time is over."""
+@dataclass(frozen=True)
+class Goal:
+    """How deep pieces may be below their hulls, metres, and by how much these may be larger in sum, m^3."""
+
+    depth_m: float
+    excess_m3: float
+
+
+def refine(search: Search, goal: Goal, max_pieces: int, progress: Callable[[Search, float], None]) -> None:
+    """Cut the deepest piece, and then that with the most excess, again and again, until they reach the goal
+    or the time is over."""
     done: set[int] = set()
     while len(search.pieces) < max_pieces and not search.over():
-        open_pieces = [p for p in search.pieces if p.depth_m > target_m and id(p) not in done]
-        if not open_pieces:
+        left = [piece for piece in search.pieces if id(piece) not in done]
+        deep = [piece for piece in left if piece.depth_m > goal.depth_m]
+        swollen = not deep and sum(piece.excess_m3 for piece in search.pieces) > goal.excess_m3
+        if not left or not (deep or swollen):
             return
-        worst = max(open_pieces, key=lambda piece: piece.depth_m)
+        worst = max(left, key=lambda piece: piece.depth_m if deep else piece.excess_m3)
         began = time.process_time()
         found = _cut(worst, search)
         search.seconds += time.process_time() - began
@@ -126,12 +140,13 @@ def refine(
             search.cuts += 1
         else:
             done.add(id(worst))
-        progress(search, target_m)
+        progress(search, goal.depth_m)
 
 
-def merge(search: Search, target_m: float) -> None:
-    """Join neighbours whose common hull is not deeper than ``target_m``, those first that add least to it."""
+def merge(search: Search, goal: Goal) -> None:
+    """Join neighbours whose common hull does for the goal, those first that add least to it."""
     pieces = dict(enumerate(search.pieces))
+    spare = goal.excess_m3 - sum(piece.excess_m3 for piece in search.pieces)
     pairs = [
         (_added(pieces[a], pieces[b]), a, b) for a in pieces for b in range(a) if _meet(pieces[a], pieces[b])
     ]
@@ -142,8 +157,12 @@ def merge(search: Search, target_m: float) -> None:
         if one not in pieces or two not in pieces:
             continue
         joined = _pieces(pieces[one].solid + pieces[two].solid, 0.0)
-        if len(joined) != 1 or joined[0].depth_m > target_m:
+        if len(joined) != 1 or joined[0].depth_m > goal.depth_m:
             continue
+        more = joined[0].excess_m3 - pieces[one].excess_m3 - pieces[two].excess_m3
+        if more > max(spare, 0.0):
+            continue
+        spare -= more
         del pieces[one], pieces[two]
         number = next(numbers)
         pieces[number] = joined[0]
@@ -196,10 +215,9 @@ def _cut(piece: Piece, search: Search) -> list[Piece]:
     points, corners = _surface(piece.solid)
     crumb = _CRUMB * float(np.prod(np.maximum(np.ptp(points, axis=0), 1e-9)))
     enough = piece.excess_m3 * (1.0 - _WORTH)
-    planes = [*_creases(corners), *_across(points, _SHARES)]
-    best = _best(piece.solid, planes, crumb, search)
+    best = _best(piece.solid, _tried(points, corners), crumb, search)
     if best is None or best.cost > enough:
-        middles = [_halves(piece.solid, plane, crumb) for plane in _across(points, (0.5,))]
+        middles = [_halves(piece.solid, plane, crumb) for plane in _across(points, _SHARES[-1])]
         ahead = [(_cost_after(halves.solids, crumb, search), halves) for halves in middles if halves]
         if ahead:
             cost, halves = min(ahead, key=lambda found: found[0])
@@ -239,7 +257,9 @@ def _cost_after(solids: list[manifold3d.Manifold], crumb_m3: float, search: Sear
     total = 0.0
     for solid in solids:
         uncut = solid.hull().volume() - solid.volume()
-        best = _best(solid, _across(_surface(solid)[0], (0.3, 0.5, 0.7)), crumb_m3, search)
+        points, corners = _surface(solid)
+        shares = _SHARES[1] if len(corners) <= _WORK // 36 else _SHARES[2]
+        best = _best(solid, _across(points, shares), crumb_m3, search)
         total += uncut if best is None else min(uncut, best.cost)
     return float(total)
 
@@ -287,6 +307,17 @@ def _surface(solid: manifold3d.Manifold) -> tuple[FloatArray, FloatArray]:
 
 
 # -------------------------------------------------------------------------------------------- planes
+
+
+def _tried(points: FloatArray, corners: FloatArray) -> list[Plane]:
+    """The planes to try for one cut, no more than :data:`_WORK` allows."""
+    most = max(_FEWEST, _WORK // len(corners))
+    creases = _creases(corners)[: max(_CREASES // 4, most // 3)]
+    for shares in _SHARES:
+        across = _across(points, shares)
+        if len(creases) + len(across) <= most:
+            break
+    return [*creases, *across]
 
 
 def _across(points: FloatArray, shares: Sequence[float]) -> list[Plane]:

@@ -21,7 +21,7 @@ SEED = 0
 
 PATIENCE = 30.0
 """By the clock it may take so many times as long as by the processor's time: chunks go before it."""
-_WAY_OUT = "Simplify the mesh, or give its convex parts"
+_WAY_OUT = "Simplify or mend the mesh, allow more time, or give its convex parts"
 
 
 @dataclass(frozen=True)

@@ -177,6 +177,8 @@ class _Loading:
             mesh = {"mesh": content, **item.mesh.model_dump()}
         if item.convex_parts:
             mesh["convex_parts"] = self._reader.content(member_of(place, "convex-parts"))
+            # As accepted as they were where they come from.
+            mesh["accept_deviation"] = True
         made = self._db.objects.create(**properties, **mesh)
         self._objects.append(made)
         self.made.objects[item.id] = made.id

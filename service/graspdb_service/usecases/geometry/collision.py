@@ -14,6 +14,7 @@ from graspdb.wire.queries import PreOpening
 from graspdb_density.se3 import Poses
 from graspdb_geometry import meshes, openings
 from graspdb_geometry.collision import Scene, Surface
+from graspdb_geometry.deviation import deviation
 from graspdb_geometry.grippers import GripperShape, shape_of
 from graspdb_geometry.openings import Values
 from graspdb_geometry.plausibility import Target
@@ -25,17 +26,15 @@ from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.geometry.mesh_form import MeshForm, form_of
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
-from graspdb_service.usecases.runtime.compute import Compute, by_steps
+from graspdb_service.usecases.runtime.compute import Compute, breathe, by_steps
 from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
 
 Solid = Scene | Surface
-"""An object's convex parts once they exist, and its mesh's own triangles before."""
+"""An object's mesh, exactly; its convex parts, from which they may differ, where it has no mesh."""
 
 _MAX_BYTES = 256 * 2**20
-#: Hulls, planes, edges and trees take about this many times the bytes of the file.
-_GROWTH = 10
 #: How much wider than it needs the jaw is with ``auto``: half of that beside either finger.
 CLEARANCE_M = 0.01
 #: What reaches less far between the fingers is grazed: no gripper is placed more exactly.
@@ -43,12 +42,6 @@ _GRAZED_M = 1e-3
 #: Poses tested between two breaths, with one jaw for all, or a jaw of each pose's own: that takes some ten
 #: times as long.
 _OF_ONE_JAW, _OF_OWN_JAWS = 16_384, 2_048
-
-
-@dataclass(frozen=True)
-class _Prepared:
-    solid: Solid
-    nbytes: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +126,18 @@ class CollisionTest:
 
 
 class Scenes:
-    """Prepared geometry, by content: the same parts are prepared once, whichever object they belong to."""
+    """Prepared geometry, by content: the same mesh is prepared once, whichever object it belongs to.
+
+    Questions are tested against the mesh itself: convex parts swell it where it is not convex, and would call
+    collisions what a robot can do. Parts tell only what an open mesh does not, what lies inside of it.
+    """
 
     def __init__(self, database: Database, compute: Compute, features: Features) -> None:
         self._database = database
         self._compute = compute
         self.features = features
-        self._cache: SingleFlightCache[tuple[str, MeshForm | str], _Prepared] = SingleFlightCache(
-            _MAX_BYTES, lambda p: p.nbytes
+        self._cache: SingleFlightCache[tuple[str, MeshForm | str, str | None], Solid] = SingleFlightCache(
+            _MAX_BYTES, lambda solid: solid.nbytes
         )
 
     def test(self, selected: Selected, pre_opening_m: PreOpening = None) -> CollisionTest | None:
@@ -181,34 +178,44 @@ class Scenes:
         return Target(lower, upper, self._solid(row), shape_of(profile))
 
     def _solid(self, row: ObjectRow) -> Solid | None:
-        if row.parts_sha256 is not None:
-            return self._prepared(
-                row.parts_sha256, "parts", lambda content, _: Scene(meshes.parts_from_glb(content))
-            )
-        info = row.mesh_info
+        parts, info = row.parts_sha256, row.mesh_info
         if row.mesh_sha256 is None or info is None:
-            return None
-        form = form_of(row)
+            if parts is None:
+                return None
+            return self._prepared(
+                (parts, "parts", None), lambda found: Scene(meshes.parts_from_glb(found[0]))
+            )
+        form, closed = form_of(row), bool(info["watertight"])
+        inside = None if closed else parts
+        off_m = (row.parts_info or {}).get("deviation_m")
 
-        def own(content: bytes, _: str) -> Solid:
-            mesh = form.read(content)
+        def prepare(found: list[bytes]) -> Solid:
+            mesh = form.read(found[0])
+            breathe()
             if info["convex"]:
                 return Scene([(mesh.vertices, mesh.faces)])
-            return Surface(mesh.vertices, mesh.faces, watertight=info["watertight"])
+            if inside is None:
+                return Surface(mesh.vertices, mesh.faces, watertight=closed)
+            known = meshes.parts_from_glb(found[1])
+            off = deviation(mesh, known).largest_m if off_m is None else float(off_m)
+            return Surface(mesh.vertices, mesh.faces, watertight=False, inside=Scene(known), inside_off_m=off)
 
-        return self._prepared(row.mesh_sha256, form, own)
+        return self._prepared((row.mesh_sha256, form, inside), prepare)
 
     def _prepared(
-        self, sha256: str, reading: MeshForm | str, prepare: Callable[[bytes, str], Solid]
+        self, key: tuple[str, MeshForm | str, str | None], prepare: Callable[[list[bytes]], Solid]
     ) -> Solid:
-        def make(_: _Prepared | None) -> _Prepared:
-            with self._database.read() as tx:
-                found = assets.get(tx, sha256)
-            if found is None:
-                raise conflict("object-changed", "The object's geometry was replaced just now: ask again")
-            return _Prepared(self._compute.run(lambda: prepare(*found)), _GROWTH * len(found[0]))
+        """What is made of the contents that a key names."""
 
-        return self._cache.get((sha256, reading), lambda _: True, make).solid
+        def make(_: Solid | None) -> Solid:
+            with self._database.read() as tx:
+                found = [assets.get(tx, sha256) for sha256 in (key[0], key[2]) if sha256 is not None]
+            contents = [content for content, _ in filter(None, found)]
+            if len(contents) < len(found):
+                raise conflict("object-changed", "The object's geometry was replaced just now: ask again")
+            return self._compute.run(lambda: prepare(contents))
+
+        return self._cache.get(key, lambda _: True, make)
 
 
 def _check_pre_opening(selected: Selected, pre_opening_m: PreOpening) -> None:

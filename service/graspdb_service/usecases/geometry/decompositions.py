@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from graspdb.wire import DecomposePayload, GridPlan, MeshInfo
+import numpy as np
+
+from graspdb.wire import DecomposePayload, GridPlan, MeshInfo, PartsInfo
 from graspdb.wire.states import JobState, SweepState
 from graspdb.wire.sweeps import WaitingFor
 from graspdb_geometry import meshes
+from graspdb_geometry.deviation import accepted_m
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.storage.database import Tx
 from graspdb_service.storage.objects import ObjectRow
@@ -74,13 +77,31 @@ def settle(tx: Tx, row: ObjectRow) -> None:
     decompositions.cancel(tx, row.id)
 
 
+def warnings(row: ObjectRow) -> list[str]:
+    """What a sweep with the object's parts has to say of them."""
+    if row.parts_info is None or row.mesh_info is None:
+        return []
+    parts, box = PartsInfo.model_validate(row.parts_info), row.mesh_info["bounding_box"]
+    off = parts.deviation_m
+    # Parts that were stored before this was looked at have their distance alone.
+    far = off is not None and off > accepted_m(max(np.subtract(box["upper"], box["lower"])))
+    if off is None or not (parts.deviates or far):
+        return []
+    volume = "" if parts.volume_share is None else f" and have {parts.volume_share:.1%} of its volume"
+    return [
+        f"it simulates convex parts that are up to {1000 * off:.3g} mm off the mesh{volume}: outcomes there"
+        " may not hold for the object, collisions above all"
+    ]
+
+
 def take_parts(tx: Tx, row: ObjectRow, sweep: SweepRow) -> None:
     """Complete a sweep's snapshot with the parts of its object."""
     world: dict[str, Any] = {**sweep.snapshot["world"], "parts_sha256": row.parts_sha256}
     density = world.pop("density_kg_m3", None)
     if world["mass_kg"] is None:
         world["mass_kg"] = density * (row.parts_info or {})["volume_m3"]
-    snapshot = {**sweep.snapshot, "world": world}
+    told = [*sweep.snapshot.get("warnings", []), *warnings(row)]
+    snapshot = {**sweep.snapshot, "world": world, **({"warnings": told} if told else {})}
     if sweep.plan == "grid":
         grid = GridPlan.model_validate(sweep.snapshot["grid"])
         snapshot["repeat_key"] = sweep_plan.repeat_key(world, sweep.protocol, sweep.fidelity, grid)

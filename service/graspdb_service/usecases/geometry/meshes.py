@@ -10,7 +10,7 @@ import numpy as np
 
 from graspdb.wire import BoundingBox, MeshInfo, PartsInfo
 from graspdb_geometry import meshes
-from graspdb_geometry.deviation import deviation, united_volume
+from graspdb_geometry.deviation import Fit, fit
 from graspdb_geometry.meshes import Inspection, Mesh, MeshError, Part
 from graspdb_service.formats.negotiation import GLB
 from graspdb_service.problems import ProblemError, conflict, not_found
@@ -30,9 +30,8 @@ MEDIA_TYPES = meshes.MEDIA_TYPES
 # Parts come from the mesh, rounded or slightly inflated: within this they describe the same object.
 _FIT_M = 1e-3
 _FIT_SHARE = 0.02
-# Parts are the mesh to rounding: nearer than this, and with no more volume than this added or lost.
-_SAME_SHARE = 1e-4
-_SAME_VOLUME = 1e-3
+#: More parts than these are simulated slowly, and seldom say more.
+_MANY_PARTS = 256
 
 
 def put_mesh(ctx: Runtime, slug: str, content: bytes, *, form: MeshForm) -> MeshInfo:
@@ -49,6 +48,7 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, form: MeshForm) -> Mesh
     inspection = _inspect(ctx, content, form)
     info = _mesh_info(inspection, sha256, form, len(content))
     own = meshes.parts_to_glb(inspection.parts) if inspection.parts else None
+    earlier = None if own is not None else _parts_before(ctx, row, content, form, info)
     with ctx.database.write() as tx:
         row = require(tx, slug, lock=True)
         if _is_stored(row, sha256, form):
@@ -65,16 +65,37 @@ def put_mesh(ctx: Runtime, slug: str, content: bytes, *, form: MeshForm) -> Mesh
         elif row.mesh_sha256 is not None:
             # The parts were those of the mesh before.
             values |= {"parts_sha256": None, "parts_info": None}
+        elif row.parts_sha256 is not None:
+            if earlier is None or earlier.sha256 != row.parts_sha256:
+                raise conflict(
+                    "object-changed", f"The parts of {slug!r} were changed at the same moment: try again"
+                )
+            values["parts_info"] = earlier.model_dump(mode="json")
         objects.change(tx, row.id, values)
         audit.record(tx, "mesh.put", object=slug)
     _drop_unused(ctx, row)
     return info
 
 
-def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
+def _parts_before(
+    ctx: Runtime, row: ObjectRow, content: bytes, form: MeshForm, mesh: MeshInfo
+) -> PartsInfo | None:
+    """Parts that were there before their mesh, measured against it; None for none."""
+    if row.mesh_sha256 is not None or row.parts_sha256 is None:
+        return None
+    with ctx.database.read() as tx:
+        found = assets.get(tx, row.parts_sha256)
+    if found is None:
+        return None
+    parts = meshes.parts_from_glb(found[0])
+    return _measured(_parts_info(found[0], parts, mesh), _fit(ctx, parts, content, form, mesh))
+
+
+def put_parts(ctx: Runtime, slug: str, content: bytes, *, accept_deviation: bool = False) -> PartsInfo:
     """Check and store an object's convex parts, a GLB in metres with one geometry a part.
 
-    413 and 422 for what can't be used; 409 for other parts once a sweep exists.
+    413 and 422 for what can't be used, or, unless ``accept_deviation``, does not follow a closed mesh; 409
+    for other parts once a sweep exists.
     """
     sha256 = hashlib.sha256(content).hexdigest()
     with ctx.database.read() as tx:
@@ -82,7 +103,7 @@ def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
         if row.parts_sha256 == sha256:
             return PartsInfo.model_validate(row.parts_info)
         _refuse_other_parts(tx, row)
-    info = check_parts(ctx, row, content)
+    info = check_parts(ctx, row, content, accept_deviation=accept_deviation)
     with ctx.database.write() as tx:
         locked = require(tx, slug, lock=True)
         if locked.parts_sha256 == sha256:
@@ -99,8 +120,12 @@ def put_parts(ctx: Runtime, slug: str, content: bytes) -> PartsInfo:
     return info
 
 
-def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
-    """Check convex parts, wherever they come from, and measure them against their object's mesh."""
+def check_parts(ctx: Runtime, row: ObjectRow, content: bytes, *, accept_deviation: bool = False) -> PartsInfo:
+    """Check convex parts, wherever they come from, and measure them against their object's mesh.
+
+    422 for those that do not follow a closed mesh, unless ``accept_deviation``. What an open mesh leaves open
+    they may fill: then the warnings tell how far they differ.
+    """
     parts = _inspect(ctx, content, MeshForm(GLB), field="parts").parts
     mesh = None if row.mesh_info is None else MeshInfo.model_validate(row.mesh_info)
     info = _parts_info(content, parts, mesh)
@@ -112,15 +137,44 @@ def check_parts(ctx: Runtime, row: ObjectRow, content: bytes) -> PartsInfo:
         raise conflict(
             "object-changed", f"The mesh of {row.slug!r} was changed at the same moment: try again"
         )
-    own = form_of(row).read(found[0])
-    apart, volume = ctx.compute.run(lambda: (deviation(own, parts).largest_m, united_volume(parts)))
-    longest = max(np.subtract(mesh.bounding_box.upper, mesh.bounding_box.lower))
-    added = 0.0 if mesh.volume_m3 is None else volume / mesh.volume_m3 - 1.0
+    told = _fit(ctx, parts, found[0], form_of(row), mesh)
+    if not told.accepted and mesh.watertight and not accept_deviation:
+        raise _deviate(told, info.warnings)
+    return _measured(info, told)
+
+
+def _deviate(told: Fit, doubts: list[str]) -> ProblemError:
+    doubt = "".join(f" ({text})" for text in doubts)
+    return ProblemError(
+        422,
+        "convex-parts-deviate",
+        f"The parts' surface is {told}{doubt}: physics would tell of another object than the mesh. Decompose"
+        " it finer; or leave it to a worker, for the first sweep of an object without parts has them made; or"
+        " take them all the same, and every sweep says so: send them with ?accept_deviation=true"
+        " (on the command line --accept-deviation)",
+        errors=[("parts", "too far from the mesh")],
+        extra={"deviation_m": told.deviation_m, "accepted_m": told.accepted_m, "volume_share": told.volume},
+    )
+
+
+def _fit(ctx: Runtime, parts: list[Part], content: bytes, form: MeshForm, mesh: MeshInfo) -> Fit:
+    own = form.read(content)
+    return ctx.compute.run(lambda: fit(own, parts, mesh.volume_m3))
+
+
+def _measured(info: PartsInfo, told: Fit) -> PartsInfo:
+    """What is known of parts, and how far they stand for their mesh."""
     warnings = list(info.warnings)
-    if not warnings and (apart > _SAME_SHARE * longest or abs(added) > _SAME_VOLUME):
-        share = "" if mesh.volume_m3 is None else f", their volume is {volume / mesh.volume_m3:.1%} of its"
-        warnings.append(f"the parts' surface is up to {1000 * apart:.3g} mm off the mesh's{share}")
-    return info.model_copy(update={"deviation_m": apart, "warnings": warnings})
+    if not told.same:
+        warnings.append(f"the parts' surface is {told}")
+    return info.model_copy(
+        update={
+            "deviation_m": told.deviation_m,
+            "volume_share": told.volume,
+            "deviates": not told.accepted,
+            "warnings": warnings,
+        }
+    )
 
 
 def store_parts(tx: Tx, row: ObjectRow, content: bytes, info: PartsInfo) -> None:
@@ -260,6 +314,10 @@ def _parts_info(content: bytes, parts: list[Part], mesh: MeshInfo | None) -> Par
                 f"the parts' bounding box is up to {float(off.max()):.3g} m off the mesh's:"
                 " are they of this mesh, and in metres?"
             )
+    if len(parts) > _MANY_PARTS:
+        warnings.append(
+            f"{len(parts)} parts are simulated slowly: {_MANY_PARTS} or fewer tell as much of most objects"
+        )
     return PartsInfo(
         sha256=hashlib.sha256(content).hexdigest(),
         parts=len(parts),

@@ -75,7 +75,7 @@ class Pictures:
                 "mesh-missing",
                 f"Object {slug!r} has no mesh to draw a picture of: PUT /objects/{slug}/mesh stores one",
             )
-        # Parts tell how far the jaw closes.
+        # Parts tell what is inside of an open mesh, and so whether the jaw closes at all.
         depends = (
             row.mesh_sha256,
             form_of(row),

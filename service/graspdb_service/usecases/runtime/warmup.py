@@ -77,7 +77,9 @@ def _exercise() -> None:
     faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7]])
     scene = Scene([(corners, faces)])
     jaw = shape_of(PRESETS["pg70"].profile)
-    Surface(corners, faces, watertight=False).collides(poses, jaw)
+    surface = Surface(corners, faces, watertight=False)
+    surface.collides(poses, jaw)
+    surface.widths(poses, jaw)
     kernel = IsotropicKernel(0.015, math.radians(15.0))
     region = Region([[0.0, 0.0, 1.0, 0.0]], approach=(0.0, 0.0, 1.0), approach_angle=1.0)
 

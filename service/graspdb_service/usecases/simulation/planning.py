@@ -100,6 +100,7 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
     chunk = _chunk_size(ctx, spec, plan)
     # In memory and in one go, before the transaction, that it may be short.
     numbers = jobs.job_ids(created_ms, -(-plan.count // chunk), urgent=spec.purpose == "check")
+    plan = replace(plan, warnings=[*plan.warnings, *decompositions.warnings(row)])
     snapshot = _snapshot(world, plan, spec)
 
     def store(tx: Tx) -> Created:
