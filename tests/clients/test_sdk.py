@@ -123,9 +123,10 @@ def test_convex_parts_from_meshes(db: Client, fresh_id: str) -> None:
 
 def test_parts_that_fill_a_room_are_taken_on_request_alone(db: Client, fresh_id: str) -> None:
     tube = trimesh.creation.annulus(r_min=0.03, r_max=0.035, height=0.1)
+    made = db.objects.create(fresh_id, mesh=tube)
     with pytest.raises(InvalidInput, match="accept_deviation"):
-        db.objects.create(fresh_id, mesh=tube, convex_parts=[tube.convex_hull])
-    made = db.objects.create(fresh_id, mesh=tube, convex_parts=[tube.convex_hull], accept_deviation=True)
+        made.upload_convex_parts([tube.convex_hull])
+    made.upload_convex_parts([tube.convex_hull], accept_deviation=True)
     assert made.info.convex_parts is not None
     assert made.info.convex_parts.deviates
     assert "mm off the mesh" in made.summary()["convex parts warning 1"]
