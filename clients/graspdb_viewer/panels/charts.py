@@ -23,7 +23,8 @@ def convergence(report: Convergence) -> go.Figure:
             line={"color": colour},
         )
         figure.add_hline(curve.verdict.target, line={"color": GREY, "dash": "dot"})
-    figure.update_xaxes(type="log")
+    tried = sorted({point.grasps for curve in report.raw.curves for point in curve.points})
+    _logarithmic(figure, {float(count): f"{count:,}" for count in tried})
     return figure
 
 
@@ -56,11 +57,13 @@ def widths(report: Bandwidth) -> go.Figure:
         figure.add_scatter(
             x=[1e3 * point.sigma_position_m for point in points],
             y=[point.log_likelihood for point in points],
-            name=f"{turn:.1f}°",
+            name=f"{turn:.3g}°",
             line={"color": colour},
         )
     figure.add_vline(1e3 * report.recommended[0], line={"color": GREY, "dash": "dot"})
-    figure.update_xaxes(type="log")
+    figure.update_layout(legend_title_text="rotation width")
+    tried = sorted({1e3 * point.sigma_position_m for point in report.raw.grid})
+    _logarithmic(figure, {width: f"{width:.3g}" for width in tried})
     return figure
 
 
@@ -100,6 +103,11 @@ def _figure(across: str, upward: str) -> go.Figure:
         yaxis_title=upward,
     )
     return figure
+
+
+def _logarithmic(figure: go.Figure, ticks: dict[float, str]) -> None:
+    """Across by factors, with a tick where something was computed."""
+    figure.update_xaxes(type="log", tickvals=list(ticks), ticktext=list(ticks.values()))
 
 
 def _axis(direction: Any) -> str:
