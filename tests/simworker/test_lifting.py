@@ -159,12 +159,14 @@ def test_a_heavier_bar_slips_where_a_lighter_one_stays(payload_of: MakePayload) 
         for mass in (0.4, 1.0, 1.5, 4.0)
     ]
     assert [label.outcome for label in labels] == [Outcome.SUCCESS] * 3 + [Outcome.DROPPED]
-    # What holds does not creep: less than 0.2 mm and 0.3 degrees.
-    assert all(label.quality > 0.98 for label in labels[:3])
+    # What holds does not creep: less than 0.01 mm and 0.005 degrees, and close to the limit, where parts of
+    # the patches already slip, 0.1 mm and 0.05 degrees.
+    assert all(label.quality > 0.99 for label in labels[:2])
+    assert labels[2].quality > 0.9
 
 
-def test_light_objects_meet_the_full_force_in_slow_motion(payload_of: MakePayload) -> None:
-    """Below 0.3 kg the jaw closes with a quarter of its force: loads are scaled alike, so that just as
+def test_light_objects_are_carried_with_the_full_force(payload_of: MakePayload) -> None:
+    """Below 0.3 kg the jaw closes with a quarter of its force, but carries with all of it, so that just as
     slippery a bar slips on either side of that mass."""
     for friction, outcome in ((0.4, Outcome.SUCCESS), (0.025, Outcome.DROPPED)):
         for mass in (0.299, 0.301):

@@ -190,6 +190,7 @@ class End(Enum):
     EMPTY = "empty"
     TIMEOUT = "timeout"
     UNSTABLE = "unstable"
+    SUNK = "sunk"
 
 
 @dataclass(frozen=True)

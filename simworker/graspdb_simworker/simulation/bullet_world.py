@@ -16,7 +16,7 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from graspdb_simworker.simulation import camera, urdf
+from graspdb_simworker.simulation import camera
 from graspdb_simworker.simulation.bodies import (
     Gripper,
     MassProperties,
@@ -30,9 +30,6 @@ from graspdb_simworker.simulation.bodies import (
 COLLISION_MARGIN_M = 0.0005
 """Bullet inflates convex hulls by this much; boxes keep their size."""
 CONTACT_BREAKING_M = 0.002
-_RESIDUAL = 1e-7
-"""Bullet's own threshold below which it iterates no more; the contacts of two faces reach it long before
-friction is balanced between them."""
 PARKED: Vector = (0.0, 0.0, -1000.0)
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
@@ -53,8 +50,8 @@ class _Connection:
 class BulletWorld:
     """A jaw at the origin, its tool frame the world's, and an object.
 
-    ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3). ``by_faces``: faces
-    can touch in whole polygons, see :mod:`.urdf`, once they are told to. ``visible``: build what can be seen.
+    ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3). ``visible``:
+    build what can be seen.
     """
 
     def __init__(
@@ -65,7 +62,6 @@ class BulletWorld:
         gripper: Gripper,
         *,
         solver_iterations: int,
-        by_faces: bool,
         visible: bool,
     ) -> None:
         self.gripper = gripper
@@ -76,25 +72,20 @@ class BulletWorld:
         # Gives every call the world's number; calls of every step give it themselves, which is faster.
         self._bullet = _Connection()
         self._client = self._bullet.number
-        self._configure(solver_iterations, by_faces)
-        if by_faces:
-            self._jaw, self._object = self._load_bodies(parts)
-        else:
-            self._jaw, self._object = self._build_gripper(), self._build_object(parts, self.mass)
+        self._configure(solver_iterations)
+        self._jaw, self._object = self._build_gripper(), self._build_object(parts, self.mass)
         self._column, self._column_at = self._build_column()
-        self._gear = self._build_gear() if by_faces else -1
-        self._finish_bodies(math.sqrt(friction), anchored=by_faces)
+        self._finish_bodies(math.sqrt(friction))
 
     def close_world(self) -> None:
         """Free Bullet's memory at once; the world can't be used afterwards."""
         self._bullet.end()
 
-    def _configure(self, solver_iterations: int, by_faces: bool) -> None:
+    def _configure(self, solver_iterations: int) -> None:
         self._bullet.resetSimulation()
         self._bullet.setGravity(0.0, 0.0, 0.0)
         self._bullet.setPhysicsEngineParameter(
             numSolverIterations=solver_iterations,
-            solverResidualThreshold=0.0 if by_faces else _RESIDUAL,
             contactBreakingThreshold=CONTACT_BREAKING_M,
             deterministicOverlappingPairs=1,
             numSubSteps=0,
@@ -155,17 +146,6 @@ class BulletWorld:
             raise RuntimeError("pybullet refused the object's convex parts")
         return body
 
-    def _load_bodies(self, parts: Sequence[Part]) -> tuple[int, int]:
-        """Gripper and object with contact by faces."""
-        flags = pybullet.URDF_INITIALIZE_SAT_FEATURES | pybullet.URDF_USE_INERTIA_FROM_FILE
-        with tempfile.TemporaryDirectory(prefix="graspdb-bodies-") as name:
-            folder = Path(name)
-            gripper = os.fspath(urdf.write_gripper(folder, self.gripper))
-            place = (0.0, 0.0, self.gripper.palm_centre_z)
-            jaw = self._bullet.loadURDF(gripper, basePosition=place, useFixedBase=1, flags=flags)
-            thing = os.fspath(urdf.write_object(folder, parts, self.mass))
-            return jaw, self._bullet.loadURDF(thing, basePosition=PARKED, flags=flags)
-
     def _build_column(self) -> tuple[int, Vector]:
         """The space between the open fingers: a shape without a body, which would cost time at every step,
         and its centre."""
@@ -173,27 +153,11 @@ class BulletWorld:
         shape = self._box((half[0], 0.5 * self.gripper.max_opening_m, half[2]))
         return shape, (0.0, 0.0, self.gripper.tip_offset_m - half[2])
 
-    def _build_gear(self) -> int:
-        """What couples the fingers while they carry: both joints move alike. Idle until then."""
-        axis, middle = (0.0, 1.0, 0.0), (0.0, 0.0, 0.0)
-        gear: int = self._bullet.createConstraint(
-            self._jaw, 0, self._jaw, 1, pybullet.JOINT_GEAR, axis, middle, middle
-        )
-        self._couple(gear, 0.0)
-        return gear
-
-    def _couple(self, gear: int, force_n: float) -> None:
-        self._bullet.changeConstraint(gear, gearRatio=-1, maxForce=force_n)
-
-    def _finish_bodies(self, friction_root: float, *, anchored: bool) -> None:
-        """Surfaces and inertia. ``anchored`` friction pulls back what crept: the solver balances speeds only,
-        and what it leaves undone at every step lets a firmly held object slide by millimetres while it is
-        carried, even at the fine step (a bar of 1.5 kg in the middle of its faces)."""
+    def _finish_bodies(self, friction_root: float) -> None:
+        """Surfaces and inertia."""
         # Bullet multiplies the coefficients of the two bodies, hence the root.
         surface = {"lateralFriction": friction_root}
         surface |= dict.fromkeys(("spinningFriction", "rollingFriction", "restitution"), 0.0)
-        if anchored:
-            surface["frictionAnchor"] = 1
         for body, links in ((self._jaw, (-1, 0, 1)), (self._object, (-1,))):
             for link in links:
                 # In a call of its own: beside a setting that only a base has, such as a damping or a
@@ -211,9 +175,6 @@ class BulletWorld:
         for link in (0, 1):
             self._bullet.changeDynamics(self._jaw, link, jointDamping=0.0)
         self._bullet.changeDynamics(self._object, -1, localInertiaDiagonal=self.mass.inertia)
-
-    def _touch_by_faces(self, yes: bool) -> None:
-        self._bullet.setPhysicsEngineParameter(enableSAT=int(yes))
 
     def _damp(self, rate: float) -> None:
         self._bullet.changeDynamics(self._object, -1, linearDamping=rate, angularDamping=rate)

@@ -3,7 +3,8 @@
 The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at
 the origin, its tool frame is the world frame; for every grasp the *object* is moved instead. Nothing
 weighs: the object floats, so that the jaw centres it as it closes, and gravity enters afterwards
-through the force test in :mod:`graspdb_simworker.simulation.labels`.
+through the force test in :mod:`graspdb_simworker.simulation.labels`, or as a load on what is carried: Bullet
+closes the jaw, and :mod:`graspdb_simworker.simulation.carrying` lifts.
 
 What the solver does depends on what it did before: Bullet keeps contact caches and the order of
 overlapping pairs. Parking the object far away and stepping the world once after every grasp empties
@@ -23,7 +24,7 @@ import pybullet
 from numpy.typing import NDArray
 
 from graspdb.wire.sweeps import Fidelity
-from graspdb_simworker.simulation import lifting
+from graspdb_simworker.simulation import carrying, lifting
 from graspdb_simworker.simulation.bodies import (
     HEAVY_KG,
     Carried,
@@ -40,7 +41,7 @@ from graspdb_simworker.simulation.bodies import (
 )
 from graspdb_simworker.simulation.bullet_world import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
 from graspdb_simworker.simulation.force_test import rating
-from graspdb_simworker.simulation.labels import MOVED_M, TURNED_RAD
+from graspdb_simworker.simulation.labels import RATED
 
 APPROACH_GAP_M = 0.0005
 """The fingers start this far before their first contact: nothing can happen on the way there."""
@@ -61,41 +62,54 @@ finger to finger, and whether it stays depends on the time step more than on the
 docs/experiments.md."""
 SLACK_S = 1.0
 """A closing may last this much longer than the fingers need to meet at full speed."""
-LOST = 5.0
-"""A carried object this many times farther away than allowed is lost: no need to see where it ends."""
+LOST = carrying.Lost(0.050, math.radians(75.0))
+"""A carried object that is farther off than this in the jaw is lost: no need to see where it ends."""
+LIFTED_AFTER_S = 0.100
+"""This long after the stall the jaw begins to lift: it has nearly stopped swinging by then."""
+SUNK_M = 0.0008
+"""A finger this deep in the object is passing through it: Bullet's contacts of single points may rock a flat
+object from corner to corner at every step and never stop the jaw."""
+STALLED_SUNK_M = 0.0002
+"""Nor has a jaw stalled soundly this deep in it: what is firmly held is 0.02 mm deep."""
 _EMPTY_CHECK_STEPS = 10
+_SUNK_CHECK_STEPS = 3
 _SURELY_BETWEEN = 0.8
 """An object that no point of which moved by this share of its depth between the fingers is still there."""
 _ANY_LINK = -2
-_GEAR_FORCES = 100.0
-"""The coupling of the fingers may exert so many times the closing force: as good as rigid."""
 
 
 @dataclass(frozen=True)
 class Stepping:
-    """How time is cut: until both fingers touch, from then on, and while the object is carried."""
+    """How time is cut: until both fingers touch, from then on, and while the object is carried, when patches
+    of contact are cut into areas of ``area_m``."""
 
     approach_dt_s: float
     squeeze_dt_s: float
-    carry_dt_s: float
     solver_iterations: int
+    carry_dt_s: float
+    area_m: float
 
 
-_LIGHT = Stepping(1.0 / 240.0, 1.0 / 480.0, 1.0 / 240.0, 50)
-_HEAVY = Stepping(1.0 / 240.0, 1.0 / 240.0, 1.0 / 240.0, 80)
+_LIGHT = Stepping(1.0 / 240.0, 1.0 / 480.0, 50, 1.0 / 240.0, 0.005)
+_HEAVY = Stepping(1.0 / 240.0, 1.0 / 240.0, 80, 1.0 / 240.0, 0.005)
 """What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each."""
-_LIFTED = Stepping(1.0 / 240.0, 1.0 / 480.0, 1.0 / 240.0, 300)
-"""Whether it slips hangs on friction that is balanced between many contacts, which takes many iterations."""
-_FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 1.0 / 2000.0, 200)
+_FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200, 1.0 / 960.0, 0.0025)
+"""Also what a doubtful closing is simulated with once more."""
 
 
-def stepping_for(fidelity: Fidelity, mass_kg: float, *, lifts: bool = False) -> Stepping:
+def stepping_for(fidelity: Fidelity, mass_kg: float) -> Stepping:
     """How finely to simulate an object of this mass."""
     if fidelity == "fine":
         return _FINE
-    if lifts:
-        return _LIFTED
     return _HEAVY if mass_kg >= HEAVY_KG else _LIGHT
+
+
+def doubtful(closing: Closing) -> bool:
+    """Whether a closing can't be believed at the ordinary step: the fingers sank into the object, or the
+    readings that count contradict each other, some hold the weight and some do not. What is slippery or light
+    makes the forces ring, and the median of what rings is no measure."""
+    counted = closing.ratings[-RATED:]
+    return closing.end is End.SUNK or (bool(counted) and min(counted) < 1.0 <= max(counted))
 
 
 class Moment(NamedTuple):
@@ -133,20 +147,16 @@ class GraspWorld(BulletWorld):
         film_every_s: float = math.inf,
         moments_every_s: float = math.inf,
     ) -> None:
-        stepping = stepping_for(fidelity, mass_kg, lifts=lifts)
-        # What is lifted must not turn where faces hold it.
+        stepping = stepping_for(fidelity, mass_kg)
         super().__init__(
             parts,
             mass_kg,
             friction,
             gripper,
             solver_iterations=stepping.solver_iterations,
-            by_faces=lifts,
             visible=visible,
         )
         self.stepping = stepping
-        self._damping = DAMPING * math.sqrt(gripper.closing_force_n / mass_kg)
-        self._lifts = lifts
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
         self._moments_every_s = moments_every_s
@@ -157,11 +167,16 @@ class GraspWorld(BulletWorld):
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
         the end is last. Empty unless the world is visible."""
+        self._carrier = (
+            carrying.Carrier(parts, self.mass, gripper, friction, stepping.carry_dt_s, stepping.area_m, LOST)
+            if lifts
+            else None
+        )
         self._to_body = inverse(self.mass.principal_xyzw)
         self._radius = self.mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
         self._seen: tuple[Vector, Quaternion, float] | None = None
-        self._damp(self._damping)
+        self._damp(DAMPING * math.sqrt(gripper.closing_force_n / mass_kg))
         self._park()
 
     # -- one grasp -----------------------------------------------------------------------------------------
@@ -171,18 +186,28 @@ class GraspWorld(BulletWorld):
 
         Each finger can close by ``travel_m`` before the first of the two touches, by the exact geometry.
         """
+        stepping = self.stepping
         try:
-            self.pictures.clear()
-            self.moments.clear()
-            self._filmed_s = self._time_s = 0.0
             closing = self._close(position, quaternion_xyzw, travel_m)
+            if stepping is not _FINE and doubtful(closing):
+                self._step_by(_FINE)
+                closing = self._close(position, quaternion_xyzw, travel_m)
             if self._moments_every_s < math.inf and self.moments[-1].time_s < self._time_s:
                 self.moments.append(self._moment())
             if self._visible:
                 self.pictures.append(self._render())
             return closing
         finally:
-            self._park()
+            if self.stepping is stepping:
+                self._park()
+            else:
+                self._step_by(stepping)
+
+    def _step_by(self, stepping: Stepping) -> None:
+        """Leave the running grasp and cut time otherwise from now on."""
+        self.stepping = stepping
+        self._bullet.setPhysicsEngineParameter(numSolverIterations=stepping.solver_iterations)
+        self._park()
 
     def _watch(self, dt: float) -> None:
         """Keep a moment, and take a picture, when it is time for the next."""
@@ -209,6 +234,9 @@ class GraspWorld(BulletWorld):
     def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
         client, jaw, body = self._client, self._jaw, self._object
         gripper, stepping = self.gripper, self.stepping
+        self.pictures.clear()
+        self.moments.clear()
+        self._filmed_s = self._time_s = 0.0
         where, orientation = self._body_pose(position, quaternion_xyzw)
         # Parking left the object at rest and the motors driven at the steps of the approach.
         pybullet.resetBasePositionAndOrientation(body, where, orientation, physicsClientId=client)
@@ -220,7 +248,7 @@ class GraspWorld(BulletWorld):
             pybullet.resetJointState(jaw, joint, start, -gripper.max_speed_m_s, physicsClientId=client)
 
         dt = stepping.approach_dt_s
-        touched = by_faces = False
+        touched = False
         elapsed = 0.0
         limit = 2.0 * start / gripper.max_speed_m_s + SLACK_S
         opening = 2.0 * start
@@ -234,6 +262,7 @@ class GraspWorld(BulletWorld):
         # arguments without their names.
         step, states, touching = pybullet.stepSimulation, pybullet.getJointStates, pybullet.getContactPoints
         watched, joints = self._watched, (0, 1)
+        ages = READING_AGES_S if self._carrier is None else (LIFTED_AFTER_S,)
         while elapsed < limit:
             step(client)
             steps += 1
@@ -262,30 +291,24 @@ class GraspWorld(BulletWorld):
                 mark_opening, mark_time = opening, elapsed
                 contacts.clear()
                 ratings.clear()
-            elif elapsed - mark_time >= READING_AGES_S[len(contacts)] - 1e-9:
-                if self._lifts and not by_faces:
-                    # Stalled, so from now on by faces, which takes many times as long; and until it has
-                    # stalled on them as well.
-                    by_faces = True
-                    self._touch_by_faces(True)
-                    mark_opening, mark_time = opening, elapsed
-                    continue
+            elif elapsed - mark_time >= ages[len(contacts)] - 1e-9:
                 contacts.append(self._contacts())
-                if not self._lifts:
+                if self._carrier is None:
                     ratings.append(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction))
-                if (
-                    self._lifts
-                    or len(contacts) == len(READING_AGES_S)
-                    or ratings[-1] >= NO_DOUBT[len(contacts) - 1]
-                ):
+                if len(contacts) == len(ages) or ratings[-1] >= NO_DOUBT[len(contacts) - 1]:
                     end = End.STALLED
                     break
             if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
                 end = End.EMPTY
                 break
+            if touched and steps % _SUNK_CHECK_STEPS == 0 and self._sunk(SUNK_M):
+                end = End.SUNK
+                break
+        if end is End.STALLED and self._sunk(STALLED_SUNK_M):
+            end = End.SUNK
         closing = self._closing(end, touched, opening, contacts, ratings, steps)
-        if self._lifts and closing.end is End.STALLED:
-            return replace(closing, carried=self._carry())
+        if self._carrier is not None and closing.end is End.STALLED:
+            return replace(closing, carried=self._carry(self._carrier))
         return closing
 
     def _body_pose(self, position: Vector, quaternion_xyzw: Quaternion) -> tuple[Vector, Quaternion]:
@@ -315,52 +338,24 @@ class GraspWorld(BulletWorld):
             np.array([contact[3] for contact in contacts], dtype=np.int64),
         )
 
-    def _carry(self) -> Carried:
-        """Lift and shake what the stalled jaw holds."""
-        client, body, dt = self._client, self._object, self.stepping.carry_dt_s
-        # Where the jaw closes with less than its force, every force is scaled alike and time runs slower
-        # by the root: the same motion, in slow motion.
-        scale = self.gripper.closing_force_n / self.gripper.force_n
-        pace = math.sqrt(scale)
-        mass, inertia = self.mass.mass_kg, self.mass.inertia
-        self._damp(0.0)
-        self._drive(dt)
-        self._couple(self._gear, _GEAR_FORCES * self.gripper.closing_force_n)
-        pybullet.resetBaseVelocity(body, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=client)
-        where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
-        # The point of the object at the tool's origin, in the object's principal frame.
-        began = orientation
-        anchor = rotate(inverse(began), (-where[0], -where[1], -where[2]))
-        translation = rotation = 0.0
-        held = True
-        for step, frame in enumerate(lifting.frames(dt * pace), 1):
-            velocity, spin = pybullet.getBaseVelocity(body, physicsClientId=client)
-            velocity = (velocity[0] / pace, velocity[1] / pace, velocity[2] / pace)
-            spin = (spin[0] / pace, spin[1] / pace, spin[2] / pace)
-            force, torque = lifting.load(frame, mass, inertia, where, orientation, velocity, spin)
-            pybullet.applyExternalForce(
-                body, -1, [scale * f for f in force], where, pybullet.WORLD_FRAME, physicsClientId=client
-            )
-            pybullet.applyExternalTorque(
-                body, -1, [scale * f for f in torque], pybullet.WORLD_FRAME, physicsClientId=client
-            )
-            pybullet.stepSimulation(physicsClientId=client)
-            if self._watched:
+    def _carry(self, carrier: carrying.Carrier) -> Carried:
+        """Lift and shake what the stalled jaw holds, with the gripper's own force."""
+        (first, *_), (second, *_) = self._bullet.getJointStates(self._jaw, (0, 1))
+        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
+        dt = self.stepping.carry_dt_s
+        carried, path = carrier.carry(where, orientation, (first, second), lifting.frames(dt))
+        if self._watched:
+            for row in path.tolist():
+                self._bullet.resetBasePositionAndOrientation(self._object, row[:3], row[3:7])
+                for joint in (0, 1):
+                    self._bullet.resetJointState(self._jaw, joint, row[7 + joint])
                 self._watch(dt)
-            where, orientation = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
-            if step % _EMPTY_CHECK_STEPS:
-                continue
-            moved = rotate(orientation, anchor)
-            away = math.hypot(where[0] + moved[0], where[1] + moved[1], where[2] + moved[2])
-            translation = max(translation, away)
-            rotation = max(rotation, lifting.angle_between(began, orientation))
-            if not self._between():
-                held = False
-                break
-            if max(translation / MOVED_M, rotation / TURNED_RAD) > LOST:
-                break
-        held = held and {0, 1} <= set(self._contacts().fingers.tolist())
-        return Carried(held, translation, rotation)
+        return carried
+
+    def _sunk(self, depth_m: float) -> bool:
+        """Whether any contact is deeper than this."""
+        touching = pybullet.getContactPoints(self._jaw, self._object, _ANY_LINK, _ANY_LINK, self._client)
+        return any(contact[8] < -depth_m for contact in touching)
 
     def _between(self) -> bool:
         """Whether any of the object is in the space between the open fingers.
@@ -392,18 +387,13 @@ class GraspWorld(BulletWorld):
         if not all(map(math.isfinite, (*position, *quaternion))):
             end = End.UNSTABLE
         elif end is End.STALLED:
-            # Bullet's hulls are inflated by the margin on both sides, but for contact by faces; the
-            # object is not.
-            opening -= 0.0 if self._lifts else 2.0 * COLLISION_MARGIN_M
+            # Bullet's hulls are inflated by the margin on both sides; the object is not.
+            opening -= 2.0 * COLLISION_MARGIN_M
         held, rated = (tuple(contacts), tuple(ratings)) if end is End.STALLED else ((), ())
         return Closing(end, touched, opening, held, position, quaternion, steps, ratings=rated)
 
     def _park(self) -> None:
         """Empty Bullet's caches: the object far away, one step without any contact."""
-        if self._lifts:
-            self._couple(self._gear, 0.0)
-            self._touch_by_faces(False)
-            self._damp(self._damping)
         self._bullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY)
         self._bullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         for joint in (0, 1):

@@ -2,12 +2,13 @@
 
 **wrench**: can the contact forces hold the object, whichever way down is (:mod:`.force_test`)? Where the
 forces ring because the object still moves, several instants of the stalled jaw are rated and the median of
-the last five counts.
+the last five counts. If some of these hold the weight and some do not, the closing is simulated finer.
 
-**lift**: is the object still held, and where it was, after the jaw lifted and shook it
-(:mod:`.lifting`)? A grasp on two points may well hold the object and let it swing; so the
-object may move by :data:`MOVED_M` at the tool's origin and turn by :data:`TURNED_RAD` at most, the steps of
-the default grid: further off it is another grasp.
+**lift**: is the object still held, and where it was, after the jaw lifted and shook it (:mod:`.lifting`)? So
+the object may move by :data:`MOVED_M` at the tool's origin and turn by :data:`TURNED_RAD` at most. What
+friction holds moves by hundredths of that, on the pads' give. The motion's hardest instants are short, and
+what they ask for beyond what friction gives lets an object slide by little: a quarter too much is some 9 mm
+of a fall, or 2 degrees of a turn. A wider tolerance would call that held.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from enum import IntEnum
 
 from graspdb_simworker.simulation.bodies import Carried, Closing, End
 
-MOVED_M = 0.010
-TURNED_RAD = math.radians(15.0)
+MOVED_M = 0.001
+TURNED_RAD = math.radians(0.5)
 WORST_QUALITY = -1000.0
 RATED = 5
 """So many of the last instants of a stalled jaw are rated at most."""
@@ -46,7 +47,7 @@ class Label:
 
     ``quality`` of ``wrench`` is the largest weight the contacts hold in the worst direction, over the
     object's weight; success from 1 on. Of ``lift``: 1 minus the farthest displacement in the jaw, in units of
-    what is allowed (the larger of translation / 10 mm and rotation / 15 degrees); 1 did not move at all,
+    what is allowed (the larger of translation / 1 mm and rotation / half a degree); 1 did not move at all,
     success down to 0. NaN where nothing was measured.
     """
 
@@ -63,15 +64,16 @@ def label_of(closing: Closing) -> Label:
 
     ``missed``: nothing was between the fingers, or the object was pushed out before both touched it;
     ``slipped``: both had touched it and it was squeezed out; ``timeout``: the jaw neither stalled nor
-    closed; ``simulation_error``: a pose that is not finite any more; ``wrench_insufficient``: the force
-    test failed. After a lift: ``dropped``: not held at the end; ``slipped``: held, but moved too far.
+    closed; ``simulation_error``: a pose that is not finite any more, or fingers that sank into the object;
+    ``wrench_insufficient``: the force test failed. After a lift: ``dropped``: not held at the end;
+    ``slipped``: held, but moved too far.
     """
     width = max(0.0, closing.opening_m)
     if closing.end is End.EMPTY:
         return Label(Outcome.SLIPPED if closing.touched else Outcome.MISSED, width, 0.0)
     if closing.end is End.TIMEOUT:
         return Label(Outcome.TIMEOUT, width, math.nan)
-    if closing.end is End.UNSTABLE:
+    if closing.end in (End.UNSTABLE, End.SUNK):
         return SIMULATION_ERROR
     if closing.carried is not None:
         return _carried_label(closing.carried, width)

@@ -8,7 +8,7 @@ at v, spinning at w (all in that frame), moves as if under the force and the tor
     T     = -I a - s x I s + 2 w x J s,      J = tr(I) / 2 - I,
 
 where s is the frame's angular velocity and a its rate. That is exact for a rigid body; no contact is
-ever dragged by a body that was set to a new place.
+ever dragged by a body that was set to a new place. What holds the object against it: :mod:`.carrying`.
 
 The jaw points down: gravity starts along its approach. Gravity grows in, the jaw rises by 10 cm, then
 goes there and back once along each of its axes and turns there and back once about each (through the
@@ -23,7 +23,9 @@ import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from graspdb_simworker.simulation.bodies import Quaternion, Vector, inverse, multiply, rotate
 from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
@@ -83,9 +85,12 @@ def frame_at(time_s: float) -> Frame:
 
 
 @lru_cache(maxsize=4)
-def frames(step_s: float) -> tuple[Frame, ...]:
-    """The jaw's motion in the middle of every step, from the first on."""
-    return tuple(frame_at((k + 0.5) * step_s) for k in range(math.ceil(DURATION_S / step_s)))
+def frames(step_s: float) -> NDArray[np.float64]:
+    """The jaw's motion at the end of every step (n, 9), each frame's vectors one after the other."""
+    times = ((k + 1) * step_s for k in range(math.ceil(DURATION_S / step_s)))
+    motion = np.array([[x for vector in frame_at(min(t, DURATION_S)) for x in vector] for t in times])
+    motion.setflags(write=False)
+    return motion
 
 
 @njit(cache=True)
@@ -96,7 +101,7 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 _turned: Any = njit(rotate)
 
 
-@njit
+@njit(cache=True)
 def load(frame, mass_kg, inertia, position, orientation, velocity, spin):  # type: ignore[no-untyped-def]
     """Force (newtons, at the centre of mass) and torque (newton metres) on a carried body.
 

@@ -22,6 +22,10 @@ from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.trial_columns import Bools, Ints, TrialColumns
 
+_MADE_ANEW = {"lift": 2}
+"""Protocols whose simulation became another one, and its number: what an earlier one said of a pose
+is no repeat of what this one says."""
+
 
 def grid_of(sweep: SweepRow) -> PoseGrid:
     """The grid of a sweep that has one."""
@@ -40,6 +44,8 @@ def repeat_key(world: dict[str, Any], protocol: str, fidelity: str, grid: GridPl
     """
     lattice = grid.model_dump(exclude={"region", "max_poses", "seed"})
     document = {"world": world, "protocol": protocol, "fidelity": fidelity, "grid": lattice}
+    if protocol in _MADE_ANEW:
+        document["simulation"] = _MADE_ANEW[protocol]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 

@@ -1,0 +1,105 @@
+"""What the worker says of grasps that mechanics knows: held below 80 % of the limit, not above 125 %."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import bench
+import closed_forms
+import numpy as np
+import pytest
+from closed_forms import Case
+
+from graspdb_simworker.simulation.labels import Outcome
+
+CORNERS = (0.4, 0.8, 1.25, 2.5)
+
+
+def judge(found: bench.Row | None) -> None:
+    assert found is not None, "theory does not speak of this grasp"
+    assert not found.wrong
+    assert found.flips == 1
+
+
+@pytest.mark.parametrize(
+    ("case", "friction"),
+    [
+        (closed_forms.box((0.06, 0.02, 0.02)), 0.1),
+        (closed_forms.box((0.1, 0.02, 0.03), 0.02, 0.0), 0.4),
+        (closed_forms.box((0.12, 0.004, 0.08), 0.0, 0.01), 0.4),
+        (closed_forms.cylinder_by_its_ends(0.02, 0.03, 0.005), 0.2),
+        (closed_forms.cylinder_by_its_side(0.025, 0.05, "x", 0.01), 0.1),
+        (closed_forms.cylinder_by_its_side(0.015, 0.08, "z"), 0.7),
+        (closed_forms.sphere(0.02), 0.4),
+    ],
+    ids=lambda value: value.name if isinstance(value, Case) else str(value),
+)
+@pytest.mark.parametrize("protocol", ["wrench", "lift"])
+def test_labels_flip_at_the_limit(case: Case, friction: float, protocol: str) -> None:
+    judge(bench.row(case.rubbing(friction), protocol, "standard", CORNERS))
+
+
+@pytest.mark.parametrize("protocol", ["wrench", "lift"])
+@pytest.mark.parametrize("friction", [0.2, 0.7])
+def test_a_wedge_is_held_up_to_the_angle_of_friction(friction: float, protocol: str) -> None:
+    assert bench.wedge_label(friction, 0.8, protocol, "standard").outcome is Outcome.SUCCESS
+    assert bench.wedge_label(friction, 1.25, protocol, "standard").outcome is not Outcome.SUCCESS
+
+
+def test_fingers_do_not_pass_through_what_lies_flat_against_them() -> None:
+    """Bullet's contacts of single points rock such a box from corner to corner."""
+    case = closed_forms.box((0.06, 0.02, 0.03))
+    for mass in (0.1, 1.0):
+        label = closed_forms.simulate(case.part, (0.01, 0.0, 0.0), mass, 0.4)
+        assert label.outcome is Outcome.SUCCESS
+        assert label.width_m == pytest.approx(0.02, abs=2e-4)
+
+
+def test_the_limit_surface_of_a_patch_has_its_textbook_ends() -> None:
+    # Forces alone: friction times the two normal forces. A torque alone: that times the mean distance from
+    # the middle, of a square of side a 0.3826 a.
+    case = closed_forms.box((0.02, 0.02, 0.02))
+    force = 2.0 * 0.4 * 40.0
+    loads = np.array(
+        [[force, 0, 0, 0, 0, 0], [0, 0, -force, 0, 0, 0], [0, 0, 0, 0, force * 0.3826 * 0.02, 0]]
+    )
+    assert closed_forms.slip_ratio(case, loads) == pytest.approx(np.ones(3), rel=5e-3)
+    # Of a line, a quarter of its length.
+    line = closed_forms.cylinder_by_its_side(0.015, 0.08, "x")
+    torque = np.array([[0, 0, 0, 0, force * 0.02 / 4.0, 0]])
+    assert closed_forms.slip_ratio(line, torque) == pytest.approx([1.0], rel=5e-3)
+    # Proportional to the load, and a ball rolls about neither axis before friction at its arm gives way.
+    assert closed_forms.slip_ratio(case, 0.5 * loads) == pytest.approx(np.full(3, 0.5), rel=5e-3)
+    ball = closed_forms.sphere(0.02)
+    assert closed_forms.slip_ratio(ball, np.array([[0, 0, 0, force * 0.02, 0, 0]])) == pytest.approx([1.0])
+
+
+# -- all of it ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("fidelity", ["standard", "fine"])
+@pytest.mark.parametrize("protocol", ["wrench", "lift"])
+@pytest.mark.parametrize("friction", bench.FRICTIONS)
+@pytest.mark.parametrize("cases", [bench.boxes, bench.cylinders, bench.balls])
+def test_no_label_is_wrong(
+    cases: Callable[[], Iterator[Case]], friction: float, protocol: str, fidelity: str
+) -> None:
+    rows = [bench.row(case.rubbing(friction), protocol, fidelity) for case in cases()]
+    spoken_of = [row for row in rows if row is not None]
+    assert spoken_of or friction > 0.5
+    assert [wrong for row in spoken_of for wrong in row.wrong] == []
+    assert [row.case.name for row in spoken_of if row.flips != 1] == []
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("fidelity", ["standard", "fine"])
+@pytest.mark.parametrize("protocol", ["wrench", "lift"])
+@pytest.mark.parametrize("friction", bench.FRICTIONS)
+def test_wedges_by_angle(friction: float, protocol: str, fidelity: str) -> None:
+    for share in (0.4, 0.8, 1.25, 1.5):
+        held = bench.wedge_label(friction, share, protocol, fidelity).outcome is Outcome.SUCCESS
+        assert held == (share < 1.0), (share, math.degrees(share * math.atan(friction)))
