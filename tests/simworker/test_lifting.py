@@ -159,10 +159,8 @@ def test_a_heavier_bar_slips_where_a_lighter_one_stays(payload_of: MakePayload) 
         for mass in (0.4, 1.0, 1.5, 4.0)
     ]
     assert [label.outcome for label in labels] == [Outcome.SUCCESS] * 3 + [Outcome.DROPPED]
-    # What holds does not creep: less than 0.01 mm and 0.005 degrees, and close to the limit, where parts of
-    # the patches already slip, 0.1 mm and 0.05 degrees.
-    assert all(label.quality > 0.99 for label in labels[:2])
-    assert labels[2].quality > 0.9
+    # What holds does not creep: less than 0.05 mm and 0.025 degrees, even close to the limit.
+    assert all(label.quality > 0.95 for label in labels[:3])
 
 
 def test_light_objects_are_carried_with_the_full_force(payload_of: MakePayload) -> None:
