@@ -43,7 +43,12 @@ def repeat_key(world: dict[str, Any], protocol: str, fidelity: str, grid: GridPl
     ``region``, ``max_poses`` and ``seed`` choose among the indices of a grid and change none of them.
     """
     lattice = grid.model_dump(exclude={"region", "max_poses", "seed"})
-    document = {"world": world, "protocol": protocol, "fidelity": fidelity, "grid": lattice}
+    document: dict[str, Any] = {
+        "world": world,
+        "protocol": protocol,
+        "fidelity": fidelity,
+        "grid": lattice,
+    }
     if protocol in _MADE_ANEW:
         document["simulation"] = _MADE_ANEW[protocol]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
