@@ -104,7 +104,7 @@ def run(
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
     ] = False,
     once: Annotated[bool, typer.Option(help="Stop after one job for each process.")] = False,
-    decompose_seconds: DecomposeSeconds = 40.0,
+    decompose_seconds: DecomposeSeconds = 120.0,
     decompose_memory_mib: DecomposeMemory = 4096,
     api_key: ApiKey = None,
     verbose: Annotated[bool, typer.Option(help="Say what is going on.")] = False,

@@ -27,8 +27,11 @@ Plane = tuple[FloatArray, float]
 
 #: Triangles that a piece is simplified to before the search, as far as its tolerance allows.
 FACES = 3_000
-#: Vertices of one part at most: the physics engine gets slow beyond, and nothing is gained.
-MAX_PART_VERTICES = 128
+#: Vertices that a part is simplified to, for the physics gets slow beyond, as long as neighbours still meet:
+#: hulls that shrink by more than this share of what parts may be off leave cracks between them. Beyond the
+#: second number they are simplified whatever becomes of them.
+MAX_PART_VERTICES, MOST_PART_VERTICES = 128, 256
+_MEETING_SHARE = 0.125
 #: Planes along faces at concave edges that are tried, those of the longest edges.
 _CREASES = 24
 #: Planes that are tried for any piece.
@@ -177,7 +180,9 @@ def hulls(search: Search, tolerance_m: float) -> Iterator[FloatArray]:
     for piece in search.pieces:
         hull = piece.hull
         share = 0.05
-        while hull.num_vert() > MAX_PART_VERTICES and share < 100.0:
+        while share < 100.0 and hull.num_vert() > (
+            MAX_PART_VERTICES if share <= _MEETING_SHARE else MOST_PART_VERTICES
+        ):
             hull = piece.hull.simplify(share * tolerance_m)
             share *= 1.5
         yield np.array(hull.to_mesh64().vert_properties[:, :3])

@@ -111,8 +111,16 @@ class _Members:
 
     @classmethod
     def of(cls, stored: Stored) -> _Members:
-        chunks = {(each.chunk.sweep_id, each.chunk.number): len(each.chunk.outcomes) for each in stored.swept}
+        chunks = {}
+        for each in stored.swept:
+            codes = np.frombuffer(each.chunk.outcomes, dtype=np.uint8)
+            counted = len(codes) - int(np.isin(codes, stored.without).sum())
+            chunks[each.chunk.sweep_id, each.chunk.number] = counted
         return cls(stored.rows.seq, stored.rows.outcome, chunks)
+
+    @property
+    def count(self) -> int:
+        return len(self.seq) + sum(self.chunks.values())
 
     def followed_by(self, later: _Members) -> _Members:
         return _Members(
@@ -136,7 +144,7 @@ class _Members:
 @dataclass(frozen=True, eq=False)
 class _Attempts:
     """A model as of a revision, and the repeat key of every sweep in it; ``sample`` of a large one. Its
-    ``reach`` was validated when the attempts were ``judged``.
+    ``reach`` was validated when the attempts were ``judged``; so many are ``others`` now.
     """
 
     revision: int
@@ -149,6 +157,7 @@ class _Attempts:
     members: _Members
     reach: Reach | None
     judged: _Members | None
+    others: int
 
     @property
     def nbytes(self) -> int:
@@ -157,7 +166,7 @@ class _Attempts:
 
 
 _NOBODY = _Members(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.uint8), {})
-_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None, _NOBODY, None, None)
+_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None, _NOBODY, None, None, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,24 +301,29 @@ class Successes:
             share = _SAMPLE / size if old is None or sample is None else sample.size / old.size
             chosen = np.random.default_rng(row.revision).random(len(new)) < share
             sample = self._compute.run(lambda: _extended(sample, new, chosen, kernel))
-        members = before.members.followed_by(_Members.of(stored))
-        reach, judged = self._reach(model, members, known)
-        revision, epoch, last_seq = row.revision, row.epoch, row.last_seq
-        return _Attempts(
-            revision, epoch, last_seq, selected.tried, names, model, sample, members, reach, judged
-        )
-
-    def _reach(
-        self, model: SuccessModel | None, members: _Members, known: _Attempts
-    ) -> tuple[Reach | None, _Members | None]:
-        """How far a model tells, and of which attempts that was found out: anew where enough are others."""
+        came = _Members.of(stored)
+        members = before.members.followed_by(came)
+        reach, judged, others = known.reach, known.judged, known.others + came.count
+        if before is _NONE and judged is not None:
+            others = members.others(judged)
         if model is None:
-            return None, None
-        if known.judged is not None and known.reach is not None:
-            others = members.others(known.judged)
-            if others == 0 or (model.size > _FEW and others < _CHANGED * known.reach.attempts):
-                return known.reach, known.judged
-        return self._compute.run(lambda: validate_reach(model, threads=self._compute.threads)), members
+            reach = None
+        elif reach is None or (others and (model.size <= _FEW or others >= _CHANGED * reach.attempts)):
+            reach = self._compute.run(lambda: validate_reach(model, threads=self._compute.threads))
+            judged, others = members, 0
+        return _Attempts(
+            revision=row.revision,
+            epoch=row.epoch,
+            last_seq=row.last_seq,
+            tried=selected.tried,
+            sweeps=names,
+            model=model,
+            sample=sample,
+            members=members,
+            reach=reach,
+            judged=judged,
+            others=others,
+        )
 
 
 def _share_of_held(model: Model | None, test: CollisionTest, threads: int) -> float:
