@@ -302,6 +302,16 @@ def test_a_bad_request_names_its_field(sqlite_http: httpx.Client) -> None:
     assert sqlite_http.get("/sweeps").json()["items"] == []
 
 
+def test_more_poses_than_a_sweep_takes_are_told_as_such(serve: Any, sqlite_url: str) -> None:
+    with httpx.Client(base_url=serve(sqlite_url, max_samples=2), timeout=60) as http:
+        add_box(http)
+        for spec, field in (({"poses": [GIVEN] * 3}, "poses"), ({"sample": {"count": 3}}, "sample.count")):
+            answer = http.post("/objects/box/sweeps", json=spec)
+            assert problem(answer) == (422, "too-many-poses", [field])
+            assert answer.json()["limit"] == 2
+            assert "several sweeps" in answer.json()["title"]
+
+
 def test_a_grid_over_the_limit_says_how_to_shrink_it(serve: Any, sqlite_url: str) -> None:
     with httpx.Client(base_url=serve(sqlite_url, max_sweep_poses=10_000), timeout=60) as http:
         add_box(http)

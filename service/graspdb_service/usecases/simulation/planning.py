@@ -19,7 +19,7 @@ from graspdb.wire import (
     SweepCreate,
 )
 from graspdb_density.se3 import Poses
-from graspdb_service.problems import conflict, invalid
+from graspdb_service.problems import ProblemError, conflict, invalid
 from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx, clock
 from graspdb_service.storage.objects import ObjectRow
@@ -249,11 +249,22 @@ def _plan(ctx: Estimators, slug: str, spec: SweepCreate, world: _World, given: G
     return _Plan("grid", count, grid=plan, full_count=full)
 
 
+def _check_count(ctx: Estimators, field: str, count: int) -> None:
+    """422 for more given or drawn poses, which are stored one by one, than a sweep may have."""
+    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
+    if count > limit:
+        raise ProblemError(
+            422,
+            "too-many-poses",
+            f"{count} poses that are no grid are over a sweep's limit of {limit}: make several sweeps of them",
+            errors=[(field, f"at most {limit}")],
+            extra={"limit": limit, "poses": count},
+        )
+
+
 def _given(ctx: Estimators, given: Given) -> _Plan:
     poses, densities = given.poses, given.proposal_density
-    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
-    if len(poses) > limit:
-        raise invalid("poses", f"{len(poses)} are more than {limit}: make several sweeps of them")
+    _check_count(ctx, "poses", len(poses))
     if densities.shape not in ((), (len(poses),)):
         raise invalid("proposal_density", f"{len(densities)} values for {len(poses)} poses")
     table = np.column_stack([*poses, np.broadcast_to(densities, len(poses))])
@@ -261,9 +272,7 @@ def _given(ctx: Estimators, given: Given) -> _Plan:
 
 
 def _drawn(ctx: Estimators, slug: str, spec: SweepCreate, sample: SampleSpec) -> _Plan:
-    limit = min(ctx.settings.max_samples, ctx.settings.max_sweep_poses)
-    if sample.count > limit:
-        raise invalid("sample.count", f"at most {limit}")
+    _check_count(ctx, "sample.count", sample.count)
     selection = Selection(gripper=spec.gripper, protocol=sample.protocol, kernel=sample.kernel)
     drawn = samples.draw(ctx, slug, selection, sample.count, sample.seed, support=False)
     table = np.column_stack([drawn.position, drawn.quaternion_xyzw, drawn.proposal_density])
