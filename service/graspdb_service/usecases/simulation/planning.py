@@ -256,7 +256,7 @@ def _check_count(ctx: Estimators, field: str, count: int) -> None:
         raise ProblemError(
             422,
             "too-many-poses",
-            f"{count} poses that are no grid are over a sweep's limit of {limit}: make several sweeps of them",
+            f"{count} poses that are no grid are over a sweep's limit of {limit}: make several sweeps",
             errors=[(field, f"at most {limit}")],
             extra={"limit": limit, "poses": count},
         )
