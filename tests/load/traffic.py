@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import json
 import math
 import random
 import time
@@ -68,6 +69,11 @@ def poses(count: int, rng: np.random.Generator) -> list[dict[str, Any]]:
     return [{"position": position, "quaternion_xyzw": turn} for position, turn in columns]
 
 
+def _sweep(rng: np.random.Generator) -> bytes:
+    wish = {"poses": poses(CHUNK * CHUNKS, rng), "gripper": "pg70", "chunk_poses": CHUNK}
+    return json.dumps(wish).encode()
+
+
 class Traffic:
     """Actors of one service, with ``think_s`` seconds between an answer and the next request, on average."""
 
@@ -76,6 +82,8 @@ class Traffic:
         self._clients, self._workers = clients, workers
         self.seen = Seen()
         self._end = 0.0
+        # Written beforehand: meanwhile no answer could be noted.
+        self._sweeps = [_sweep(np.random.default_rng()) for _ in range(4 if workers else 0)]
 
     async def run(self, seconds: float) -> Seen:
         self._end = time.monotonic() + seconds
@@ -163,10 +171,11 @@ class Traffic:
 
     async def _planner(self, http: httpx.AsyncClient) -> None:
         """Keeps workers busy: a sweep after the other, each deleted when it is done."""
-        rng = np.random.default_rng()
+        typed = {"Content-Type": "application/json"}
         while time.monotonic() < self._end:
-            wish = {"poses": poses(CHUNK * CHUNKS, rng), "gripper": "pg70", "chunk_poses": CHUNK}
-            sweep = await self._ask(http, "sweep", "POST", f"/objects/{SWEPT}/sweeps", json=wish)
+            wish = random.choice(self._sweeps)
+            path = f"/objects/{SWEPT}/sweeps"
+            sweep = await self._ask(http, "sweep", "POST", path, content=wish, headers=typed)
             while sweep is not None and sweep["state"] in ("queued", "running"):
                 if time.monotonic() > self._end:
                     return
