@@ -8,7 +8,6 @@ import json
 import logging
 import math
 import os
-import platform
 import signal
 import socket
 import sys
@@ -16,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from rich.console import Console
@@ -26,7 +25,9 @@ from graspdb.errors import GraspDBError
 from graspdb.processes import LIFELINE_HELP, end_with_parent
 from graspdb.transport import Transport
 from graspdb.wire import Pose
+from graspdb.wire.sweeps import Engine
 from graspdb_simworker.process.runner import ChunkRunner
+from graspdb_simworker.simulation.engines import installed
 
 app = typer.Typer(
     add_completion=False,
@@ -38,18 +39,24 @@ app = typer.Typer(
 log = logging.getLogger("graspdb.simworker")
 
 
-def _require_pybullet() -> None:
-    """Say in one line what is missing and leave with code 2."""
-    needed = ("pybullet", "numba", "scipy", "manifold3d", "PIL")
-    missing = [name for name in needed if importlib.util.find_spec(name) is None]
+def _require_physics(engine: str | None) -> Engine:
+    """The engine asked for, or the default one; says in one line what is missing and leaves with code 2."""
+    missing = [
+        name for name in ("numba", "scipy", "manifold3d", "PIL") if importlib.util.find_spec(name) is None
+    ]
     if missing:
-        typer.echo(
-            f"graspdb-simworker: {', '.join(missing)} is missing: install the extra, `pip install"
-            " 'graspdb[sim]'` (pybullet has wheels for CPython 3.10 and 3.11 on x86-64 Linux; this is CPython"
-            f" {platform.python_version()} on {platform.machine()} {platform.system()})",
-            err=True,
-        )
-        raise typer.Exit(2)
+        _leave(f"{', '.join(missing)} is missing: install the extra, `pip install 'graspdb[sim]'`")
+    if engine is not None and engine not in installed.ENGINES:
+        _leave(f"no engine {engine!r}; there are {', '.join(installed.ENGINES)}")
+    try:
+        return installed.require(engine)
+    except installed.EngineMissing as error:
+        _leave(str(error))
+
+
+def _leave(message: str) -> NoReturn:
+    typer.echo(f"graspdb-simworker: {message}", err=True)
+    raise typer.Exit(2)
 
 
 ObjectName = Annotated[
@@ -66,6 +73,14 @@ ApiKey = Annotated[
     str | None, typer.Option(envvar="GRASPDB_API_KEY", help="With the scope jobs:work, to run; else read.")
 ]
 Numbers = Annotated[str, typer.Option(help="Comma-separated, object frame.")]
+EngineName = Annotated[
+    str | None,
+    typer.Option(
+        "--engine",
+        metavar="pybullet|mujoco",
+        help="Physics engine: pybullet where it is installed, else mujoco.",
+    ),
+]
 Protocol = Annotated[str, typer.Option(help="wrench or lift.")]
 DecomposeSeconds = Annotated[
     float,
@@ -104,15 +119,19 @@ def run(
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
     ] = False,
     once: Annotated[bool, typer.Option(help="Stop after one job for each process.")] = False,
+    engine: EngineName = None,
     decompose_seconds: DecomposeSeconds = 120.0,
     decompose_memory_mib: DecomposeMemory = 4096,
     api_key: ApiKey = None,
     verbose: Annotated[bool, typer.Option(help="Say what is going on.")] = False,
 ) -> None:
-    """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked."""
-    _require_pybullet()
+    """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked.
+
+    A chunk that names an engine is simulated with that one; --engine says which simulates the others.
+    """
+    chosen = None if dask else _require_physics(engine)
     from graspdb_simworker.decomposition import supervisor as decomposition  # extra: sim
-    from graspdb_simworker.loop import Worker, WorkerFailed  # extra: sim
+    from graspdb_simworker.loop import NoPhysics, Worker, WorkerFailed  # extra: sim
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
@@ -141,13 +160,14 @@ def run(
             once=once,
             make_runner=cluster.make_runner,
             decompositions=limits,
+            engine=chosen,
         )
         _stop_on_signals(worker.stop)
         try:
             worker.run()
         except WorkerFailed as error:
             typer.echo(f"graspdb-simworker: {error}", err=True)
-            raise typer.Exit(2 if "pybullet" in str(error) else 1) from None
+            raise typer.Exit(2 if isinstance(error, NoPhysics) else 1) from None
     typer.echo(str(worker.tally), err=True)
 
 
@@ -192,6 +212,7 @@ def verify(
     count: Annotated[int, typer.Option(min=10, help="Grasps to simulate again.")] = 1000,
     gripper: GripperName = "pg70",
     protocol: Protocol = "wrench",
+    engine: EngineName = None,
     sweep: Annotated[
         str | None, typer.Option(help="Verify what the service has stored of this sweep instead.")
     ] = None,
@@ -199,13 +220,13 @@ def verify(
     url: ServiceUrl = None,
     api_key: ApiKey = None,
 ) -> None:
-    """Simulate a sample of the grid's physics poses at 1/2000 s and 200 iterations; print the agreement.
+    """Simulate a sample of the grid's physics poses at the fine step, 1/2000 s; print the agreement.
 
     With --sweep the sweep says which object, gripper and protocol, and its stored outcomes are compared;
     all of them are read to sample fairly, so a sweep of a random part of the grid (--max-poses) is
     verified sooner.
     """
-    _require_pybullet()
+    chosen = _require_physics(engine)
     from graspdb_simworker.inspection import agreement, inputs, stored_outcomes  # extra: sim
 
     with _explained():
@@ -217,14 +238,22 @@ def verify(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
             object_name, gripper, protocol = info.object, info.gripper, info.protocol
-            payload, parts = inputs.load(object_name, gripper, protocol=protocol, url=url, api_key=api_key)
+            payload, parts = inputs.load(
+                object_name, gripper, protocol=protocol, engine=chosen, url=url, api_key=api_key
+            )
             with _progress("grasps") as progress:
                 found = agreement.verify_stored(
                     payload, parts, stored, count=count, seed=seed, progress=progress
                 )
         elif object_name:
             payload, parts = inputs.load(
-                object_name, gripper, protocol=protocol, url=url, api_key=api_key, seed=seed
+                object_name,
+                gripper,
+                protocol=protocol,
+                engine=chosen,
+                url=url,
+                api_key=api_key,
+                seed=seed,
             )
             payload = agreement.enough_poses(payload, parts, count)
             with _progress("grasps") as progress:
@@ -244,19 +273,20 @@ def show(
     ] = Path("grasp.png"),
     gripper: GripperName = "pg70",
     protocol: Protocol = "wrench",
-    fine: Annotated[bool, typer.Option(help="1/2000 s and 200 iterations.")] = False,
+    engine: EngineName = None,
+    fine: Annotated[bool, typer.Option(help="The fine step, 1/2000 s.")] = False,
     url: ServiceUrl = None,
     api_key: ApiKey = None,
 ) -> None:
     """Simulate one grasp and draw it from two sides, seen from the jaw, or write what moved how."""
     end_with_parent()
-    _require_pybullet()
+    chosen = _require_physics(engine)
     from graspdb_simworker.inspection import inputs, motions, pictures  # extra: sim
 
     with _explained():
         pose = Pose.model_validate({"position": position, "quaternion_xyzw": quaternion})
         payload, parts = inputs.load(
-            object_name, gripper, protocol=protocol, fine=fine, url=url, api_key=api_key
+            object_name, gripper, protocol=protocol, fine=fine, engine=chosen, url=url, api_key=api_key
         )
         if out.suffix.lower() == ".json":
             moved = motions.motion(payload, parts, pose)

@@ -20,9 +20,10 @@ from typing import Any
 
 from graspdb import errors, wire
 from graspdb.transport import Transport
+from graspdb.wire.sweeps import Engine
 from graspdb_simworker.decomposition.supervisor import DecompositionFailed, ResourceLimits, decompose
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PhysicsMissing
 
 log = logging.getLogger("graspdb.simworker")
 
@@ -40,6 +41,10 @@ _REFUSED = (errors.AuthenticationError, errors.PermissionDenied)
 
 class WorkerFailed(Exception):
     """The worker can't go on; the message says what to do."""
+
+
+class NoPhysics(WorkerFailed):
+    """Something that simulating takes is not installed."""
 
 
 @dataclass
@@ -84,7 +89,8 @@ class Worker:
     Give ``transport``, which all threads share, few retries: this loop has its own. ``exit_when_idle``
     returns when there is nothing left to claim, ``once`` after one job for each process. ``decompositions``
     are the limits of one mesh's; None leaves them to other workers. They have a thread of their own, which
-    the service lists as another worker, so that no chunk that is ready waits for one.
+    the service lists as another worker, so that no chunk that is ready waits for one. ``engine`` simulates
+    chunks that name none; None for the default of whoever simulates.
     """
 
     transport: Transport
@@ -95,6 +101,7 @@ class Worker:
     once: bool = False
     make_runner: Callable[[], ChunkRunner] = LocalRunner
     decompositions: ResourceLimits | None = None
+    engine: Engine | None = None
 
     def __post_init__(self) -> None:
         if self.processes < 1:
@@ -115,7 +122,7 @@ class Worker:
     def run(self) -> None:
         """Work until stopped, or idle if so asked.
 
-        WorkerFailed if the service refuses this worker, pybullet is missing or the heartbeat died.
+        WorkerFailed if the service refuses this worker, no engine is installed or the heartbeat died.
         """
         heartbeat = threading.Thread(
             target=self._guard, args=(self._heartbeat,), name="heartbeat", daemon=True
@@ -149,8 +156,8 @@ class Worker:
             body()
         except WorkerFailed as error:
             self._fail(error)
-        except PybulletMissing as error:
-            self._fail(WorkerFailed(f"pybullet can't be imported: {error}"))
+        except PhysicsMissing as error:
+            self._fail(NoPhysics(f"no physics here: {error}"))
         except BaseException as error:
             log.exception("the worker's %s died", threading.current_thread().name)
             self._fail(WorkerFailed(f"{threading.current_thread().name} died: {error!r}"))
@@ -252,6 +259,8 @@ class Worker:
                 if runner is None:
                     raise ChunkFailed("chunks were not asked for here")
                 parts = self._parts_of(payload, lease)
+                if payload.engine is None:
+                    payload = payload.model_copy(update={"engine": self.engine})
                 result = runner.run(payload, parts, wanted=lambda: self._wanted(lease))
             except ChunkCancelled:
                 self._abandon(lease)
@@ -259,7 +268,7 @@ class Worker:
                 log.error("job %s failed: %s", job.id, error)
                 self.tally.failures += 1
                 self._report_failure(lease, str(error), permanent=isinstance(error, DecompositionFailed))
-            except PybulletMissing:
+            except PhysicsMissing:
                 self._release(lease)
                 raise
             else:

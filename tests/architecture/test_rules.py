@@ -41,6 +41,7 @@ OPTIONAL = {
     "matplotlib",
     "mcp",
     "mcp_types",
+    "mujoco",
     "opentelemetry",
     "pandas",
     "PIL",

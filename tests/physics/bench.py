@@ -78,14 +78,22 @@ def asked(case: Case, protocol: str) -> float | None:
     return limit if closed_forms.tilt_ratio(case, closed_forms.lift_loads(case, limit)) < _STEADY else None
 
 
-def row(case: Case, protocol: str, fidelity: str, loads: Sequence[float] = LOADS) -> Row | None:
+def row(
+    case: Case, protocol: str, fidelity: str, loads: Sequence[float] = LOADS, engine: str = "pybullet"
+) -> Row | None:
     """Simulate a case at loads over its limit; None where theory does not speak of it."""
     limit = asked(case, protocol)
     if limit is None:
         return None
     labels = [
         closed_forms.simulate(
-            case.part, case.position, load * limit, case.friction, protocol=protocol, fidelity=fidelity
+            case.part,
+            case.position,
+            load * limit,
+            case.friction,
+            protocol=protocol,
+            fidelity=fidelity,
+            engine=engine,
         )
         for load in loads
     ]

@@ -40,6 +40,19 @@ def test_labels_flip_at_the_limit(case: Case, friction: float, protocol: str) ->
     judge(bench.row(case.rubbing(friction), protocol, "standard", CORNERS))
 
 
+@pytest.mark.parametrize(
+    ("case", "friction"),
+    [
+        (closed_forms.box((0.1, 0.02, 0.03), 0.02, 0.0), 0.2),
+        (closed_forms.cylinder_by_its_side(0.025, 0.05, "x", 0.01), 0.4),
+        (closed_forms.sphere(0.02), 1.0),
+    ],
+    ids=lambda value: value.name if isinstance(value, Case) else str(value),
+)
+def test_labels_flip_at_the_limit_in_mujoco_too(case: Case, friction: float) -> None:
+    judge(bench.row(case.rubbing(friction), "wrench", "standard", CORNERS, "mujoco"))
+
+
 @pytest.mark.parametrize("protocol", ["wrench", "lift"])
 @pytest.mark.parametrize("friction", [0.2, 0.7])
 def test_a_wedge_is_held_up_to_the_angle_of_friction(friction: float, protocol: str) -> None:

@@ -88,15 +88,16 @@ def payload_of() -> Callable[..., SimulatePayload]:
 
 
 @pytest.fixture(scope="session")
-def workpiece_of() -> Iterator[Callable[[str, str], chunks.Workpiece]]:
-    """A workpiece of an example object at a fidelity, built once."""
-    built: dict[tuple[str, str], chunks.Workpiece] = {}
+def workpiece_of() -> Iterator[Callable[..., chunks.Workpiece]]:
+    """A workpiece of an example object at a fidelity in an engine, built once."""
+    built: dict[tuple[str, str, str], chunks.Workpiece] = {}
 
-    def get(name: str, fidelity: str = "standard") -> chunks.Workpiece:
-        key = (name, fidelity)
+    def get(name: str, fidelity: str = "standard", engine: str = "pybullet") -> chunks.Workpiece:
+        key = (name, fidelity, engine)
         if key not in built:
             thing = example(name)
-            built[key] = chunks.prepare(plan(thing, stop=1, fidelity=fidelity), thing.parts)
+            payload = plan(thing, stop=1, fidelity=fidelity, engine=engine)
+            built[key] = chunks.prepare(payload, thing.parts)
         return built[key]
 
     yield get

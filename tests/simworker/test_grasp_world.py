@@ -10,10 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
+from graspdb.wire import SimulatePayload
 from graspdb_geometry import collision
 from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.simulation.bodies import Closing, End
-from graspdb_simworker.simulation.chunks import Workpiece
+from graspdb_simworker.simulation.chunks import Workpiece, prepare
 from graspdb_simworker.simulation.grasp_world import GraspWorld
 from graspdb_simworker.simulation.labels import Outcome, label_of
 
@@ -45,11 +46,16 @@ def same(a: Closing, b: Closing) -> bool:
     )
 
 
+@pytest.fixture(params=["pybullet", "mujoco"])
+def engine(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 @pytest.mark.parametrize("fidelity", ["standard", "fine"])
 def test_the_rim_of_a_mug_is_held(
-    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], fidelity: str
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], fidelity: str, engine: str
 ) -> None:
-    workpiece = workpiece_of("mug", fidelity)
+    workpiece = workpiece_of("mug", fidelity, engine)
     held = workpiece.world.close(*grasps["rim"])
     assert held.end is End.STALLED
     assert held.touched
@@ -66,16 +72,18 @@ def test_the_rim_of_a_mug_is_held(
 
 
 def test_nothing_to_close_on_is_a_miss(
-    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], engine: str
 ) -> None:
-    workpiece = workpiece_of("mug")
+    workpiece = workpiece_of("mug", engine=engine)
     closing = workpiece.world.close(*grasps["above"])
     assert closing.end is End.EMPTY
     assert label_of(closing).outcome is Outcome.MISSED
 
 
-def test_the_cone_is_as_wide_as_it_is(workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]) -> None:
-    workpiece = workpiece_of("cone")
+def test_the_cone_is_as_wide_as_it_is(
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], engine: str
+) -> None:
+    workpiece = workpiece_of("cone", engine=engine)
     position, quaternion = grasps["waist"]
     for z in (-0.1, 0.0, 0.1):
         closing = workpiece.world.close((*position[:2], z), quaternion)
@@ -89,9 +97,9 @@ def test_the_cone_is_as_wide_as_it_is(workpiece_of: GetWorkpiece, grasps: dict[s
 
 
 def test_starting_near_the_contact_changes_nothing_but_the_time(
-    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], engine: str
 ) -> None:
-    workpiece = workpiece_of("cone")
+    workpiece = workpiece_of("cone", engine=engine)
     (travel,) = travels(workpiece, [grasps["waist"]])
     assert 0.008 < travel < 0.0101
     slow, quick = (workpiece.world.close(*grasps["waist"], t) for t in (0.0, travel))
@@ -101,9 +109,9 @@ def test_starting_near_the_contact_changes_nothing_but_the_time(
 
 
 def test_an_off_centre_object_is_centred(
-    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]]
+    workpiece_of: GetWorkpiece, grasps: dict[str, tuple[Any, Any]], engine: str
 ) -> None:
-    workpiece = workpiece_of("cone")
+    workpiece = workpiece_of("cone", engine=engine)
     position, quaternion = grasps["waist"]
     closing = workpiece.world.close((position[0], 0.008, position[2]), quaternion)
     assert closing.end is End.STALLED
@@ -113,9 +121,13 @@ def test_an_off_centre_object_is_centred(
 
 @pytest.mark.parametrize("name", ["mug", "elongated-d"])
 def test_labels_do_not_depend_on_order_or_world(
-    workpiece_of: GetWorkpiece, physical_poses: FindPoses, name: str
+    workpiece_of: GetWorkpiece,
+    physical_poses: FindPoses,
+    payload_of: Callable[..., SimulatePayload],
+    name: str,
+    engine: str,
 ) -> None:
-    workpiece = workpiece_of(name)
+    workpiece = workpiece_of(name, engine=engine)
     poses = physical_poses(name, 60)
     travel = travels(workpiece, poses)
     forward = close_all(workpiece.world, poses, travel)
@@ -123,7 +135,7 @@ def test_labels_do_not_depend_on_order_or_world(
     shuffled = close_all(workpiece.world, [poses[k] for k in order], [travel[k] for k in order])
     assert all(same(forward[k], result) for k, result in zip(order, shuffled, strict=True))
     thing = example(name)
-    other = GraspWorld(thing.parts, thing.mass_kg, thing.friction, workpiece.gripper)
+    other = prepare(payload_of(name, stop=1, engine=engine), thing.parts).world
     fresh = [other.close(*poses[k], travel[k]) for k in reversed(range(20))]
     other.close_world()
     assert all(same(a, b) for a, b in zip(forward[:20], reversed(fresh), strict=True))
@@ -140,13 +152,13 @@ def outcomes(workpiece: Workpiece, poses: list[tuple[Any, Any]]) -> np.ndarray:
     )
 
 
-def test_mirrored_twins_agree(workpiece_of: GetWorkpiece, physical_poses: FindPoses) -> None:
-    workpiece = workpiece_of("mug")
+def test_mirrored_twins_agree(workpiece_of: GetWorkpiece, physical_poses: FindPoses, engine: str) -> None:
+    workpiece = workpiece_of("mug", engine=engine)
     poses = physical_poses("mug", 150)
     half_turn = Rotation.from_quat([0.0, 0.0, 1.0, 0.0])
     twins = [(p, tuple((Rotation.from_quat(q) * half_turn).as_quat().tolist())) for p, q in poses]
     agree = outcomes(workpiece, poses) == outcomes(workpiece, twins)
-    # Not a matter of course: Bullet treats the fingers one after the other.
+    # Not a matter of course: solvers treat the fingers one after the other.
     assert agree.mean() >= 0.97
 
 
@@ -157,3 +169,12 @@ def test_standard_agrees_with_fine(workpiece_of: GetWorkpiece, physical_poses: F
     fine = outcomes(workpiece_of(name, "fine"), poses) == Outcome.SUCCESS
     assert 0.05 < fine.mean() < 0.95
     assert (standard == fine).mean() >= 0.96
+
+
+@pytest.mark.parametrize("name", ["mug", "cone", "elongated-d"])
+def test_engines_agree(workpiece_of: GetWorkpiece, physical_poses: FindPoses, name: str) -> None:
+    poses = physical_poses(name, 120)
+    bullet = outcomes(workpiece_of(name), poses) == Outcome.SUCCESS
+    mujoco = outcomes(workpiece_of(name, engine="mujoco"), poses) == Outcome.SUCCESS
+    assert 0.05 < bullet.mean() < 0.95
+    assert (bullet == mujoco).mean() >= 0.95

@@ -217,7 +217,7 @@ def test_the_fingers_rub_as_they_were_told(payload_of: MakePayload, protocol: st
     payload = payload_of("cone", stop=1, protocol=protocol, mass_kg=0.5, friction=friction)
     workpiece = chunks.prepare(payload, bar(0.06))
     try:
-        world = workpiece.world
+        world = workpiece.world._engine
         roots = [
             pybullet.getDynamicsInfo(body, link, physicsClientId=world._client)[1]
             for body, link in ((world._object, -1), (world._jaw, -1), (world._jaw, 0), (world._jaw, 1))

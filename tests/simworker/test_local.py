@@ -19,7 +19,7 @@ from graspdb.examples import example
 from graspdb.wire import SimulatePayload
 from graspdb_simworker.process import channel, local
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, PhysicsMissing
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.labels import Outcome
 
@@ -103,16 +103,29 @@ def test_a_child_that_dies_at_once_fails_the_chunk(payload_of: MakePayload, mug_
         runner.run(payload_of("mug", stop=10), mug_glb)
 
 
-def test_a_missing_pybullet_is_told_apart(payload_of: MakePayload, mug_glb: bytes) -> None:
-    script = (
-        "import sys; sys.modules['pybullet'] = None;"
-        " from graspdb_simworker.process import child; sys.exit(child.main())"
-    )
+WITHOUT = (
+    "import sys; sys.modules.update(dict.fromkeys({missing}));"
+    " from graspdb_simworker.process import child; sys.exit(child.main())"
+)
+
+
+def test_a_missing_engine_is_told_apart(payload_of: MakePayload, mug_glb: bytes) -> None:
+    script = WITHOUT.format(missing=["pybullet", "mujoco"])
     with (
         LocalRunner((sys.executable, "-c", script)) as runner,
-        pytest.raises(PybulletMissing, match="pybullet"),
+        pytest.raises(PhysicsMissing, match=r"pybullet.*graspdb\[sim,mujoco\]"),
     ):
         runner.run(payload_of("mug", stop=10), mug_glb)
+
+
+def test_without_pybullet_mujoco_simulates(
+    payload_of: MakePayload, mug_glb: bytes, grasps: dict[str, tuple[Any, Any]]
+) -> None:
+    with LocalRunner((sys.executable, "-c", WITHOUT.format(missing=["pybullet"]))) as runner:
+        held = runner.run(payload_of("mug", poses=[grasps["rim"], grasps["above"]]), mug_glb)
+        assert list(held.outcomes) == [Outcome.SUCCESS, Outcome.MISSED]
+        with pytest.raises(ChunkFailed, match=r"pybullet is not installed: `pip install 'graspdb\[sim\]'`"):
+            runner.run(payload_of("mug", poses=[grasps["rim"]], engine="pybullet"), mug_glb)
 
 
 def test_a_chunk_that_is_not_wanted_any_more_kills_its_child(payload_of: MakePayload, mug_glb: bytes) -> None:

@@ -318,12 +318,23 @@ def test_the_command_works_until_idle_and_ends_well_on_a_signal(
     )
 
 
-def test_the_command_explains_a_missing_pybullet_in_one_line() -> None:
-    script = "import sys; sys.modules['pybullet'] = None; from graspdb_simworker.cli import main; main()"
+@pytest.mark.parametrize(
+    ("missing", "asked", "remedy"),
+    [
+        (["pybullet", "mujoco"], [], "graspdb[sim,mujoco]"),
+        (["pybullet"], ["--engine", "pybullet"], "x86-64"),
+        (["mujoco"], ["--engine", "mujoco"], "graspdb[sim,mujoco]"),
+        ([], ["--engine", "drake"], "pybullet, mujoco"),
+    ],
+)
+def test_the_command_explains_a_missing_engine_in_one_line(
+    missing: list[str], asked: list[str], remedy: str
+) -> None:
+    hide = f"import sys; sys.modules.update(dict.fromkeys({missing}));"
+    script = f"{hide} from graspdb_simworker.cli import main; main()"
     done = subprocess.run(
-        [sys.executable, "-c", script, "run"], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", script, "run", *asked], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
-    assert "graspdb[sim]" in line
-    assert "x86-64" in line
+    assert remedy in line

@@ -9,7 +9,7 @@ from pydantic import Base64Bytes, Field
 
 from graspdb.wire.base import MANY, ObjectId, Request, Response, Text, ToolPositions, ToolRotations, Triple
 from graspdb.wire.grippers import GripperProfile
-from graspdb.wire.sweeps import Fidelity, Protocol
+from graspdb.wire.sweeps import Engine, Fidelity, Protocol
 
 WorkerName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
 Capability = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f]+$")]
@@ -79,6 +79,8 @@ class SimulatePayload(Response):
     """How an outcome is judged: by the contact wrench, or by a lift."""
     fidelity: Fidelity
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
+    engine: Engine | None = None
+    """Physics engine to simulate with; null for the worker's own."""
     grid: GridPlan | None = None
     """The grid that the chunk is cut from; null where poses are given."""
     poses: PosePlan | None = None

@@ -36,6 +36,7 @@ from graspdb.wire.trials import ProposalDensity
 
 Protocol = Literal["wrench", "lift"]
 Fidelity = Literal["standard", "fine"]
+Engine = Literal["pybullet", "mujoco"]
 Purpose = Literal["collect", "check"]
 
 

@@ -11,7 +11,7 @@ from graspdb.examples import example
 from graspdb.transport import Transport
 from graspdb.wire import GridPlan, GridSpec, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
 from graspdb.wire.presets.grippers import PRESETS
-from graspdb.wire.sweeps import Protocol
+from graspdb.wire.sweeps import Engine, Protocol
 from graspdb_geometry import meshes
 from graspdb_simworker.simulation.bodies import Part
 
@@ -22,13 +22,14 @@ def load(
     *,
     protocol: str = "wrench",
     fine: bool = False,
+    engine: Engine | None = None,
     url: str | None = None,
     api_key: str | None = None,
     seed: int = 0,
 ) -> tuple[SimulatePayload, Sequence[Part]]:
     """Payload of an object's default grid (10 mm, 15 degrees, 20 mm margin), and its convex parts.
 
-    They come from the service at ``url``, or without one from the examples.
+    They come from the service at ``url``, or without one from the examples. No engine: the default one.
 
     ValueError for an unknown example, gripper or protocol, or an object that can't be simulated yet.
     """
@@ -67,6 +68,7 @@ def load(
         gripper=profile,
         protocol=cast(Protocol, protocol),
         fidelity="fine" if fine else "standard",
+        engine=engine,
         grid=grid,
         start=0,
         stop=0,

@@ -1,8 +1,8 @@
 """The process that simulates: reads chunks from its standard input, answers on its standard output.
 
-Run as ``python -m graspdb_simworker.process.child`` by :mod:`graspdb_simworker.process.local`. pybullet lives
-here, because it can crash or hang a whole process on one unlucky pose, and leaks. A pose that takes too
-long ends the process by an alarm of the kernel's, which works even while pybullet holds the
+Run as ``python -m graspdb_simworker.process.child`` by :mod:`graspdb_simworker.process.local`. The engine
+lives here, because pybullet can crash or hang a whole process on one unlucky pose, and leaks. A pose that
+takes too long ends the process by an alarm of the kernel's, which works even while an engine holds the
 interpreter's lock.
 """
 
@@ -13,6 +13,7 @@ import sys
 from contextlib import suppress
 
 from graspdb_simworker.process import channel
+from graspdb_simworker.simulation.engines import installed
 
 
 def main() -> int:
@@ -22,7 +23,9 @@ def main() -> int:
     os.dup2(0, 2)  # pybullet greets on the standard error
     try:
         from graspdb_simworker.process import serving  # extra: sim
-    except ImportError as error:
+
+        installed.world_of(installed.require(None))
+    except (ImportError, installed.EngineMissing) as error:
         channel.send(sink, channel.MISSING, str(error).encode())
         return 2
     finally:

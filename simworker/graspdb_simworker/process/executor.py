@@ -1,7 +1,7 @@
 """Chunks simulated elsewhere: by any :class:`concurrent.futures.Executor`, such as a Dask cluster's.
 
 What is sent is a function, a chunk's payload and the object's parts; what comes back is its result. Where it
-runs, the function supervises a pybullet child of its own, as the worker does at home: a member of a pool can
+runs, the function supervises a child of its own, as the worker does at home: a member of a pool can
 neither be killed when a pose hangs, nor, if it is a daemon, start a process by ``multiprocessing``.
 """
 
@@ -14,7 +14,7 @@ from concurrent import futures
 
 from graspdb.wire import SimulatePayload, SimulateResult
 from graspdb_simworker.process.local import LocalRunner
-from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PhysicsMissing
 
 POLL_S = 0.2
 
@@ -55,7 +55,7 @@ class ExecutorRunner(ChunkRunner):
                 raise ChunkCancelled
         try:
             return SimulateResult.model_validate_json(future.result())
-        except (ChunkFailed, PybulletMissing):
+        except (ChunkFailed, PhysicsMissing):
             raise
         except Exception as error:
             raise ChunkFailed(f"the executor lost the chunk: {type(error).__name__}: {error}") from error

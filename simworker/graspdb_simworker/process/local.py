@@ -1,4 +1,4 @@
-"""One pybullet child, started, watched, killed and replaced: whatever a pose does to it, the chunk gets
+"""One simulating child, started, watched, killed and replaced: whatever a pose does to it, the chunk gets
 its result."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from graspdb.processes import ChildProcess
 from graspdb.wire import SimulatePayload, SimulateResult
 from graspdb_simworker.process import channel
 from graspdb_simworker.process.messages import Chunk
-from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PybulletMissing
+from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkRunner, PhysicsMissing
 from graspdb_simworker.simulation.labels import SIMULATION_ERROR, Label
 
 COMMAND = (sys.executable, "-m", "graspdb_simworker.process.child")
@@ -23,7 +23,7 @@ POSE_SECONDS = 10.0
 SILENT = 6.0
 """A process that says nothing for this many times as long by the clock sleeps, however busy the machine."""
 START_SECONDS = 600.0
-"""Loading pybullet and, the first time on a machine, compiling the collision test; on a starved one, too."""
+"""Loading an engine and, the first time on a machine, compiling the collision test; if starved, too."""
 RECYCLE_CHUNKS = 64
 """pybullet leaks: a child is replaced after this many chunks."""
 MAX_DEATHS = 50
@@ -113,7 +113,7 @@ class LocalRunner(ChunkRunner):
         except (channel.Closed, channel.Silent) as error:
             raise ChunkFailed(f"the simulating process did not start: {self._cause_of_death()}") from error
         if kind == channel.MISSING:
-            raise PybulletMissing(body.decode(errors="replace"))
+            raise PhysicsMissing(body.decode(errors="replace"))
         return process
 
     def _cause_of_death(self) -> str:

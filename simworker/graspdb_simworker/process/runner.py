@@ -17,8 +17,8 @@ class ChunkFailed(Exception):
     """The chunk can't be simulated; the message says why."""
 
 
-class PybulletMissing(Exception):
-    """The simulating process could not import pybullet."""
+class PhysicsMissing(Exception):
+    """The simulating process has no engine, or lacks what it needs beside it; the message says which."""
 
 
 class ChunkRunner(AbstractContextManager[Any], Protocol):
@@ -30,5 +30,5 @@ class ChunkRunner(AbstractContextManager[Any], Protocol):
         """Simulate a chunk of an object with these convex parts; ``wanted`` is asked several times a second.
 
         ChunkCancelled if it was not wanted any more; ChunkFailed, with the reason, if the chunk as a whole
-        can't be simulated; PybulletMissing.
+        can't be simulated; PhysicsMissing.
         """

@@ -1,4 +1,4 @@
-"""The child's work: chunks in, labels and results out. Imported only where pybullet is."""
+"""The child's work: chunks in, labels and results out. Imported only where there is an engine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graspdb_simworker.process.messages import Chunk
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.labels import Label
 
-WORKPIECE_FIELDS = {"parts_sha256", "mass_kg", "friction", "gripper", "protocol", "fidelity"}
+WORKPIECE_FIELDS = {"parts_sha256", "mass_kg", "friction", "gripper", "protocol", "fidelity", "engine"}
 """Chunks that agree in these share a world."""
 
 

@@ -1,1 +1,1 @@
-"""Grasps in physics: poses of a chunk in, labelled outcomes out. Only here pybullet is imported."""
+"""Grasps in physics: poses of a chunk in, labelled outcomes out."""

@@ -75,7 +75,7 @@ def prepare(
     """Build what the payload's chunks are simulated with; visible for pictures of the end, or at intervals.
     Moments of each closing are kept at such intervals, too.
 
-    UnsupportedProtocol, or ValueError for parts or a gripper that no physics can be done with.
+    UnsupportedProtocol, EngineMissing, or ValueError for parts or a gripper that no physics can be done with.
     """
     if payload.protocol not in PROTOCOLS:
         raise UnsupportedProtocol(
@@ -89,6 +89,7 @@ def prepare(
         payload.friction,
         gripper,
         payload.fidelity,
+        engine=payload.engine,
         lifts=payload.protocol == "lift",
         visible=visible,
         film_every_s=film_every_s,

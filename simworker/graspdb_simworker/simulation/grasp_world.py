@@ -1,32 +1,27 @@
-"""Closing a parallel jaw on a free-floating object in pybullet.
+"""Closing a parallel jaw on a free-floating object, in the world of a physics engine.
 
 The world is built once and reused. The gripper (a palm and two fingers on prismatic joints) stays at
 the origin, its tool frame is the world frame; for every grasp the *object* is moved instead. Nothing
 weighs: the object floats, so that the jaw centres it as it closes, and gravity enters afterwards
-through the force test in :mod:`graspdb_simworker.simulation.labels`, or as a load on what is carried: Bullet
-closes the jaw, and :mod:`graspdb_simworker.simulation.carrying` lifts.
-
-What the solver does depends on what it did before: Bullet keeps contact caches and the order of
-overlapping pairs. Parking the object far away and stepping the world once after every grasp empties
-both, and results become bitwise independent of the order of grasps, of the process and of the world
-(saving and restoring Bullet's state does not achieve that).
+through the force test in :mod:`graspdb_simworker.simulation.labels`, or as a load on what is carried: the
+engine closes the jaw, and :mod:`graspdb_simworker.simulation.carrying` lifts. What is an engine's own is
+behind :class:`~graspdb_simworker.simulation.engines.world.EngineWorld`; when a closing is over is decided
+here, alike for all.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
-from graspdb.wire.sweeps import Fidelity
+from graspdb.wire.sweeps import Engine, Fidelity
 from graspdb_simworker.simulation import carrying, lifting
 from graspdb_simworker.simulation.bodies import (
-    HEAVY_KG,
     Carried,
     Closing,
     Contacts,
@@ -36,10 +31,12 @@ from graspdb_simworker.simulation.bodies import (
     Quaternion,
     Vector,
     inverse,
+    mass_properties,
     multiply,
     rotate,
 )
-from graspdb_simworker.simulation.bullet_world import COLLISION_MARGIN_M, IDENTITY, PARKED, BulletWorld
+from graspdb_simworker.simulation.engines import installed
+from graspdb_simworker.simulation.engines.world import Stepping
 from graspdb_simworker.simulation.force_test import rating
 from graspdb_simworker.simulation.labels import RATED
 
@@ -78,33 +75,21 @@ _EMPTY_CHECK_STEPS = 10
 _SUNK_CHECK_STEPS = 3
 _SURELY_BETWEEN = 0.8
 """An object that no point of which moved by this share of its depth between the fingers is still there."""
-_ANY_LINK = -2
 
 
 @dataclass(frozen=True)
-class Stepping:
-    """How time is cut: until both fingers touch, from then on, and while the object is carried, when patches
-    of contact are cut into areas of ``area_m``."""
+class Carrying:
+    """How finely a lift is simulated: its steps, and areas that patches of contact are cut into, by their
+    side."""
 
-    approach_dt_s: float
-    squeeze_dt_s: float
-    solver_iterations: int
-    carry_dt_s: float
+    dt_s: float
     area_m: float
 
 
-_LIGHT = Stepping(1.0 / 240.0, 1.0 / 480.0, 50, 1.0 / 240.0, 0.005)
-_HEAVY = Stepping(1.0 / 240.0, 1.0 / 240.0, 80, 1.0 / 240.0, 0.005)
-"""What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each."""
-_FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200, 1.0 / 960.0, 0.0025)
-"""Also what a doubtful closing is simulated with once more."""
-
-
-def stepping_for(fidelity: Fidelity, mass_kg: float) -> Stepping:
-    """How finely to simulate an object of this mass."""
-    if fidelity == "fine":
-        return _FINE
-    return _HEAVY if mass_kg >= HEAVY_KG else _LIGHT
+CARRYING: Mapping[Fidelity, Carrying] = {
+    "standard": Carrying(1.0 / 240.0, 0.005),
+    "fine": Carrying(1.0 / 960.0, 0.0025),
+}
 
 
 def doubtful(closing: Closing) -> bool:
@@ -127,8 +112,8 @@ class Moment(NamedTuple):
     quaternion_xyzw: Quaternion
 
 
-class GraspWorld(BulletWorld):
-    """One object and one gripper in a headless Bullet world.
+class GraspWorld:
+    """One object and one gripper in the world of an engine, by default the worker's own.
 
     ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3); ``friction`` is
     Coulomb's coefficient between object and gripper; ``fidelity`` is ``standard`` or ``fine``. ``lifts``:
@@ -145,21 +130,21 @@ class GraspWorld(BulletWorld):
         gripper: Gripper,
         fidelity: Fidelity = "standard",
         *,
+        engine: Engine | None = None,
         lifts: bool = False,
         visible: bool = False,
         film_every_s: float = math.inf,
         moments_every_s: float = math.inf,
     ) -> None:
-        stepping = stepping_for(fidelity, mass_kg)
-        super().__init__(
-            parts,
-            mass_kg,
-            friction,
-            gripper,
-            solver_iterations=stepping.solver_iterations,
-            visible=visible,
-        )
-        self.stepping = stepping
+        self.gripper = gripper
+        self.friction = friction
+        self.mass = mass_properties(parts, mass_kg)
+        world_of = installed.world_of(installed.require(engine))
+        self._engine = world_of(parts, mass_kg, friction, gripper, visible=visible)
+        self._stepping = self._engine.stepping(fidelity, mass_kg)
+        self._running = self._stepping
+        self._fine = self._engine.stepping("fine", mass_kg)
+        self._visible = visible
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
         self._moments_every_s = moments_every_s
@@ -170,8 +155,11 @@ class GraspWorld(BulletWorld):
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
         the end is last. Empty unless the world is visible."""
+        self._carrying = CARRYING[fidelity]
         self._carrier = (
-            carrying.Carrier(parts, self.mass, gripper, friction, stepping.carry_dt_s, stepping.area_m, LOST)
+            carrying.Carrier(
+                parts, self.mass, gripper, friction, self._carrying.dt_s, self._carrying.area_m, LOST
+            )
             if lifts
             else None
         )
@@ -179,8 +167,13 @@ class GraspWorld(BulletWorld):
         self._radius = self.mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
         self._seen: tuple[Vector, Quaternion, float] | None = None
-        self._damp(DAMPING * math.sqrt(gripper.closing_force_n / mass_kg))
-        self._park()
+        self._engine.damp(DAMPING * math.sqrt(gripper.closing_force_n / mass_kg))
+        self._engine.cut(self._running)
+        self._engine.park()
+
+    def close_world(self) -> None:
+        """Free the engine's memory at once; the world can't be used afterwards."""
+        self._engine.close_world()
 
     # -- one grasp -----------------------------------------------------------------------------------------
 
@@ -189,28 +182,26 @@ class GraspWorld(BulletWorld):
 
         Each finger can close by ``travel_m`` before the first of the two touches, by the exact geometry.
         """
-        stepping = self.stepping
+        stepping = self._stepping
         try:
             closing = self._close(position, quaternion_xyzw, travel_m)
-            if stepping is not _FINE and doubtful(closing):
-                self._step_by(_FINE)
+            if stepping != self._fine and doubtful(closing):
+                self._step_by(self._fine)
                 closing = self._close(position, quaternion_xyzw, travel_m)
             if self._moments_every_s < math.inf and self.moments[-1].time_s < self._time_s:
                 self.moments.append(self._moment())
             if self._visible:
-                self.pictures.append(self._render())
+                self.pictures.append(self._engine.picture())
             return closing
         finally:
-            if self.stepping is stepping:
-                self._park()
-            else:
-                self._step_by(stepping)
+            self._step_by(stepping)
 
     def _step_by(self, stepping: Stepping) -> None:
-        """Leave the running grasp and cut time otherwise from now on."""
-        self.stepping = stepping
-        self._bullet.setPhysicsEngineParameter(numSolverIterations=stepping.solver_iterations)
-        self._park()
+        """Leave the running grasp, and cut time so in the next."""
+        if stepping is not self._running:
+            self._running = stepping
+            self._engine.cut(stepping)
+        self._engine.park()
 
     def _watch(self, dt: float) -> None:
         """Keep a moment, and take a picture, when it is time for the next."""
@@ -220,35 +211,29 @@ class GraspWorld(BulletWorld):
         self._filmed_s += dt
         if self._visible and self._filmed_s >= self._film_every_s:
             self._filmed_s = 0.0
-            self.pictures.append(self._render())
+            self.pictures.append(self._engine.picture())
 
     def _moment(self) -> Moment:
-        (first, *_), (second, *_) = self._bullet.getJointStates(self._jaw, (0, 1))
-        return Moment(self._time_s, (first, second), *self._object_pose())
+        return Moment(self._time_s, self._engine.fingers(), *self._object_pose())
 
     def _object_pose(self) -> tuple[Vector, Quaternion]:
         """Pose of the object frame in the tool frame."""
-        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
+        where, orientation = self._engine.body()
         quaternion = multiply(orientation, self._to_body)
         shift = rotate(quaternion, self.mass.centre)
         return (where[0] - shift[0], where[1] - shift[1], where[2] - shift[2]), quaternion
 
     # long: one step after the other, with every name looked up once: it runs ten thousand times a second
     def _close(self, position: Vector, quaternion_xyzw: Quaternion, travel_m: float) -> Closing:
-        client, jaw, body = self._client, self._jaw, self._object
-        gripper, stepping = self.gripper, self.stepping
+        engine, gripper, stepping = self._engine, self.gripper, self._running
         self.pictures.clear()
         self.moments.clear()
         self._filmed_s = self._time_s = 0.0
-        where, orientation = self._body_pose(position, quaternion_xyzw)
-        # Parking left the object at rest and the motors driven at the steps of the approach.
-        pybullet.resetBasePositionAndOrientation(body, where, orientation, physicsClientId=client)
         self._seen = None
-        if self._visible:
-            self._aim()
         start = gripper.max_opening_m * 0.5 - max(0.0, travel_m - APPROACH_GAP_M)
-        for joint in (0, 1):
-            pybullet.resetJointState(jaw, joint, start, -gripper.max_speed_m_s, physicsClientId=client)
+        engine.place(*self._body_pose(position, quaternion_xyzw), start)
+        if self._visible:
+            engine.aim()
 
         dt = stepping.approach_dt_s
         touched = False
@@ -261,41 +246,32 @@ class GraspWorld(BulletWorld):
         ratings: list[float] = []
         steps = 0
         end = End.TIMEOUT
-        # What is done at every step costs as much as the physics of a light one: names looked up once, and
-        # arguments without their names.
-        step, states, touching = pybullet.stepSimulation, pybullet.getJointStates, pybullet.getContactPoints
-        watched, joints = self._watched, (0, 1)
+        # What is done at every step costs as much as the physics of a light one: names looked up once.
+        advance, watched = engine.advance, self._watched
         ages = READING_AGES_S if self._carrier is None else (LIFTED_AFTER_S,)
         while elapsed < limit:
-            step(client)
+            opening = advance()
             steps += 1
             elapsed += dt
             if watched:
                 self._watch(dt)
-            first, second = states(jaw, joints, client)
-            opening = first[0] + second[0]
             if not 0.0 < opening < math.inf:
                 end = End.EMPTY if math.isfinite(opening) else End.UNSTABLE
                 break
-            if not touched:
-                pressing = 0
-                for contact in touching(jaw, body, _ANY_LINK, _ANY_LINK, client):
-                    if contact[9] > 0.0:
-                        pressing |= 1 << (contact[3] + 1)
-                if pressing & 0b110 == 0b110:
-                    touched = True
-                    dt = stepping.squeeze_dt_s
-                    if dt != stepping.approach_dt_s:
-                        self._drive(dt)
-                    mark_opening, mark_time = opening, elapsed
-                    contacts.clear()
-                    ratings.clear()
+            if not touched and engine.pressed():
+                touched = True
+                dt = stepping.squeeze_dt_s
+                if dt != stepping.approach_dt_s:
+                    engine.drive(dt)
+                mark_opening, mark_time = opening, elapsed
+                contacts.clear()
+                ratings.clear()
             if mark_opening - opening > STALL_PROGRESS_M:
                 mark_opening, mark_time = opening, elapsed
                 contacts.clear()
                 ratings.clear()
             elif elapsed - mark_time >= ages[len(contacts)] - 1e-9:
-                contacts.append(self._contacts())
+                contacts.append(engine.contacts())
                 if self._carrier is None:
                     ratings.append(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction))
                 if len(contacts) == len(ages) or ratings[-1] >= NO_DOUBT[len(contacts) - 1]:
@@ -304,10 +280,10 @@ class GraspWorld(BulletWorld):
             if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
                 end = End.EMPTY
                 break
-            if touched and steps % _SUNK_CHECK_STEPS == 0 and self._sunk(SUNK_M):
+            if touched and steps % _SUNK_CHECK_STEPS == 0 and engine.sunk(SUNK_M):
                 end = End.SUNK
                 break
-        if end is End.STALLED and self._sunk(STALLED_SUNK_M if self._carrier is None else CARRIED_SUNK_M):
+        if end is End.STALLED and engine.sunk(STALLED_SUNK_M if self._carrier is None else CARRIED_SUNK_M):
             end = End.SUNK
         closing = self._closing(end, touched, opening, contacts, ratings, steps)
         if self._carrier is not None and closing.end is End.STALLED:
@@ -324,41 +300,15 @@ class GraspWorld(BulletWorld):
         offset = (centre[0] - position[0], centre[1] - position[1], centre[2] - position[2])
         return rotate(back, offset), multiply(back, self.mass.principal_xyzw)
 
-    def _drive(self, dt: float) -> None:
-        # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
-        self._bullet.setPhysicsEngineParameter(fixedTimeStep=dt)
-        speeds, forces = [-self.gripper.max_speed_m_s] * 2, [self.gripper.closing_force_n] * 2
-        self._bullet.setJointMotorControlArray(
-            self._jaw, (0, 1), pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=forces
-        )
-
-    def _contacts(self) -> Contacts:
-        contacts = [c for c in self._bullet.getContactPoints(self._jaw, self._object) if c[9] > 0.0]
-        # contactNormalOnB points from B, the object, to A: turned round it points into the object.
-        return Contacts(
-            np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
-            np.array([contact[9] for contact in contacts], dtype=np.float64),
-            np.array([contact[3] for contact in contacts], dtype=np.int64),
-        )
-
     def _carry(self, carrier: carrying.Carrier) -> Carried:
         """Lift and shake what the stalled jaw holds, with the gripper's own force."""
-        (first, *_), (second, *_) = self._bullet.getJointStates(self._jaw, (0, 1))
-        where, orientation = self._bullet.getBasePositionAndOrientation(self._object)
-        dt = self.stepping.carry_dt_s
-        carried, path = carrier.carry(where, orientation, (first, second), lifting.frames(dt))
+        dt = self._carrying.dt_s
+        carried, path = carrier.carry(*self._engine.body(), self._engine.fingers(), lifting.frames(dt))
         if self._watched:
             for row in path.tolist():
-                self._bullet.resetBasePositionAndOrientation(self._object, row[:3], row[3:7])
-                for joint in (0, 1):
-                    self._bullet.resetJointState(self._jaw, joint, row[7 + joint])
+                self._engine.show(tuple(row[:3]), tuple(row[3:7]), (row[7], row[8]))
                 self._watch(dt)
         return carried
-
-    def _sunk(self, depth_m: float) -> bool:
-        """Whether any contact is deeper than this."""
-        touching = pybullet.getContactPoints(self._jaw, self._object, _ANY_LINK, _ANY_LINK, self._client)
-        return any(contact[8] < -depth_m for contact in touching)
 
     def _between(self) -> bool:
         """Whether any of the object is in the space between the open fingers.
@@ -367,13 +317,13 @@ class GraspWorld(BulletWorld):
         of it before one of its points has moved by d: so the collision test, which takes as long as a step,
         is not made again until then.
         """
-        where, orientation = pybullet.getBasePositionAndOrientation(self._object, self._client)
+        where, orientation = self._engine.body()
         if self._seen is not None:
             then, turned, depth = self._seen
             moved = math.dist(where, then) + self._radius * lifting.angle_between(turned, orientation)
             if moved < _SURELY_BETWEEN * depth:
                 return True
-        depth = self._depth_between()
+        depth = self._engine.depth_between()
         self._seen = (where, orientation, depth)
         return depth > -math.inf
 
@@ -390,16 +340,6 @@ class GraspWorld(BulletWorld):
         if not all(map(math.isfinite, (*position, *quaternion))):
             end = End.UNSTABLE
         elif end is End.STALLED:
-            # Bullet's hulls are inflated by the margin on both sides; the object is not.
-            opening -= 2.0 * COLLISION_MARGIN_M
+            opening -= 2.0 * self._engine.inflated_m
         held, rated = (tuple(contacts), tuple(ratings)) if end is End.STALLED else ((), ())
         return Closing(end, touched, opening, held, position, quaternion, steps, ratings=rated)
-
-    def _park(self) -> None:
-        """Empty Bullet's caches: the object far away, one step without any contact."""
-        self._bullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY)
-        self._bullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        for joint in (0, 1):
-            self._bullet.resetJointState(self._jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0)
-        self._drive(self.stepping.approach_dt_s)
-        self._bullet.stepSimulation()

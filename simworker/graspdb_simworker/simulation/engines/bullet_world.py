@@ -1,5 +1,10 @@
-"""Gripper and object in a headless Bullet world, built once, to be posed and driven by
-:mod:`graspdb_simworker.simulation.grasp_world`. Only these two modules import pybullet."""
+"""Gripper and object in a headless Bullet world. Only this module imports pybullet.
+
+What the solver does depends on what it did before: Bullet keeps contact caches and the order of
+overlapping pairs. Parking the object far away and stepping the world once after every grasp empties
+both, and results become bitwise independent of the order of grasps, of the process and of the world
+(saving and restoring Bullet's state does not achieve that).
+"""
 
 from __future__ import annotations
 
@@ -16,8 +21,11 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
+from graspdb.wire.sweeps import Fidelity
 from graspdb_simworker.simulation import camera
 from graspdb_simworker.simulation.bodies import (
+    HEAVY_KG,
+    Contacts,
     Gripper,
     MassProperties,
     Part,
@@ -26,12 +34,20 @@ from graspdb_simworker.simulation.bodies import (
     mass_properties,
     obj_of_parts,
 )
+from graspdb_simworker.simulation.engines.world import EngineWorld, Stepping
 
 COLLISION_MARGIN_M = 0.0005
 """Bullet inflates convex hulls by this much; boxes keep their size."""
 CONTACT_BREAKING_M = 0.002
 PARKED: Vector = (0.0, 0.0, -1000.0)
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+_ANY_LINK = -2
+_JOINTS = (0, 1)
+
+_LIGHT = Stepping(1.0 / 240.0, 1.0 / 480.0, 50)
+_HEAVY = Stepping(1.0 / 240.0, 1.0 / 240.0, 80)
+"""What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each."""
+_FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200)
 
 
 class _Connection:
@@ -47,45 +63,111 @@ class _Connection:
         return functools.partial(getattr(pybullet, function), physicsClientId=self.number)
 
 
-class BulletWorld:
-    """A jaw at the origin, its tool frame the world's, and an object.
+class BulletWorld(EngineWorld):
+    """A world of pybullet's, without a window. What is done at every step costs as much as the physics of a
+    light one: it calls pybullet itself, with arguments without their names."""
 
-    ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3). ``visible``:
-    build what can be seen.
-    """
+    inflated_m = COLLISION_MARGIN_M
 
     def __init__(
-        self,
-        parts: Sequence[Part],
-        mass_kg: float,
-        friction: float,
-        gripper: Gripper,
-        *,
-        solver_iterations: int,
-        visible: bool,
+        self, parts: Sequence[Part], mass_kg: float, friction: float, gripper: Gripper, *, visible: bool
     ) -> None:
         self.gripper = gripper
-        self.friction = friction
         self.mass = mass_properties(parts, mass_kg)
         self._visible = visible
         self._views: list[camera.View] = []
         # Gives every call the world's number; calls of every step give it themselves, which is faster.
         self._bullet = _Connection()
         self._client = self._bullet.number
-        self._configure(solver_iterations)
+        self._approach_dt = _LIGHT.approach_dt_s
+        self._configure()
         self._jaw, self._object = self._build_gripper(), self._build_object(parts, self.mass)
         self._column, self._column_at = self._build_column()
         self._finish_bodies(math.sqrt(friction))
 
+    @staticmethod
+    def stepping(fidelity: Fidelity, mass_kg: float) -> Stepping:
+        if fidelity == "fine":
+            return _FINE
+        return _HEAVY if mass_kg >= HEAVY_KG else _LIGHT
+
     def close_world(self) -> None:
-        """Free Bullet's memory at once; the world can't be used afterwards."""
         self._bullet.end()
 
-    def _configure(self, solver_iterations: int) -> None:
+    def cut(self, stepping: Stepping) -> None:
+        self._approach_dt = stepping.approach_dt_s
+        self._bullet.setPhysicsEngineParameter(numSolverIterations=stepping.iterations)
+
+    def damp(self, rate: float) -> None:
+        self._bullet.changeDynamics(self._object, -1, linearDamping=rate, angularDamping=rate)
+
+    def drive(self, dt: float) -> None:
+        # The step first: a motor's largest impulse, force times step, is frozen when the command is given.
+        self._bullet.setPhysicsEngineParameter(fixedTimeStep=dt)
+        speeds, forces = [-self.gripper.max_speed_m_s] * 2, [self.gripper.closing_force_n] * 2
+        self._bullet.setJointMotorControlArray(
+            self._jaw, _JOINTS, pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=forces
+        )
+
+    def place(self, where: Vector, orientation: Quaternion, finger_m: float) -> None:
+        # Parking left the object at rest and the motors driven at the steps of the approach.
+        client, jaw, speed = self._client, self._jaw, -self.gripper.max_speed_m_s
+        pybullet.resetBasePositionAndOrientation(self._object, where, orientation, physicsClientId=client)
+        for joint in _JOINTS:
+            pybullet.resetJointState(jaw, joint, finger_m, speed, physicsClientId=client)
+
+    def advance(self) -> float:
+        client = self._client
+        pybullet.stepSimulation(client)
+        first, second = pybullet.getJointStates(self._jaw, _JOINTS, client)
+        return float(first[0] + second[0])
+
+    def pressed(self) -> bool:
+        pressing = 0
+        for contact in pybullet.getContactPoints(self._jaw, self._object, _ANY_LINK, _ANY_LINK, self._client):
+            if contact[9] > 0.0:
+                pressing |= 1 << (contact[3] + 1)
+        return pressing & 0b110 == 0b110
+
+    def contacts(self) -> Contacts:
+        contacts = [c for c in self._bullet.getContactPoints(self._jaw, self._object) if c[9] > 0.0]
+        # contactNormalOnB points from B, the object, to A: turned round it points into the object.
+        return Contacts(
+            np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
+            np.array([contact[9] for contact in contacts], dtype=np.float64),
+            np.array([contact[3] for contact in contacts], dtype=np.int64),
+        )
+
+    def sunk(self, depth_m: float) -> bool:
+        touching = pybullet.getContactPoints(self._jaw, self._object, _ANY_LINK, _ANY_LINK, self._client)
+        return any(contact[8] < -depth_m for contact in touching)
+
+    def body(self) -> tuple[Vector, Quaternion]:
+        where, orientation = pybullet.getBasePositionAndOrientation(self._object, self._client)
+        return where, orientation
+
+    def fingers(self) -> tuple[float, float]:
+        (first, *_), (second, *_) = self._bullet.getJointStates(self._jaw, _JOINTS)
+        return first, second
+
+    def show(self, where: Vector, orientation: Quaternion, fingers_m: tuple[float, float]) -> None:
+        self._bullet.resetBasePositionAndOrientation(self._object, where, orientation)
+        for joint in _JOINTS:
+            self._bullet.resetJointState(self._jaw, joint, fingers_m[joint])
+
+    def park(self) -> None:
+        """Empty Bullet's caches: the object far away, one step without any contact."""
+        self._bullet.resetBasePositionAndOrientation(self._object, PARKED, IDENTITY)
+        self._bullet.resetBaseVelocity(self._object, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        for joint in _JOINTS:
+            self._bullet.resetJointState(self._jaw, joint, 0.5 * self.gripper.max_opening_m, 0.0)
+        self.drive(self._approach_dt)
+        self._bullet.stepSimulation()
+
+    def _configure(self) -> None:
         self._bullet.resetSimulation()
         self._bullet.setGravity(0.0, 0.0, 0.0)
         self._bullet.setPhysicsEngineParameter(
-            numSolverIterations=solver_iterations,
             contactBreakingThreshold=CONTACT_BREAKING_M,
             deterministicOverlappingPairs=1,
             numSubSteps=0,
@@ -176,14 +258,7 @@ class BulletWorld:
             self._bullet.changeDynamics(self._jaw, link, jointDamping=0.0)
         self._bullet.changeDynamics(self._object, -1, localInertiaDiagonal=self.mass.inertia)
 
-    def _damp(self, rate: float) -> None:
-        self._bullet.changeDynamics(self._object, -1, linearDamping=rate, angularDamping=rate)
-
-    def _depth_between(self) -> float:
-        """How deep the object is in the space between the open fingers, metres; negative outside.
-
-        The deepest part counts: moved by less than its depth, it is still there.
-        """
+    def depth_between(self) -> float:
         points = pybullet.getClosestPoints(
             bodyA=self._object,
             bodyB=-1,
@@ -194,8 +269,7 @@ class BulletWorld:
         )
         return max((-float(point[8]) for point in points), default=-math.inf)
 
-    def _aim(self) -> None:
-        """Choose from where the grasp that begins is looked at."""
+    def aim(self) -> None:
         low, high = np.array(self._bullet.getAABB(self._object, -1))
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
         finger, palm = (
@@ -245,6 +319,6 @@ class BulletWorld:
             far * near / (far - (far - near) * buffer),
         )
 
-    def _render(self) -> NDArray[np.uint8]:
+    def picture(self) -> NDArray[np.uint8]:
         views = [camera.finished(*self._draw(view, 1280, 960)) for view in self._views]
         return np.concatenate(views, axis=1)
