@@ -81,7 +81,7 @@ EngineName = Annotated[
         help="Physics engine: pybullet where it is installed, else mujoco.",
     ),
 ]
-Protocol = Annotated[str, typer.Option(help="wrench or lift.")]
+Protocol = Annotated[str, typer.Option(help="wrench, lift or shake.")]
 DecomposeSeconds = Annotated[
     float,
     typer.Option(
@@ -300,7 +300,7 @@ def show(
         written = pictures.write(out, shown.pictures, f"{object_name}, {gripper}, {protocol}: {outcome}")
     width, quality = (f"{v:.4g}" if v == v else "unknown" for v in (shown.label.width_m, shown.label.quality))
     meaning = (
-        "(1: did not move in the jaw, below 0: too far)" if protocol == "lift" else "times the weight held"
+        "times the weight held" if protocol == "wrench" else "(1: did not move in the jaw, below 0: too far)"
     )
     typer.echo(
         f"{shown.label.outcome.name.lower()}: fingers {width} m apart, quality {quality} {meaning};"

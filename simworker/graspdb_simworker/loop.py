@@ -27,7 +27,7 @@ from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkR
 
 log = logging.getLogger("graspdb.simworker")
 
-CAPABILITIES = ("simulate", "lift")
+CAPABILITIES = ("simulate", "lift", "shake")
 """Job kinds, and protocols beyond ``wrench``, that this worker's processes claim."""
 DECOMPOSING = ("decompose",)
 """What it claims besides, one at a time."""

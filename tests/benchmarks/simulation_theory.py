@@ -1,5 +1,6 @@
 """What the worker says of grasps whose outcome mechanics knows: labels that theory forbids, by protocol,
-fidelity and kind of grasp. Takes an hour of one core. The labels themselves go to the standard error stream.
+fidelity and kind of grasp. Takes two hours of one core. The labels themselves go to the standard error
+stream.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def main() -> None:
     heads = ("protocol", "fidelity", "held", "grasps", "labels", "false failures", "false successes")
     print("|", " | ".join(heads), "| flip not once | s |")
     print("|---" * 9 + "|")
-    for protocol in ("wrench", "lift"):
+    for protocol in ("wrench", "lift", "shake"):
         for fidelity in ("standard", "fine"):
             measure(protocol, fidelity)
 

@@ -10,11 +10,15 @@ import closed_forms
 from closed_forms import Case
 
 from graspdb_simworker.simulation.labels import Label, Outcome
+from graspdb_simworker.simulation.lifting import LIFT, MOTIONS, SHAKE
 
 FRICTIONS = (0.1, 0.2, 0.4, 0.7, 1.0)
 LOADS = (0.4, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.5)
 """Shares of the limit: at most the second must hold, and from the sixth on none may."""
 HOLDS, FAILS = 0.8, 1.25
+_UNMOVED = 1.0 - LIFT.allowed.translation_m / SHAKE.allowed.translation_m
+"""Quality of ``shake`` from which on an object moved by 1 mm at most, as ``lift`` allows; turned by 3.6
+degrees."""
 _STEADY = 0.8
 """Where tilting takes this share of what lifts a patch's edge off, its pressure is not uniform any more."""
 
@@ -46,13 +50,16 @@ class Row:
     """What was said of one grasp: the load over the limit, and the label."""
 
     case: Case
+    protocol: str
     limit_kg: float
     loads: tuple[float, ...]
     labels: tuple[Label, ...]
 
     @property
     def held(self) -> tuple[bool, ...]:
-        return tuple(label.outcome is Outcome.SUCCESS for label in self.labels)
+        """Which succeeded; ``shake`` lets objects slide, so here also: and did not."""
+        least = _UNMOVED if self.protocol == "shake" else -math.inf
+        return tuple(label.outcome is Outcome.SUCCESS and label.quality >= least for label in self.labels)
 
     @property
     def wrong(self) -> list[str]:
@@ -74,8 +81,10 @@ def asked(case: Case, protocol: str) -> float | None:
     """The limit in kilograms; None where theory does not speak of the case."""
     if protocol == "wrench":
         return closed_forms.wrench_limit(case.friction)
-    limit = closed_forms.lift_limit(case)
-    return limit if closed_forms.tilt_ratio(case, closed_forms.lift_loads(case, limit)) < _STEADY else None
+    motion = MOTIONS[protocol]
+    limit = closed_forms.carried_limit(case, motion)
+    tilt = closed_forms.tilt_ratio(case, closed_forms.loads_of(case, limit, motion))
+    return limit if tilt < _STEADY else None
 
 
 def row(
@@ -97,7 +106,7 @@ def row(
         )
         for load in loads
     ]
-    return Row(case, limit, tuple(loads), tuple(labels))
+    return Row(case, protocol, limit, tuple(loads), tuple(labels))
 
 
 def wedge_label(friction: float, share: float, protocol: str, fidelity: str) -> Label:

@@ -6,8 +6,8 @@ body, patch points x_i carrying normal forces N_i, and u_i(v) the speed along th
 
     ratio(W) = max over v of  W . v / (mu sum_i N_i |u_i(v)|)
 
-is 1 at the limit surface and proportional to the load. The largest ratio over the motion of protocol ``lift``
-is a grasp's ``lift`` ratio; where it is 1, the motion's hardest instant is just held.
+is 1 at the limit surface and proportional to the load. Where the largest ratio over the motion of protocol
+``lift`` or ``shake`` is 1, the motion's hardest instant is just held.
 """
 
 from __future__ import annotations
@@ -155,16 +155,16 @@ def wedge(half_angle: float) -> Part:
 # -- loads -------------------------------------------------------------------------------------------------
 
 
-def lift_loads(case: Case, mass_kg: float, step_s: float = 0.01) -> FLOAT:
-    """Force and torque about the tool's origin (t, 6), in the tool frame, while ``lift`` carries the body."""
+def loads_of(case: Case, mass_kg: float, motion: lifting.Motion, step_s: float = 0.01) -> FLOAT:
+    """Force and torque about the tool's origin (t, 6), in the tool frame, while the jaw carries the body."""
     mass = mass_properties([case.part], mass_kg)
     back = Rotation.from_quat(DOWN).inv()
     centre = back.apply(np.array(mass.centre) - case.position)
     turn = (back * Rotation.from_quat(mass.principal_xyzw)).as_quat()
     still = (0.0, 0.0, 0.0)
     found = []
-    for t in np.arange(0.0, lifting.DURATION_S, step_s):
-        frame = lifting.frame_at(float(t))
+    for t in np.arange(0.0, motion.duration_s, step_s):
+        frame = motion.at(float(t))
         force, torque = lifting.load(frame, mass_kg, mass.inertia, tuple(centre), tuple(turn), still, still)
         found.append(np.concatenate([force, np.array(torque) + np.cross(centre, force)]))
     return np.array(found)
@@ -212,11 +212,11 @@ def tilt_ratio(case: Case, loads: FLOAT, force_n: float = PG70.force_n) -> float
     return float(ratio.max())
 
 
-def lift_limit(case: Case) -> float:
-    """The mass (kg) that the jaw just carries through ``lift``; infinite pushes along y are not looked at."""
+def carried_limit(case: Case, motion: lifting.Motion) -> float:
+    """The mass (kg) that the jaw just carries unmoved; infinite pushes along y are not looked at."""
     mass = 1.0
     for _ in range(30):
-        ratio = float(slip_ratio(case, lift_loads(case, mass)).max())
+        ratio = float(slip_ratio(case, loads_of(case, mass, motion)).max())
         if abs(ratio - 1.0) < 1e-3:
             break
         mass /= ratio
@@ -226,6 +226,24 @@ def lift_limit(case: Case) -> float:
 def wrench_limit(friction: float, force_n: float = PG70.force_n) -> float:
     """The mass (kg) whose weight two opposite contacts just hold, whichever way down is."""
     return min(2.0 * friction * force_n * math.cos(math.atan(friction)), force_n) / GRAVITY_M_S2
+
+
+def slid(
+    mass_kg: float, friction: float, motion: lifting.Motion, axis: int, force_n: float = PG70.force_n
+) -> FLOAT:
+    """How far (t,) a block between two flat fingers slides along one axis (0 or 2) of a motion without turns,
+    from step to step of 0.1 ms, metres: Coulomb's friction on both sides against what pushes it."""
+    dt, most = 1e-4, 2.0 * friction * force_n / mass_kg
+    way = speed = 0.0
+    found = []
+    for t in np.arange(0.0, motion.duration_s, dt):
+        push = motion.at(float(t)).push[axis]
+        # What brakes it may stop it, and keeps it, but never turns it back.
+        free = speed + push * dt
+        speed = math.copysign(max(0.0, abs(free) - most * dt), free)
+        way += speed * dt
+        found.append(way)
+    return np.array(found)
 
 
 # -- simulation --------------------------------------------------------------------------------------------

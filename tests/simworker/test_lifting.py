@@ -1,10 +1,10 @@
-"""The protocol ``lift``: the motion itself, and what it does to grasps that only seem to hold."""
+"""The protocols ``lift`` and ``shake``: the motions, and what they do to grasps that only seem to hold."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pybullet
@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb.wire import Finger, GripperProfile, SimulatePayload
+from graspdb.wire.sweeps import Protocol
 from graspdb_simworker.loop import CAPABILITIES
 from graspdb_simworker.simulation import chunks, lifting
 from graspdb_simworker.simulation.bodies import Part, mass_properties
@@ -60,7 +61,7 @@ def grasp(
 
 def test_the_jaw_ends_ten_centimetres_higher_and_at_rest() -> None:
     times = np.linspace(0.0, lifting.DURATION_S, 60_001)
-    pushes = np.array([lifting.frame_at(float(t)).push for t in times])
+    pushes = np.array([lifting.lift_at(float(t)).push for t in times])
     steps = np.diff(times, prepend=0.0)
     before = times <= lifting.ONSET_S + lifting.LIFT_S
     rising = np.where(before & (times > lifting.ONSET_S), pushes[:, 2] - GRAVITY_M_S2, 0.0)
@@ -80,12 +81,31 @@ def test_the_jaw_ends_ten_centimetres_higher_and_at_rest() -> None:
         assert way.min() == pytest.approx(-lifting.SHAKE_M, rel=1e-2)
 
 
-def test_nothing_jumps() -> None:
-    times = np.linspace(0.0, lifting.DURATION_S, 33_001)
-    values = np.array([np.concatenate([f.push, f.spin]) for f in map(lifting.frame_at, times.tolist())])
-    assert np.abs(np.diff(values, axis=0)).max() < 0.05
+def test_a_shake_has_the_stated_accelerations_and_comes_home() -> None:
+    times = np.linspace(0.0, lifting.SHAKE.duration_s, 60_001)
+    rows = [lifting.shake_at(float(t)) for t in times]
+    pushes, rates = np.array([f.push for f in rows]), np.array([f.spin_rate for f in rows])
+    assert np.abs(pushes).max(axis=0) == pytest.approx([lifting.ALONG_M_S2] * 3, rel=1e-3)
+    assert np.abs(rates).max(axis=0) == pytest.approx([lifting.ABOUT_RAD_S2] * 3, rel=1e-3)
+    for second, stroke in ((-pushes, lifting.ALONG_M), (rates, lifting.ABOUT_RAD)):
+        first = np.cumsum(second, axis=0) * times[1]
+        way = np.cumsum(first, axis=0) * times[1]
+        assert np.abs(first[-1]).max() < 1e-2 * np.abs(first).max()
+        assert np.abs(way[-1]).max() < 1e-2 * stroke
+        assert way.max(axis=0) == pytest.approx([stroke] * 3, rel=1e-2)
+        assert way.min(axis=0) == pytest.approx([-stroke] * 3, rel=1e-2)
+    assert np.array([f.spin for f in rows]) == pytest.approx(np.cumsum(rates, axis=0) * times[1], abs=0.02)
+
+
+@pytest.mark.parametrize("protocol", ["lift", "shake"])
+def test_nothing_jumps(protocol: str) -> None:
+    motion = lifting.MOTIONS[protocol]
+    times = np.linspace(0.0, motion.duration_s, 33_001)
+    values = np.array([np.concatenate([f.push, f.spin]) for f in map(motion.at, times.tolist())])
+    assert np.abs(np.diff(values, axis=0)).max() < 0.1
     assert values[0] == pytest.approx(np.zeros(6))
-    assert values[-1] == pytest.approx([0.0, 0.0, GRAVITY_M_S2, 0.0, 0.0, 0.0])
+    weight = GRAVITY_M_S2 if protocol == "lift" else 0.0
+    assert values[-1] == pytest.approx([0.0, 0.0, weight, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -101,7 +121,7 @@ def test_a_body_that_nothing_holds_falls_freely_however_the_jaw_turns(axis: int)
     def rates(t: float, state: np.ndarray) -> np.ndarray:
         r, v, q, spin = state[:3], state[3:6], state[6:10] / np.linalg.norm(state[6:10]), state[10:]
         where = (tuple(r), tuple(q), tuple(v), tuple(spin))
-        force, torque = lifting.load(lifting.frame_at(began + t), mass.mass_kg, mass.inertia, *where)
+        force, torque = lifting.load(lifting.lift_at(began + t), mass.mass_kg, mass.inertia, *where)
         rotation = Rotation.from_quat(q)
         own_spin, own_torque = rotation.inv().apply(spin), rotation.inv().apply(torque)
         own_rate = (own_torque - np.cross(own_spin, inertia * own_spin)) / inertia
@@ -152,6 +172,22 @@ def test_what_is_too_slippery_is_dropped(payload_of: MakePayload) -> None:
     assert label.quality < -1.0
 
 
+def test_a_shake_asks_for_no_more_than_that_it_is_not_lost(payload_of: MakePayload) -> None:
+    """A bar that turns between the fingers, where lift calls it lost, stays; a short slippery one is lost."""
+    off = (0.05, 0.0, 0.0)
+    lifted = grasp(payload_of, bar(0.4), off, protocol="lift", mass_kg=0.5, friction=0.4)
+    assert lifted.outcome is not Outcome.SUCCESS
+    swung = grasp(payload_of, bar(0.4), off, protocol="shake", mass_kg=0.5, friction=0.4)
+    assert swung.outcome is Outcome.SUCCESS
+    assert swung.quality < 0.9
+    firm = grasp(payload_of, bar(0.06), (0.0, 0.0, 0.0), protocol="shake", mass_kg=0.5, friction=0.4)
+    assert firm.outcome is Outcome.SUCCESS
+    assert firm.quality > 0.99
+    lost = grasp(payload_of, bar(0.06), (0.0, 0.0, 0.0), protocol="shake", mass_kg=0.5, friction=0.02)
+    assert lost.outcome is Outcome.DROPPED
+    assert lost.quality < 0.0
+
+
 def test_a_heavier_bar_slips_where_a_lighter_one_stays(payload_of: MakePayload) -> None:
     """Two contacts of 40 N at friction 0.4 hold 3.3 kg at rest, and half of it at an acceleration of 1 g."""
     labels = [
@@ -174,7 +210,27 @@ def test_light_objects_are_carried_with_the_full_force(payload_of: MakePayload) 
             assert label.outcome is outcome, (friction, mass)
 
 
-@pytest.mark.parametrize("protocol", ["wrench", "lift"])
+@pytest.mark.parametrize("protocol", ["lift", "shake"])
+def test_what_is_beside_a_finger_does_not_touch_it(payload_of: MakePayload, protocol: str) -> None:
+    """A rod that passes the corner of a fingertip, slanting: their bounding boxes overlap, they are 4 mm
+    apart."""
+    ends = [(0.040, 0.0), (0.0, -0.040)]
+    corners = [
+        (x + dx, -0.017 + dy, z + dz)
+        for x, z in ends
+        for dx in (-5e-4, 5e-4)
+        for dy in (-5e-4, 5e-4)
+        for dz in (-5e-4, 5e-4)
+    ]
+    rod = trimesh.convex.convex_hull(np.array(corners))
+    part = (np.asarray(rod.vertices, dtype=np.float64), np.asarray(rod.faces, dtype=np.int64))
+    fields = {"protocol": protocol, "mass_kg": 0.05, "friction": 0.4}
+    label = grasp(payload_of, [*bar(0.06), part], (0.0, 0.0, 0.0), **fields)
+    assert label.outcome is Outcome.SUCCESS
+    assert label.quality > 0.9
+
+
+@pytest.mark.parametrize("protocol", ["wrench", "lift", "shake"])
 def test_the_panda_hand_grasps_a_bar(payload_of: MakePayload, protocol: str) -> None:
     fields = {"gripper": PANDA, "mass_kg": 0.4, "friction": 0.4, "protocol": protocol}
     label = grasp(payload_of, bar(0.2), (0.0, 0.0, 0.0), **fields)
@@ -206,8 +262,9 @@ def test_lifts_do_not_depend_on_order_or_world(payload_of: MakePayload, physical
     assert sum(c.carried is not None for c in forward) >= 2
 
 
-def test_the_worker_says_that_it_can_lift() -> None:
-    assert "lift" in CAPABILITIES
+def test_the_worker_says_what_it_can_do() -> None:
+    assert set(CAPABILITIES) == {"simulate", *get_args(Protocol)} - {"wrench"}
+    assert set(chunks.PROTOCOLS) == set(get_args(Protocol))
 
 
 @pytest.mark.parametrize("friction", [0.1, 0.4, 0.9])

@@ -59,8 +59,9 @@ class SweepOptions(PoseFrame, total=False):
     Poses are stored with their ``proposal_density``, (N,) or one number, 1/(m^3 rad^3), NaN where unknown; by
     default that of the samples or proposals that ``poses`` are. What poses are of: :class:`PoseFrame`.
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
-    counter gravity in every direction) or ``lift``; ``fidelity`` ``standard`` or ``fine`` (smaller time
-    step); ``purpose`` ``collect``, or ``check``: outcomes are stored but enter no density.
+    counter gravity in every direction), ``lift`` (still where it was after a lift) or ``shake`` (not lost
+    when shaken without gravity); ``fidelity`` ``standard`` or ``fine`` (smaller time step); ``purpose``
+    ``collect``, or ``check``: outcomes are stored but enter no density.
     """
 
     max_poses: Annotated[int | None, Option("A random part of the grid.", min=1)]
@@ -78,7 +79,7 @@ class SweepOptions(PoseFrame, total=False):
     sample: Annotated[int | None, Option("Simulate so many draws from the density.", min=1)]
     seed: Annotated[int | None, Option("Of --max-poses or --sample.", min=0)]
     gripper: Annotated[str | None, Option("Gripper profile [pg70].")]
-    protocol: Annotated[str | None, Option("wrench or lift [wrench].")]
+    protocol: Annotated[str | None, Option("wrench, lift or shake [wrench].")]
     fidelity: Annotated[str | None, Option("standard or fine [standard].")]
     purpose: Annotated[str | None, Option("collect or check [collect].")]
     chunk_poses: Annotated[int | None, Option("Poses a job.", min=1)]

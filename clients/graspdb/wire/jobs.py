@@ -24,7 +24,7 @@ class ClaimRequest(Request):
     capabilities: Annotated[list[Capability], Field(min_length=1, max_length=32)] = Field(
         default_factory=lambda: ["simulate"]
     )
-    """Job kinds the worker can do, and ``lift`` where it has that protocol."""
+    """Job kinds the worker can do, and ``lift`` and ``shake`` where it has these protocols."""
     limit: Annotated[int, Field(ge=1, le=64)] = 1
     """How many jobs it takes at most."""
 
@@ -76,7 +76,7 @@ class SimulatePayload(Response):
     gripper: GripperProfile
     """Profile of the gripper as it was when the sweep was planned."""
     protocol: Protocol
-    """How an outcome is judged: by the contact wrench, or by a lift."""
+    """How an outcome is judged: by the contact wrench, by a lift, or by shaking."""
     fidelity: Fidelity
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
     engine: Engine | None = None

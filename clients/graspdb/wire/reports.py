@@ -578,7 +578,7 @@ class SimulatedDraws(Response):
     kernel: KernelInfo
     """The kernel of the density that was drawn from."""
     protocol: str
-    """How their outcomes were judged: ``wrench`` or ``lift``."""
+    """How their outcomes were judged: ``wrench``, ``lift`` or ``shake``."""
     draws: int
     """How many draws were simulated."""
     outcomes: OutcomeCounts

@@ -34,7 +34,7 @@ from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
 from graspdb.wire.trials import ProposalDensity
 
-Protocol = Literal["wrench", "lift"]
+Protocol = Literal["wrench", "lift", "shake"]
 Fidelity = Literal["standard", "fine"]
 Engine = Literal["pybullet", "mujoco"]
 Purpose = Literal["collect", "check"]
@@ -104,8 +104,9 @@ class SweepCreate(Request):
     gripper: GripperRef = "pg70"
     """Id of the gripper that grasps, in its newest version, or one version of it, as in ``panda@1``."""
     protocol: Protocol = "wrench"
-    """``wrench``: the contact forces can counter gravity in every direction; ``lift``: still held after a
-    lift and a shake."""
+    """``wrench``: the contact forces can counter gravity in every direction; ``lift``: still held, and
+    where it was, after the jaw lifted it and moved it about; ``shake``: not lost when the jaw shakes it,
+    without gravity."""
     fidelity: Fidelity = "standard"
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
     purpose: Purpose = "collect"
@@ -168,7 +169,7 @@ class SweepInfo(Response):
     """Id of the gripper that grasps."""
     gripper_version: OneGripperVersion = None
     protocol: str
-    """How an outcome is judged: ``wrench`` or ``lift``."""
+    """How an outcome is judged: ``wrench``, ``lift`` or ``shake``."""
     fidelity: str
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
     purpose: str

@@ -208,7 +208,7 @@ class Contacts:
 
 @dataclass(frozen=True)
 class Carried:
-    """How the object came through lift and shake: whether both fingers still press on it at the end.
+    """How the object came through a motion: whether both fingers still press on it at the end.
 
     ``translation_m`` is the farthest that the point of the object at the tool's origin moved from there,
     ``rotation_rad`` the farthest that the object turned in the jaw.
@@ -225,8 +225,8 @@ class Closing:
 
     ``touched``: both fingers had touched the object at the same time. ``opening_m`` is between the fingers;
     of a stalled jaw, what it holds is this wide. ``contacts`` are several instants of a stalled jaw, none of
-    any other; ``ratings`` weights held at these, over the object's, or ``carried`` what came of lift and
-    shake, where that was asked for.
+    any other; ``ratings`` weights held at these, over the object's, or ``carried`` what came of the
+    motion, where one was asked for.
     """
 
     end: End

@@ -78,13 +78,6 @@ class Grip(NamedTuple):
     friction: float
 
 
-class Lost(NamedTuple):
-    """From here on a carried object is not followed any more: metres and radians."""
-
-    translation_m: float
-    rotation_rad: float
-
-
 _multiplied: Any = njit(multiply)
 _turned: Any = njit(rotate)
 
@@ -469,7 +462,8 @@ def carry(body, jaw, grip, mass_kg, moments, centre, turn, fingers, frames, dt, 
 
 
 class Carrier:
-    """An object of ``parts`` and the jaw that carries it; ``areas_m`` is how finely patches are divided."""
+    """An object of ``parts`` and the jaw that carries it through a motion, in steps of ``step_s`` seconds;
+    ``area_m`` is how finely patches are divided."""
 
     def __init__(
         self,
@@ -477,29 +471,30 @@ class Carrier:
         mass: MassProperties,
         gripper: Gripper,
         friction: float,
+        motion: lifting.Motion,
         step_s: float,
         area_m: float,
-        lost: Lost,
     ) -> None:
         self._body, self._jaw, self._mass = body_of(parts, mass), jaw_of(gripper), mass
         self._grip = Grip(gripper.force_n, gripper.finger_mass_kg, gripper.max_speed_m_s, friction)
-        self._step_s, self._area_m, self._lost = step_s, area_m, lost
+        self._step_s, self._area_m, self._lost = step_s, area_m, motion.lost
         # Compile now: a grasp's time is limited, and this may take longer.
-        self.carry((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0), lifting.frames(step_s)[:0])
+        self._frames = np.empty((0, 9))
+        self.carry((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0))
+        self._frames = lifting.frames(motion, step_s)
 
     def carry(
         self,
         centre: Vector,
         principal_xyzw: Quaternion,
         fingers_m: tuple[float, float],
-        frames: NDArray[np.float64],
     ) -> tuple[Carried, NDArray[np.float64]]:
-        """Carry the object through frames (n, 9), see :func:`graspdb_simworker.simulation.lifting.frames`.
+        """Carry the object through the motion.
 
         It begins with its centre of mass and principal axes there in the tool frame and the fingers that far
         from y = 0, metres. Returns what came of it and its way, rows of centre, orientation and fingers.
         """
-        path = np.empty((len(frames), 9))
+        path = np.empty((len(self._frames), 9))
         held, translation, rotation, steps = carry(
             self._body,
             self._jaw,
@@ -509,7 +504,7 @@ class Carrier:
             np.array(centre),
             principal_xyzw,
             np.array(fingers_m),
-            frames,
+            self._frames,
             self._step_s,
             self._area_m,
             self._lost,

@@ -27,8 +27,9 @@ from graspdb_simworker.simulation.bodies import MIN_FINGER_SHARE, Gripper, Part,
 from graspdb_simworker.simulation.force_test import compile_force_test
 from graspdb_simworker.simulation.grasp_world import GraspWorld
 from graspdb_simworker.simulation.labels import Label, Outcome, label_of
+from graspdb_simworker.simulation.lifting import MOTIONS
 
-PROTOCOLS = ("wrench", "lift")
+PROTOCOLS = ("wrench", *MOTIONS)
 """Protocols this worker can simulate."""
 
 
@@ -58,7 +59,7 @@ class Workpiece:
         """Close the jaw at one pose (tool in the object frame) and label the outcome."""
         px, py, pz = (float(v) for v in position)
         x, y, z, w = (float(v) for v in quaternion)
-        return label_of(self.world.close((px, py, pz), (x, y, z, w), travel_m))
+        return label_of(self.world.close((px, py, pz), (x, y, z, w), travel_m), self.world.motion)
 
     def close(self) -> None:
         self.world.close_world()
@@ -90,7 +91,7 @@ def prepare(
         gripper,
         payload.fidelity,
         engine=payload.engine,
-        lifts=payload.protocol == "lift",
+        motion=MOTIONS.get(payload.protocol),
         visible=visible,
         film_every_s=film_every_s,
         moments_every_s=moments_every_s,

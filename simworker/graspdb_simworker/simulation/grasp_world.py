@@ -4,7 +4,7 @@ The world is built once and reused. The gripper (a palm and two fingers on prism
 the origin, its tool frame is the world frame; for every grasp the *object* is moved instead. Nothing
 weighs: the object floats, so that the jaw centres it as it closes, and gravity enters afterwards
 through the force test in :mod:`graspdb_simworker.simulation.labels`, or as a load on what is carried: the
-engine closes the jaw, and :mod:`graspdb_simworker.simulation.carrying` lifts. What is an engine's own is
+engine closes the jaw, and :mod:`graspdb_simworker.simulation.carrying` carries. What is an engine's own is
 behind :class:`~graspdb_simworker.simulation.engines.world.EngineWorld`; when a closing is over is decided
 here, alike for all.
 """
@@ -59,10 +59,8 @@ finger to finger, and whether it stays depends on the time step more than on the
 docs/experiments.md."""
 SLACK_S = 1.0
 """A closing may last this much longer than the fingers need to meet at full speed."""
-LOST = carrying.Lost(0.050, math.radians(75.0))
-"""A carried object that is farther off than this in the jaw is lost: no need to see where it ends."""
-LIFTED_AFTER_S = 0.100
-"""This long after the stall the jaw begins to lift: it has nearly stopped swinging by then."""
+MOVED_AFTER_S = 0.100
+"""This long after the stall the jaw begins to move: what it holds has nearly stopped swinging by then."""
 SUNK_M = 0.002
 """A finger this deep in the object is passing through it: Bullet's contacts of single points may rock a flat
 object from corner to corner at every step and never stop the jaw. What turns as it is squeezed is up to
@@ -79,7 +77,7 @@ _SURELY_BETWEEN = 0.8
 
 @dataclass(frozen=True)
 class Carrying:
-    """How finely a lift is simulated: its steps, and areas that patches of contact are cut into, by their
+    """How finely carrying is simulated: its steps, and areas that patches of contact are cut into, by their
     side."""
 
     dt_s: float
@@ -116,8 +114,8 @@ class GraspWorld:
     """One object and one gripper in the world of an engine, by default the worker's own.
 
     ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3); ``friction`` is
-    Coulomb's coefficient between object and gripper; ``fidelity`` is ``standard`` or ``fine``. ``lifts``:
-    lift and shake what is held after every closing, see :mod:`graspdb_simworker.simulation.lifting`.
+    Coulomb's coefficient between object and gripper; ``fidelity`` is ``standard`` or ``fine``. ``motion``:
+    carry what is held through it after every closing.
     ``visible``: build what can be seen, for :attr:`pictures`, one at the end and one every ``film_every_s``.
     ``moments_every_s``: keep :attr:`moments` that far apart, which changes nothing about what comes out.
     """
@@ -131,7 +129,7 @@ class GraspWorld:
         fidelity: Fidelity = "standard",
         *,
         engine: Engine | None = None,
-        lifts: bool = False,
+        motion: lifting.Motion | None = None,
         visible: bool = False,
         film_every_s: float = math.inf,
         moments_every_s: float = math.inf,
@@ -155,13 +153,10 @@ class GraspWorld:
         self.pictures: list[NDArray[np.uint8]] = []
         """The last closing as a whole and close by, each (480, 1280, 3), drawn by pybullet's CPU renderer;
         the end is last. Empty unless the world is visible."""
+        self.motion = motion
         self._carrying = CARRYING[fidelity]
-        self._carrier = (
-            carrying.Carrier(
-                parts, self.mass, gripper, friction, self._carrying.dt_s, self._carrying.area_m, LOST
-            )
-            if lifts
-            else None
+        self._carrier = motion and carrying.Carrier(
+            parts, self.mass, gripper, friction, motion, self._carrying.dt_s, self._carrying.area_m
         )
         self._to_body = inverse(self.mass.principal_xyzw)
         self._radius = self.mass.radius_of(parts)
@@ -248,7 +243,7 @@ class GraspWorld:
         end = End.TIMEOUT
         # What is done at every step costs as much as the physics of a light one: names looked up once.
         advance, watched = engine.advance, self._watched
-        ages = READING_AGES_S if self._carrier is None else (LIFTED_AFTER_S,)
+        ages = READING_AGES_S if self._carrier is None else (MOVED_AFTER_S,)
         while elapsed < limit:
             opening = advance()
             steps += 1
@@ -301,9 +296,9 @@ class GraspWorld:
         return rotate(back, offset), multiply(back, self.mass.principal_xyzw)
 
     def _carry(self, carrier: carrying.Carrier) -> Carried:
-        """Lift and shake what the stalled jaw holds, with the gripper's own force."""
+        """Move what the stalled jaw holds, with the gripper's own force."""
         dt = self._carrying.dt_s
-        carried, path = carrier.carry(*self._engine.body(), self._engine.fingers(), lifting.frames(dt))
+        carried, path = carrier.carry(*self._engine.body(), self._engine.fingers())
         if self._watched:
             for row in path.tolist():
                 self._engine.show(tuple(row[:3]), tuple(row[3:7]), (row[7], row[8]))

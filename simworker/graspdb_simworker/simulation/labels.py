@@ -1,14 +1,12 @@
-"""From a closing to a label, by one of two protocols.
+"""From a closing to a label, by one of three protocols.
 
 **wrench**: can the contact forces hold the object, whichever way down is (:mod:`.force_test`)? Where the
 forces ring because the object still moves, several instants of the stalled jaw are rated and the median of
 the last five counts. If some of these hold the weight and some do not, the closing is simulated finer.
 
-**lift**: is the object still held, and where it was, after the jaw lifted and shook it (:mod:`.lifting`)? So
-the object may move by :data:`MOVED_M` at the tool's origin and turn by :data:`TURNED_RAD` at most. What
-friction holds moves by hundredths of that, on the pads' give. The motion's hardest instants are short, and
-what they ask for beyond what friction gives lets an object slide by little: a quarter too much is some 9 mm
-of a fall, or 2 degrees of a turn. A wider tolerance would call that held.
+**lift**: is the object still held, and where it was, after the jaw lifted and shook it? **shake**: is it
+still held after the jaw shook it, nothing weighing? Motions, and how far an object may move in the jaw, are
+in :mod:`.lifting`.
 """
 
 from __future__ import annotations
@@ -19,9 +17,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from graspdb_simworker.simulation.bodies import Carried, Closing, End
+from graspdb_simworker.simulation.lifting import Displacement, Motion
 
-MOVED_M = 0.001
-TURNED_RAD = math.radians(0.5)
 WORST_QUALITY = -1000.0
 RATED = 5
 """So many of the last instants of a stalled jaw are rated at most."""
@@ -46,9 +43,10 @@ class Label:
     """What a grasp came to; ``width_m`` is between the fingers at the end.
 
     ``quality`` of ``wrench`` is the largest weight the contacts hold in the worst direction, over the
-    object's weight; success from 1 on. Of ``lift``: 1 minus the farthest displacement in the jaw, in units of
-    what is allowed (the larger of translation / 1 mm and rotation / half a degree); 1 did not move at all,
-    success down to 0. NaN where nothing was measured.
+    object's weight; success from 1 on. Of the others: 1 minus the farthest displacement in the jaw, in units
+    of what is allowed (the larger of translation and rotation over theirs: 1 mm and half a degree of
+    ``lift``, 50 mm and half a turn of ``shake``); 1 did not move at all, success down to 0. NaN where
+    nothing was measured.
     """
 
     outcome: Outcome
@@ -59,13 +57,13 @@ class Label:
 SIMULATION_ERROR = Label(Outcome.SIMULATION_ERROR, math.nan, math.nan)
 
 
-def label_of(closing: Closing) -> Label:
-    """Name a closing's outcome and rate it.
+def label_of(closing: Closing, motion: Motion | None = None) -> Label:
+    """Name a closing's outcome and rate it; ``motion`` is what the object was carried through.
 
     ``missed``: nothing was between the fingers, or the object was pushed out before both touched it;
     ``slipped``: both had touched it and it was squeezed out; ``timeout``: the jaw neither stalled nor
     closed; ``simulation_error``: a pose that is not finite any more, or fingers that sank into the object;
-    ``wrench_insufficient``: the force test failed. After a lift: ``dropped``: not held at the end;
+    ``wrench_insufficient``: the force test failed. After a motion: ``dropped``: not held at the end;
     ``slipped``: held, but moved too far.
     """
     width = max(0.0, closing.opening_m)
@@ -75,14 +73,16 @@ def label_of(closing: Closing) -> Label:
         return Label(Outcome.TIMEOUT, width, math.nan)
     if closing.end in (End.UNSTABLE, End.SUNK):
         return SIMULATION_ERROR
-    if closing.carried is not None:
-        return _carried_label(closing.carried, width)
+    if closing.carried is not None and motion is not None:
+        return _carried_label(closing.carried, motion.allowed, width)
     quality = statistics.median(closing.ratings[-RATED:])
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
 
 
-def _carried_label(carried: Carried, width_m: float) -> Label:
-    quality = 1.0 - max(carried.translation_m / MOVED_M, carried.rotation_rad / TURNED_RAD)
+def _carried_label(carried: Carried, allowed: Displacement, width_m: float) -> Label:
+    quality = 1.0 - max(
+        carried.translation_m / allowed.translation_m, carried.rotation_rad / allowed.rotation_rad
+    )
     if not math.isfinite(quality):
         return SIMULATION_ERROR
     quality = max(WORST_QUALITY, quality)

@@ -1,4 +1,4 @@
-"""The protocol ``lift``: what a held object feels while the jaw lifts and shakes it, seen from the jaw.
+"""The protocols ``lift`` and ``shake``: what a held object feels while the jaw moves it, seen from the jaw.
 
 In the simulation the jaw stands still. Its motion is put on the object instead: in a frame that moves
 with rotation R(t) and origin p(t), a body of mass m and inertia I, with its centre of mass at r moving
@@ -10,16 +10,24 @@ at v, spinning at w (all in that frame), moves as if under the force and the tor
 where s is the frame's angular velocity and a its rate. That is exact for a rigid body; no contact is
 ever dragged by a body that was set to a new place. What holds the object against it: :mod:`.carrying`.
 
-The jaw points down: gravity starts along its approach. Gravity grows in, the jaw rises by 10 cm, then
-goes there and back once along each of its axes and turns there and back once about each (through the
-tool's origin), with accelerations of about 1 g and 33 rad/s^2 at most. Then it rests. The object is at
-rest in the jaw when this begins. The fingers are coupled, as a parallel jaw's are: they can be forced
-open, but not pushed aside together.
+**lift**: the jaw points down: gravity starts along its approach. Gravity grows in, the jaw rises by 10 cm,
+then goes there and back once along each of its axes and turns there and back once about each (through the
+tool's origin), with accelerations of about 1 g and 33 rad/s^2 at most. Then it rests. The object has to stay
+where it was in the jaw.
+
+**shake**: nothing weighs. The jaw goes 10 cm there, back and home along each of its axes, with accelerations
+of 20 m/s^2 at most, turns by 45 degrees likewise about each (through the tool's origin) with 100 rad/s^2 at
+most, and rests. The object has to be between the fingers still, wherever it slid: so data sets label whose
+grasps are shaken without gravity. Whether it stayed firmly or slid by little is told by the quality.
+
+The object is at rest in the jaw when either begins. The fingers are coupled, as a parallel jaw's are: they
+can be forced open, but not pushed aside together.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -42,6 +50,14 @@ ONSET_S, LIFT_S, SHAKE_S, TURN_S, REST_S = 0.1, 0.4, 0.4, 0.8, 0.1
 _TURNS_FROM_S = ONSET_S + LIFT_S + 3.0 * SHAKE_S
 DURATION_S = _TURNS_FROM_S + 3.0 * TURN_S + REST_S
 
+ALONG_M, ALONG_M_S2 = 0.10, 20.0
+ABOUT_RAD, ABOUT_RAD_S2 = math.radians(45.0), 100.0
+_HARDEST = 2.735815 / _AMPLITUDE
+"""Largest acceleration of :func:`_there_and_back` in a period of 2 pi."""
+ALONG_S = 2.0 * math.pi * math.sqrt(ALONG_M * _HARDEST / ALONG_M_S2)
+ABOUT_S = 2.0 * math.pi * math.sqrt(ABOUT_RAD * _HARDEST / ABOUT_RAD_S2)
+"""What going there and back along an axis takes, and about one."""
+
 
 class Frame(NamedTuple):
     """The jaw's motion at one instant, in its own axes.
@@ -55,8 +71,28 @@ class Frame(NamedTuple):
     spin_rate: Vector
 
 
-def frame_at(time_s: float) -> Frame:
-    """The jaw's motion at a time from 0 to :data:`DURATION_S`."""
+class Displacement(NamedTuple):
+    """How far an object is from where it was in the jaw: metres and radians."""
+
+    translation_m: float
+    rotation_rad: float
+
+
+class Motion(NamedTuple):
+    """What a protocol does with what the jaw holds: the frame at a time from 0 to ``duration_s``.
+
+    The grasp has succeeded up to the displacement ``allowed``; from ``lost`` on an object is not followed
+    any more.
+    """
+
+    at: Callable[[float], Frame]
+    duration_s: float
+    allowed: Displacement
+    lost: Displacement
+
+
+def lift_at(time_s: float) -> Frame:
+    """The jaw's motion in ``lift``."""
     if time_s < ONSET_S:
         s = max(0.0, time_s) / ONSET_S
         return Frame((0.0, 0.0, GRAVITY_M_S2 * s * s * (3.0 - 2.0 * s)), _NOTHING, _NOTHING)
@@ -84,13 +120,47 @@ def frame_at(time_s: float) -> Frame:
     return Frame((0.0, 0.0, GRAVITY_M_S2), _NOTHING, _NOTHING)
 
 
-@lru_cache(maxsize=4)
-def frames(step_s: float) -> NDArray[np.float64]:
-    """The jaw's motion at the end of every step (n, 9), each frame's vectors one after the other."""
-    times = ((k + 1) * step_s for k in range(math.ceil(DURATION_S / step_s)))
-    motion = np.array([[x for vector in frame_at(min(t, DURATION_S)) for x in vector] for t in times])
-    motion.setflags(write=False)
-    return motion
+def shake_at(time_s: float) -> Frame:
+    """The jaw's motion in ``shake``."""
+    if time_s < 3.0 * ALONG_S:
+        _, _, acceleration = _there_and_back(math.fmod(time_s, ALONG_S) / ALONG_S, ALONG_S)
+        push = _scaled(_AXES[int(time_s / ALONG_S)], -ALONG_M * acceleration)
+        return Frame(push, _NOTHING, _NOTHING)
+    time_s -= 3.0 * ALONG_S
+    if time_s < 3.0 * ABOUT_S:
+        axis = _AXES[int(time_s / ABOUT_S)]
+        _, rate, acceleration = _there_and_back(math.fmod(time_s, ABOUT_S) / ABOUT_S, ABOUT_S)
+        return Frame(_NOTHING, _scaled(axis, ABOUT_RAD * rate), _scaled(axis, ABOUT_RAD * acceleration))
+    return Frame(_NOTHING, _NOTHING, _NOTHING)
+
+
+LIFT = Motion(
+    lift_at,
+    DURATION_S,
+    allowed=Displacement(0.001, math.radians(0.5)),
+    lost=Displacement(0.050, math.radians(75.0)),
+)
+"""What friction holds moves by hundredths of what is allowed, on the pads' give. The motion's hardest
+instants are short, and what they ask for beyond what friction gives lets an object slide by little: a quarter
+too much is some 9 mm of a fall, or 2 degrees of a turn. A wider tolerance would call that held."""
+SHAKE = Motion(
+    shake_at,
+    3.0 * (ALONG_S + ABOUT_S) + REST_S,
+    allowed=Displacement(0.050, math.pi),
+    lost=Displacement(0.050, math.pi),
+)
+"""However it is turned, and up to 5 cm off: it is not lost."""
+MOTIONS: Mapping[str, Motion] = {"lift": LIFT, "shake": SHAKE}
+"""By the protocols that they belong to."""
+
+
+@lru_cache(maxsize=8)
+def frames(motion: Motion, step_s: float) -> NDArray[np.float64]:
+    """A motion at the end of every step (n, 9), each frame's vectors one after the other."""
+    times = ((k + 1) * step_s for k in range(math.ceil(motion.duration_s / step_s)))
+    rows = np.array([[x for v in motion.at(min(t, motion.duration_s)) for x in v] for t in times])
+    rows.setflags(write=False)
+    return rows
 
 
 @njit(cache=True)

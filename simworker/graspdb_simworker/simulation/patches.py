@@ -172,8 +172,10 @@ def _face(points, triangles, axis, sign, offset, low, high, reach, spacing, area
         if sign * offset - min(sign * a[axis], sign * b[axis], sign * c[axis]) <= -reach:
             continue
         for k in range(3):
-            one[0, k], one[1, k], one[2, k] = a[k], b[k], c[k]
-        corners = _clip(one, 3, across, 1.0, high[across], two)
+            two[0, k], two[1, k], two[2, k] = a[k], b[k], c[k]
+        # What lies beyond the opposite face is beside the box and not deep in it.
+        corners = _clip(two, 3, axis, -sign, -sign * (low[axis] if sign > 0.0 else high[axis]), one)
+        corners = _clip(one, corners, across, 1.0, high[across], two)
         corners = _clip(two, corners, across, -1.0, -low[across], one)
         corners = _clip(one, corners, along, 1.0, high[along], two)
         corners = _clip(two, corners, along, -1.0, -low[along], one)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, KernelInfo
 from graspdb.wire.reports import CheckCall
+from graspdb.wire.sweeps import Protocol
 from graspdb_density import IsotropicKernel
 from graspdb_density.se3 import Poses
 from graspdb_service.storage.database import Database
@@ -20,7 +21,6 @@ from graspdb_service.usecases.trials import sweep_plan
 
 #: Draws that a sweep named in a report makes: a share of .3 is then known within .04.
 DRAWS = 500
-_SIMULATED = ("wrench", "lift")
 _NO_ATTEMPT = OUTCOME_CODES["simulation_error"]
 
 
@@ -92,7 +92,7 @@ def calls(built: Built, kernels: Iterable[IsotropicKernel | str]) -> list[CheckC
         body: dict[str, Any] = {"sample": sample, "purpose": "check"}
         if selected.gripper is not None:
             body["gripper"] = selected.gripper
-        if selected.protocol in _SIMULATED:
+        if selected.protocol in get_args(Protocol):
             body["protocol"] = selected.protocol
         made.append(CheckCall(method="POST", path=f"/objects/{built.object_row.slug}/sweeps", body=body))
     return made

@@ -22,7 +22,7 @@ from graspdb_service.storage.simulation import sweeps
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.trial_columns import Bools, Ints, TrialColumns
 
-_MADE_ANEW = {"lift": 2}
+_MADE_ANEW = {"lift": 3}
 """Protocols whose simulation became another one, and its number: what an earlier one said of a pose
 is no repeat of what this one says."""
 
