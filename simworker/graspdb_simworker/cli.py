@@ -11,11 +11,11 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, NamedTuple, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn, cast
 
 import typer
 from rich.console import Console
@@ -129,7 +129,7 @@ def run(
 
     A chunk that names an engine is simulated with that one; --engine says which simulates the others.
     """
-    chosen = None if dask else _require_physics(engine)
+    chosen, engines = _engines(dask, engine)
     from graspdb_simworker.decomposition import supervisor as decomposition  # extra: sim
     from graspdb_simworker.loop import NoPhysics, Worker, WorkerFailed  # extra: sim
 
@@ -161,6 +161,7 @@ def run(
             make_runner=cluster.make_runner,
             decompositions=limits,
             engine=chosen,
+            engines=engines,
         )
         _stop_on_signals(worker.stop)
         try:
@@ -169,6 +170,15 @@ def run(
             typer.echo(f"graspdb-simworker: {error}", err=True)
             raise typer.Exit(2 if isinstance(error, NoPhysics) else 1) from None
     typer.echo(str(worker.tally), err=True)
+
+
+def _engines(dask: str | None, engine: str | None) -> tuple[Engine | None, Sequence[Engine]]:
+    """The engine that simulates chunks that name none, and those that chunks may name."""
+    if dask is None:
+        return _require_physics(engine), installed.names()
+    # What a cluster has nobody here knows: it is taken at the word of whoever names an engine.
+    chosen = cast("Engine | None", engine)
+    return chosen, [] if chosen is None else [chosen]
 
 
 class _Cluster(NamedTuple):
@@ -238,6 +248,7 @@ def verify(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
             object_name, gripper, protocol = info.object, info.gripper, info.protocol
+            chosen = _require_physics(engine or info.engine)
             payload, parts = inputs.load(
                 object_name, gripper, protocol=protocol, engine=chosen, url=url, api_key=api_key
             )

@@ -90,7 +90,8 @@ class Worker:
     returns when there is nothing left to claim, ``once`` after one job for each process. ``decompositions``
     are the limits of one mesh's; None leaves them to other workers. They have a thread of their own, which
     the service lists as another worker, so that no chunk that is ready waits for one. ``engine`` simulates
-    chunks that name none; None for the default of whoever simulates.
+    chunks that name none; None for the default of whoever simulates. ``engines`` are those that chunks may
+    name.
     """
 
     transport: Transport
@@ -102,6 +103,7 @@ class Worker:
     make_runner: Callable[[], ChunkRunner] = LocalRunner
     decompositions: ResourceLimits | None = None
     engine: Engine | None = None
+    engines: Sequence[Engine] = ()
 
     def __post_init__(self) -> None:
         if self.processes < 1:
@@ -206,7 +208,7 @@ class Worker:
 
     def _slot(self) -> None:
         with self.make_runner() as runner:
-            self._pull(self.name, CAPABILITIES, lambda job: self._work(runner, job))
+            self._pull(self.name, (*CAPABILITIES, *self.engines), lambda job: self._work(runner, job))
 
     def _decomposer(self) -> None:
         self._pull(f"{self.name}-parts", DECOMPOSING, lambda job: self._work(None, job))

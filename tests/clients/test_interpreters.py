@@ -152,3 +152,19 @@ def test_the_service_runs_on_every_python(served: tuple[Path, str]) -> None:
         assert arrow.status_code == 200
         answer = http.get("/objects/box/best-grasp", params={"gripper": "panda"})
         assert answer.json()["grasps"][0]["prior"], answer.text
+
+
+@pytest.mark.parametrize("python", ["3.10", "3.12", "3.13"])
+def test_the_worker_simulates_in_mujoco_on_every_python(wheel: Path, tmp_path: Path, python: str) -> None:
+    bin = _installed(python, tmp_path / "venv", f"{wheel}[sim,mujoco]")
+    rim = ["--position=0,0.028,0.035", "--quaternion=1,0,0,0", "--url="]
+    done = subprocess.run(
+        [str(bin / "graspdb-simworker"), "show", "mug", *rim, "--engine=mujoco", "--out=motion.json"],
+        capture_output=True,
+        text=True,
+        env={key: value for key, value in os.environ.items() if not key.startswith("PYTHON")},
+        check=False,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("success: ")

@@ -485,6 +485,43 @@ def test_a_lift_sweep_waits_for_a_worker_that_can(sqlite_http: httpx.Client, sql
     database.dispose()
 
 
+def test_a_sweep_of_an_engine_waits_for_a_worker_that_has_it(http: httpx.Client, box: Database) -> None:
+    def ask(worker: str, *can: str) -> list[dict[str, Any]]:
+        body = {"worker": worker, "capabilities": ["simulate", *can], "limit": 1}
+        found: list[dict[str, Any]] = http.post("/jobs/claim", json=body).json()["jobs"]
+        return found
+
+    sweep = start_sweep(http, 2_000, engine="mujoco")
+    assert (sweep["engine"], sweep["engines"]) == ("mujoco", [])
+    (warning,) = sweep["warnings"]
+    assert "no worker that has mujoco" in warning
+    assert "graspdb[sim,mujoco]" in warning
+    assert ask("old") == []
+    assert ask("bullet", "pybullet") == []
+    (job,) = ask("both", "pybullet", "mujoco")
+    assert job["payload"]["engine"] == "mujoco"
+    assert http.get(f"/sweeps/{sweep['id']}").json()["warnings"] == []
+    refused = put_result(http, job, simulate(job["payload"]) | {"engine": "MuJoCo!"})
+    assert (refused.status_code, refused.json()["errors"][0]["field"]) == (422, "engine")
+    stored = put_result(http, job, simulate(job["payload"]) | {"engine": "mujoco 4.0.0"}).json()
+    assert http.get(f"/sweeps/{sweep['id']}").json()["engines"] == ["mujoco 4.0.0"]
+    assert http.get(f"/objects/box/batches/{sweep['batch']}").json()["engines"] == ["mujoco 4.0.0"]
+
+    # What another engine says of the same poses is no repeat; the same engine again is one.
+    for engine, kept in (("pybullet", stored["inserted"]), ("mujoco", 0)):
+        start_sweep(http, 2_000, engine=engine)
+        (job,) = ask("both", "pybullet", "mujoco")
+        assert put_result(http, job).json()["inserted"] == kept
+
+    # A sweep that names none goes to any worker, and a worker that tells none leaves it unknown.
+    free = start_sweep(http, 2_000)
+    (job,) = ask("old")
+    assert job["payload"]["engine"] is None
+    put_result(http, job)
+    done = http.get(f"/sweeps/{free['id']}").json()
+    assert (done["state"], done["engine"], done["engines"]) == ("done", None, [])
+
+
 # --- against a model ------------------------------------------------------------------------------------
 
 

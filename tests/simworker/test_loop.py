@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from typing import Any
 
 import httpx
@@ -316,6 +317,20 @@ def test_the_command_works_until_idle_and_ends_well_on_a_signal(
         len(http.post("/jobs/claim", json={"worker": "next", "capabilities": ["simulate"]}).json()["jobs"])
         == 1
     )
+
+
+def test_a_sweep_is_simulated_by_the_engine_that_it_names(
+    http: httpx.Client, transport: Transport, plan: Plan
+) -> None:
+    named, free = plan(600, 600, engine="mujoco"), plan(601, 601)
+    Worker(transport, name="bullet", exit_when_idle=True, engine="pybullet", engines=["pybullet"]).run()
+    told = [http.get(f"/sweeps/{sweep['id']}").json() for sweep in (named, free)]
+    assert [sweep["state"] for sweep in told] == ["queued", "done"]
+    assert "no worker that has mujoco" in told[0]["warnings"][-1]
+    assert told[1]["engines"] == [f"pybullet {version('pybullet')}"]
+    Worker(transport, name="both", exit_when_idle=True, engines=["pybullet", "mujoco"]).run()
+    done = http.get(f"/sweeps/{named['id']}").json()
+    assert (done["state"], done["engines"]) == ("done", [f"mujoco {version('mujoco')}"])
 
 
 @pytest.mark.parametrize(

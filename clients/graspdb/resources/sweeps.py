@@ -60,7 +60,8 @@ class SweepOptions(PoseFrame, total=False):
     default that of the samples or proposals that ``poses`` are. What poses are of: :class:`PoseFrame`.
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
     counter gravity in every direction), ``lift`` (still where it was after a lift) or ``shake`` (not lost
-    when shaken without gravity); ``fidelity`` ``standard`` or ``fine`` (smaller time step); ``purpose``
+    when shaken without gravity); ``fidelity`` ``standard`` or ``fine`` (smaller time step); ``engine``
+    ``pybullet`` or ``mujoco``, by default that of whichever workers come; ``purpose``
     ``collect``, or ``check``: outcomes are stored but enter no density.
     """
 
@@ -81,6 +82,7 @@ class SweepOptions(PoseFrame, total=False):
     gripper: Annotated[str | None, Option("Gripper profile [pg70].")]
     protocol: Annotated[str | None, Option("wrench, lift or shake [wrench].")]
     fidelity: Annotated[str | None, Option("standard or fine [standard].")]
+    engine: Annotated[str | None, Option("pybullet or mujoco [the workers' own].")]
     purpose: Annotated[str | None, Option("collect or check [collect].")]
     chunk_poses: Annotated[int | None, Option("Poses a job.", min=1)]
 
@@ -184,6 +186,9 @@ class Sweep(Resource):
             if any("decompose" in worker.capabilities for worker in workers):
                 return None
             return "no worker that has CoACD has come yet, which makes the convex parts: graspdb[sim]"
+        engine = self.info.engine
+        if workers and engine is not None and not any(engine in worker.capabilities for worker in workers):
+            return f"no worker that has {engine} has come yet, and no other takes this sweep"
         if workers:
             return None
         return f"no worker has come yet: graspdb-simworker run --url {self._transport.url}"
@@ -224,6 +229,7 @@ class Sweep(Resource):
             "object": info.object,
             "plan": f"{info.plan}, {info.protocol}, {info.fidelity}, {info.purpose}",
             "gripper": info.gripper,
+            "engine": ", ".join(info.engines) or info.engine or "the workers' own",
             "state": info.state,
             "poses": f"{info.poses_done:,} of {info.poses:,}",
             "chunks": f"{info.chunks_done:,} of {info.chunks:,}"

@@ -13,6 +13,7 @@ from graspdb.wire.sweeps import Engine, Fidelity, Protocol
 
 WorkerName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
 Capability = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f]+$")]
+EngineVersion = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[a-z0-9_-]+ [\w.+-]+$")]
 JobKind = Literal["simulate", "decompose"]
 
 
@@ -24,7 +25,8 @@ class ClaimRequest(Request):
     capabilities: Annotated[list[Capability], Field(min_length=1, max_length=32)] = Field(
         default_factory=lambda: ["simulate"]
     )
-    """Job kinds the worker can do, and ``lift`` and ``shake`` where it has these protocols."""
+    """Job kinds the worker can do, ``lift`` and ``shake`` where it has these protocols, and its physics
+    engines: a chunk that names none goes to any worker."""
     limit: Annotated[int, Field(ge=1, le=64)] = 1
     """How many jobs it takes at most."""
 
@@ -167,6 +169,9 @@ class SimulateResult(Request):
     """One uint8 code of an outcome for every pose of the chunk, in order, as base64."""
     rows: ResultRows
     """What was measured of the poses that met physics."""
+    engine: EngineVersion | None = None
+    """Physics engine that simulated the chunk and its version, as in ``pybullet 3.2.7``; null where the
+    worker does not say."""
 
 
 class ResultAccepted(Response):
@@ -206,7 +211,7 @@ class WorkerInfo(Response):
     worker: str
     """Name the worker gave itself."""
     capabilities: list[str]
-    """Job kinds it can do, and protocols beyond ``wrench``."""
+    """Job kinds it can do, protocols beyond ``wrench``, and physics engines it has."""
     last_seen: datetime
     """When it last called, UTC."""
     jobs_leased: int

@@ -109,6 +109,9 @@ class SweepCreate(Request):
     without gravity."""
     fidelity: Fidelity = "standard"
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
+    engine: Engine | None = None
+    """Physics engine that simulates it: only workers that have it take its chunks. Null for that of whichever
+    workers come."""
     purpose: Purpose = "collect"
     """``collect``, or ``check``: outcomes are stored but enter no density."""
     chunk_poses: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
@@ -172,6 +175,11 @@ class SweepInfo(Response):
     """How an outcome is judged: ``wrench``, ``lift`` or ``shake``."""
     fidelity: str
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
+    engine: str | None = None
+    """Physics engine that was asked for; null for that of whichever workers come."""
+    engines: list[str] = Field(default_factory=list)
+    """Engines that have simulated chunks of it, with their versions, as in ``pybullet 3.2.7``; none of chunks
+    from before workers told."""
     purpose: str
     """``collect``, or ``check``: outcomes enter no density."""
     plan: Literal["grid", "poses", "sample"]

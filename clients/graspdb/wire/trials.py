@@ -327,6 +327,8 @@ class BatchInfo(Response):
     """Sources that its trials name."""
     protocols: list[str] = Field(default_factory=list)
     """Protocols that its trials name."""
+    engines: list[str] = Field(default_factory=list)
+    """Physics engines that simulated its trials, with their versions; none where that is not known."""
     findings: list[Finding] = Field(default_factory=list)
     """What was doubtful about its trials when they came."""
     created_at: datetime

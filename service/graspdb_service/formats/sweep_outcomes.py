@@ -32,12 +32,14 @@ _COLUMNS: dict[str, TypeAdapter[Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class ChunkResult:
-    """What a worker measured: an outcome code (n,) a pose of the chunk, and columns of those with physics."""
+    """What a worker measured: an outcome code (n,) a pose of the chunk, columns of those with physics, and in
+    which engine, with its version."""
 
     outcomes: NDArray[np.uint8]
     pose_index: Ints
     width_m: Floats
     quality: Floats
+    engine: str | None
 
 
 def read_result(request: Request, body: bytes) -> ChunkResult:
@@ -58,7 +60,7 @@ def _read_result(content: dict[str, Any]) -> ChunkResult:
     result = validated(content, SimulateResult)
     short = {name: _array(name, getattr(result.rows, name)) for name in _COLUMNS}
     columns = {name: np.concatenate([short[name], *long.get(name, [])]) for name in _COLUMNS}
-    return ChunkResult(np.frombuffer(result.outcomes, dtype=np.uint8), **columns)
+    return ChunkResult(np.frombuffer(result.outcomes, dtype=np.uint8), engine=result.engine, **columns)
 
 
 def _numbers(name: str, items: list[Any]) -> NDArray[Any]:

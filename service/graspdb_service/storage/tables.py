@@ -317,6 +317,8 @@ jobs = Table(
     Column("kind", String(16), nullable=False),
     # What a worker must be able to do to take it: the kind, or a protocol of its own such as lift.
     Column("capability", String(16), nullable=False),
+    # The physics engine that it has to have, too; null: any.
+    Column("engine", String(16)),
     Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False, index=True),
     Column("sweep_id", ForeignKey("sweeps.id", ondelete="CASCADE"), index=True),
     Column("number", BigInteger, nullable=False),
@@ -359,6 +361,8 @@ packed_outcomes = Table(
     Column("number", BigInteger, nullable=False),
     Column("revision", BigInteger, nullable=False),
     Column("outcomes", LargeBinary, nullable=False),
+    # What simulated it, with its version; null: the worker did not say.
+    Column("engine", String(64)),
 )
 
 workers = Table(

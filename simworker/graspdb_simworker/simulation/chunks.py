@@ -174,7 +174,8 @@ def simulate_chunk(
             rows.pose_index.append(int(indices[row]))
             rows.width_m.append(_finite(label.width_m, 7))
             rows.quality.append(_finite(label.quality, 4))
-    return SimulateResult(outcomes=base64.b64encode(outcomes.tobytes()), rows=rows)
+    packed = base64.b64encode(outcomes.tobytes())
+    return SimulateResult(outcomes=packed, rows=rows, engine=workpiece.world.engine)
 
 
 @contextmanager

@@ -137,7 +137,10 @@ class GraspWorld:
         self.gripper = gripper
         self.friction = friction
         self.mass = mass_properties(parts, mass_kg)
-        world_of = installed.world_of(installed.require(engine))
+        name = installed.require(engine)
+        world_of = installed.world_of(name)
+        self.engine = f"{name} {installed.version_of(name)}"
+        """The engine and its version."""
         self._engine = world_of(parts, mass_kg, friction, gripper, visible=visible)
         self._stepping = self._engine.stepping(fidelity, mass_kg)
         self._running = self._stepping

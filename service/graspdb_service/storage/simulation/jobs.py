@@ -124,6 +124,8 @@ def _claimable(
     return and_(
         jobs.c.state.in_([JobState.QUEUED, JobState.LEASED]),
         jobs.c.capability.in_(capabilities),
+        # Engines stand among what a worker can do.
+        or_(jobs.c.engine.is_(None), jobs.c.engine.in_(capabilities)),
         or_(jobs.c.state == JobState.QUEUED, ran_out),
         *(_of_objects(prefix) if prefix else ()),
     )
@@ -282,6 +284,13 @@ def credit_worker(tx: Tx, name: str | None, poses: int) -> None:
 def worker_age(tx: Tx, name: str) -> float | None:
     """Seconds since a worker was last seen; None for an unknown one."""
     return tx.scalar(select(unix_now() - workers.c.last_seen).where(workers.c.name == name))
+
+
+def someone_has(tx: Tx, engine: str, *, within_s: float) -> bool:
+    """Whether a worker that has this engine asked for jobs lately, or is at one."""
+    at_work = exists().where(jobs.c.state == JobState.LEASED, jobs.c.worker == workers.c.name)
+    query = select(workers.c.capabilities).where(or_(workers.c.last_seen > unix_now() - within_s, at_work))
+    return any(engine in capabilities for capabilities in tx.scalars(query))
 
 
 def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerInfo]:

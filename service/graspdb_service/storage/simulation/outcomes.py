@@ -31,13 +31,28 @@ class PackedChunk:
     outcomes: bytes
 
 
-def store(tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, outcomes: bytes) -> None:
-    """Keep a chunk's uint8 outcome codes, one for every pose of it."""
+def store(
+    tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, outcomes: bytes, engine: str | None
+) -> None:
+    """Keep a chunk's uint8 outcome codes, one for every pose of it, and what simulated it."""
     tx.execute(
         insert(packed_outcomes).values(
-            job_id=job_id, sweep_id=sweep_id, number=number, revision=revision, outcomes=outcomes
+            job_id=job_id,
+            sweep_id=sweep_id,
+            number=number,
+            revision=revision,
+            outcomes=outcomes,
+            engine=engine,
         )
     )
+
+
+def engines(tx: Tx, sweep_id: str) -> list[str]:
+    """The engines, with their versions, that simulated chunks of a sweep."""
+    query = select(packed_outcomes.c.engine).where(
+        packed_outcomes.c.sweep_id == sweep_id, packed_outcomes.c.engine.is_not(None)
+    )
+    return sorted(str(engine) for engine in tx.scalars(query.distinct()))
 
 
 def page(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[PackedChunk]:

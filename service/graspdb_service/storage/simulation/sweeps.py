@@ -129,6 +129,7 @@ def create(
                     "id": job_id,
                     "kind": "simulate",
                     "capability": capability,
+                    "engine": sweep["request"].get("engine"),
                     "object_id": sweep["object_id"],
                     "sweep_id": sweep["id"],
                     "number": number,

@@ -97,6 +97,7 @@ def _payload(tx: Tx, sweep: SweepRow, job: JobRow) -> SimulatePayload:
             "convex_parts": f"/objects/{sweep.object}/convex-parts",
             "protocol": sweep.protocol,
             "fidelity": sweep.fidelity,
+            "engine": sweep.request.get("engine"),
             "start": job.start,
             "stop": job.stop,
         }

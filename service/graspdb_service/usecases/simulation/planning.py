@@ -156,7 +156,7 @@ def _snapshot(world: _World, plan: _Plan, spec: SweepCreate) -> dict[str, Any]:
     if plan.grid is not None:
         snapshot["grid"] = plan.grid.model_dump(mode="json")
         snapshot["repeat_key"] = sweep_plan.repeat_key(
-            world.snapshot, spec.protocol, spec.fidelity, plan.grid
+            world.snapshot, spec.protocol, spec.fidelity, plan.grid, spec.engine
         )
     if plan.warnings:
         snapshot["warnings"] = list(plan.warnings)

@@ -150,6 +150,7 @@ class _Chunk:
 
     outcomes: npt.NDArray[np.uint8]
     rows: TrialColumns
+    engine: str | None
     packed: dict[int, int]
     counts: dict[str, dict[str, int]]
 
@@ -208,7 +209,7 @@ def _chunk(
         "all": {OUTCOMES[code]: number for code, number in _count(outcomes).items()},
         "packed": {str(code): number for code, number in packed.items()},
     }
-    return _Chunk(outcomes, columns, packed, counts)
+    return _Chunk(outcomes, columns, result.engine, packed, counts)
 
 
 def _count(codes: npt.NDArray[np.uint8]) -> dict[int, int]:
@@ -250,6 +251,7 @@ def _store(
             number=job.number,
             revision=revision,
             outcomes=chunk.outcomes.tobytes(),
+            engine=chunk.engine,
         )
         sweeps.note_finished(tx, sweep.id)
         batch = batches.of_sweep(tx, sweep.id)

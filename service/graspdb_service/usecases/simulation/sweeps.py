@@ -8,12 +8,14 @@ from graspdb_service import principal
 from graspdb_service.problems import conflict, found
 from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx, clock
-from graspdb_service.storage.simulation import sweeps
+from graspdb_service.storage.simulation import jobs, outcomes, sweeps
 from graspdb_service.storage.simulation.sweeps import Progress, SweepRow
 from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.simulation import feasibility
+
+_LATELY_S = 120.0
 
 
 def require_sweep(tx: Tx, sweep_id: str) -> SweepRow:
@@ -91,6 +93,8 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
             **vars(row),
             "batch": row.snapshot["batch"],
             "key": row.made_by,
+            "engine": row.request.get("engine"),
+            "engines": outcomes.engines(tx, row.id),
             "grid": grid,
             "seed": (grid or row.request.get("sample") or {}).get("seed"),
             "state": state,
@@ -107,9 +111,22 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
             "warnings": [
                 *feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
                 *row.snapshot.get("warnings", []),
+                *_without_engine(tx, row),
             ],
         }
     )
+
+
+def _without_engine(tx: Tx, row: SweepRow) -> list[str]:
+    """What a sweep waits for that asks for an engine which no worker has."""
+    engine = row.request.get("engine")
+    if engine is None or row.finished_at is not None or jobs.someone_has(tx, engine, within_s=_LATELY_S):
+        return []
+    extras = {"pybullet": "sim", "mujoco": "sim,mujoco"}[engine]
+    return [
+        f"no worker that has {engine} was here in the last {_LATELY_S / 60:.0f} minutes, and no other takes"
+        f" what this sweep has left: pip install 'graspdb[{extras}]' on a worker, and start it again"
+    ]
 
 
 def _rate(row: SweepRow, done: Progress) -> float | None:

@@ -11,6 +11,7 @@ from graspdb_service.storage import objects
 from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.simulation import outcomes as packed
 from graspdb_service.storage.trials import batches, findings, provenances
 from graspdb_service.storage.trials.batches import BatchRow
 from graspdb_service.storage.trials.qualities import names_of
@@ -103,6 +104,7 @@ def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInf
             "gripper_versions": distinct(item.gripper for item in items),
             "sources": distinct(item.source for item in items),
             "protocols": distinct(item.protocol for item in items),
+            "engines": [] if batch.sweep_id is None else packed.engines(tx, batch.sweep_id),
             "qualities": names_of(batch.quality_layout),
             "findings": words.of_batch(stored.get(batch.id, []), batch.inserted, keys),
         }

@@ -37,7 +37,9 @@ def pose_grid(plan: GridPlan) -> PoseGrid:
     return PoseGrid(**{name: getattr(plan, name) for name in GridPlan.model_fields})
 
 
-def repeat_key(world: dict[str, Any], protocol: str, fidelity: str, grid: GridPlan) -> str:
+def repeat_key(
+    world: dict[str, Any], protocol: str, fidelity: str, grid: GridPlan, engine: str | None
+) -> str:
     """Equal for sweeps in which one pose index means one and the same simulation.
 
     ``region``, ``max_poses`` and ``seed`` choose among the indices of a grid and change none of them.
@@ -49,6 +51,8 @@ def repeat_key(world: dict[str, Any], protocol: str, fidelity: str, grid: GridPl
         "fidelity": fidelity,
         "grid": lattice,
     }
+    if engine is not None:
+        document["engine"] = engine
     if protocol in _MADE_ANEW:
         document["simulation"] = _MADE_ANEW[protocol]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()

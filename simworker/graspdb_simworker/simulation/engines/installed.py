@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import platform
 from collections.abc import Sequence
@@ -40,6 +41,11 @@ def require(engine: Engine | None) -> Engine:
             f" ({here})"
         )
     return engine or there[0]
+
+
+def version_of(engine: Engine) -> str:
+    """The version of an engine that is installed."""
+    return importlib.metadata.version(engine)
 
 
 def world_of(engine: Engine) -> type[EngineWorld]:
