@@ -56,7 +56,7 @@ def test_show_names_what_is_wrong() -> None:
         (("show", "teapot"), "teapot"),
         (("show", "mug", "--quaternion", "1,0,0,1"), "norm"),
         (("verify", "mug", "--gripper", "claw"), "claw"),
-        (("verify", "mug", "--protocol", "shake"), "shake"),
+        (("verify", "mug", "--protocol", "juggle"), "juggle"),
         (("verify", "--sweep", "abc"), "--url"),
         (("verify",), "name an object"),
     ):
