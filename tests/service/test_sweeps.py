@@ -281,7 +281,7 @@ BAD_REQUESTS: list[tuple[dict[str, Any], str]] = [
     ({"proposal_density": 1.0}, "body"),
     ({"grid": GRID, "chunk_poses": 0}, "chunk_poses"),
     ({"grid": {"position_step_m": 0.005}, "chunk_poses": 1}, "chunk_poses"),
-    ({"protocol": "shake"}, "protocol"),
+    ({"protocol": "juggle"}, "protocol"),
     ({"sample": {"count": 2_000_000}}, "sample.count"),
     ({"grips": 1}, "grips"),
 ]
