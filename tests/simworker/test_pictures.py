@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from contextlib import closing
@@ -115,6 +116,17 @@ def test_a_motion_is_that_of_the_label(tmp_path: Path, protocol: str) -> None:
     assert np.linalg.norm(places[1] - places[0]) < 2e-4
     assert np.linalg.norm(places[-1] - places[0]) > 1e-3
     assert np.linalg.norm(moved["quaternion_xyzw"], axis=1) == pytest.approx(1.0)
+
+
+def test_a_motion_moves_the_finger_that_moved() -> None:
+    payload, parts = inputs.load("cone", "pg70")
+    for shift in (0.005, -0.005):
+        # Beside the cone's axis: pushed by one finger, it ends beyond the middle, and the fingers with it.
+        pose = Pose(position=(0.0, shift, 0.0), quaternion_xyzw=(0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+        moved = motions.motion(payload, parts, pose)
+        ahead, behind = moved["fingers_m"][-1]
+        assert abs(moved["position"][-1][1]) > 1e-3
+        assert 0.5 * (ahead - behind) == pytest.approx(moved["position"][-1][1], abs=5e-4)
 
 
 def test_a_motion_is_written_and_none_where_geometry_decides(tmp_path: Path) -> None:

@@ -212,7 +212,8 @@ class GraspWorld:
             self.pictures.append(self._engine.picture())
 
     def _moment(self) -> Moment:
-        return Moment(self._time_s, self._engine.fingers(), *self._object_pose())
+        first, second = self._engine.fingers()
+        return Moment(self._time_s, (second, first), *self._object_pose())
 
     def _object_pose(self) -> tuple[Vector, Quaternion]:
         """Pose of the object frame in the tool frame."""

@@ -76,7 +76,7 @@ class EngineWorld(Protocol):
         """Where the object is."""
 
     def fingers(self) -> tuple[float, float]:
-        """How far the finger at +y and that at -y are from the middle, metres."""
+        """How far the finger at -y, the first, and that at +y are from the middle, metres."""
 
     def show(self, where: Vector, orientation: Quaternion, fingers_m: tuple[float, float]) -> None:
         """Put object and fingers here, to be looked at."""
