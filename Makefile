@@ -10,7 +10,7 @@ KEEP ?=
 VIEW ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install docs demo test chromium test-core test-long test-compose check format bench load openapi requirements clean
+.PHONY: help install docs demo test chromium test-core test-long test-compose check format bench load openapi requirements recompile clean
 
 help:  ## What can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -79,6 +79,9 @@ requirements:  ## Pin what pyproject.toml allows, for development and for the im
 	  --output-file simworker/requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra view --build-deps-for wheel \
 	  --output-file clients/requirements.txt pyproject.toml
+
+recompile:  ## Forget what Numba keeps compiled: it does not see where a function that others call has changed
+	find service simworker -name '*.nb[ic]' -delete
 
 clean:  ## Remove the environment and what tools left behind
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache demo dist
