@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 import trimesh
 import typer
+from typer.testing import CliRunner
 
-from graspdb.cli import TABLE, app
+from graspdb.cli import TABLE, Entry, app
 from graspdb.cli.common import show_table
 from graspdb.options import Corners
 from graspdb.resources.kernels import KernelOptions
@@ -59,6 +60,30 @@ def trials_file(tmp_path: Path, clusters: Callable[..., np.ndarray]) -> str:
         writer.writerow(["x", "y", "z", "qx", "qy", "qz", "qw", "outcome"])
         writer.writerows([*row, "success"] for row in poses.tolist())
     return str(path)
+
+
+def test_an_interruption_in_the_midst_of_an_import_is_not_swallowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    guarded = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    os.getpid()
+except BaseException:
+    pass
+
+def command() -> None:
+    print("went on")
+"""
+    (tmp_path / "guarded_import.py").write_text(guarded)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(TABLE, "guarded", Entry("", "guarded_import:command"))
+    result = CliRunner().invoke(app, ["guarded"])
+    assert result.exit_code == 130
+    assert "went on" not in result.output
+    # Once is enough: the command itself can be run.
+    assert "went on" in CliRunner().invoke(app, ["guarded"]).output
 
 
 def test_objects_from_creation_to_deletion(run: Run, fresh_id: str, tmp_path: Path) -> None:

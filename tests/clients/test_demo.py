@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +90,24 @@ def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(
 
 
 Living = Callable[[], list[str]]
+Starting = Callable[[], subprocess.Popen[str]]
 
 
-def _started(*arguments: str) -> subprocess.Popen[str]:
-    arguments = (GRASPDB, "demo", "--max-poses", "2000000", "--processes", "1", *arguments)
-    return subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
+    """Starts a demo that lasts; with the test it ends, whatever became of it."""
+    begun: list[subprocess.Popen[str]] = []
+
+    def begin() -> subprocess.Popen[str]:
+        words = (GRASPDB, "demo", "--max-poses", "2000000", "--processes", "1", "--folder", str(tmp_path))
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        begun.append(process)
+        return process
+
+    yield begin
+    for process in begun:
+        with process:
+            process.kill()
 
 
 def _runs(descendants: Living, text: str) -> Callable[[], bool]:
@@ -102,9 +115,9 @@ def _runs(descendants: Living, text: str) -> Callable[[], bool]:
 
 
 def test_stopped_in_the_middle_it_leaves_no_process(
-    tmp_path: Path, descendants: Living, eventually: Callable[..., Any]
+    start: Starting, descendants: Living, eventually: Callable[..., Any]
 ) -> None:
-    process = _started("--folder", str(tmp_path))
+    process = start()
     eventually(_runs(descendants, "graspdb-simworker run"))
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=60)
@@ -124,9 +137,13 @@ def test_stopped_in_the_middle_it_leaves_no_process(
     ],
 )
 def test_however_early_and_hard_it_is_stopped_nothing_is_left(
-    tmp_path: Path, descendants: Living, eventually: Callable[..., Any], appeared: str, number: signal.Signals
+    start: Starting,
+    descendants: Living,
+    eventually: Callable[..., Any],
+    appeared: str,
+    number: signal.Signals,
 ) -> None:
-    process = _started("--folder", str(tmp_path))
+    process = start()
     eventually(_runs(descendants, appeared))
     time.sleep(np.random.default_rng().uniform(0.0, 3.0 if appeared == "demo" else 0.5))
     process.send_signal(number)

@@ -9,8 +9,10 @@ what a run of one command costs would otherwise be the import of all the others.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib
+import signal
 import sys
 from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass
@@ -110,7 +112,24 @@ TABLE = {
 def _loaded(place: str) -> Any:
     """What a module has under a name, ``module:name``."""
     module, _, name = place.partition(":")
-    return getattr(importlib.import_module(module), name)
+    with _interrupted_afterwards():
+        return getattr(importlib.import_module(module), name)
+
+
+@contextlib.contextmanager
+def _interrupted_afterwards() -> Iterator[None]:
+    """Have Ctrl-C wait for the end of an import: raised in its midst it may be swallowed there."""
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 class _Loading(MutableMapping[str, Any]):
