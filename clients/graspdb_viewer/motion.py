@@ -78,8 +78,8 @@ def simulated(trial: TrialOut, sweep: SweepInfo, url: str, api_key: str | None) 
         given = [f"--{name}={value}" for name, value in arguments.items()]
         fine = ["--fine"] if sweep.fidelity == "fine" else []
         # Of several it may have been any.
-        if len(engines := {told.split()[0] for told in sweep.engines}) == 1:
-            given.append(f"--engine={engines.pop()}")
+        if sweep.sole_engine is not None:
+            given.append(f"--engine={sweep.sole_engine}")
         key = {} if api_key is None else {"GRASPDB_API_KEY": api_key}
         process = ChildProcess(
             [found, "show", sweep.object, *given, *fine],

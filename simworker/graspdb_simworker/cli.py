@@ -248,7 +248,11 @@ def verify(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
             object_name, gripper, protocol = info.object, info.gripper, info.protocol
-            chosen = _require_physics(engine or info.engine)
+            if engine is None and info.engines and info.sole_engine is None:
+                _leave(
+                    f"{' and '.join(info.engines)} simulated this sweep: say with --engine which to compare"
+                )
+            chosen = _require_physics(engine or info.engine or info.sole_engine)
             payload, parts = inputs.load(
                 object_name, gripper, protocol=protocol, engine=chosen, url=url, api_key=api_key
             )

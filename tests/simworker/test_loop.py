@@ -20,7 +20,7 @@ from graspdb.errors import Unreachable
 from graspdb.examples import example
 from graspdb.processes import ChildProcess
 from graspdb.transport import Transport
-from graspdb.wire import OUTCOMES, ClaimedJob, ClaimRequest, SimulatePayload
+from graspdb.wire import OUTCOMES, ClaimedJob, ClaimRequest, SimulatePayload, SweepInfo
 from graspdb_simworker import loop
 from graspdb_simworker.loop import Lease, Worker, WorkerFailed
 from graspdb_simworker.process.local import LocalRunner
@@ -330,6 +330,9 @@ def test_a_sweep_is_simulated_by_the_engine_that_it_names(
     Worker(transport, name="both", exit_when_idle=True, engines=["pybullet", "mujoco"]).run()
     done = http.get(f"/sweeps/{named['id']}").json()
     assert (done["state"], done["engines"]) == ("done", [f"mujoco {version('mujoco')}"])
+    assert SweepInfo.model_validate(done).sole_engine == "mujoco"
+    mixed = {**done, "engines": [*done["engines"], *told[1]["engines"]]}
+    assert SweepInfo.model_validate(mixed).sole_engine is None
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import gc
 import importlib
 import signal
 import sys
+import threading
 from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -119,7 +120,8 @@ def _loaded(place: str) -> Any:
 @contextlib.contextmanager
 def _interrupted_afterwards() -> Iterator[None]:
     """Have Ctrl-C wait for the end of an import: raised in its midst it may be swallowed there."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return
     came: list[int] = []

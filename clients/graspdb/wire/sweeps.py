@@ -219,6 +219,12 @@ class SweepInfo(Response):
     finished_at: datetime | None = None
     """When its last chunk ended, UTC; null before."""
 
+    @property
+    def sole_engine(self) -> str | None:
+        """The engine that simulated it, of whatever versions; None where several did, or none is known."""
+        names = {told.split()[0] for told in self.engines}
+        return names.pop() if len(names) == 1 else None
+
 
 class SweepOutcomes(Response):
     """Every pose of the finished chunks, collisions included, in columns, ascending within a chunk."""

@@ -67,8 +67,8 @@ object from corner to corner at every step and never stop the jaw. What turns as
 1.6 mm deep for a while, and comes out again."""
 STALLED_SUNK_M, CARRIED_SUNK_M = 0.0008, 0.0002
 """Nor has a jaw stalled soundly this deep in it, whose forces are rated, or whose patches are to carry: what
-is firmly held is 0.02 mm deep. Of 62 closings of a screwdriver that stalled at 0.2 to 0.8 mm, each was called
-at the fine step what it had been called before."""
+is firmly held is 0.02 mm deep. Of 63 closings of a screwdriver that were 0.8 mm deep on the way, or 0.2 when
+stalled, the fine step called 62 what they were called before."""
 _EMPTY_CHECK_STEPS = 10
 _SUNK_CHECK_STEPS = 3
 _SURELY_BETWEEN = 0.8
