@@ -9,7 +9,7 @@ from pydantic import Base64Bytes, Field
 
 from graspdb.wire.base import MANY, ObjectId, Request, Response, Text, ToolPositions, ToolRotations, Triple
 from graspdb.wire.grippers import GripperProfile
-from graspdb.wire.sweeps import Engine, Fidelity, Protocol
+from graspdb.wire.sweeps import Engine, Fidelity, Protocol, Randomise
 
 WorkerName = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f]+$")]
 Capability = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f]+$")]
@@ -25,7 +25,8 @@ class ClaimRequest(Request):
     capabilities: Annotated[list[Capability], Field(min_length=1, max_length=32)] = Field(
         default_factory=lambda: ["simulate"]
     )
-    """Job kinds the worker can do, ``lift`` and ``shake`` where it has these protocols, and its physics
+    """Job kinds the worker can do, ``lift`` and ``shake`` where it has these protocols, ``drawn-wrench``,
+    ``drawn-lift`` and ``drawn-shake`` where it can simulate a pose under what is drawn, and its physics
     engines: a chunk that names none goes to any worker."""
     limit: Annotated[int, Field(ge=1, le=64)] = 1
     """How many jobs it takes at most."""
@@ -83,6 +84,8 @@ class SimulatePayload(Response):
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
     engine: Engine | None = None
     """Physics engine to simulate with; null for the worker's own."""
+    randomise: Randomise | None = None
+    """What to draw anew in each of several simulations of every pose; null: one of what is known."""
     grid: GridPlan | None = None
     """The grid that the chunk is cut from; null where poses are given."""
     poses: PosePlan | None = None
@@ -166,9 +169,12 @@ class SimulateResult(Request):
     """What became of a chunk's poses."""
 
     outcomes: Base64Bytes
-    """One uint8 code of an outcome for every pose of the chunk, in order, as base64."""
+    """One uint8 code of an outcome for every pose of the chunk, in order, as base64: ``success`` where a pose
+    succeeded in at least half of its draws, else the failure that most of them ended in."""
+    successes: Base64Bytes | None = None
+    """How many draws of every pose succeeded, one uint8 each, as base64; null where nothing is drawn."""
     rows: ResultRows
-    """What was measured of the poses that met physics."""
+    """What was measured of the poses that met physics, in any draw: medians over the draws that did."""
     engine: EngineVersion | None = None
     """Physics engine that simulated the chunk and its version, as in ``pybullet 3.2.7``; null where the
     worker does not say."""

@@ -86,6 +86,44 @@ class SampleSpec(Request):
     """The same seed and revision draw the same poses."""
 
 
+_LogSpread = Annotated[float, Field(ge=0, le=1.0)]
+
+
+class Randomise(Request):
+    """Each pose is simulated several times under what is not known exactly, and succeeds k times of n.
+
+    What a spread is of is drawn from a normal distribution of that standard deviation about what object and
+    gripper say; of friction, mass and compliance their logarithms, so that .2 is about 20 %. The draws of
+    these, and of the centre of mass, are the same for all poses, which are thereby compared in the same
+    worlds; each pose has noise of its own.
+    """
+
+    draws: Annotated[int, Field(ge=2, le=100)] = 10
+    """How many times each pose is simulated."""
+    friction: _LogSpread = 0.2
+    """Standard deviation of the friction coefficient's natural logarithm; 0: as it is."""
+    mass: _LogSpread = 0.1
+    """Standard deviation of the mass's natural logarithm; 0: as it is."""
+    centre_of_mass_m: Annotated[float, Field(ge=0, le=1.0)] = 0.002
+    """Standard deviation of the centre of mass along each axis of the object, metres; 0: where it is."""
+    pose_noise_m: Annotated[float, Field(ge=0, le=0.1)] = 0.002
+    """Standard deviation of the tool's position along each of its axes, metres; 0: none."""
+    pose_noise_deg: Annotated[float, Field(ge=0, le=90.0)] = 2.0
+    """Standard deviation of the tool's rotation about each of its axes, degrees; 0: none."""
+    finger_compliance: _LogSpread = 0.0
+    """Standard deviation of the natural logarithm of how compliant the fingers' pads are; 0: as they are. Of
+    ``lift`` and ``shake``: pads have no part in the force test of ``wrench``."""
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    """The same seed draws the same."""
+
+    @model_validator(mode="after")
+    def _something(self) -> Randomise:
+        spreads = (self.friction, self.mass, self.centre_of_mass_m, self.pose_noise_m, self.pose_noise_deg)
+        if not any((*spreads, self.finger_compliance)):
+            raise ValueError("nothing is drawn: every spread is 0")
+        return self
+
+
 class SweepCreate(Request):
     """Exactly one of ``grid``, ``poses`` and ``sample``; none of them means the default grid."""
 
@@ -112,6 +150,9 @@ class SweepCreate(Request):
     engine: Engine | None = None
     """Physics engine that simulates it: only workers that have it take its chunks. Null for that of whichever
     workers come."""
+    randomise: Randomise | None = None
+    """What is drawn anew in each of several simulations of every pose; null: one simulation of what is
+    known."""
     purpose: Purpose = "collect"
     """``collect``, or ``check``: outcomes are stored but enter no density."""
     chunk_poses: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
@@ -125,6 +166,8 @@ class SweepCreate(Request):
             raise ValueError("proposal_density is of given poses: grids and samples have their own")
         if (self.frame, self.convention) != (None, None) and self.poses is None:
             raise ValueError("frame and convention are of given poses: leave them out")
+        if self.randomise is not None and self.randomise.finger_compliance and self.protocol == "wrench":
+            raise ValueError("randomise.finger_compliance is of lift and shake: wrench has no pads")
         return self
 
 
@@ -180,6 +223,8 @@ class SweepInfo(Response):
     engines: list[str] = Field(default_factory=list)
     """Engines that have simulated chunks of it, with their versions, as in ``pybullet 3.2.7``; none of chunks
     from before workers told."""
+    randomise: Randomise | None = None
+    """What is drawn anew in each of several simulations of a pose; null: each is simulated once."""
     purpose: str
     """``collect``, or ``check``: outcomes enter no density."""
     plan: Literal["grid", "poses", "sample"]
@@ -240,6 +285,10 @@ class SweepOutcomes(Response):
     tool_to_frame: ToolToFrame = None
     warnings: Warnings = Field(default_factory=list)
     outcome: list[str]
-    """What became of each pose, by name."""
+    """What became of each pose, by name: ``success`` where it succeeded in at least half of its attempts."""
+    attempts: list[int] | None = None
+    """How often each pose was simulated; null where the sweep simulates each once."""
+    successes: list[int] | None = None
+    """How many of these succeeded; null where the sweep simulates each once."""
     next: str | None = None
     """Cursor of the following page; null at the end."""
