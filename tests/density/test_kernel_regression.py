@@ -124,7 +124,11 @@ def test_a_wide_kernel_blurs_an_edge_more_than_one_half_as_wide() -> None:
 def test_bad_input_is_refused() -> None:
     p, q = np.zeros((2, 3)), np.tile(se3.IDENTITY, (2, 1))
     with pytest.raises(ValueError, match="success must be bools"):
-        SuccessModel.build(Poses.of(p, q), [1.0, 0.0], kernel=KERNELS[0])
+        SuccessModel.build(Poses.of(p, q), [1, 0], kernel=KERNELS[0])
+    with pytest.raises(ValueError, match="success must be from 0 to 1"):
+        SuccessModel.build(Poses.of(p, q), [1.5, 0.0], kernel=KERNELS[0])
+    with pytest.raises(ValueError, match="spread must be bools or float64 of shape"):
+        SuccessModel.build(Poses.of(p, q), [1.0, 0.0], kernel=KERNELS[0], spread=[0.1])
     with pytest.raises(ValueError, match="symmetric"):
         SuccessModel.build(Poses.of(p, q), [True, False], kernel=KERNELS[0], symmetric=[True])
     model = SuccessModel.build(Poses.of(p, q), [True, False], kernel=KERNELS[0])
@@ -170,3 +174,50 @@ def test_attempts_that_count_less_say_less() -> None:
     assert (fifth.high - fifth.low > full.high - full.low).all()
     with pytest.raises(ValueError, match="positive"):
         SuccessModel.build(rows, won, kernel=kernel, weights=np.zeros(500))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 50), st.integers(1, 8))
+def test_k_of_n_is_one_attempt_that_succeeded_by_its_share(seed: int, tries: int) -> None:
+    """Its probability is that of as many rows, k of them successes, and it counts as one in the interval."""
+    rng = np.random.default_rng(seed)
+    rows = Poses(rng.normal(size=(40, 3)) * 0.02, se3.random_quaternions(40, rng))
+    successes = rng.integers(0, tries, 40, endpoint=True)
+    kernel = IsotropicKernel(0.015, 0.6)
+    first, rest = slice(0, 15), slice(15, 40)
+    model = SuccessModel.build(rows[first], successes[first] / tries, kernel=kernel)
+    model = model.extend(rows[rest], successes[rest] / tries)
+    each = np.repeat(np.arange(40), tries)
+    won = np.concatenate([np.arange(tries) < k for k in successes])
+    repeated = SuccessModel.build(rows[each], won, kernel=kernel, weights=np.full(len(each), 1.0 / tries))
+    at = Poses(rng.normal(size=(20, 3)) * 0.02, se3.random_quaternions(20, rng))
+    one, other = model.evaluate(at), repeated.evaluate(at)
+    for name in ("probability", "low", "high", "effective_trials"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-6)
+    assert model.size == 40
+    assert model.worth == pytest.approx((successes.sum() / tries, 40.0))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 50))
+def test_what_either_judge_says_lies_within_the_interval(seed: int) -> None:
+    """Two judges of the same attempts: the interval of both holds the share that each alone tells."""
+    rng = np.random.default_rng(seed)
+    rows = Poses(rng.normal(size=(60, 3)) * 0.02, se3.random_quaternions(60, rng))
+    one, other = rng.random((2, 60)) < 0.5
+    kernel = IsotropicKernel(0.015, 0.6)
+    spread = 0.5 * np.abs(one.astype(float) - other)
+    both = SuccessModel.build(rows, 0.5 * (one + other.astype(float)), kernel=kernel, spread=spread)
+    agreed = SuccessModel.build(rows, 0.5 * (one + other.astype(float)), kernel=kernel)
+    at = Poses(rng.normal(size=(20, 3)) * 0.02, se3.random_quaternions(20, rng))
+    found, without = both.evaluate(at), agreed.evaluate(at)
+    np.testing.assert_array_equal(found.probability, without.probability)
+    assert (found.low <= without.low).all()
+    assert (found.high >= without.high).all()
+    np.testing.assert_array_equal(both.lower_end(at), found.low)
+    for won in (one, other):
+        told = SuccessModel.build(rows, won, kernel=kernel).probability(at)
+        # The prior's own share differs between the judges, too, and counts as one attempt.
+        slack = abs(won.mean() - agreed.prior_share) / (1.0 + found.effective_trials)
+        assert (found.low - slack - 1e-9 <= told).all()
+        assert (told <= found.high + slack + 1e-9).all()

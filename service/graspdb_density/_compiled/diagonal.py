@@ -213,14 +213,14 @@ def nearest_anywhere(cells, positions, quaternions, half, turning, out):
 
 @exact
 def left_out_sums(
-    cells, won, positions, quaternions, own, sides, half, turning, radius, step, width, sums, nearest
+    cells, share, positions, quaternions, own, sides, half, turning, radius, step, width, sums, nearest
 ):
     """Kernel sums of rows by how far they are from every judged pose (J), as if the pose stood at the edge of
     what was tried: of displacements only those that point to one side count.
 
     Parameters
     ----------
-    won : whether these rows succeeded
+    share : by how much these rows succeeded
     own : (J,) the row that is the pose itself, left out; -1 where it is not among these
     sides : (J, 6) the directions away from the side that counts, of translation and of the rotation vector
     step : every so many'th row is looked at
@@ -250,6 +250,6 @@ def left_out_sums(
                 for kind in range(2):
                     if along[kind] <= 0.0:
                         row = sums[j, kind, min(int(apart[kind] / width), shells - 1)]
-                        row[0] += k if won else 0.0
+                        row[0] += share * k
                         row[1] += k
                         row[2] += k * k

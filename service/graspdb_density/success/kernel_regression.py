@@ -9,6 +9,13 @@ Attempts that are trusted less have a weight w below 1: an attempt then counts a
 of k^2 and in m0 alike, so that twice the weight is the same as posting it twice (power prior, Ibrahim and
 Chen 2000).
 
+An attempt may be k of n tries at one pose: it succeeded by that share, s = k / n, and is one attempt. Tries at
+one pose tell much of it and little of its neighbours, so they narrow no interval there.
+
+Where judges of attempts differ, such as two engines, s is their mean, and each attempt's spread is half of
+what they differ by. The ends of the interval move outwards by the spread's own kernel mean: within them lies
+what any of the judges alone says.
+
 The kernel is isotropic, or a Gaussian with a bandwidth for every axis. The interval covers the truth smoothed
 by it, not the truth at a point.
 """
@@ -16,7 +23,7 @@ by it, not the truth at a point.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -103,11 +110,14 @@ class SuccessEstimate:
 
 
 class Part(NamedTuple):
-    """Attempts that succeeded, or that failed, sorted; each counts as ``weight`` of one."""
+    """Attempts that succeeded by one ``share`` (1, or 0, of most), sorted; each counts as ``weight`` of one.
+    The share is known to within the ``spread``.
+    """
 
     cells: Cells
-    won: bool
+    share: float
     weight: float
+    spread: float
 
     @property
     def size(self) -> int:
@@ -115,14 +125,20 @@ class Part(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Weighted sums of k and k^2 (M, 2) at poses over the successes and over the failures; of every part
-    (P, M) the nearest attempt's exponent and its place, where they were asked for.
+    """Weighted sums at poses (M,): of k times the share of success, of k, of k^2, and of k times the spread;
+    of every part (P, M) the nearest attempt's exponent and its place, where they were asked for.
     """
 
     won: Floats
-    lost: Floats
+    total: Floats
+    squares: Floats
+    spread: Floats
     best: Floats
     places: Floats
+
+    @classmethod
+    def zeros(cls, count: int, parts: int) -> _Sums:
+        return cls(*np.zeros((4, count)), *np.empty((2, parts, count)))
 
 
 class SuccessModel:
@@ -130,7 +146,7 @@ class SuccessModel:
 
     def __init__(self, kernel: SuccessKernel, parts: tuple[Part, ...] = ()) -> None:
         self.kernel = kernel
-        #: The attempts by weight and outcome, successes first.
+        #: The attempts by share of success, weight and spread, successes first.
         self.parts = parts
 
     @classmethod
@@ -142,6 +158,7 @@ class SuccessModel:
         kernel: SuccessKernel,
         symmetric: ArrayLike | bool = True,
         weights: ArrayLike | None = None,
+        spread: ArrayLike | None = None,
     ) -> SuccessModel:
         """Sort attempts.
 
@@ -149,19 +166,22 @@ class SuccessModel:
         ----------
         poses : N
             Every attempt, failures included; attempts that broke off for reasons of their own are left out.
-        success : (N,) bool
+        success : (N,) bool, or float from 0 to 1
+            Whether each succeeded, or by what share, of few different values.
         kernel
         symmetric : bool or (N,)
             Whether the row's jaw is mirror-symmetric.
         weights : (N,) or None
             As how much of an attempt each counts, positive, of few different values; None: 1.
+        spread : (N,) or None
+            By how much each share may be wrong either way, of few different values; None: 0.
 
         Raises
         ------
         ValueError
-            For wrong shapes, or weights that are not positive and finite.
+            For wrong shapes, shares or spreads outside 0 to 1, or weights that are not positive and finite.
         """
-        return cls(kernel).extend(poses, success, symmetric, weights)
+        return cls(kernel).extend(poses, success, symmetric, weights, spread)
 
     def extend(
         self,
@@ -169,23 +189,23 @@ class SuccessModel:
         success: ArrayLike,
         symmetric: ArrayLike | bool = True,
         weights: ArrayLike | None = None,
+        spread: ArrayLike | None = None,
     ) -> SuccessModel:
         """A model with further attempts; what is present is not sorted again."""
-        won = checked_outcomes(success, len(poses))
+        won = _shares("success", success, len(poses))
+        apart = None if spread is None else _shares("spread", spread, len(poses))
         attempts = Rows.of(self._along(poses), weights, symmetric)
         worth = attempts.weights
         # Weights are the parts': kernels count once.
         attempts = Rows(attempts.poses, np.ones(len(attempts)), attempts.symmetric)
-        parts = {(part.won, part.weight): part.cells for part in self.parts}
-        for weight in np.unique(worth).tolist():
-            for outcome in (True, False):
-                rows = attempts[(won == outcome) & (worth == weight)]
-                present = parts.get((outcome, weight))
-                if present is not None:
-                    parts[outcome, weight] = present.extend(rows) if len(rows) else present
-                elif len(rows):
-                    # No width is larger than the one the cells are made for, so their runs reach far enough.
-                    parts[outcome, weight] = Cells.build(rows, self.widest_m)
+        parts = {part[1:]: part.cells for part in self.parts}
+        for share, weight, wide, chosen in _alike(won, worth, apart):
+            rows = attempts[chosen]
+            present = parts.get((share, weight, wide))
+            # No width is larger than the one the cells are made for, so their runs reach far enough.
+            parts[share, weight, wide] = (
+                Cells.build(rows, self.widest_m) if present is None else present.extend(rows)
+            )
         # Heaviest successes first, whatever came first.
         ordered = sorted(parts, reverse=True)
         return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered))
@@ -198,7 +218,7 @@ class SuccessModel:
     @property
     def worth(self) -> tuple[float, float]:
         """As how many attempts those that succeeded count by their weights, and all of them."""
-        won = sum(part.weight * part.size for part in self.parts if part.won)
+        won = sum(part.weight * part.size * part.share for part in self.parts)
         return won, sum(part.weight * part.size for part in self.parts)
 
     @property
@@ -217,12 +237,16 @@ class SuccessModel:
         random in proportion to their weights.
         """
         found = []
-        for outcome in (True, False):
-            parts = [part for part in self.parts if part.won == outcome]
-            total = sum(part.weight * part.size for part in parts)
+        for won in (True, False):
+            counted = [
+                part.weight * part.size * (part.share if won else 1.0 - part.share) for part in self.parts
+            ]
+            total = sum(counted)
             drawn = [Poses(np.empty((0, 3)), np.empty((0, 4)))]
-            for part in parts:
-                most = math.ceil(count * part.weight * part.size / total)
+            for part, counts in zip(self.parts, counted, strict=True):
+                if not counts:
+                    continue
+                most = math.ceil(count * counts / total)
                 drawn.append(part.cells.poses(rng.permutation(part.size)[:most]))
             poses = Poses.concatenate(drawn)
             if isinstance(self.kernel, DiagonalKernel):
@@ -252,8 +276,9 @@ class SuccessModel:
             raise ValueError(f"level must be between 0 and 1, not {level!r}")
         probability, trials, alpha, beta = self._beta(sums)
         tail = 0.5 * (1.0 - level)
-        low = _quantiles(alpha, beta, tail, threads)
-        high = _quantiles(alpha, beta, 1.0 - tail, threads)
+        apart = _spread(sums)
+        low = np.maximum(_quantiles(alpha, beta, tail, threads) - apart, 0.0)
+        high = np.minimum(_quantiles(alpha, beta, 1.0 - tail, threads) + apart, 1.0)
         return SuccessEstimate(probability, low, high, trials, level)
 
     def probability(self, poses: Poses, *, threads: int = 1) -> Floats:
@@ -284,11 +309,10 @@ class SuccessModel:
         """
         sums = self._sums(poses, threads, nearest=near is not None)
         _, _, alpha, beta = self._beta(sums)
-        low = _quantiles(alpha, beta, 0.5 * (1.0 - level), threads)
+        low = np.maximum(_quantiles(alpha, beta, 0.5 * (1.0 - level), threads) - _spread(sums), 0.0)
         if near is None:
             return low
-        nothing = np.zeros((1, 2))
-        _, _, alpha, beta = self._beta(_Sums(nothing, nothing, nothing, nothing))
+        _, _, alpha, beta = self._beta(_Sums.zeros(1, 0))
         untried = _quantiles(alpha, beta, 0.5 * (1.0 - level), 1)
         told = near(self._nearest(poses, sums, threads, everywhere=False))
         return np.where(told, low, np.minimum(low, untried))
@@ -298,8 +322,7 @@ class SuccessModel:
         if not self.size:
             raise ValueError("a success probability needs at least one attempt")
         prior = self.prior_share
-        total, squares = (sums.won + sums.lost).T
-        probability, trials, share = shrunk_share(sums.won[:, 0], total, squares, prior)
+        probability, trials, share = shrunk_share(sums.won, sums.total, sums.squares, prior)
         alpha = PRIOR_TRIALS * prior + trials * share
         beta = PRIOR_TRIALS * (1.0 - prior) + trials * (1.0 - share)
         # Without any success, or any failure, the matching Beta would be a point: the interval then starts
@@ -312,14 +335,19 @@ class SuccessModel:
 
     def _sums(self, poses: Poses, threads: int, *, nearest: bool = False) -> _Sums:
         """The kernel sums at poses; with the ``nearest`` attempt of every part."""
-        count = len(poses)
-        found = _Sums(np.zeros((count, 2)), np.zeros((count, 2)), *np.empty((2, len(self.parts), count)))
+        found = _Sums.zeros(len(poses), len(self.parts))
         for number, part in enumerate(self.parts):
-            sums = self._sums_of(part.cells, poses, 4 if nearest else 2, threads)
-            outcome = found.won if part.won else found.lost
-            outcome += sums[:, :2] if part.weight == 1.0 else part.weight * sums[:, :2]
+            total, squares, *place = self._sums_of(part.cells, poses, 4 if nearest else 2, threads).T
+            for column, factor, of in (
+                (found.won, part.share, total),
+                (found.total, 1.0, total),
+                (found.squares, 1.0, squares),
+                (found.spread, part.spread, total),
+            ):
+                if factor:
+                    column += of if factor * part.weight == 1.0 else factor * part.weight * of
             if nearest:
-                found.best[number], found.places[number] = sums[:, 2:].T
+                found.best[number], found.places[number] = place
         return found
 
     def _sums_of(self, cells: Cells, poses: Poses, columns: int, threads: int) -> Floats:
@@ -446,6 +474,40 @@ def _quantiles(alpha: Floats, beta: Floats, level: float, threads: int) -> Float
 
     for_blocks(work, len(alpha), block=4_096, threads=threads)
     return out
+
+
+def _spread(sums: _Sums) -> Floats:
+    """The kernel mean (M,) of by how much shares may be wrong."""
+    return np.asarray(sums.spread / np.where(sums.total > 0.0, sums.total, 1.0))
+
+
+def _alike(
+    won: NDArray[Any], worth: Floats, spread: NDArray[Any] | None
+) -> Iterator[tuple[float, float, float, NDArray[np.bool_]]]:
+    """Attempts (N,) that share a share, a weight and a spread: the three, and which they are."""
+    # Of millions nearly all succeeded or failed, and weigh the same: no search for what differs then.
+    shares = (1.0, 0.0) if won.dtype == np.bool_ else np.unique(won).tolist()
+    spreads = [0.0] if spread is None else np.unique(spread).tolist()
+    for weight in np.unique(worth).tolist():
+        weighs = worth == weight
+        for share in shares:
+            alike = weighs & (won == share)
+            for wide in spreads:
+                chosen = alike if spread is None else alike & (spread == wide)
+                if chosen.any():
+                    yield share, weight, wide, chosen
+
+
+def _shares(name: str, values: ArrayLike, count: int) -> NDArray[Any]:
+    """Whether attempts (N,) succeeded, or by what share, checked."""
+    found = np.asarray(values)
+    if found.shape != (count,) or found.dtype not in (np.bool_, np.float64):
+        raise ValueError(
+            f"{name} must be bools or float64 of shape ({count},), not {found.dtype} of shape {found.shape}"
+        )
+    if found.dtype != np.bool_ and not ((found >= 0.0) & (found <= 1.0)).all():
+        raise ValueError(f"{name} must be from 0 to 1")
+    return found
 
 
 def checked_outcomes(success: ArrayLike, count: int) -> NDArray[np.bool_]:

@@ -120,15 +120,15 @@ def validate_reach(model: SuccessModel, *, threads: int = 1) -> Reach:
 class _Judged:
     """Attempts (J) that are predicted again, their positions along the kernel's axes.
 
-    ``own`` (P, J) is each one's place in its part of the model, -1 in the others; ``weight`` (J,) what each
-    stands for, ``worth`` (J,) as how much of an attempt it counts; ``sides`` (J, 6) directions of translation
+    ``own`` (P, J) is each one's place in its part of the model, -1 in the others; ``share`` (J,) by how much
+    each succeeded, ``weight`` (J,) what each stands for, ``worth`` (J,) as how much of an attempt it counts; ``sides`` (J, 6) directions of translation
     and rotation; ``pairs`` (K, 2) of them, drawn at random.
     """
 
     model: SuccessModel
     poses: Poses
     own: NDArray[np.int64]
-    won: Bools
+    share: Floats
     weight: Floats
     worth: Floats
     sides: Floats
@@ -137,10 +137,10 @@ class _Judged:
     @classmethod
     def of(cls, model: SuccessModel, rng: np.random.Generator) -> _Judged:
         """Half of them successes, where there are as many: those are few among many failures."""
-        poses, own, successes, stands_for, counts = [], [], [], [], []
+        poses, own, shares, stands_for, counts = [], [], [], [], []
         for number, part in enumerate(model.parts):
             size = part.size
-            alike = sum(other.size for other in model.parts if other.won == part.won)
+            alike = sum(other.size for other in model.parts if (other.share >= 0.5) == (part.share >= 0.5))
             most = math.ceil(_JUDGED // 2 * size / alike)
             # By when they came, not by how they are sorted, which depends on how they were added.
             places = np.argsort(part.cells.rows)[rng.permutation(size)[:most]]
@@ -148,15 +148,15 @@ class _Judged:
             every = np.full((len(model.parts), len(places)), -1, dtype=np.int64)
             every[number] = places
             own.append(every)
-            successes.append(np.full(len(places), part.won))
+            shares.append(np.full(len(places), part.share))
             stands_for.append(np.full(len(places), part.weight * size / len(places)))
             counts.append(np.full(len(places), part.weight))
         rows = np.concatenate(own, axis=1)
         sides = rng.standard_normal((rows.shape[1], 6))
         pairs = rng.integers(0, rows.shape[1], (_DISPLACED, 2))
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-        won, weights, worth = (np.concatenate(column) for column in (successes, stands_for, counts))
-        return cls(model, Poses.concatenate(poses), rows, won, weights, worth, sides, pairs)
+        share, weights, worth = (np.concatenate(column) for column in (shares, stands_for, counts))
+        return cls(model, Poses.concatenate(poses), rows, share, weights, worth, sides, pairs)
 
     def ranges(self) -> Floats:
         """How far apart attempts near one another lie along and about each axis, metres and radians, (6,)."""
@@ -202,10 +202,10 @@ class _Judged:
     ) -> None:
         """The sums of some judged attempts over a part of the model."""
         rows = slice(begin, end)
-        (cells, won, weight), (p, q) = self.model.parts[number], self.poses[rows]
+        (cells, share, weight, _), (p, q) = self.model.parts[number], self.poses[rows]
         added = np.zeros_like(sums[rows])
         diagonal.left_out_sums(
-            cells.arrays, won, p, q, self.own[number, rows], self.sides[rows],
+            cells.arrays, share, p, q, self.own[number, rows], self.sides[rows],
             self.model.half(cells), self.model.turning, radius, step, _STEP, added, nearest[rows],
         )  # fmt: skip
         sums[rows] += weight * added
@@ -219,7 +219,7 @@ def _validated(judged: _Judged, sums: Floats) -> float | None:
     sums : (J, K, 3)
         By the distance of what was tried, in steps.
     """
-    model, won = judged.model, judged.won.astype(np.float64)
+    model, won = judged.model, judged.share
     if model.size < _LEAST_JUDGED:
         return None
     try:
