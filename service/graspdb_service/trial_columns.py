@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.wire import OUTCOME_CODES
 from graspdb.wire.trials import BatchDefaults
 from graspdb_density.se3 import Poses
 
@@ -57,6 +58,8 @@ class TrialColumns:
     ascending, ``batch`` internal, ``withdrawn`` (n,) whether it counts no more. ``answer`` is which answer
     was tried, -1 for none: its place in a list that comes with the columns, once stored its number.
     ``achieved`` (n, 7) is where the tool was after all, position and quaternion, NaN where that is unknown.
+    ``attempts`` and ``successes`` (n,) say how often a pose was tried and succeeded, NaN where it was tried
+    once.
     ``qualities`` (n, k) are named scores, NaN for none; the names come with the columns, of stored ones with
     the batch, whose first name is in column 0.
     """
@@ -77,6 +80,8 @@ class TrialColumns:
     batch: Ints = field(default_factory=_ints)
     answer: Ints = field(default_factory=_ints)
     achieved: Floats = field(default_factory=_floats)
+    attempts: Floats = field(default_factory=_floats)
+    successes: Floats = field(default_factory=_floats)
     qualities: Floats = field(default_factory=_floats)
     withdrawn: NDArray[np.bool_] = field(default_factory=_flags)
 
@@ -115,6 +120,14 @@ class TrialColumns:
         known = ~np.isnan(self.achieved[:, :1])
         position = np.where(known, self.achieved[:, :3], self.position)
         return Poses(position, np.where(known, self.achieved[:, 3:], self.quaternion_xyzw))
+
+    @property
+    def share(self) -> Floats:
+        """By how much each succeeded (n,): k of n, else 1 or 0."""
+        won = (self.outcome == OUTCOME_CODES["success"]).astype(np.float64)
+        if not len(self.attempts):
+            return won
+        return np.asarray(np.where(np.isnan(self.attempts), won, self.successes / self.attempts))
 
     def __getitem__(self, rows: slice | Bools | Ints) -> TrialColumns:
         """Some of the trials: a slice of any, else of those whose columns are all arrays."""

@@ -49,6 +49,8 @@ OutcomeIn = Annotated[Outcome, BeforeValidator(_outcome_of_bool)]
 """An outcome's name; true and false mean success and failure."""
 ProposalDensity = Annotated[float, Field(ge=1e-30, le=1e15)]
 Width = Annotated[float, Field(ge=0, le=10)]
+Attempts = Annotated[int, Field(ge=1, le=1_000_000)]
+Successes = Annotated[int, Field(ge=0, le=1_000_000)]
 _Covariance = Annotated[float, Field(ge=-1e6, le=1e6)]
 Row6 = tuple[_Covariance, _Covariance, _Covariance, _Covariance, _Covariance, _Covariance]
 Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
@@ -101,7 +103,13 @@ class TrialIn(Pose, TrialDefaults):
     """One attempt."""
 
     outcome: OutcomeIn
-    """What became of it, by name; true and false mean success and failure."""
+    """What became of it, by name; true and false mean success and failure. Of several ``attempts``: success
+    from half of them on, else how most failed."""
+    attempts: Attempts | None = None
+    """How often this grasp was tried, where that was more than once: it counts as one attempt that succeeded
+    by the share of its ``successes``; null: once."""
+    successes: Successes | None = None
+    """How many of its ``attempts`` succeeded; null: as the outcome says."""
     quality: Quality | None = None
     """Any score of the user's, without a unit; null for the batch's first of ``qualities``, or none."""
     qualities: Annotated[dict[QualityName, Quality | None], _QUALITIES] | None = None
@@ -133,7 +141,13 @@ class TrialColumns(Request):
     quaternion_xyzw: Annotated[list[Quaternion], Field(min_length=1), MANY]
     """Rotations of the tool frame in the object frame, one unit quaternion x, y, z, w a trial."""
     outcome: Annotated[list[OutcomeIn], Field(min_length=1), MANY]
-    """What became of each, by name; true and false mean success and failure."""
+    """What became of each, by name; true and false mean success and failure. Of several ``attempts``: success
+    from half of them on, else how most failed."""
+    attempts: Annotated[list[Attempts | None], MANY] | None = None
+    """How often each grasp was tried, where that was more than once: it counts as one attempt that succeeded
+    by the share of its ``successes``; null: once."""
+    successes: Annotated[list[Successes | None], MANY] | None = None
+    """How many of its ``attempts`` succeeded, of each; null: as the outcome says."""
     gripper: Annotated[list[GripperRef | None], MANY] | None = None
     """Id of the gripper of each, or one version of it; null if unknown."""
     source: Annotated[list[Source | None], MANY] | None = None
@@ -188,7 +202,12 @@ class TrialOut(Response):
     position: AskedPosition
     quaternion_xyzw: AskedRotation
     outcome: Outcome
-    """What became of it, by name."""
+    """What became of it, by name; of several ``attempts``: success from half of them on, else how most
+    failed."""
+    attempts: int | None = None
+    """How often this grasp was tried, or simulated under what was drawn; null: once."""
+    successes: int | None = None
+    """How many of its ``attempts`` succeeded; null where it was tried once."""
     gripper: str | None = None
     """Id of the gripper that grasped; null if unknown."""
     gripper_version: OneGripperVersion = None

@@ -103,18 +103,24 @@ class Blocks:
 
 def _checked(
     predictions: ArrayLike, outcomes: ArrayLike, weights: ArrayLike | None, *, probability: bool = True
-) -> tuple[Floats, NDArray[np.bool_], Floats]:
+) -> tuple[Floats, Floats, Floats]:
     p, y = np.array(predictions, dtype=np.float64), np.asarray(outcomes)
     if p.ndim != 1 or y.shape != p.shape or not len(p):
         raise ValueError("predictions and outcomes are arrays (N,) of one length, at least 1")
-    if y.dtype != np.bool_ and not np.all((y == 0) | (y == 1)):
-        raise ValueError("outcomes are true or false")
+    y = y.astype(np.float64)
+    if not np.all((y >= 0.0) & (y <= 1.0)):
+        raise ValueError("outcomes are true or false, or shares from 0 to 1")
     if np.isnan(p).any() or (probability and not np.all((p >= 0.0) & (p <= 1.0))):
         raise ValueError("predictions must be probabilities" if probability else "scores must not be nan")
     w = np.ones(len(p)) if weights is None else np.array(weights, dtype=np.float64)
     if w.shape != p.shape or not np.all(np.isfinite(w)) or np.any(w < 0.0) or not w.sum() > 0.0:
         raise ValueError("weights are not negative, finite, (N,), and not all zero")
-    return p, y.astype(bool), w
+    return p, y, w
+
+
+def _squared_error(p: Floats, y: Floats) -> Floats:
+    """Mean squared error (N,) of predictions over tries, of which these shares succeed."""
+    return np.asarray(p * p - 2.0 * p * y + y)
 
 
 def brier_skill(predictions: ArrayLike, outcomes: ArrayLike, *, weights: ArrayLike | None = None) -> float:
@@ -122,7 +128,8 @@ def brier_skill(predictions: ArrayLike, outcomes: ArrayLike, *, weights: ArrayLi
     p, y, w = _checked(predictions, outcomes, weights)
     share = float(np.average(y, weights=w))
     reference = share * (1.0 - share)
-    return 1.0 - float(np.average((p - y) ** 2, weights=w)) / reference if reference > 0.0 else math.nan
+    error = float(np.average(_squared_error(p, y), weights=w))
+    return 1.0 - error / reference if reference > 0.0 else math.nan
 
 
 def reliability(
@@ -140,7 +147,8 @@ def reliability(
     Parameters
     ----------
     predictions : (N,) in [0, 1]
-    outcomes : (N,) bool
+    outcomes : (N,) bool, or float from 0 to 1
+        Whether each succeeded, or by what share of several tries.
     weights : (N,) or None
     blocks : (N,) int or None
         Outcomes of neighbours are alike. Given blocks, intervals come from resampling whole blocks; without,
@@ -200,7 +208,7 @@ def jeffreys_interval(share: ArrayLike, trials: ArrayLike, level: float) -> tupl
 
 def _bin_intervals(
     place: NDArray[np.int64],
-    y: NDArray[np.bool_],
+    y: Floats,
     w: Floats,
     observed: Floats,
     effective: Floats,
@@ -271,7 +279,7 @@ def area_under_curve(scores: ArrayLike, outcomes: ArrayLike, *, weights: ArrayLi
     s, y, w = _checked(scores, outcomes, weights, probability=False)
     _, place = np.unique(s, return_inverse=True)
     wins = np.bincount(place, weights=w * y)
-    losses = np.bincount(place, weights=w * ~y)
+    losses = np.bincount(place, weights=w * (1.0 - y))
     if not wins.sum() > 0.0 or not losses.sum() > 0.0:
         return math.nan
     below = np.cumsum(losses) - losses
@@ -292,7 +300,7 @@ def calibrate(
     p, y, w = _checked(predictions, outcomes, weights)
     if not 0.0 < level < 1.0:
         raise ValueError("level lies between 0 and 1")
-    score = float(np.average((p - y) ** 2, weights=w))
+    score = float(np.average(_squared_error(p, y), weights=w))
     skill = brier_skill(p, y, weights=w)
     group = np.arange(len(p)) if blocks is None else _group(blocks, len(p))
     groups = int(group.max()) + 1
@@ -300,7 +308,7 @@ def calibrate(
     if blocks is None and groups > 2_000:
         group = np.random.default_rng(seed).permutation(groups) % 2_000
         groups = 2_000
-    sums = np.stack([_tally(group, v, groups) for v in (w, w * y, w * (p - y) ** 2)])
+    sums = np.stack([_tally(group, v, groups) for v in (w, w * y, w * _squared_error(p, y))])
     again = _bootstrap_counts(groups, seed)
     total, wins, loss = (again @ row for row in sums)
     share = wins / total
@@ -311,7 +319,7 @@ def calibrate(
     return Calibration(
         bins=reliability(p, y, weights=w, blocks=blocks, bins=bins, level=level, seed=seed),
         count=len(p),
-        successes=int(y.sum()),
+        successes=int((y >= 0.5).sum()),
         brier=score,
         skill=skill,
         skill_low=float(low),

@@ -9,8 +9,8 @@ Attempts that are trusted less have a weight w below 1: an attempt then counts a
 of k^2 and in m0 alike, so that twice the weight is the same as posting it twice (power prior, Ibrahim and
 Chen 2000).
 
-An attempt may be k of n tries at one pose: it succeeded by that share, s = k / n, and is one attempt. Tries at
-one pose tell much of it and little of its neighbours, so they narrow no interval there.
+An attempt may be k of n tries at one pose: it succeeded by that share, s = k / n, and is one attempt. Tries
+at one pose tell much of it and little of its neighbours, so they narrow no interval there.
 
 Where judges of attempts differ, such as two engines, s is their mean, and each attempt's spread is half of
 what they differ by. The ends of the interval move outwards by the spread's own kernel mean: within them lies

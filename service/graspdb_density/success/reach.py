@@ -121,8 +121,8 @@ class _Judged:
     """Attempts (J) that are predicted again, their positions along the kernel's axes.
 
     ``own`` (P, J) is each one's place in its part of the model, -1 in the others; ``share`` (J,) by how much
-    each succeeded, ``weight`` (J,) what each stands for, ``worth`` (J,) as how much of an attempt it counts; ``sides`` (J, 6) directions of translation
-    and rotation; ``pairs`` (K, 2) of them, drawn at random.
+    each succeeded, ``weight`` (J,) what each stands for, ``worth`` (J,) as how much of an attempt it counts;
+    ``sides`` (J, 6) directions of translation and rotation; ``pairs`` (K, 2) of them, drawn at random.
     """
 
     model: SuccessModel

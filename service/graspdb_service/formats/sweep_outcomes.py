@@ -25,6 +25,7 @@ from graspdb_service.problems import invalid
 from graspdb_service.trial_columns import Floats, Ints, TrialColumns
 
 _HEADERS = {"Vary": "Accept"}
+_SEVERAL = ("attempts", "successes")
 _COLUMNS: dict[str, TypeAdapter[Any]] = {
     name: TypeAdapter(field.annotation or list) for name, field in ResultRows.model_fields.items()
 }
@@ -32,10 +33,11 @@ _COLUMNS: dict[str, TypeAdapter[Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class ChunkResult:
-    """What a worker measured: an outcome code (n,) a pose of the chunk, columns of those with physics, and in
-    which engine, with its version."""
+    """What a worker measured: an outcome code (n,) a pose of the chunk, of several draws how many succeeded,
+    columns of those with physics, and in which engine, with its version."""
 
     outcomes: NDArray[np.uint8]
+    successes: NDArray[np.uint8] | None
     pose_index: Ints
     width_m: Floats
     quality: Floats
@@ -60,7 +62,8 @@ def _read_result(content: dict[str, Any]) -> ChunkResult:
     result = validated(content, SimulateResult)
     short = {name: _array(name, getattr(result.rows, name)) for name in _COLUMNS}
     columns = {name: np.concatenate([short[name], *long.get(name, [])]) for name in _COLUMNS}
-    return ChunkResult(np.frombuffer(result.outcomes, dtype=np.uint8), engine=result.engine, **columns)
+    won = None if result.successes is None else np.frombuffer(result.successes, dtype=np.uint8)
+    return ChunkResult(np.frombuffer(result.outcomes, dtype=np.uint8), won, engine=result.engine, **columns)
 
 
 def _numbers(name: str, items: list[Any]) -> NDArray[Any]:
@@ -85,8 +88,10 @@ def page_response(head: dict[str, Any], page: TrialColumns, kind: str) -> Respon
     if kind == ARROW:
         return Response(b"".join(_stream(head, iter([page]))), media_type=ARROW, headers=_HEADERS)
     columns = {name: getattr(page, name) for name in ("pose_index", "position", "quaternion_xyzw")}
-    outcome = np.array(OUTCOMES, dtype=object)[page.outcome].tolist()
-    return columns_json({**head, "outcome": outcome}, columns, _HEADERS)
+    told = {"outcome": np.array(OUTCOMES, dtype=object)[page.outcome].tolist()}
+    if len(page.attempts):
+        told |= {name: getattr(page, name).astype(int).tolist() for name in _SEVERAL}
+    return columns_json({**head, **told}, columns, _HEADERS)
 
 
 def _stream(told: dict[str, Any], pages: Iterator[TrialColumns]) -> Iterator[bytes]:
@@ -97,6 +102,7 @@ def _stream(told: dict[str, Any], pages: Iterator[TrialColumns]) -> Iterator[byt
                 "position": arrow.vectors(page.position, 3),
                 "quaternion_xyzw": arrow.vectors(page.quaternion_xyzw, 4),
                 "outcome": arrow.outcome_names(page.outcome),
+                **{name: getattr(page, name).astype(np.int32) for name in _SEVERAL if len(page.attempts)},
             },
             told,
         )

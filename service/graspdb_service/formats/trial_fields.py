@@ -25,8 +25,9 @@ from graspdb_service.trial_columns import Floats, Ints, Provenance, TrialBatch, 
 
 DEFAULTS = frozenset(BatchDefaults.model_fields)
 REQUIRED = ("position", "quaternion_xyzw", "outcome")
-SCALARS = ("proposal_density", "quality", "width_m")
-_OPTIONAL = ("quality", "width_m", "pose_covariance", "measured_at", "achieved_pose", "qualities")
+SEVERAL = ("attempts", "successes")
+SCALARS = ("proposal_density", "quality", "width_m", *SEVERAL)
+_OPTIONAL = (*SEVERAL, "quality", "width_m", "pose_covariance", "measured_at", "achieved_pose", "qualities")
 NAMES = frozenset(REQUIRED) | frozenset(_OPTIONAL) | frozenset(TrialDefaults.model_fields)
 #: What a column of one quality is called, with its name after it.
 QUALITIES = "qualities."
@@ -44,6 +45,8 @@ _QUALITY_NAME: TypeAdapter[str] = TypeAdapter(QualityName)
 _METADATA: TypeAdapter[Any] = TypeAdapter(Metadata)
 _TIME: TypeAdapter[datetime] = TypeAdapter(datetime)
 _MOST_ERRORS = 20
+#: Attempts that one trial may stand for.
+MOST_ATTEMPTS = 1_000_000
 #: Trials that are looked at together.
 BLOCK = 16_384
 
@@ -230,10 +233,14 @@ def _check(fields: Fields, defaults: BatchDefaults) -> TrialBatch:
     """Checked trials, or 422 naming the fields that are wrong, those found before included."""
     position, quaternion = _vectors(fields, "position", 3), _vectors(fields, "quaternion_xyzw", 4)
     refuse = fields.fault
+    outcome = _outcomes(fields)
+    attempts, successes = _several(fields, outcome)
     columns = TrialColumns(
         position=near(position, refuse),
         quaternion_xyzw=unit(quaternion, refuse),
-        outcome=_outcomes(fields),
+        outcome=outcome,
+        attempts=attempts,
+        successes=successes,
         proposal_density=_scalars(fields, "proposal_density", 1e-30, 1e15),
         quality=_scalars(fields, "quality", -1e9, 1e9),
         width_m=_scalars(fields, "width_m", 0.0, 10.0),
@@ -315,6 +322,35 @@ def _outcomes(fields: Fields) -> NDArray[np.uint8]:
     told = f"one of {', '.join(OUTCOMES)}, true or false"
     fields.refuse("outcome", lambda value: isinstance(value, str | bool) and value in names, told)
     return np.empty(0, dtype=np.uint8)
+
+
+def _several(fields: Fields, outcome: NDArray[np.uint8]) -> tuple[Floats, Floats]:
+    """How often each trial was tried, and succeeded, (n,) whole numbers, NaN for once; empty without any."""
+    given = [
+        _scalars(fields, name, float(least), MOST_ATTEMPTS)
+        for name, least in zip(SEVERAL, (1, 0), strict=True)
+    ]
+    tried, won = (column if len(column) else np.full(fields.count, np.nan) for column in given)
+    if np.isnan(tried).all() and np.isnan(won).all():
+        return np.empty(0), np.empty(0)
+    for name, column in zip(SEVERAL, (tried, won), strict=True):
+        for row in np.flatnonzero(~np.isnan(column) & (column != np.round(column))):
+            fields.fault(name, int(row), "a whole number")
+    for row in np.flatnonzero(np.isnan(tried) != np.isnan(won)):
+        missing = SEVERAL[int(np.isnan(won[row]))]
+        fields.fault(missing, int(row), "attempts and successes come together: k successes of n attempts")
+    for row in np.flatnonzero(won > tried):
+        fields.fault("successes", int(row), f"{won[row]:g} successes of {tried[row]:g} attempts")
+    if len(outcome):
+        half = 2.0 * won >= tried
+        for row in np.flatnonzero(~np.isnan(tried) & (half != (outcome == OUTCOME_CODES["success"]))):
+            told = "success" if half[row] else "a failure"
+            fields.fault(
+                "outcome",
+                int(row),
+                f"{won[row]:g} successes of {tried[row]:g} attempts are {told}: it is one from half on",
+            )
+    return tried, won
 
 
 def _provenances(fields: Fields, defaults: TrialDefaults) -> tuple[list[Provenance], Ints]:

@@ -20,6 +20,7 @@ from graspdb_service.formats.trial_fields import (
     QUALITIES,
     REQUIRED,
     SCALARS,
+    SEVERAL,
     Faults,
     Fields,
     Place,
@@ -274,6 +275,8 @@ def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
         "proposal_density": columns.proposal_density,
         "quality": columns.quality,
         "width_m": columns.width_m,
+        "attempts": columns.attempts,
+        "successes": columns.successes,
         "pose_covariance": columns.pose_covariance,
         "measured_at": columns.measured_at,
         "metadata": [batch.metadata if value is None else value for value, batch in own],
@@ -293,6 +296,8 @@ def documents(page: TrialPage) -> list[dict[str, Any]]:
     values["pose_index"] = [None if index < 0 else index for index in values["pose_index"]]
     for name in SCALARS:
         values[name] = [None if value != value else value for value in values[name]]
+    for name in SEVERAL:
+        values[name] = [None if value is None else int(value) for value in values[name]]
     values["qualities"] = _scores(page)
     return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
 

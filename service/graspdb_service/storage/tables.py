@@ -247,6 +247,9 @@ trials = Table(
     Column("answer_number", BigInteger),
     # Where the tool was after all, where that is known: all of it or nothing.
     *(Column(f"achieved_{name}", Double) for name in ("px", "py", "pz", "qx", "qy", "qz", "qw")),
+    # Of a pose tried several times under one number: how often, and how often it succeeded. Null: once.
+    Column("attempts", Integer),
+    Column("successes", Integer),
     # Its named scores, packed as its batch says; names would take more room than the numbers.
     Column("qualities", LargeBinary),
     # Few trials name an answer: found without reading the rest.
@@ -256,6 +259,14 @@ trials = Table(
         "seq",
         sqlite_where=text("answer_number IS NOT NULL"),
         postgresql_where=text("answer_number IS NOT NULL"),
+    ),
+    # Few were tried several times, and how often they succeeded is read beside the others.
+    Index(
+        "ix_trials_of_several",
+        "object_id",
+        "seq",
+        sqlite_where=text("attempts IS NOT NULL"),
+        postgresql_where=text("attempts IS NOT NULL"),
     ),
     # Successes are what densities are built of and few among the trials: found without reading the rest.
     Index(
@@ -361,6 +372,8 @@ packed_outcomes = Table(
     Column("number", BigInteger, nullable=False),
     Column("revision", BigInteger, nullable=False),
     Column("outcomes", LargeBinary, nullable=False),
+    # Of a sweep that simulates each pose several times: how often each succeeded, one uint8 a pose.
+    Column("successes", LargeBinary),
     # What simulated it, with its version; null: the worker did not say.
     Column("engine", String(64)),
 )

@@ -22,19 +22,30 @@ from graspdb_service.trial_columns import gripper_parts
 
 @dataclass(frozen=True)
 class PackedChunk:
-    """Outcome codes (uint8) of the places ``start`` to ``stop`` of a sweep's plan."""
+    """Outcome codes (uint8) of the places ``start`` to ``stop`` of a sweep's plan, and how often each pose
+    succeeded (uint8) where each was simulated several times."""
 
     sweep_id: str
     number: int
     start: int
     stop: int
     outcomes: bytes
+    successes: bytes | None
 
 
 def store(
-    tx: Tx, *, job_id: str, sweep_id: str, number: int, revision: int, outcomes: bytes, engine: str | None
+    tx: Tx,
+    *,
+    job_id: str,
+    sweep_id: str,
+    number: int,
+    revision: int,
+    outcomes: bytes,
+    successes: bytes | None,
+    engine: str | None,
 ) -> None:
-    """Keep a chunk's uint8 outcome codes, one for every pose of it, and what simulated it."""
+    """Keep a chunk's uint8 outcome codes, one for every pose of it, of several attempts how many succeeded,
+    and what simulated it."""
     tx.execute(
         insert(packed_outcomes).values(
             job_id=job_id,
@@ -42,6 +53,7 @@ def store(
             number=number,
             revision=revision,
             outcomes=outcomes,
+            successes=successes,
             engine=engine,
         )
     )
@@ -72,6 +84,7 @@ def page(tx: Tx, sweep_id: str, *, first_number: int, poses: int) -> list[Packed
             listed.c.start,
             listed.c.stop,
             packed_outcomes.c.outcomes,
+            packed_outcomes.c.successes,
         )
         .join(listed, listed.c.job_id == packed_outcomes.c.job_id)
         .where(listed.c.before < poses)
@@ -122,6 +135,7 @@ def _of_object(object_id: int, purpose: str) -> Select[Any]:
             jobs.c.start,
             jobs.c.stop,
             packed_outcomes.c.outcomes,
+            packed_outcomes.c.successes,
         )
         .join(jobs, jobs.c.id == packed_outcomes.c.job_id)
         .join(sweeps, sweeps.c.id == packed_outcomes.c.sweep_id)

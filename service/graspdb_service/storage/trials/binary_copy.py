@@ -29,13 +29,14 @@ _INTEGERS = (
     "measured_at",
     "answer_number",
 )
+_SHORT = {"outcome": ">i2", "attempts": ">i4", "successes": ">i4"}
 _EPOCH = datetime(2000, 1, 1, tzinfo=timezone.utc)
 
 
 def _kind(name: str, values: Any = None) -> Any:
     if name == "qualities":
         return values.dtype
-    return ">i8" if name in _INTEGERS else ">i2" if name == "outcome" else ">f8"
+    return ">i8" if name in _INTEGERS else _SHORT.get(name, ">f8")
 
 
 def encode(

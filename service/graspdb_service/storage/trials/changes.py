@@ -20,6 +20,8 @@ class TrialRow(NamedTuple):
     outcome: int
     withdrawn: bool | None
     metadata: dict[str, Any] | None
+    attempts: int | None
+    successes: int | None
 
 
 class ChangeRow(NamedTuple):

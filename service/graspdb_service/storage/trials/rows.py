@@ -26,7 +26,8 @@ SUCCESS = 1
 COPY_ROWS = 50_000
 
 _POSE = ("px", "py", "pz", "qx", "qy", "qz", "qw")
-_OPTIONAL = ("proposal_density", "quality", "width_m", "pose_index")
+_SEVERAL = ("attempts", "successes")
+_OPTIONAL = ("proposal_density", "quality", "width_m", "pose_index", *_SEVERAL)
 _ACHIEVED = tuple(f"achieved_{name}" for name in _POSE)
 _DOCUMENTS = ("pose_covariance", "metadata")
 
@@ -111,8 +112,10 @@ def _copy_in(
     values: dict[str, Any] = {**shared, **_numbers(columns, first_seq)}
     maybe = (*_OPTIONAL, "answer_number", *_ACHIEVED)
     nulls = {name: np.isnan(values[name]) for name in maybe if name in values}
-    if "answer_number" in values:
-        values["answer_number"] = np.where(nulls["answer_number"], 0, values["answer_number"])
+    # What is no float has no NaN.
+    for name in ("answer_number", *_SEVERAL):
+        if name in values:
+            values[name] = np.where(nulls[name], 0, values[name])
     times = columns.measured_at
     if times:
         nulls["measured_at"] = np.array([time is None for time in times])
@@ -152,12 +155,14 @@ _READ = ("seq", *_POSE, "proposal_density", "provenance_id", "outcome")
 
 
 def successes(tx: Tx, object_id: int, provenance_ids: Collection[int], *, after_seq: int = 0) -> TrialColumns:
-    """Successes after a sequence number, ascending ``seq``, with the batch each came in; none withdrawn.
+    """Successes after a sequence number, ascending ``seq``, with the batch each came in, and what succeeded
+    in some of several attempts, if in few; none withdrawn.
 
     Each at the pose that was achieved, where that is known.
     """
     # Said literally, as the partial index has it.
-    return _read(tx, object_id, provenance_ids, after_seq, (*_READ, "batch_id"), f"outcome = {SUCCESS}")
+    once, several = (f"outcome = {SUCCESS}",), ("successes > 0",)
+    return _read(tx, object_id, provenance_ids, after_seq, (*_READ, "batch_id"), once, several)
 
 
 def posted(
@@ -174,10 +179,29 @@ def posted(
     codes = ", ".join(str(int(code)) for code in without)
     # Only a sweep's trials have a place in a plan.
     conditions = ["pose_index IS NULL", *([f"outcome NOT IN ({codes})"] if codes else [])]
-    return _read(tx, object_id, provenance_ids, after_seq, _READ, *conditions)
+    return _read(tx, object_id, provenance_ids, after_seq, _READ, conditions, conditions)
 
 
 def _read(
+    tx: Tx,
+    object_id: int,
+    provenance_ids: Collection[int],
+    after_seq: int,
+    columns: Sequence[str],
+    of_once: Iterable[str],
+    of_several: Iterable[str],
+) -> TrialColumns:
+    """Trials by conditions for those tried once, and for those tried several times."""
+    asked = tx, object_id, provenance_ids, after_seq
+    once = _read_some(*asked, columns, "attempts IS NULL", *of_once)
+    # Said literally, as the partial index has it.
+    several = _read_some(*asked, (*columns, *_SEVERAL), "attempts IS NOT NULL", *of_several)
+    if not len(several):
+        return once
+    return (both := TrialColumns.joined([once, several]))[np.argsort(both.seq)]
+
+
+def _read_some(
     tx: Tx,
     object_id: int,
     provenance_ids: Collection[int],
@@ -202,6 +226,8 @@ def _read(
         provenance=table["provenance_id"].astype(np.int64),
         outcome=table["outcome"].astype(np.uint8),
         batch=table["batch_id"].astype(np.int64) if "batch_id" in columns else np.empty(0, dtype=np.int64),
+        attempts=table["attempts"].astype(np.float64) if "attempts" in columns else np.empty(0),
+        successes=table["successes"].astype(np.float64) if "successes" in columns else np.empty(0),
     )
 
 
@@ -253,7 +279,7 @@ def _fetch(tx: Tx, query: str) -> list[Any]:
 _ALL = (
     "seq", "revision", "batch_id", "provenance_id", "outcome", *_POSE, "proposal_density", "quality",
     "width_m", "coalesce(pose_index, -1)", "measured_at", *_DOCUMENTS, "withdrawn IS NOT NULL",
-    "coalesce(answer_number, -1)", *_ACHIEVED, "qualities",
+    "coalesce(answer_number, -1)", *_ACHIEVED, "qualities", *_SEVERAL,
 )  # fmt: skip
 
 
@@ -321,6 +347,8 @@ def page(
         withdrawn=np.array(cells[19], dtype=np.bool_),
         answer=np.array(cells[20], dtype=np.int64),
         achieved=np.array(cells[21:28], dtype=np.float64).T.reshape(-1, 7),
+        attempts=np.array(cells[29], dtype=np.float64),
+        successes=np.array(cells[30], dtype=np.float64),
         qualities=scores,
     )
 

@@ -170,6 +170,7 @@ class Densities:
                 exposure,
                 codes_of(selected, rows.provenance, rows.proposal_density, swept),
                 rows.proposal_density,
+                rows.share,
                 selected.weights_by_source,
             )
             known = None if before is None else before.weighing

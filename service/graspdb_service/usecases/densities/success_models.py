@@ -1,7 +1,8 @@
 """How likely a grasp is to succeed: models of all attempts, kept and extended like the densities.
 
 Every attempt counts, packed ones of sweeps included; ``simulation_error`` is none, and every other outcome
-but ``success`` is a failure. Where the geometry is known, a pose at which the open gripper collides has the
+but ``success`` is a failure; what was tried several times is one attempt that succeeded by its share. Where
+the geometry is known, a pose at which the open gripper collides has the
 probability 0 and attempts that collided tell nothing of the others; where it is not, they are failures.
 
 A probability is told only as far from the attempts as the model's own validated reach
@@ -352,8 +353,4 @@ def _extended(
     """A model with some attempts more."""
     if not rows.any():
         return old
-    if old is None:
-        return new.success_model(kernel, rows)
-    return old.extend(
-        new.poses[rows], new.success[rows], symmetric=new.symmetric[rows], weights=new.weight[rows]
-    )
+    return new.success_model(kernel, rows) if old is None else new.added_to(old, rows)

@@ -5,9 +5,9 @@ proposal densities; those of a source that do not. Of one source alone, grids we
 (`proposal_density`), told densities ``1 / g``, others beside them their mean, and where nothing is told all
 weigh the same. Where a selection mixes sources, or grids and other trials, every success weighs
 ``1 / sum_s n_s g_s(x)`` over all strategies (the balance heuristic): n_s attempts, failures included, chosen
-by the density g_s. At a success of
-its own g_s is what it tells; elsewhere, and where it tells nothing, it is estimated from where the attempts
-of s lie (:mod:`graspdb_density.kde.attempt_exposure`), 0 far from all of them.
+by the density g_s. A pose tried several times weighs that times its share of successes, k of n. At a success
+of its own g_s is what it tells; elsewhere, and where it tells nothing, it is estimated from where the
+attempts of s lie (:mod:`graspdb_density.kde.attempt_exposure`), 0 far from all of them.
 """
 
 from __future__ import annotations
@@ -139,14 +139,16 @@ class Tried:
 class Weighing:
     """What tells how much the successes (N,) of a density weigh.
 
-    ``proposal`` is in 1/(m^3 rad^3) as it came, NaN where unknown. ``tried`` and ``near`` (N,), how densely
-    strategies other than grids tried there, only where strategies are mixed; a strategy that tells its
-    density is left out at its own successes. Weights are multiplied by those ``by_source``.
+    ``proposal`` is in 1/(m^3 rad^3) as it came, NaN where unknown; ``share`` by how much each succeeded.
+    ``tried`` and ``near`` (N,), how densely strategies other than grids tried there, only where strategies
+    are mixed; a strategy that tells its density is left out at its own successes. Weights are multiplied by
+    those ``by_source``.
     """
 
     exposure: Exposure
     codes: Codes
     proposal: Floats
+    share: Floats
     by_source: Mapping[str, float] = field(default_factory=dict)
     tried: Tried | None = None
     near: Floats | None = None
@@ -159,6 +161,7 @@ class Weighing:
             by_source=more.by_source,
             codes=np.concatenate([self.codes, more.codes]),
             proposal=np.concatenate([self.proposal, more.proposal]),
+            share=np.concatenate([self.share, more.share]),
         )
 
     @property
@@ -173,7 +176,7 @@ class Weighing:
 
     @property
     def nbytes(self) -> int:
-        held = self.codes.nbytes + self.proposal.nbytes
+        held = self.codes.nbytes + self.proposal.nbytes + self.share.nbytes
         more = (part.nbytes for part in (self.tried, self.near) if part is not None)
         return held + sum(more)
 
@@ -184,9 +187,10 @@ class Weighing:
             by_source = np.array([self.by_source.get(name, 1.0) for name in SOURCE_NAMES])
             g = self._mixed(poses, symmetric) / by_source[self.codes // _KINDS]
         known = g[~np.isnan(g)]
-        if not len(known) or (known == known[0]).all():
+        alike = not len(known) or bool((known == known[0]).all())
+        if alike and (self.share == self.share[0]).all():
             return None
-        weights = importance_weights(g)
+        weights = self.share if alike else importance_weights(g) * self.share
         weights = np.maximum(weights, weights.max() * _LEAST_SHARE)
         return np.asarray(weights / weights.mean(), dtype=np.float64)
 
@@ -241,6 +245,8 @@ class Weighing:
             kind, rule = "own", "1 / g of each trial's own proposal density"
             if unknown:
                 rule += "; trials without a proposal density take the mean weight of the rest"
+        if (self.share < 1.0).any():
+            rule += "; of several attempts at one pose, times the share that succeeded"
         return WeightsInfo(kind=kind, rule=rule, poses_tried=tried, without_proposal_density=unknown)
 
     def _parts_told(self) -> list[str]:

@@ -104,8 +104,9 @@ def take_parts(tx: Tx, row: ObjectRow, sweep: SweepRow) -> None:
     snapshot = {**sweep.snapshot, "world": world, **({"warnings": told} if told else {})}
     if sweep.plan == "grid":
         grid = GridPlan.model_validate(sweep.snapshot["grid"])
+        engine, drawn = (sweep.request.get(name) for name in ("engine", "randomise"))
         snapshot["repeat_key"] = sweep_plan.repeat_key(
-            world, sweep.protocol, sweep.fidelity, grid, sweep.request.get("engine")
+            world, sweep.protocol, sweep.fidelity, grid, engine, drawn
         )
     sweeps.keep_snapshot(tx, sweep.id, snapshot)
 

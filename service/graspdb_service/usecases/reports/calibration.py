@@ -72,11 +72,11 @@ def calibration_report(
     blocks = enough(lambda: assign_blocks(everything.poses.positions, edge_m=edge, folds=_FOLDS))
     judged, weights = _judged(everything)
     predicted, ranked = _predictions(inputs, built, everything, test, blocks, judged, progress)
-    won, collided, block = everything.success[judged], everything.collided[judged], blocks.block[judged]
+    won, collided, block = everything.shares[judged], everything.collided[judged], blocks.block[judged]
     whole = calibrate(predicted, won, weights=weights, blocks=block, level=LEVEL)
     apart = None
     free = ~collided
-    if test is not None and collided.any() and won[free].any() and not won[free].all():
+    if test is not None and collided.any() and 0.0 < won[free].mean() < 1.0:
         apart = _skill(
             calibrate(predicted[free], won[free], weights=weights[free], blocks=block[free], level=LEVEL)
         )

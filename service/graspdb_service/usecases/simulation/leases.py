@@ -98,6 +98,7 @@ def _payload(tx: Tx, sweep: SweepRow, job: JobRow) -> SimulatePayload:
             "protocol": sweep.protocol,
             "fidelity": sweep.fidelity,
             "engine": sweep.request.get("engine"),
+            "randomise": sweep.request.get("randomise"),
             "start": job.start,
             "stop": job.stop,
         }

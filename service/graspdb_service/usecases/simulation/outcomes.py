@@ -68,7 +68,8 @@ def page(
             assert grid is not None
             poses = sweep_plan.grid_poses(grid, grid.pose_indices(chunk.start, chunk.stop))
         outcome = np.frombuffer(chunk.outcomes, dtype=np.uint8)
-        parts.append(replace(poses, outcome=outcome)[first:last])
+        told = sweep_plan.with_draws(replace(poses, outcome=outcome), row, chunk.successes, slice(None))
+        parts.append(told[first:last])
         limit -= last - first
         if last < chunk.stop - chunk.start:
             following = f"{chunk.number}.{last}"
@@ -79,6 +80,8 @@ def page(
         quaternion_xyzw=poses_found.quaternions_xyzw,
         outcome=np.concatenate([part.outcome for part in parts]),
         pose_index=np.concatenate([part.pose_index for part in parts]),
+        attempts=np.concatenate([part.attempts for part in parts]),
+        successes=np.concatenate([part.successes for part in parts]),
     )
     return columns, following
 

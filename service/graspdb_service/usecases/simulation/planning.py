@@ -127,7 +127,9 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
             "pose_count": plan.count,
             "chunk_poses": chunk,
         }
-        capability = "simulate" if spec.protocol == "wrench" else spec.protocol
+        capability: str = "simulate" if spec.protocol == "wrench" else spec.protocol
+        if spec.randomise is not None:
+            capability = f"drawn-{spec.protocol}"
         sweeps.create(tx, sweep, poses=plan.poses, job_ids=numbers, capability=capability, waiting=waiting)
         if waiting:
             # Until there are parts, it repeats no other's poses.
@@ -155,8 +157,9 @@ def _snapshot(world: _World, plan: _Plan, spec: SweepCreate) -> dict[str, Any]:
     snapshot: dict[str, Any] = {"world": world.snapshot, "full_count": plan.full_count}
     if plan.grid is not None:
         snapshot["grid"] = plan.grid.model_dump(mode="json")
+        drawn = None if spec.randomise is None else spec.randomise.model_dump(mode="json")
         snapshot["repeat_key"] = sweep_plan.repeat_key(
-            world.snapshot, spec.protocol, spec.fidelity, plan.grid, spec.engine
+            world.snapshot, spec.protocol, spec.fidelity, plan.grid, spec.engine, drawn
         )
     if plan.warnings:
         snapshot["warnings"] = list(plan.warnings)

@@ -80,7 +80,8 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Chun
         else:
             poses = stored
             fresh = np.ones(len(outcomes), dtype=np.bool_)
-        chunk = _chunk(sweep, result, outcomes, poses, fresh)
+        successes = _successes(result, outcomes, sweep_plan.draws(sweep))
+        chunk = _chunk(sweep, result, outcomes, successes, poses, fresh)
         try:
             return _store(ctx, job, lease_id, sha256, sweep, chunk, list(twins), seen)
         except _Overtaken:
@@ -149,6 +150,7 @@ class _Chunk:
     """A checked result: every outcome, and what of it is new to the object."""
 
     outcomes: npt.NDArray[np.uint8]
+    successes: npt.NDArray[np.uint8] | None
     rows: TrialColumns
     engine: str | None
     packed: dict[int, int]
@@ -169,10 +171,39 @@ def _outcomes(result: ChunkResult, job: JobRow) -> npt.NDArray[np.uint8]:
     return outcomes
 
 
+def _successes(
+    result: ChunkResult, outcomes: npt.NDArray[np.uint8], draws: int
+) -> npt.NDArray[np.uint8] | None:
+    """How many draws of each pose succeeded; None where each is simulated once."""
+    won = result.successes
+    if (won is None) != (draws == 1):
+        told = "each pose is simulated once: leave it out" if draws == 1 else f"of {draws} draws of each pose"
+        raise invalid("successes", told)
+    if won is None:
+        return None
+    if len(won) != len(outcomes):
+        raise invalid(
+            "successes", f"{len(outcomes)} numbers, one for every pose of the chunk, not {len(won)}"
+        )
+    many = np.flatnonzero(won > draws)
+    if many.size:
+        raise invalid("successes", f"{int(won[many[0]])} at place {int(many[0])} is more than {draws} draws")
+    odd = np.flatnonzero((2 * won.astype(np.int64) >= draws) != (outcomes == _SUCCESS))
+    if odd.size:
+        at = int(odd[0])
+        raise invalid(
+            "outcomes",
+            f"{OUTCOMES[outcomes[at]]} at place {at}, and {int(won[at])} of {draws} draws succeeded: success"
+            " is half of them",
+        )
+    return won
+
+
 def _chunk(
     sweep: SweepRow,
     result: ChunkResult,
     outcomes: npt.NDArray[np.uint8],
+    successes: npt.NDArray[np.uint8] | None,
     poses: TrialColumns,
     fresh: Bools,
 ) -> _Chunk:
@@ -188,12 +219,13 @@ def _chunk(
     strange = np.flatnonzero(poses.pose_index[place] != index)
     if strange.size:
         raise invalid("rows.pose_index", f"{int(index[strange[0]])} is no pose of this chunk")
-    if np.any(outcomes[place] == _COLLISION):
+    held = outcomes == _SUCCESS if successes is None else successes > 0
+    if np.any((outcomes[place] == _COLLISION) & ~held[place]):
         raise invalid("rows.pose_index", "a pose that collides meets no physics: it must have no row")
     is_row = np.zeros(len(outcomes), dtype=np.bool_)
     is_row[place] = True
-    if np.any((outcomes == _SUCCESS) & ~is_row):
-        missing = int(poses.pose_index[np.flatnonzero((outcomes == _SUCCESS) & ~is_row)[0]])
+    if np.any(held & ~is_row):
+        missing = int(poses.pose_index[np.flatnonzero(held & ~is_row)[0]])
         raise invalid("rows.pose_index", f"pose {missing} succeeded, so it must have a row")
     kept = place[fresh[place]]
     new = fresh[place]
@@ -204,12 +236,14 @@ def _chunk(
         quality=result.quality[new],
         width_m=result.width_m[new],
     )
+    drawn = None if successes is None else successes.tobytes()
+    columns = sweep_plan.with_draws(columns, sweep, drawn, kept)
     packed = {} if sweep.purpose == "check" else _count(outcomes[fresh & ~is_row])
     counts: dict[str, dict[str, int]] = {
         "all": {OUTCOMES[code]: number for code, number in _count(outcomes).items()},
         "packed": {str(code): number for code, number in packed.items()},
     }
-    return _Chunk(outcomes, columns, result.engine, packed, counts)
+    return _Chunk(outcomes, successes, columns, result.engine, packed, counts)
 
 
 def _count(codes: npt.NDArray[np.uint8]) -> dict[int, int]:
@@ -251,6 +285,7 @@ def _store(
             number=job.number,
             revision=revision,
             outcomes=chunk.outcomes.tobytes(),
+            successes=None if chunk.successes is None else chunk.successes.tobytes(),
             engine=chunk.engine,
         )
         sweeps.note_finished(tx, sweep.id)

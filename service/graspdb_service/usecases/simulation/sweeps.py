@@ -95,6 +95,7 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
             "key": row.made_by,
             "engine": row.request.get("engine"),
             "engines": outcomes.engines(tx, row.id),
+            "randomise": row.request.get("randomise"),
             "grid": grid,
             "seed": (grid or row.request.get("sample") or {}).get("seed"),
             "state": state,

@@ -25,15 +25,18 @@ from graspdb_service.usecases.trials.selection import Selected
 
 COLLISION, NO_ATTEMPT = OUTCOME_CODES["collision"], OUTCOME_CODES["simulation_error"]
 _SUCCESS = OUTCOME_CODES["success"]
+#: Shares of success are told apart to so many'ths: of whatever n, models sort attempts by few different ones.
+_SHARES = 60
 
 
 @dataclass(frozen=True, eq=False)
 class AllTrials:
     """Attempts (n,): the rows posted first, then those of sweeps; each pose of a grid once.
 
-    ``provenance`` are internal ids, ``weight`` how much each counts by its source; ``proposal`` is in
-    1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal where two poses of the one
-    grid share them; None unless all are of one grid. ``left_out`` attempts that collided are not here, where
+    ``success`` is an outcome; ``share`` by how much each succeeded, k of n, to within a 120th, None where
+    nothing was tried several times. ``provenance`` are internal ids, ``weight`` how much each counts by its
+    source; ``proposal`` is in 1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal
+    where two poses of the one grid share them; None unless all are of one grid. ``left_out`` attempts that collided are not here, where
     fewer were asked for: those that are stand for all, each as much as the other.
     """
 
@@ -46,6 +49,7 @@ class AllTrials:
     proposal: Floats
     keys: tuple[Ints, Ints] | None
     left_out: int = 0
+    share: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.success)
@@ -55,6 +59,11 @@ class AllTrials:
         """All of them, those left out too."""
         return len(self) + self.left_out
 
+    @property
+    def shares(self) -> Floats:
+        """By how much each succeeded (n,), from 0 to 1."""
+        return self.success.astype(np.float64) if self.share is None else self.share
+
     def some(self, most: int) -> Ints:
         """Rows of all of them, or of so many drawn at random."""
         if len(self) <= most:
@@ -63,13 +72,12 @@ class AllTrials:
 
     def success_model(self, kernel: SuccessKernel, rows: Bools | Ints) -> SuccessModel:
         """How likely success is by some of them."""
-        return SuccessModel.build(
-            self.poses[rows],
-            self.success[rows],
-            kernel=kernel,
-            symmetric=self.symmetric[rows],
-            weights=self.weight[rows],
-        )
+        return self.added_to(SuccessModel(kernel), rows)
+
+    def added_to(self, model: SuccessModel, rows: Bools | Ints) -> SuccessModel:
+        """A model with some of them more."""
+        won = self.success if self.share is None else self.share
+        return model.extend(self.poses[rows], won[rows], self.symmetric[rows], self.weight[rows])
 
     def density(
         self, kernel: IsotropicKernel, rows: Bools | Ints, weights: ArrayLike | None = None
@@ -170,7 +178,8 @@ def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
             assert index is not None
             chunk = sweep_plan.grid_poses(grids[item.sweep.id], index[keep])
         provenance = np.full(len(chunk), item.sweep.provenance_id)
-        parts.append(replace(chunk, outcome=code[keep], provenance=provenance))
+        chunk = replace(chunk, outcome=code[keep], provenance=provenance)
+        parts.append(sweep_plan.with_draws(chunk, item.sweep, item.chunk.successes, keep))
 
     def column(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(part, name) for part in parts])
@@ -186,6 +195,7 @@ def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
         proposal=column("proposal_density"),
         keys=_keys(stored, parts, grids),
         left_out=left_out,
+        share=np.round(column("share") * _SHARES) / _SHARES if any(len(p.attempts) for p in parts) else None,
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, TrialInfo, TrialPatch
 from graspdb_service.formats.trial_json import documents
-from graspdb_service.problems import conflict, found
+from graspdb_service.problems import conflict, found, invalid
 from graspdb_service.storage import objects
 from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
@@ -45,6 +45,7 @@ def correct(
         after = _changed(before, given)
         different = {name for name in given if getattr(after, name) != getattr(before, name)}
         if different:
+            _check_several(seq, slug, before, after)
             if before.pose_index is not None:
                 raise conflict(
                     "trial-of-a-sweep",
@@ -79,6 +80,18 @@ def _changed(before: TrialRow, given: dict[str, Any]) -> TrialRow:
         # As rows that were never withdrawn have it.
         values["withdrawn"] = values["withdrawn"] or None
     return before._replace(**values)
+
+
+def _check_several(seq: int, slug: str, before: TrialRow, after: TrialRow) -> None:
+    """422 for an outcome that contradicts how many of a trial's attempts succeeded."""
+    won, tried = before.successes, before.attempts
+    if won is None or tried is None or (2 * won >= tried) == (after.outcome == OUTCOME_CODES["success"]):
+        return
+    raise invalid(
+        "outcome",
+        f"trial {seq} succeeded in {won} of {tried} attempts: withdraw it (DELETE"
+        f" /objects/{slug}/trials/{seq}) and post it again as it was",
+    )
 
 
 def _worded(name: str, value: Any) -> Any:

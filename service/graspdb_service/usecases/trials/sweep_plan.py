@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,12 @@ def pose_grid(plan: GridPlan) -> PoseGrid:
 
 
 def repeat_key(
-    world: dict[str, Any], protocol: str, fidelity: str, grid: GridPlan, engine: str | None
+    world: dict[str, Any],
+    protocol: str,
+    fidelity: str,
+    grid: GridPlan,
+    engine: str | None,
+    randomise: dict[str, Any] | None,
 ) -> str:
     """Equal for sweeps in which one pose index means one and the same simulation.
 
@@ -53,9 +59,28 @@ def repeat_key(
     }
     if engine is not None:
         document["engine"] = engine
+    if randomise is not None:
+        document["randomise"] = randomise
     if protocol in _MADE_ANEW:
         document["simulation"] = _MADE_ANEW[protocol]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def draws(sweep: SweepRow) -> int:
+    """How often each pose of a sweep is simulated."""
+    return int((sweep.request.get("randomise") or {}).get("draws", 1))
+
+
+def with_draws(
+    poses: TrialColumns, sweep: SweepRow, successes: bytes | None, kept: Bools | Ints | slice
+) -> TrialColumns:
+    """Poses (those ``kept`` of a chunk) with how often each was simulated and succeeded; as they are, where
+    each was once.
+    """
+    if successes is None:
+        return poses
+    won = np.frombuffer(successes, dtype=np.uint8)[kept].astype(np.float64)
+    return replace(poses, attempts=np.full(len(won), float(draws(sweep))), successes=won)
 
 
 def chunk_poses(tx: Tx, sweep: SweepRow, start: int, stop: int) -> TrialColumns | None:
