@@ -124,7 +124,7 @@ class TrialColumns:
     @property
     def share(self) -> Floats:
         """By how much each succeeded (n,): k of n, else 1 or 0."""
-        won = (self.outcome == OUTCOME_CODES["success"]).astype(np.float64)
+        won: Floats = (self.outcome == OUTCOME_CODES["success"]).astype(np.float64)
         if not len(self.attempts):
             return won
         return np.asarray(np.where(np.isnan(self.attempts), won, self.successes / self.attempts))
