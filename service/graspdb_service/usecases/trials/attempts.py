@@ -37,7 +37,7 @@ class AllTrials:
     nothing was tried several times. ``provenance`` are internal ids, ``weight`` how much each counts by its
     source; ``proposal`` is in 1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal
     where two poses of the one grid share them; None unless all are of one grid. ``left_out`` attempts that
-    collided are not here, where fewer were asked for: those that are stand for all, each as much as the other.
+    collided are not here, where fewer were asked for: those that are stand for all, each as much.
     """
 
     poses: Poses
