@@ -1,8 +1,8 @@
 """Trials and poses in files: JSON, NDJSON and CSV, and poses in .npy.
 
 CSV has a header line. A pose is ``x,y,z,qx,qy,qz,qw``; a trial adds ``outcome`` and, where wanted,
-``gripper``, ``source``, ``protocol``, ``proposal_density``, ``quality``, ``width_m``, ``measured_at``,
-``answer``, the pose that was achieved as ``achieved_x`` to ``achieved_qw``, and named scores as
+``gripper``, ``source``, ``protocol``, ``proposal_density``, ``attempts``, ``successes``, ``quality``,
+``width_m``, ``measured_at``, ``answer``, the pose that was achieved as ``achieved_x`` to ``achieved_qw``, and named scores as
 ``qualities.NAME``; an empty cell is a value not given. JSON is what the HTTP interface takes: one trial, a
 list of trials, ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values shared by all
 beside them.
@@ -28,7 +28,8 @@ OUTCOME_COLUMNS = ("outcome", "success", "label", "result", "held", "object_in_g
 """What tables call the column of what became of a grasp; the first that is there counts."""
 _TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at", "answer"})
 _ACHIEVED_COLUMNS = tuple(f"achieved_{name}" for name in POSE_COLUMNS)
-_NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m"})
+_COUNT_COLUMNS = frozenset({"attempts", "successes"})
+_NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m", *_COUNT_COLUMNS})
 _QUALITIES = "qualities."
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -242,6 +243,9 @@ def _csv(path: str, *, trials: bool) -> list[dict[str, Any]]:
                     text = row[name].strip()
                     if text:
                         record[name] = _number(where, name, text) if name in _NUMBER_COLUMNS else text
+                for name in _COUNT_COLUMNS & record.keys():
+                    # Tables with gaps have 10.0; the service names what is no whole number.
+                    record[name] = int(record[name]) if record[name].is_integer() else record[name]
                 record |= {name: _number(where, name, row[name]) for name in scores if row[name].strip()}
                 record = _gathered(record)
                 record["outcome"] = _outcome(row[told].strip() or None)

@@ -757,6 +757,7 @@ class TrialArrays(TriedPoses):
     def _columns(self) -> dict[str, Any]:
         names = ["gripper", "source", "protocol", "batch", "sweep", "pose_index", "quality", "width_m"]
         names += ["proposal_density", "measured_at", "revision", "withdrawn", "answer"]
+        names += ["attempts", "successes"]
         columns = {"seq": self.seq, **pose_columns(self), "outcome": self.outcome}
         columns |= {f"achieved_{name}": x for name, x in pose_columns(self.achieved).items()}
         columns |= {f"qualities.{name}": x for name, x in self.qualities.items()}

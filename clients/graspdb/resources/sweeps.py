@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -39,13 +39,19 @@ _FIRST_POLL_S, _LAST_POLL_S = 0.2, 2.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OutcomeArrays(TriedPoses):
-    """Every simulated pose of a sweep, collisions included: ``pose_index`` (N,), poses, ``outcome`` (N,)."""
+    """Every simulated pose of a sweep, collisions included: ``pose_index`` (N,), poses, ``outcome`` (N,), and
+    of one that simulates each several times ``attempts`` and ``successes`` (N,), else None.
+    """
 
     sweep: str
     pose_index: NDArray[np.int64]
+    attempts: NDArray[np.int64] | None = None
+    successes: NDArray[np.int64] | None = None
 
     def _columns(self) -> dict[str, Any]:
-        return {"pose_index": self.pose_index, **pose_columns(self), "outcome": self.outcome}
+        columns = {"pose_index": self.pose_index, **pose_columns(self), "outcome": self.outcome}
+        several = {"attempts": self.attempts, "successes": self.successes}
+        return columns | {name: values for name, values in several.items() if values is not None}
 
     def __repr__(self) -> str:
         return f"OutcomeArrays({len(self)} poses of {self.sweep}, {int(self.success.sum())} successes)"
@@ -61,7 +67,9 @@ class SweepOptions(PoseFrame, total=False):
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
     counter gravity in every direction), ``lift`` (still where it was after a lift) or ``shake`` (not lost
     when shaken without gravity); ``fidelity`` ``standard`` or ``fine`` (smaller time step); ``engine``
-    ``pybullet`` or ``mujoco``, by default that of whichever workers come; ``purpose``
+    ``pybullet`` or ``mujoco``, by default that of whichever workers come; ``randomise`` what is drawn anew
+    in each of several simulations of a pose (:class:`graspdb.wire.Randomise`, a mapping or the number of
+    draws): a pose then succeeds k times of n; ``purpose``
     ``collect``, or ``check``: outcomes are stored but enter no density.
     """
 
@@ -83,6 +91,12 @@ class SweepOptions(PoseFrame, total=False):
     protocol: Annotated[str | None, Option("wrench, lift or shake [wrench].")]
     fidelity: Annotated[str | None, Option("standard or fine [standard].")]
     engine: Annotated[str | None, Option("pybullet or mujoco [the workers' own].")]
+    randomise: Annotated[
+        Mapping[str, float] | int | str | None,
+        Option(
+            "Simulate each pose several times: draws:10, or draws:10,friction:0.3,pose_noise_m:0.003, ..."
+        ),
+    ]
     purpose: Annotated[str | None, Option("collect or check [collect].")]
     chunk_poses: Annotated[int | None, Option("Poses a job.", min=1)]
 
@@ -211,6 +225,11 @@ class Sweep(Resource):
                 "position": np.array(page["position"], dtype=np.float64).reshape(-1, 3),
                 "quaternion_xyzw": np.array(page["quaternion_xyzw"], dtype=np.float64).reshape(-1, 4),
                 "outcome": np.array(page["outcome"], dtype=np.str_),
+                **{
+                    name: np.array(page[name], dtype=np.int64)
+                    for name in ("attempts", "successes")
+                    if page.get(name) is not None
+                },
             }
             for page in answers(
                 self._transport, f"{self._path}/outcomes", {"limit": _OUTCOMES_PAGE, **framed}
@@ -230,6 +249,7 @@ class Sweep(Resource):
             "plan": f"{info.plan}, {info.protocol}, {info.fidelity}, {info.purpose}",
             "gripper": info.gripper,
             "engine": ", ".join(info.engines) or info.engine or "the workers' own",
+            **({} if info.randomise is None else {"drawn": _drawn(info.randomise)}),
             "state": info.state,
             "poses": f"{info.poses_done:,} of {info.poses:,}",
             "chunks": f"{info.chunks_done:,} of {info.chunks:,}"
@@ -298,9 +318,32 @@ def create_sweep(transport: Transport, path: str, options: SweepOptions) -> Swee
                 end: vector(f"region's {end} corner", corner, "x, y, z") for end, corner in corners
             }
         fields["grid"] = {**grid, **seed}
+    if "randomise" in fields:
+        fields["randomise"] = _randomise(fields["randomise"])
     request = validate(wire.SweepCreate, fields)
     info = transport.model(wire.SweepInfo, "POST", f"{path}/sweeps", body=request, idempotent=True)
     return Sweep(transport, info)
+
+
+def _drawn(asked: wire.Randomise) -> str:
+    """What is drawn of each pose, in words."""
+    spreads = asked.model_dump(exclude={"draws", "seed"}).items()
+    told = ", ".join(f"{name} {spread:g}" for name, spread in spreads if spread)
+    return f"each pose {asked.draws} times: {told}"
+
+
+def _randomise(given: Mapping[str, float] | int | str) -> Any:
+    """What is drawn, of a mapping, a number of draws, or ``draws:10,friction:0.3``."""
+    if isinstance(given, int):
+        return {"draws": given}
+    if not isinstance(given, str):
+        return given
+    if given.isdigit():
+        return {"draws": int(given)}
+    parts = [part.partition(":") for part in given.split(",")]
+    if not all(colon for _, colon, _ in parts):
+        raise ValueError(f"randomise: {given!r} is not NAME:NUMBER,NAME:NUMBER, as in draws:10,friction:0.3")
+    return {name.strip(): value for name, _, value in parts}
 
 
 def convex_parts_told(waiting: wire.sweeps.WaitingFor) -> str:

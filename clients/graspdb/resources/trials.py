@@ -136,6 +136,8 @@ class Trials(Resource):
         source: str | None = None,
         protocol: str | None = None,
         proposal_density: ArrayLike | None = None,
+        attempts: ArrayLike | None = None,
+        successes: ArrayLike | None = None,
         quality: ArrayLike | None = None,
         qualities: Mapping[str, ArrayLike] | None = None,
         width_m: ArrayLike | None = None,
@@ -159,6 +161,8 @@ class Trials(Resource):
         - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
         - ``gripper``, ``source``, ``protocol``: of the whole upload.
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
+        - ``attempts``, ``successes``: (N,) or one whole number; NaN where tried once: how often a grasp was tried
+          and succeeded, as one attempt that succeeded by that share. Its outcome is success from half on.
         - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
         - ``qualities``: scores by name, each as ``quality``, at most 32; the first stands for ``quality``,
           too, where that is unknown.
@@ -176,6 +180,9 @@ class Trials(Resource):
         columns = {**given.columns(), "outcome": _outcomes(outcomes, count)}
         given_numbers = {"proposal_density": proposal_density, "quality": quality, "width_m": width_m}
         columns |= {name: numbers(name, x, count) for name, x in given_numbers.items() if x is not None}
+        for name, several in (("attempts", attempts), ("successes", successes)):
+            if several is not None:
+                columns[name] = [_whole(x) for x in numbers(name, several, count)]
         scores = {name: numbers(f"qualities[{name!r}]", x, count) for name, x in (qualities or {}).items()}
         if pose_covariance is not None:
             covariances = np.asarray(pose_covariance, dtype=np.float64)
@@ -519,6 +526,11 @@ def _achieved(poses: Any, count: int) -> list[Any]:
     rows = zip(given.position.tolist(), given.quaternion_xyzw.tolist(), strict=True)
     known = ({"position": position, "quaternion_xyzw": quaternion} for position, quaternion in rows)
     return [None if missing else next(known) for missing in unknown]
+
+
+def _whole(number: float | None) -> float | int | None:
+    """A whole number as one; what is none is left for the service to name."""
+    return int(number) if number is not None and number.is_integer() else number
 
 
 def _each(name: str, values: Any, kind: type[Any], count: int) -> list[Any]:

@@ -96,6 +96,7 @@ from graspdb.wire.support import SelectionInfo as SelectionInfo
 from graspdb.wire.support import Support as Support
 from graspdb.wire.support import SupportColumns as SupportColumns
 from graspdb.wire.sweeps import GridSpec as GridSpec
+from graspdb.wire.sweeps import Randomise as Randomise
 from graspdb.wire.sweeps import Region as Region
 from graspdb.wire.sweeps import SampleSpec as SampleSpec
 from graspdb.wire.sweeps import SweepCreate as SweepCreate

@@ -22,7 +22,17 @@ from graspdb.wire import GripperInfo
 
 _BEST, _SAMPLES = 20, 1_000
 #: Columns of a trial that tables keep.
-_MORE = ("width_m", "gripper", "source", "protocol", "proposal_density", "measured_at", "metadata")
+_MORE = (
+    "attempts",
+    "successes",
+    "width_m",
+    "gripper",
+    "source",
+    "protocol",
+    "proposal_density",
+    "measured_at",
+    "metadata",
+)
 #: Fields of a trial that no file has.
 _LEFT = ("achieved_pose", "pose_covariance", "answer")
 _RUN = 20_000

@@ -9,7 +9,10 @@ from dataclasses import dataclass, field
 from graspdb.files.trials import OUTCOME_COLUMNS
 
 #: Further columns of a trial, by their names on the wire.
-MORE = ("width_m", "gripper", "source", "protocol", "proposal_density", "measured_at", "answer", "metadata")
+MORE = (
+    *("attempts", "successes", "width_m", "gripper", "source", "protocol", "proposal_density"),
+    *("measured_at", "answer", "metadata"),
+)
 _PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 KEYS = (
     *("position", "quaternion", "quaternion_xyzw", "quaternion_wxyz", "rotation", "matrix"),

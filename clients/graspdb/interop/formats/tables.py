@@ -24,7 +24,7 @@ VGN_TIP_M = 0.05
 """How far the fingertips lie ahead of VGN's origin, the root of the fingers."""
 
 _LONGEST_LINE = 4_000_000
-_NUMBER_COLUMNS = ("width_m", "proposal_density")
+_NUMBER_COLUMNS = ("width_m", "proposal_density", "attempts", "successes")
 
 
 class Table(Protocol):

@@ -19,7 +19,7 @@ from graspdb.interop.writers.content import Content
 from graspdb.poses import POSE_COLUMNS
 from graspdb.wire.frames.gripper_frames import TOOL
 
-_NUMBERS = ("quality", "width_m", "proposal_density")
+_NUMBERS = ("quality", "width_m", "proposal_density", "attempts", "successes")
 
 
 def csv_file(path: Path, contents: Iterator[Content], report: Report) -> None:
