@@ -2,10 +2,10 @@
 
 CSV has a header line. A pose is ``x,y,z,qx,qy,qz,qw``; a trial adds ``outcome`` and, where wanted,
 ``gripper``, ``source``, ``protocol``, ``proposal_density``, ``attempts``, ``successes``, ``quality``,
-``width_m``, ``measured_at``, ``answer``, the pose that was achieved as ``achieved_x`` to ``achieved_qw``, and named scores as
-``qualities.NAME``; an empty cell is a value not given. JSON is what the HTTP interface takes: one trial, a
-list of trials, ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values shared by all
-beside them.
+``width_m``, ``measured_at``, ``answer``, the pose that was achieved as ``achieved_x`` to ``achieved_qw``, and
+named scores as ``qualities.NAME``; an empty cell is a value not given. JSON is what the HTTP interface takes:
+one trial, a list of trials, ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values
+shared by all beside them.
 """
 
 from __future__ import annotations

@@ -161,8 +161,8 @@ class Trials(Resource):
         - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
         - ``gripper``, ``source``, ``protocol``: of the whole upload.
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
-        - ``attempts``, ``successes``: (N,) or one whole number; NaN where tried once: how often a grasp was tried
-          and succeeded, as one attempt that succeeded by that share. Its outcome is success from half on.
+        - ``attempts``, ``successes``: (N,) or one whole number, NaN for once: how often a grasp was tried and
+          succeeded. It counts as one attempt that succeeded by that share; from half on it is a success.
         - ``quality``, ``width_m``: (N,) or one number; NaN where unknown. Width of the jaw's opening, m.
         - ``qualities``: scores by name, each as ``quality``, at most 32; the first stands for ``quality``,
           too, where that is unknown.

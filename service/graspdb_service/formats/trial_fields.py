@@ -343,7 +343,8 @@ def _several(fields: Fields, outcome: NDArray[np.uint8]) -> tuple[Floats, Floats
         fields.fault("successes", int(row), f"{won[row]:g} successes of {tried[row]:g} attempts")
     if len(outcome):
         half = 2.0 * won >= tried
-        for row in np.flatnonzero(~np.isnan(tried) & (half != (outcome == OUTCOME_CODES["success"]))):
+        known = (tried >= 1.0) & (won <= tried)
+        for row in np.flatnonzero(known & (half != (outcome == OUTCOME_CODES["success"]))):
             told = "success" if half[row] else "a failure"
             fields.fault(
                 "outcome",

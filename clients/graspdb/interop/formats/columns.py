@@ -13,6 +13,8 @@ MORE = (
     *("attempts", "successes", "width_m", "gripper", "source", "protocol", "proposal_density"),
     *("measured_at", "answer", "metadata"),
 )
+#: How often a grasp was tried and succeeded.
+_SEVERAL = {"attempts", "successes"}
 _PARTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 KEYS = (
     *("position", "quaternion", "quaternion_xyzw", "quaternion_wxyz", "rotation", "matrix"),
@@ -125,6 +127,9 @@ def plan(
     scores |= {name[8:]: name for name in there if name.startswith("quality.")}
     scores |= {name: name for name in qualities if name not in scores}
     more = {name: given.get(name, name) for name in MORE if name in given or name in known}
+    if len(_SEVERAL & more.keys()) == 1:
+        # One of the two is of something else.
+        more = {name: column for name, column in more.items() if name not in _SEVERAL}
     for name in (*scores.values(), *more.values()):
         if name not in known:
             raise ValueError(_lacks(name, there))
