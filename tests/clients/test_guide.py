@@ -109,8 +109,8 @@ def test_the_python_blocks_run(own_service_url: str, tmp_path: Path, monkeypatch
         assert (pose[:3, 3] >= [0.3, -0.2, 0.02]).all()
         assert 50 in {batch.inserted for batch in mug.batches}
         sweeps = [(sweep.info.poses, sweep.info.purpose) for sweep in mug.sweeps()]
-        assert set(sweeps) >= {(3_000, "collect"), (200, "collect"), (10, "check")}
-        assert len(sweeps) == 3 + len(names["report"].calls)
+        assert set(sweeps) >= {(3_000, "collect"), (200, "collect"), (10, "check"), (10, "collect")}
+        assert len(sweeps) == 4 + len(names["report"].calls)
         assert names["report"].recommended[0] > 0
 
 
