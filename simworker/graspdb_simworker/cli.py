@@ -24,7 +24,7 @@ from rich.progress import Progress
 from graspdb.errors import GraspDBError
 from graspdb.processes import LIFELINE_HELP, end_with_parent
 from graspdb.transport import Transport
-from graspdb.wire import Pose
+from graspdb.wire import Pose, SweepInfo
 from graspdb.wire.sweeps import Engine
 from graspdb_simworker.process.runner import ChunkRunner
 from graspdb_simworker.simulation.engines import installed
@@ -232,7 +232,7 @@ def verify(
 ) -> None:
     """Simulate a sample of the grid's physics poses at the fine step, 1/2000 s; print the agreement.
 
-    With --sweep the sweep says which object, gripper and protocol, and its stored outcomes are compared;
+    With --sweep the sweep says which object, gripper, protocol and draws, and what is stored is compared;
     all of them are read to sample fairly, so a sweep of a random part of the grid (--max-poses) is
     verified sooner.
     """
@@ -248,14 +248,11 @@ def verify(
                     sweep, per_outcome=2 * count, url=url, api_key=api_key, seed=seed, progress=progress
                 )
             object_name, gripper, protocol = info.object, info.gripper, info.protocol
-            if engine is None and info.engines and info.sole_engine is None:
-                _leave(
-                    f"{' and '.join(info.engines)} simulated this sweep: say with --engine which to compare"
-                )
-            chosen = _require_physics(engine or info.engine or info.sole_engine)
+            chosen = _engine_to_compare(info, engine)
             payload, parts = inputs.load(
                 object_name, gripper, protocol=protocol, engine=chosen, url=url, api_key=api_key
             )
+            payload = payload.model_copy(update={"randomise": info.randomise})
             with _progress("grasps") as progress:
                 found = agreement.verify_stored(
                     payload, parts, stored, count=count, seed=seed, progress=progress
@@ -278,6 +275,13 @@ def verify(
     typer.echo(found.summary(object_name))
 
 
+def _engine_to_compare(info: SweepInfo, engine: str | None) -> Engine:
+    """The engine asked for, or the one that simulated a sweep; says so and leaves if several did."""
+    if engine is None and info.engines and info.sole_engine is None:
+        _leave(f"{' and '.join(info.engines)} simulated this sweep: say with --engine which to compare")
+    return _require_physics(engine or info.engine or info.sole_engine)
+
+
 @app.command()
 def show(
     object_name: ObjectName,
@@ -293,7 +297,11 @@ def show(
     url: ServiceUrl = None,
     api_key: ApiKey = None,
 ) -> None:
-    """Simulate one grasp and draw it from two sides, seen from the jaw, or write what moved how."""
+    """Simulate one grasp and draw it from two sides, seen from the jaw, or write what moved how.
+
+    It is simulated once, of what object and gripper say: a sweep that draws friction, mass or noise anew for
+    each simulation of a pose says in its outcomes how many of them succeeded.
+    """
     end_with_parent()
     chosen = _require_physics(engine)
     from graspdb_simworker.inspection import inputs, motions, pictures  # extra: sim

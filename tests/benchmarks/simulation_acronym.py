@@ -1,13 +1,17 @@
 """How often simulated labels agree with ACRONYM's: a sample of the grasps of each file, by every protocol.
 
 ``python tests/benchmarks/simulation_acronym.py FOLDER [--grasps 400] [--protocols wrench lift shake]
-[--force-n 70] [--seed 0]``
+[--force-n 70] [--seed 0] [--randomise '{"draws": 10}']``
 
 FOLDER holds ACRONYM's .h5 files and, anywhere below it, their meshes by the names that the files give. The
 gripper is the Panda, mass and friction are the files'; with what force ACRONYM's closes they do not say, and
 ``--force-n`` may be another than the Panda's. Agreement has to be read beside the share of the majority
 class, which who always says the same reaches; balanced accuracy is the mean of the shares of both classes
-that are labelled right. Data sets are no part of this project: without a folder nothing is done.
+that are labelled right. With ``--randomise`` every grasp is simulated under what that draws (an object as
+in a sweep's request; what it leaves out is drawn as usual there), and holds if at least half of its draws do.
+What k of n tells beside that is the share of pairs in order: of a grasp that held in ACRONYM and one that did
+not, how often the first succeeds more often here; equally often counts half. Data sets are no part of this
+project: without a folder nothing is done.
 """
 
 from __future__ import annotations
@@ -25,7 +29,8 @@ from numpy.typing import NDArray
 from graspdb import interop
 from graspdb.wire import DecomposePayload, GripperProfile, SimulatePayload
 from graspdb.wire.presets.grippers import PRESETS
-from graspdb_geometry import collision, meshes
+from graspdb.wire.sweeps import Randomise
+from graspdb_geometry import meshes
 from graspdb_simworker.decomposition import supervisor
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.bodies import Part
@@ -73,8 +78,10 @@ def read(path: Path, folder: Path, count: int, seed: int) -> Labelled:
     )
 
 
-def simulated(file: Labelled, protocol: str, gripper: GripperProfile) -> NDArray[np.uint8]:
-    """Outcome codes (n,)."""
+def simulated(
+    file: Labelled, protocol: str, gripper: GripperProfile, randomise: Randomise | None
+) -> chunks.Simulated:
+    """What becomes of the grasps."""
     payload = SimulatePayload.model_validate(
         {
             "sweep": "benchmark",
@@ -86,25 +93,29 @@ def simulated(file: Labelled, protocol: str, gripper: GripperProfile) -> NDArray
             "gripper": gripper,
             "protocol": protocol,
             "fidelity": "standard",
+            "randomise": randomise,
             "start": 0,
             "stop": len(file.held),
         }
     )
     workpiece = chunks.prepare(payload, file.parts)
-    codes, travel = workpiece.classify(file.positions, file.quaternions)
-    found = np.full(len(codes), Outcome.MISSED, dtype=np.uint8)
-    found[codes == collision.COLLIDES] = Outcome.COLLISION
-    for row in np.flatnonzero(codes == collision.CONTACT).tolist():
-        place = file.positions[row], file.quaternions[row]
-        found[row] = workpiece.simulate(*place, float(travel[row])).outcome
+    indices = np.arange(payload.stop)
+    found = chunks.simulate_poses(payload, workpiece, indices, file.positions, file.quaternions)
     workpiece.close()
     return found
 
 
-def measure(file: Labelled, protocol: str, gripper: GripperProfile) -> None:
+def ranked(successes: NDArray[np.uint8], held: NDArray[np.bool_]) -> float:
+    """Share of pairs, one that held and one that did not, that successes (n,) put in this order."""
+    more = successes[held][:, None].astype(int) - successes[~held]
+    return float(np.mean(more > 0) + 0.5 * np.mean(more == 0))
+
+
+def measure(file: Labelled, protocol: str, gripper: GripperProfile, randomise: Randomise | None) -> None:
     """Print a file's row, and what the labels were that do not agree."""
     started = time.process_time()
-    outcomes = simulated(file, protocol, gripper)
+    found = simulated(file, protocol, gripper, randomise)
+    outcomes = found.outcome
     ours, theirs = outcomes == Outcome.SUCCESS, file.held
     balanced = 0.5 * (np.mean(ours[theirs]) + np.mean(~ours[~theirs]))
     majority = max(np.mean(theirs), np.mean(~theirs))
@@ -113,9 +124,10 @@ def measure(file: Labelled, protocol: str, gripper: GripperProfile) -> None:
         f"{number} held, ACRONYM's failed" if name == "success" else f"{number} {name}, ACRONYM's held"
         for name, number in wrong.most_common()
     )
+    pairs = ranked(found.successes, theirs)
     print(
         f"| {file.name} | {len(file.parts)} | {protocol} | {len(ours)} | {np.mean(ours == theirs):.3f}"
-        f" | {majority:.3f} | {balanced:.3f} | {told} | {time.process_time() - started:.0f} |",
+        f" | {majority:.3f} | {balanced:.3f} | {pairs:.3f} | {told} | {time.process_time() - started:.0f} |",
         flush=True,
     )
 
@@ -127,6 +139,7 @@ def main() -> None:
     asked.add_argument("--protocols", nargs="*", default=chunks.PROTOCOLS)
     asked.add_argument("--seed", type=int, default=0)
     asked.add_argument("--force-n", type=float, default=PANDA.force_n)
+    asked.add_argument("--randomise", type=Randomise.model_validate_json)
     given = asked.parse_args()
     gripper = PANDA.model_copy(update={"force_n": given.force_n})
     if given.folder is None:
@@ -139,14 +152,15 @@ def main() -> None:
         "agreement",
         "majority class",
         "balanced accuracy",
+        "pairs in order",
         "disagreements",
     )
     print("| object |", " | ".join(heads), "| s |")
-    print("|---" * 9 + "|")
+    print("|---" * 10 + "|")
     for path in sorted(given.folder.rglob("*.h5")):
         file = read(path, given.folder, given.grasps, given.seed)
         for protocol in given.protocols:
-            measure(file, protocol, gripper)
+            measure(file, protocol, gripper, given.randomise)
 
 
 if __name__ == "__main__":

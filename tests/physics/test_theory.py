@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from closed_forms import Case
 
-from graspdb_simworker.simulation import lifting
-from graspdb_simworker.simulation.labels import Outcome
+from graspdb.wire.sweeps import Engine
+from graspdb_simworker.simulation import chunks, lifting
+from graspdb_simworker.simulation.bodies import mass_properties
+from graspdb_simworker.simulation.grasp_world import GraspWorld
+from graspdb_simworker.simulation.labels import Outcome, label_of
 
 CORNERS = (0.4, 0.8, 1.25, 2.5)
 
@@ -60,6 +63,31 @@ def test_labels_flip_at_the_limit(case: Case, friction: float, protocol: str) ->
 )
 def test_labels_flip_at_the_limit_in_mujoco_too(case: Case, friction: float) -> None:
     judge(bench.row(case.rubbing(friction), "wrench", "standard", CORNERS, "mujoco"))
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_a_centre_of_mass_off_the_fingers_is_as_fingers_off_the_centre(engine: Engine) -> None:
+    """A bar held in its middle, whose centre of mass is drawn 2 cm beside it, has the limit of a uniform one
+    held there."""
+    size, off = (0.2, 0.03, 0.04), 0.02
+    beside = closed_forms.box(size, off).rubbing(0.4)
+    limit = bench.asked(beside, "lift")
+    assert limit is not None
+    assert limit < 0.7 * closed_forms.carried_limit(closed_forms.box(size), lifting.LIFT)
+    labels = []
+    for load in CORNERS:
+        mass = load * limit
+        world = GraspWorld(
+            [beside.part],
+            mass_properties([beside.part], mass).displaced((-off, 0.0, 0.0)),
+            beside.friction,
+            chunks.gripper_of(closed_forms.PG70, mass),
+            engine=engine,
+            motion=lifting.LIFT,
+        )
+        labels.append(label_of(world.close((0.0, 0.0, 0.0), closed_forms.DOWN), lifting.LIFT))
+        world.close_world()
+    judge(bench.Row(beside, "lift", limit, CORNERS, tuple(labels)))
 
 
 @pytest.mark.parametrize("protocol", ["wrench", "lift", "shake"])

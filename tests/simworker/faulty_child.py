@@ -22,7 +22,7 @@ def main() -> int:
     deadly = np.array([float(v) for v in sys.argv[2:5]])
     simulate = chunks.Workpiece.simulate
 
-    def faulty(self: chunks.Workpiece, position: Any, quaternion: Any, travel_m: float) -> Any:
+    def faulty(self: chunks.Workpiece, position: Any, quaternion: Any, travel_m: float, draw: int) -> Any:
         if np.allclose(position, deadly, atol=1e-12):
             if how == "crash":
                 os.kill(os.getpid(), signal.SIGSEGV)
@@ -35,7 +35,7 @@ def main() -> int:
                 while time.process_time() < began + 600.0:
                     pass
             raise RuntimeError("the parts make no sense")
-        return simulate(self, position, quaternion, travel_m)
+        return simulate(self, position, quaternion, travel_m, draw)
 
     chunks.Workpiece.simulate = faulty  # type: ignore[method-assign]
     return child.main()

@@ -263,7 +263,8 @@ def test_lifts_do_not_depend_on_order_or_world(payload_of: MakePayload, physical
 
 
 def test_the_worker_says_what_it_can_do() -> None:
-    assert set(CAPABILITIES) == {"simulate", *get_args(Protocol)} - {"wrench"}
+    drawn = {f"drawn-{protocol}" for protocol in get_args(Protocol)}
+    assert set(CAPABILITIES) == {"simulate", *drawn, *get_args(Protocol)} - {"wrench"}
     assert set(chunks.PROTOCOLS) == set(get_args(Protocol))
 
 

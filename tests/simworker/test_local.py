@@ -17,10 +17,11 @@ import pytest
 
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload
+from graspdb.wire.sweeps import Randomise
 from graspdb_simworker.process import channel, local
 from graspdb_simworker.process.local import LocalRunner
 from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, PhysicsMissing
-from graspdb_simworker.simulation import chunks
+from graspdb_simworker.simulation import chunks, draws
 from graspdb_simworker.simulation.labels import Outcome
 
 MakePayload = Callable[..., SimulatePayload]
@@ -84,6 +85,29 @@ def test_a_deadly_pose_is_a_simulation_error_and_the_rest_goes_on(
     assert [q for q, dead in zip(result.rows.quality, hit, strict=True) if not dead] == [
         q for q, dead in zip(healthy.rows.quality, hit, strict=True) if not dead
     ]
+
+
+def test_a_deadly_draw_is_one_that_did_not_hold(
+    payload_of: MakePayload, physical_poses: FindPoses, mug_glb: bytes
+) -> None:
+    asked = Randomise(draws=3, pose_noise_m=1e-4, pose_noise_deg=0.1, seed=4)
+    payload = payload_of("mug", poses=physical_poses("mug", 8), start=5, randomise=asked)
+    with LocalRunner() as runner:
+        healthy = runner.run(payload, mug_glb)
+    assert healthy.successes is not None
+    row = int(np.argmax(list(healthy.successes)))
+    assert healthy.successes[row] == 3
+    deadly = draws.noisy(asked, 1, *chunks.poses_of(payload))[0][row]
+    seen: list[int] = []
+    with LocalRunner((*FAULTY, "crash", *map(repr, deadly.tolist()))) as runner:
+        result = runner.run(payload, mug_glb, progress=seen.append)
+    expected = list(healthy.successes)
+    expected[row] = 2
+    assert result.successes is not None
+    assert list(result.successes) == expected
+    assert result.outcomes == healthy.outcomes
+    assert result.rows.pose_index == healthy.rows.pose_index
+    assert seen == sorted(seen)
 
 
 def test_what_a_chunk_raises_is_its_failure_and_the_child_lives_on(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import httpx
 import numpy as np
@@ -55,11 +56,10 @@ def test_stored_outcomes_are_verified(swept: tuple[str, str]) -> None:
     missed = [s for s in found.strata if s.outcome is Outcome.MISSED]
     assert all(s.available < stored.counts[Outcome.MISSED] for s in missed)
     # A wrong label does not go unnoticed.
-    lie = stored_outcomes.StoredOutcomes(
-        stored.positions,
-        stored.quaternions,
-        np.full_like(stored.outcomes, Outcome.SUCCESS),
-        {Outcome.SUCCESS: len(stored.outcomes)},
+    lie = replace(
+        stored,
+        outcomes=np.full_like(stored.outcomes, Outcome.SUCCESS),
+        counts={Outcome.SUCCESS: len(stored.outcomes)},
     )
     assert agreement.verify_stored(payload, parts, lie, count=24).agreement < 0.7
 

@@ -2,13 +2,14 @@
 
 The sample is stratified by the outcome at the ordinary fidelity, so that rare outcomes are checked too;
 the agreement over all poses weighs each stratum by its share. The labels are either simulated here, or
-those that a service has stored for a sweep. The lower bound is the 5 % quantile of
-that weighted sum when each stratum's agreement follows its posterior under Jeffreys' prior, Beta(agree
-+ 1/2, disagree + 1/2).
+those that a service has stored for a sweep; what such a sweep draws is drawn again, the same. The lower bound
+is the 5 % quantile of that weighted sum when each stratum's agreement follows its posterior under Jeffreys'
+prior, Beta(agree + 1/2, disagree + 1/2).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from graspdb_geometry.poses import ToolPoses
 from graspdb_simworker.inspection.stored_outcomes import StoredOutcomes
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.bodies import Part
+from graspdb_simworker.simulation.draws import noisy
 from graspdb_simworker.simulation.labels import Outcome
 
 LEVEL = 0.95
@@ -52,6 +54,8 @@ class Agreement:
     agreement: float
     lower: float
     same: float
+    successes_apart: float | None = None
+    """By what share of its draws a pose's successes differ, on average; None where nothing is drawn."""
 
     @property
     def checked(self) -> int:
@@ -70,6 +74,11 @@ class Agreement:
             f" (at least {self.lower:.4f} at {LEVEL:.0%}; {self.checked} checked);"
             f" the same outcome in {self.same:.4f}"
         )
+        if self.successes_apart is not None:
+            lines.append(
+                "success is that of at least half of a pose's draws, which were drawn again; how many of them"
+                f" succeed differs by {self.successes_apart:.4f} of them on average"
+            )
         return "\n".join(lines)
 
 
@@ -98,22 +107,24 @@ def verify(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Agreement:
     """Simulate a chunk, then a stratified sample of ``count`` of its physics poses, or all, at fine fidelity.
+    Nothing is drawn.
 
     ``progress`` is told how many of how many closings are done. ValueError if no pose meets physics.
     """
-    _, positions, quaternions = chunks.poses_of(payload)
+    _, positions, quaternions = poses = chunks.poses_of(payload)
     rng = np.random.default_rng(seed)
     with closing(chunks.prepare(payload, parts)) as coarse, closing(_fine(payload, parts)) as fine:
-        codes, travel = coarse.classify(positions, quaternions)
+        codes, _ = coarse.classify(positions, quaternions)
         rows = np.flatnonzero(codes == collision.CONTACT)
         if len(rows) == 0:
             raise ValueError("no pose of this sample needs physics: take more poses")
         rows = np.sort(rng.permutation(rows)[: 3 * count])
         total = len(rows) + min(count, len(rows))
-        poses = positions, quaternions, travel
-        labels = _outcomes(coarse, poses, rows, lambda done: progress(done, total))
+        labels = _simulated(payload, coarse, poses, rows, lambda done: progress(done, total)).outcome
         picked = _stratified(labels, count, rng)
-        again = _outcomes(fine, poses, rows[picked], lambda done: progress(len(rows) + done, total))
+        again = _simulated(
+            payload, fine, poses, rows[picked], lambda done: progress(len(rows) + done, total)
+        ).outcome
     found = {int(kind): float(n) for kind, n in zip(*np.unique(labels, return_counts=True), strict=True)}
     return _agreement(found, labels[picked], again, rng)
 
@@ -127,13 +138,19 @@ def verify_stored(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Agreement:
-    """Simulate stored outcomes of the payload's object, gripper and protocol again at fine fidelity: a
+    """Simulate stored outcomes of the payload's object, gripper, protocol and draws again at fine fidelity: a
     stratified sample of ``count``, or all, of those that met physics (ValueError if none did).
     """
     rng = np.random.default_rng(seed)
     with closing(_fine(payload, parts)) as fine:
-        codes, travel = fine.classify(stored.positions, stored.quaternions)
-        rows = np.flatnonzero(codes == collision.CONTACT)
+        poses = stored.indices, stored.positions, stored.quaternions
+        physical = np.array(
+            [
+                fine.classify(*noisy(payload.randomise, draw, *poses))[0] == collision.CONTACT
+                for draw in range(len(fine.draws))
+            ]
+        )
+        rows = np.flatnonzero(physical.any(axis=0))
         if len(rows) == 0:
             raise ValueError("no pose of this sweep needed physics")
         labels = stored.outcomes[rows]
@@ -144,28 +161,37 @@ def verify_stored(
             for kind in np.unique(labels)
         }
         picked = _stratified(labels, count, rng)
-        poses = stored.positions, stored.quaternions, travel
-        again = _outcomes(fine, poses, rows[picked], lambda done: progress(done, len(picked)))
-    return _agreement(found, labels[picked], again, rng)
+        rows = rows[picked]
+        total = int(physical[:, rows].sum())
+        again = _simulated(payload, fine, poses, rows, lambda done: progress(done, total))
+    apart = None
+    if stored.successes is not None:
+        apart = np.abs(again.successes - stored.successes[rows]) / len(fine.draws)
+    return _agreement(found, labels[picked], again.outcome, rng, apart)
 
 
 def _fine(payload: SimulatePayload, parts: Sequence[Part]) -> chunks.Workpiece:
     return chunks.prepare(payload.model_copy(update={"fidelity": "fine"}), parts)
 
 
-def _outcomes(
+def _simulated(
+    payload: SimulatePayload,
     workpiece: chunks.Workpiece,
-    poses: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    poses: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
     rows: NDArray[np.int64],
     progress: Callable[[int], None],
-) -> NDArray[np.uint8]:
-    """Outcomes of rows of tool poses (n, 3), (n, 4), whose fingers close freely by (n,) metres."""
-    positions, quaternions, travel = poses
-    found = np.empty(len(rows), dtype=np.uint8)
-    for done, row in enumerate(rows.tolist()):
-        found[done] = workpiece.simulate(positions[row], quaternions[row], float(travel[row])).outcome
-        progress(done + 1)
-    return found
+) -> chunks.Simulated:
+    """What becomes of rows of a sweep's poses: indices (n,), tool poses (n, 3), (n, 4)."""
+    indices, positions, quaternions = poses
+    done = itertools.count(1)
+    return chunks.simulate_poses(
+        payload,
+        workpiece,
+        indices[rows],
+        positions[rows],
+        quaternions[rows],
+        after=lambda *_: progress(next(done)),
+    )
 
 
 def _stratified(labels: NDArray[np.uint8], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -187,6 +213,7 @@ def _agreement(
     before: NDArray[np.uint8],
     after: NDArray[np.uint8],
     rng: np.random.Generator,
+    successes_apart: NDArray[np.float64] | None = None,
 ) -> Agreement:
     strata = []
     for kind in np.unique(before):
@@ -206,9 +233,13 @@ def _agreement(
     shares = np.array([s.agree / s.checked for s in strata])
     same = np.array([s.same / s.checked for s in strata])
     draws = np.column_stack([rng.beta(s.agree + 0.5, s.checked - s.agree + 0.5, _DRAWS) for s in strata])
+    apart = None
+    if successes_apart is not None:
+        apart = float(weights @ [successes_apart[before == s.outcome].mean() for s in strata])
     return Agreement(
         tuple(strata),
         float(weights @ shares),
         float(np.quantile(draws @ weights, 1.0 - LEVEL)),
         float(weights @ same),
+        apart,
     )

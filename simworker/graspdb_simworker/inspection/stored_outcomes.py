@@ -17,13 +17,16 @@ from graspdb.wire import OUTCOME_CODES, SweepInfo
 class StoredOutcomes:
     """A sample of a sweep's stored outcomes, and how many of each outcome the sweep has.
 
-    ``positions`` (n, 3) and ``quaternions`` (n, 4) of the tool in the object frame, ``outcomes`` (n,)
-    codes; within each outcome every pose of the sweep is as likely to be here.
+    ``indices`` (n,) in its plan, ``positions`` (n, 3) and ``quaternions`` (n, 4) of the tool in the object
+    frame, ``outcomes`` (n,) codes, ``successes`` (n,) of draws, None where nothing is drawn; within each
+    outcome every pose of the sweep is as likely to be here.
     """
 
+    indices: NDArray[np.int64]
     positions: NDArray[np.float64]
     quaternions: NDArray[np.float64]
     outcomes: NDArray[np.uint8]
+    successes: NDArray[np.float64] | None
     counts: Mapping[int, int]
 
 
@@ -42,20 +45,25 @@ def sample_of(
     """
     rng = np.random.default_rng(seed)
     # For each outcome the poses with the smallest of random keys, one drawn for each pose.
-    kept = {name: np.empty((0, 8)) for name in OUTCOME_CODES if name != "collision"}
+    kept = {name: np.empty((0, 10)) for name in OUTCOME_CODES if name != "collision"}
     counts = dict.fromkeys(OUTCOME_CODES, 0)
     with Transport(url, api_key=api_key, user_agent="graspdb-simworker") as transport:
         info = transport.model(SweepInfo, "GET", f"/sweeps/{sweep}")
         for page in answers(transport, f"/sweeps/{sweep}/outcomes", {"limit": 100_000}):
             outcomes = np.array(page["outcome"], dtype=object)
-            keys = rng.random(len(outcomes))
+            columns = np.column_stack(
+                [
+                    rng.random(len(outcomes)),
+                    np.reshape(page["position"], (-1, 3)),
+                    np.reshape(page["quaternion_xyzw"], (-1, 4)),
+                    page["pose_index"],
+                    page.get("successes") or np.zeros(len(outcomes)),
+                ]
+            )
             for name, before in kept.items():
                 rows = np.flatnonzero(outcomes == name)
                 counts[name] += len(rows)
-                new: NDArray[np.float64] = np.array(
-                    [[keys[row], *page["position"][row], *page["quaternion_xyzw"][row]] for row in rows]
-                ).reshape(-1, 8)
-                both = np.concatenate([before, new])
+                both = np.concatenate([before, columns[rows]])
                 kept[name] = both[np.argsort(both[:, 0])[:per_outcome]]
             counts["collision"] += int((outcomes == "collision").sum())
             progress(sum(counts.values()), info.poses)
@@ -64,4 +72,12 @@ def sample_of(
     sample: NDArray[np.float64] = np.concatenate(list(kept.values()))
     codes = np.repeat([OUTCOME_CODES[name] for name in kept], [len(k) for k in kept.values()])
     by_code = {OUTCOME_CODES[name]: n for name, n in counts.items()}
-    return info, StoredOutcomes(sample[:, 1:4], sample[:, 4:8], codes.astype(np.uint8), by_code)
+    successes = None if info.randomise is None else sample[:, 9]
+    return info, StoredOutcomes(
+        sample[:, 8].astype(np.int64),
+        sample[:, 1:4],
+        sample[:, 4:8],
+        codes.astype(np.uint8),
+        successes,
+        by_code,
+    )

@@ -160,8 +160,8 @@ class _Attempt:
                 if kind == channel.BEFORE:
                     self.simulating = pickle.loads(body)
                 elif kind == channel.AFTER:
-                    row, label = pickle.loads(body)
-                    self.known[row] = label
+                    closing, label = pickle.loads(body)
+                    self.known[closing] = label
                     self.simulating = None
                     self.progress(len(self.known))
                 elif kind == channel.RESULT:

@@ -11,8 +11,8 @@ from graspdb_simworker.simulation.labels import Label
 class Chunk(NamedTuple):
     """A simulate job's payload and the object's convex parts.
 
-    ``known`` are labels, by row of the chunk, that an earlier child found or died of; after ``pose_s``
-    seconds in one closing the child ends itself.
+    ``known`` are labels, by the number of the closing, that an earlier child found or died of; after
+    ``pose_s`` seconds in one closing the child ends itself.
     """
 
     payload_json: str

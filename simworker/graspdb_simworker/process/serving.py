@@ -12,8 +12,17 @@ from graspdb_simworker.process.messages import Chunk
 from graspdb_simworker.simulation import chunks
 from graspdb_simworker.simulation.labels import Label
 
-WORKPIECE_FIELDS = {"parts_sha256", "mass_kg", "friction", "gripper", "protocol", "fidelity", "engine"}
-"""Chunks that agree in these share a world."""
+WORKPIECE_FIELDS = {
+    "parts_sha256",
+    "mass_kg",
+    "friction",
+    "gripper",
+    "protocol",
+    "fidelity",
+    "engine",
+    "randomise",
+}
+"""Chunks that agree in these share their worlds."""
 
 
 def serve(source: int, sink: int) -> None:
@@ -36,13 +45,13 @@ def serve(source: int, sink: int) -> None:
                 workpiece, key = chunks.prepare(payload, meshes.parts_from_glb(chunk.parts_glb)), wanted
 
             # By the processor's time: what else the machine does must not change a label.
-            def before(row: int, limit: float = chunk.pose_s) -> None:
-                channel.send(sink, channel.BEFORE, pickle.dumps(row))
+            def before(closing: int, limit: float = chunk.pose_s) -> None:
+                channel.send(sink, channel.BEFORE, pickle.dumps(closing))
                 signal.setitimer(signal.ITIMER_PROF, limit)
 
-            def after(row: int, label: Label) -> None:
+            def after(closing: int, label: Label) -> None:
                 signal.setitimer(signal.ITIMER_PROF, 0.0)
-                channel.send(sink, channel.AFTER, pickle.dumps((row, label)))
+                channel.send(sink, channel.AFTER, pickle.dumps((closing, label)))
 
             result = chunks.simulate_chunk(payload, workpiece, known=chunk.known, before=before, after=after)
         except channel.Closed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -66,7 +66,7 @@ def closing_force(force_n: float, mass_kg: float) -> float:
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass, centre (m) and principal inertia (kg m^2) of a solid of uniform density, in the object frame.
+    """Mass, centre (m) and principal inertia (kg m^2) of a solid, in the object frame.
 
     ``principal_xyzw`` rotates from the principal frame to the object frame.
     """
@@ -81,6 +81,14 @@ class MassProperties:
         """Points (N, 3) of the object frame in the principal frame."""
         return np.asarray((points - np.array(self.centre)) @ self._axes, dtype=np.float64)
 
+    def displaced(self, offset_m: Vector) -> MassProperties:
+        """The same with the centre of mass that far off, metres in the object frame. The inertia about the
+        centre stays: how the mass is spread that puts it there is not known."""
+        if not any(offset_m):
+            return self
+        x, y, z = self.centre
+        return replace(self, centre=(x + offset_m[0], y + offset_m[1], z + offset_m[2]))
+
     def radius_of(self, parts: Sequence[Part]) -> float:
         """Farthest that any vertex is from the centre of mass, metres."""
         centre = np.array(self.centre)
@@ -88,7 +96,8 @@ class MassProperties:
 
 
 def mass_properties(parts: Sequence[Part], mass_kg: float) -> MassProperties:
-    """Mass properties of a union of convex parts; where these overlap, the volume counts once for each.
+    """Mass properties of a union of convex parts of uniform density; where these overlap, the volume counts
+    once for each.
 
     Signed tetrahedra from the origin to every face: volume det/6, first moment det/24 (a + b + c),
     second moment det/120 (s s^T + a a^T + b b^T + c c^T) with s = a + b + c. ValueError for a mass that is

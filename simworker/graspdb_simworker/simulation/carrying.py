@@ -70,12 +70,15 @@ _FREE = 7
 
 
 class Grip(NamedTuple):
-    """What closes: newtons of each finger, its mass (kg), its highest speed (m/s), friction coefficient."""
+    """What closes: newtons of each finger, its mass (kg), its highest speed (m/s), friction coefficient, and
+    how stiff its pads are: pressure over depth, and shear stress over how far an area was dragged, Pa/m."""
 
     force_n: float
     finger_mass_kg: float
     max_speed_m_s: float
     friction: float
+    pressure_pa_m: float
+    shear_pa_m: float
 
 
 _multiplied: Any = njit(multiply)
@@ -113,7 +116,7 @@ def _strain(area, move):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _contact_force(areas, count, move, friction, total):  # type: ignore[no-untyped-def]
+def _contact_force(areas, count, move, grip, total):  # type: ignore[no-untyped-def]
     """What all areas exert on object and jaw (7,): force, torque about the centre of mass, opening force."""
     total[:] = 0.0
     for i in range(count):
@@ -121,11 +124,11 @@ def _contact_force(areas, count, move, friction, total):  # type: ignore[no-unty
         depth, sx, sy, sz = _strain(area, move)
         if depth <= 0.0:
             continue
-        normal = PRESSURE_PA_M * area[AREA] * depth
-        stiff = SHEAR_PA_M * area[AREA]
+        normal = grip.pressure_pa_m * area[AREA] * depth
+        stiff = grip.shear_pa_m * area[AREA]
         shear = stiff * math.sqrt(sx * sx + sy * sy + sz * sz)
-        if shear > friction * normal:
-            stiff *= friction * normal / shear
+        if shear > grip.friction * normal:
+            stiff *= grip.friction * normal / shear
         fx = normal * area[NORMAL] - stiff * sx
         fy = normal * area[NORMAL + 1] - stiff * sy
         fz = normal * area[NORMAL + 2] - stiff * sz
@@ -139,7 +142,7 @@ def _contact_force(areas, count, move, friction, total):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def _stiffness(areas, count, move, friction, total):  # type: ignore[no-untyped-def]
+def _stiffness(areas, count, move, grip, total):  # type: ignore[no-untyped-def]
     """Minus the rate of :func:`_contact_force` with the displacement, added to ``total`` (7, 7)."""
     d = np.empty((3, 3))
     j = np.zeros((3, _FREE))
@@ -150,10 +153,10 @@ def _stiffness(areas, count, move, friction, total):  # type: ignore[no-untyped-
         if depth <= 0.0:
             continue
         n = area[NORMAL : NORMAL + 3]
-        press = PRESSURE_PA_M * area[AREA]
-        stiff = SHEAR_PA_M * area[AREA]
+        press = grip.pressure_pa_m * area[AREA]
+        stiff = grip.shear_pa_m * area[AREA]
         length = math.sqrt(sx * sx + sy * sy + sz * sz)
-        cap = friction * press * depth
+        cap = grip.friction * press * depth
         slips = stiff * length > cap
         if slips:
             stiff = cap / length
@@ -163,7 +166,7 @@ def _stiffness(areas, count, move, friction, total):  # type: ignore[no-untyped-
             for b in range(3):
                 d[a, b] = (press - stiff) * n[a] * n[b]
                 if slips:
-                    d[a, b] -= stiff * s[a] * s[b] + friction * press * s[a] * n[b]
+                    d[a, b] -= stiff * s[a] * s[b] + grip.friction * press * s[a] * n[b]
             d[a, a] += stiff
         lx, ly, lz = area[LEVER], area[LEVER + 1], area[LEVER + 2]
         j[0, 4], j[0, 5] = lz, -ly
@@ -220,7 +223,7 @@ def _solve(m, pivots, x):  # type: ignore[no-untyped-def]
 def _unbalanced(areas, count, move, inertia, push, grip, dt, left):  # type: ignore[no-untyped-def]
     """What of all forces (7,) is not in balance after a displacement; returns its size over the closing
     force, and how fast the closing force falls with the jaw's displacement."""
-    _contact_force(areas, count, move, grip.friction, left)
+    _contact_force(areas, count, move, grip, left)
     for a in range(_FREE):
         left[a] = push[a] + left[a]
         for b in range(_FREE):
@@ -255,7 +258,7 @@ def _balance(areas, count, move, inertia, push, grip, dt, factors, pivots, known
         if not known:
             factors[:] = inertia
             factors[6, 6] += rate
-            _stiffness(areas, count, move, grip.friction, factors)
+            _stiffness(areas, count, move, grip, factors)
             _factor(factors, pivots)
             known = made = True
         turn[:] = left
@@ -283,14 +286,14 @@ def _balance(areas, count, move, inertia, push, grip, dt, factors, pivots, known
 
 
 @njit(cache=True)
-def _moved(areas, count, move, friction, centre, turn, fingers):  # type: ignore[no-untyped-def]
+def _moved(areas, count, move, grip, centre, turn, fingers):  # type: ignore[no-untyped-def]
     """Displace object and jaw: depths and shears follow, and what slipped has no more shear than friction
     allows. Returns the object's new orientation."""
     for i in range(count):
         area = areas[i]
         depth, sx, sy, sz = _strain(area, move)
         area[DEPTH] = depth
-        most = friction * PRESSURE_PA_M * max(0.0, depth) / SHEAR_PA_M
+        most = grip.friction * grip.pressure_pa_m * max(0.0, depth) / grip.shear_pa_m
         length = math.sqrt(sx * sx + sy * sy + sz * sz)
         share = most / length if length > most else 1.0
         area[SHEAR], area[SHEAR + 1], area[SHEAR + 2] = sx * share, sy * share, sz * share
@@ -419,7 +422,7 @@ def carry(body, jaw, grip, mass_kg, moments, centre, turn, fingers, frames, dt, 
                 push[a] += force[a]
                 push[3 + a] += torque[a] - (speed[3 + b] * own[c] - speed[3 + c] * own[b])
         known = _balance(areas, count, move, inertia, push, grip, dt, factors, pivots, known)
-        turn = _moved(areas, count, move, grip.friction, centre, turn, fingers)
+        turn = _moved(areas, count, move, grip, centre, turn, fingers)
         since += move
         moved = _displacement(since, centre, jaw)
         if not moved < np.inf:
@@ -463,7 +466,7 @@ def carry(body, jaw, grip, mass_kg, moments, centre, turn, fingers, frames, dt, 
 
 class Carrier:
     """An object of ``parts`` and the jaw that carries it through a motion, in steps of ``step_s`` seconds;
-    ``area_m`` is how finely patches are divided."""
+    ``area_m`` is how finely patches are divided, ``compliance`` how often the pads' give is the usual one."""
 
     def __init__(
         self,
@@ -474,9 +477,17 @@ class Carrier:
         motion: lifting.Motion,
         step_s: float,
         area_m: float,
+        compliance: float = 1.0,
     ) -> None:
         self._body, self._jaw, self._mass = body_of(parts, mass), jaw_of(gripper), mass
-        self._grip = Grip(gripper.force_n, gripper.finger_mass_kg, gripper.max_speed_m_s, friction)
+        self._grip = Grip(
+            gripper.force_n,
+            gripper.finger_mass_kg,
+            gripper.max_speed_m_s,
+            friction,
+            PRESSURE_PA_M / compliance,
+            SHEAR_PA_M / compliance,
+        )
         self._step_s, self._area_m, self._lost = step_s, area_m, motion.lost
         # Compile now: a grasp's time is limited, and this may take longer.
         self._frames = np.empty((0, 9))

@@ -3,6 +3,9 @@
     poses of the plan -> exact geometry: collides | nothing between the fingers | needs physics ->
     closing -> label
 
+Where something is drawn anew in each of several simulations of a pose, each draw goes this way, at its noisy
+poses and in its world, and k of n succeed: see :mod:`.draws`.
+
 A chunk gives the same bytes whatever ran before it, in whatever order, process or world.
 """
 
@@ -11,6 +14,7 @@ from __future__ import annotations
 import base64
 import gc
 import math
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,10 +27,17 @@ from graspdb_geometry import collision
 from graspdb_geometry.grids import PoseGrid
 from graspdb_geometry.grippers import shape_of
 from graspdb_geometry.poses import ToolPoses
-from graspdb_simworker.simulation.bodies import MIN_FINGER_SHARE, Gripper, Part, closing_force
+from graspdb_simworker.simulation.bodies import (
+    MIN_FINGER_SHARE,
+    Gripper,
+    Part,
+    closing_force,
+    mass_properties,
+)
+from graspdb_simworker.simulation.draws import DrawnWorld, draws_of, noisy
 from graspdb_simworker.simulation.force_test import compile_force_test
 from graspdb_simworker.simulation.grasp_world import GraspWorld
-from graspdb_simworker.simulation.labels import Label, Outcome, label_of
+from graspdb_simworker.simulation.labels import Label, Outcome, label_of, majority
 from graspdb_simworker.simulation.lifting import MOTIONS
 
 PROTOCOLS = ("wrench", *MOTIONS)
@@ -37,13 +48,35 @@ class UnsupportedProtocol(ValueError):
     """The chunk asks for a protocol that this worker does not have."""
 
 
-@dataclass(frozen=True)
-class Workpiece:
-    """An object ready to be grasped: collision scene and physics world. Reused from chunk to chunk."""
+KEPT_WORLDS = 16
+"""So many worlds of an object are kept. What is drawn beyond is built anew for every chunk, in 60 ms: a world
+of pybullet's takes 28 MB."""
 
-    scene: collision.Scene
-    world: GraspWorld
-    gripper: Gripper
+
+class Workpiece:
+    """An object ready to be grasped: collision scene, and physics worlds, one a draw. Reused from chunk to
+    chunk. ``draws`` are the worlds that every pose is simulated in, ``build`` builds one: the first at once,
+    others when they are needed; draws that are equal share theirs.
+    """
+
+    def __init__(
+        self,
+        scene: collision.Scene,
+        gripper: Gripper,
+        draws: Sequence[DrawnWorld],
+        build: Callable[[DrawnWorld], GraspWorld],
+    ) -> None:
+        self.scene = scene
+        self.gripper = gripper
+        self.draws = tuple(draws)
+        self._build = build
+        self._worlds: dict[DrawnWorld, GraspWorld] = {}
+        self._world(self.draws[0])
+
+    @property
+    def world(self) -> GraspWorld:
+        """The first draw's, which is the only one unless something is drawn."""
+        return self._world(self.draws[0])
 
     def classify(
         self, positions: NDArray[np.float64], quaternions: NDArray[np.float64]
@@ -54,15 +87,27 @@ class Workpiece:
         return codes, np.minimum(first_contact.min(axis=1), 0.5 * self.gripper.max_opening_m)
 
     def simulate(
-        self, position: NDArray[np.float64], quaternion: NDArray[np.float64], travel_m: float
+        self, position: NDArray[np.float64], quaternion: NDArray[np.float64], travel_m: float, draw: int = 0
     ) -> Label:
-        """Close the jaw at one pose (tool in the object frame) and label the outcome."""
+        """Close the jaw at one pose (tool in the object frame), in a draw's world, and label the outcome."""
         px, py, pz = (float(v) for v in position)
         x, y, z, w = (float(v) for v in quaternion)
-        return label_of(self.world.close((px, py, pz), (x, y, z, w), travel_m), self.world.motion)
+        world = self._world(self.draws[draw])
+        return label_of(world.close((px, py, pz), (x, y, z, w), travel_m), world.motion)
 
     def close(self) -> None:
-        self.world.close_world()
+        for world in self._worlds.values():
+            world.close_world()
+        self._worlds.clear()
+
+    def _world(self, draw: DrawnWorld) -> GraspWorld:
+        world = self._worlds.get(draw)
+        if world is None:
+            if len(self._worlds) >= KEPT_WORLDS:
+                # The last: draws come in turn, and of the first all are there again for the next chunk.
+                self._worlds.popitem()[1].close_world()
+            world = self._worlds[draw] = self._build(draw)
+        return world
 
 
 def prepare(
@@ -83,20 +128,24 @@ def prepare(
             f"this worker simulates {', '.join(PROTOCOLS)}; the sweep asks for {payload.protocol!r}"
         )
     compile_force_test()
+
+    def build(draw: DrawnWorld) -> GraspWorld:
+        return GraspWorld(
+            parts,
+            mass_properties(parts, draw.mass_kg).displaced(draw.offset_m),
+            draw.friction,
+            gripper_of(payload.gripper, draw.mass_kg),
+            payload.fidelity,
+            engine=payload.engine,
+            motion=MOTIONS.get(payload.protocol),
+            compliance=draw.compliance,
+            visible=visible,
+            film_every_s=film_every_s,
+            moments_every_s=moments_every_s,
+        )
+
     gripper = gripper_of(payload.gripper, payload.mass_kg)
-    world = GraspWorld(
-        parts,
-        payload.mass_kg,
-        payload.friction,
-        gripper,
-        payload.fidelity,
-        engine=payload.engine,
-        motion=MOTIONS.get(payload.protocol),
-        visible=visible,
-        film_every_s=film_every_s,
-        moments_every_s=moments_every_s,
-    )
-    return Workpiece(collision.Scene(parts), world, gripper)
+    return Workpiece(collision.Scene(parts), gripper, draws_of(payload, parts), build)
 
 
 def gripper_of(profile: GripperProfile, mass_kg: float) -> Gripper:
@@ -143,39 +192,88 @@ def poses_of(
     return indices, positions, quaternions
 
 
+@dataclass(frozen=True)
+class Simulated:
+    """What became of poses: outcome codes (draws, poses), and by a pose's row the labels of its closings, of
+    poses that met physics in any draw."""
+
+    outcomes: NDArray[np.uint8]
+    labels: Mapping[int, Sequence[Label]]
+
+    @property
+    def outcome(self) -> NDArray[np.uint8]:
+        """What all draws of each pose come to (poses,)."""
+        return majority(self.outcomes)
+
+    @property
+    def successes(self) -> NDArray[np.uint8]:
+        """In how many draws each pose succeeded (poses,)."""
+        succeeded: NDArray[np.uint8] = (self.outcomes == Outcome.SUCCESS).sum(axis=0).astype(np.uint8)
+        return succeeded
+
+
+def simulate_poses(
+    payload: SimulatePayload,
+    workpiece: Workpiece,
+    indices: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    quaternions: NDArray[np.float64],
+    *,
+    known: Mapping[int, Label] | None = None,
+    before: Callable[[int], None] = lambda closing: None,
+    after: Callable[[int, Label], None] = lambda closing, label: None,
+) -> Simulated:
+    """Simulate poses of a sweep, by their indices (n,) in its plan, in every draw.
+
+    A closing's number is its pose's row; where something is drawn, plus the draw times the poses. ``known``
+    closings need no physics any more: an earlier process simulated them or died of them. ``before`` and
+    ``after`` are called around each of the others.
+    """
+    known = known or {}
+    outcomes = np.full((len(workpiece.draws), len(indices)), Outcome.MISSED, dtype=np.uint8)
+    labels: dict[int, list[Label]] = {}
+    with _no_cycles():
+        for draw, found in enumerate(outcomes):
+            where, turned = noisy(payload.randomise, draw, indices, positions, quaternions)
+            codes, travel = workpiece.classify(where, turned)
+            found[codes == collision.COLLIDES] = Outcome.COLLISION
+            for row in np.flatnonzero(codes == collision.CONTACT).tolist():
+                closing = draw * len(indices) + row
+                label = known.get(closing)
+                if label is None:
+                    before(closing)
+                    label = workpiece.simulate(where[row], turned[row], float(travel[row]), draw)
+                    after(closing, label)
+                found[row] = label.outcome
+                labels.setdefault(row, []).append(label)
+    return Simulated(outcomes, labels)
+
+
 def simulate_chunk(
     payload: SimulatePayload,
     workpiece: Workpiece,
     *,
     known: Mapping[int, Label] | None = None,
-    before: Callable[[int], None] = lambda row: None,
-    after: Callable[[int, Label], None] = lambda row, label: None,
+    before: Callable[[int], None] = lambda closing: None,
+    after: Callable[[int, Label], None] = lambda closing, label: None,
 ) -> SimulateResult:
-    """Simulate a chunk: an outcome for every pose, and rows for those that met physics.
-
-    ``known`` rows of the chunk need no physics any more: an earlier process simulated them or died of them.
-    ``before`` and ``after`` are called around each closing with the row within the chunk.
-    """
-    known = known or {}
-    indices, positions, quaternions = poses_of(payload)
-    codes, travel = workpiece.classify(positions, quaternions)
-    outcomes = np.full(len(indices), Outcome.MISSED, dtype=np.uint8)
-    outcomes[codes == collision.COLLIDES] = Outcome.COLLISION
-    physical = np.flatnonzero(codes == collision.CONTACT)
+    """Simulate a chunk: an outcome for every pose, and rows for those that met physics, but for what collides
+    in most draws and holds in none. Closings are numbered as in :func:`simulate_poses`."""
+    poses = poses_of(payload)
+    simulated = simulate_poses(payload, workpiece, *poses, known=known, before=before, after=after)
+    outcome, successes = simulated.outcome, simulated.successes
     rows = ResultRows(pose_index=[], width_m=[], quality=[])
-    with _no_cycles():
-        for row in physical.tolist():
-            label = known.get(row)
-            if label is None:
-                before(row)
-                label = workpiece.simulate(positions[row], quaternions[row], float(travel[row]))
-                after(row, label)
-            outcomes[row] = label.outcome
-            rows.pose_index.append(int(indices[row]))
-            rows.width_m.append(_finite(label.width_m, 7))
-            rows.quality.append(_finite(label.quality, 4))
-    packed = base64.b64encode(outcomes.tobytes())
-    return SimulateResult(outcomes=packed, rows=rows, engine=workpiece.world.engine)
+    for row, labels in sorted(simulated.labels.items()):
+        if outcome[row] != Outcome.COLLISION or successes[row]:
+            rows.pose_index.append(int(poses[0][row]))
+            rows.width_m.append(_median([label.width_m for label in labels], 7))
+            rows.quality.append(_median([label.quality for label in labels], 4))
+    return SimulateResult(
+        outcomes=base64.b64encode(outcome.tobytes()),
+        successes=None if payload.randomise is None else base64.b64encode(successes.tobytes()),
+        rows=rows,
+        engine=workpiece.world.engine,
+    )
 
 
 @contextmanager
@@ -191,6 +289,8 @@ def _no_cycles() -> Iterator[None]:
             gc.enable()
 
 
-def _finite(value: float, digits: int) -> float | None:
-    """Rounded for the wire, where a missing measurement is null: beyond 0.1 um, digits say nothing."""
-    return round(min(value, 1e9), digits) if math.isfinite(value) else None
+def _median(values: Sequence[float], digits: int) -> float | None:
+    """Of those that were measured, rounded for the wire, where a missing measurement is null: beyond 0.1 um,
+    digits say nothing."""
+    measured = [value for value in values if math.isfinite(value)]
+    return round(min(statistics.median(measured), 1e9), digits) if measured else None

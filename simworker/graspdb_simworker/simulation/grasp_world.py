@@ -27,11 +27,11 @@ from graspdb_simworker.simulation.bodies import (
     Contacts,
     End,
     Gripper,
+    MassProperties,
     Part,
     Quaternion,
     Vector,
     inverse,
-    mass_properties,
     multiply,
     rotate,
 )
@@ -115,7 +115,7 @@ class GraspWorld:
 
     ``parts`` are convex, vertices (V, 3) in the object frame, metres, and faces (F, 3); ``friction`` is
     Coulomb's coefficient between object and gripper; ``fidelity`` is ``standard`` or ``fine``. ``motion``:
-    carry what is held through it after every closing.
+    carry what is held through it after every closing, on pads of ``compliance`` times the usual give.
     ``visible``: build what can be seen, for :attr:`pictures`, one at the end and one every ``film_every_s``.
     ``moments_every_s``: keep :attr:`moments` that far apart, which changes nothing about what comes out.
     """
@@ -123,28 +123,29 @@ class GraspWorld:
     def __init__(
         self,
         parts: Sequence[Part],
-        mass_kg: float,
+        mass: MassProperties,
         friction: float,
         gripper: Gripper,
         fidelity: Fidelity = "standard",
         *,
         engine: Engine | None = None,
         motion: lifting.Motion | None = None,
+        compliance: float = 1.0,
         visible: bool = False,
         film_every_s: float = math.inf,
         moments_every_s: float = math.inf,
     ) -> None:
         self.gripper = gripper
         self.friction = friction
-        self.mass = mass_properties(parts, mass_kg)
+        self.mass = mass
         name = installed.require(engine)
         world_of = installed.world_of(name)
         self.engine = f"{name} {installed.version_of(name)}"
         """The engine and its version."""
-        self._engine = world_of(parts, mass_kg, friction, gripper, visible=visible)
-        self._stepping = self._engine.stepping(fidelity, mass_kg)
+        self._engine = world_of(parts, mass, friction, gripper, visible=visible)
+        self._stepping = self._engine.stepping(fidelity, mass.mass_kg)
         self._running = self._stepping
-        self._fine = self._engine.stepping("fine", mass_kg)
+        self._fine = self._engine.stepping("fine", mass.mass_kg)
         self._visible = visible
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
@@ -159,13 +160,13 @@ class GraspWorld:
         self.motion = motion
         self._carrying = CARRYING[fidelity]
         self._carrier = motion and carrying.Carrier(
-            parts, self.mass, gripper, friction, motion, self._carrying.dt_s, self._carrying.area_m
+            parts, mass, gripper, friction, motion, self._carrying.dt_s, self._carrying.area_m, compliance
         )
-        self._to_body = inverse(self.mass.principal_xyzw)
-        self._radius = self.mass.radius_of(parts)
+        self._to_body = inverse(mass.principal_xyzw)
+        self._radius = mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
         self._seen: tuple[Vector, Quaternion, float] | None = None
-        self._engine.damp(DAMPING * math.sqrt(gripper.closing_force_n / mass_kg))
+        self._engine.damp(DAMPING * math.sqrt(gripper.closing_force_n / mass.mass_kg))
         self._engine.cut(self._running)
         self._engine.park()
 

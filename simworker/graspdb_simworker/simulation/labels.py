@@ -16,6 +16,9 @@ import statistics
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 from graspdb_simworker.simulation.bodies import Carried, Closing, End
 from graspdb_simworker.simulation.lifting import Displacement, Motion
 
@@ -77,6 +80,22 @@ def label_of(closing: Closing, motion: Motion | None = None) -> Label:
         return _carried_label(closing.carried, motion.allowed, width)
     quality = statistics.median(closing.ratings[-RATED:])
     return Label(Outcome.SUCCESS if quality >= 1.0 else Outcome.WRENCH_INSUFFICIENT, width, quality)
+
+
+def majority(outcomes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """What draws (n, poses) of each pose come to (poses,): success where at least half succeeded, else the
+    failure that most ended in, of equally many that of the lowest code.
+
+    A simulation error is no success, and no kind of failure unless all are: beside successes alone it leaves
+    just ``failure``.
+    """
+    counts = np.array([(outcomes == code).sum(axis=0) for code in Outcome])
+    failures = counts.copy()
+    failures[[Outcome.SUCCESS, Outcome.SIMULATION_ERROR]] = 0
+    found: NDArray[np.uint8] = np.argmax(failures, axis=0).astype(np.uint8)
+    found[2 * counts[Outcome.SUCCESS] >= len(outcomes)] = Outcome.SUCCESS
+    found[counts[Outcome.SIMULATION_ERROR] == len(outcomes)] = Outcome.SIMULATION_ERROR
+    return found
 
 
 def _carried_label(carried: Carried, allowed: Displacement, width_m: float) -> Label:

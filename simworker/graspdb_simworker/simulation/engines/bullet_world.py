@@ -31,7 +31,6 @@ from graspdb_simworker.simulation.bodies import (
     Part,
     Quaternion,
     Vector,
-    mass_properties,
     obj_of_parts,
 )
 from graspdb_simworker.simulation.engines.world import EngineWorld, Stepping
@@ -70,10 +69,10 @@ class BulletWorld(EngineWorld):
     inflated_m = COLLISION_MARGIN_M
 
     def __init__(
-        self, parts: Sequence[Part], mass_kg: float, friction: float, gripper: Gripper, *, visible: bool
+        self, parts: Sequence[Part], mass: MassProperties, friction: float, gripper: Gripper, *, visible: bool
     ) -> None:
         self.gripper = gripper
-        self.mass = mass_properties(parts, mass_kg)
+        self.mass = mass
         self._visible = visible
         self._views: list[camera.View] = []
         # Gives every call the world's number; calls of every step give it themselves, which is faster.

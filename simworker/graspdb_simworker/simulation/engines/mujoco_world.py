@@ -27,7 +27,6 @@ from graspdb_simworker.simulation.bodies import (
     Part,
     Quaternion,
     Vector,
-    mass_properties,
 )
 from graspdb_simworker.simulation.engines.world import EngineWorld, Stepping
 
@@ -49,12 +48,11 @@ class MujocoWorld(EngineWorld):
     inflated_m = 0.0
 
     def __init__(
-        self, parts: Sequence[Part], mass_kg: float, friction: float, gripper: Gripper, *, visible: bool
+        self, parts: Sequence[Part], mass: MassProperties, friction: float, gripper: Gripper, *, visible: bool
     ) -> None:
         if visible:
             raise ValueError("grasps are drawn by pybullet: --engine pybullet")
         self.gripper = gripper
-        mass = mass_properties(parts, mass_kg)
         # Else a warning would be written to a file in the folder that the worker was started in.
         mujoco.set_mju_user_warning(_ignored)
         self._model: Any = mujoco.MjModel.from_xml_string(_model(parts, mass, friction, gripper))

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire.sweeps import Fidelity
-from graspdb_simworker.simulation.bodies import Contacts, Gripper, Part, Quaternion, Vector
+from graspdb_simworker.simulation.bodies import (
+    Contacts,
+    Gripper,
+    MassProperties,
+    Part,
+    Quaternion,
+    Vector,
+)
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class EngineWorld(Protocol):
     """How much thicker than it is the engine takes the object to be, on every side."""
 
     def __init__(
-        self, parts: Sequence[Part], mass_kg: float, friction: float, gripper: Gripper, *, visible: bool
+        self, parts: Sequence[Part], mass: MassProperties, friction: float, gripper: Gripper, *, visible: bool
     ) -> None:
         """``parts`` are convex, in the object frame; ``visible``: build what can be seen."""
 
