@@ -72,3 +72,19 @@ def test_stored_outcomes_are_verified(swept: tuple[str, str]) -> None:
         (trial,) = http.get("/objects/mug/trials", params={"batch": lift["batch"]}).json()["items"]
     assert (trial["outcome"], trial["protocol"]) == ("success", "lift")
     assert 0.8 < trial["quality"] <= 1.0
+
+    # And simulates poses several times, which are drawn again the same.
+    above = {**rim, "position": [0.0, 0.0, 0.1]}
+    asked = {"draws": 3, "pose_noise_m": 1e-4, "pose_noise_deg": 0.1}
+    with httpx.Client(base_url=url, timeout=30.0) as http:
+        drawn = http.post("/objects/mug/sweeps", json={"poses": [rim, above], "randomise": asked}).json()
+        with Transport(url, retries=0) as transport:
+            Worker(transport, name="drawer", exit_when_idle=True).run()
+        page = http.get(f"/sweeps/{drawn['id']}/outcomes").json()
+    assert (page["outcome"], page["successes"]) == (["success", "missed"], [3, 0])
+    info, stored = stored_outcomes.sample_of(drawn["id"], per_outcome=10, url=url)
+    assert info.randomise is not None
+    again = agreement.verify_stored(
+        payload.model_copy(update={"randomise": info.randomise}), parts, stored, count=10
+    )
+    assert (again.checked, again.agreement, again.successes_apart) == (1, 1.0, 0.0)
