@@ -138,6 +138,7 @@ class AsyncSweep(Mirror[Sweep]):
     retry = _chained(Sweep.retry)
     waits_for = _awaited(Sweep.waits_for)
     hint = _awaited(Sweep.hint)
+    linked = _mirrored(Sweep.linked, lambda other: None if other is None else AsyncSweep(other))
     outcomes = _awaited(Sweep.outcomes)
 
     async def wait(

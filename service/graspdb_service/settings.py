@@ -111,7 +111,7 @@ class Settings(BaseSettings):
     max_batch_trials: Annotated[int, Field(ge=1)] = 1_000_000
     max_object_protocols: Annotated[int, Field(ge=1, le=10_000)] = 1_000
     max_object_provenances: Annotated[int, Field(ge=1, le=10_000)] = 5_000
-    """Combinations of gripper, source and protocol among an object's trials."""
+    """Combinations of gripper, source, protocol and engine among an object's trials."""
     max_object_qualities: Annotated[int, Field(ge=0, le=10_000)] = 200
     """Names of qualities among an object's trials; those of a batch have at most 32."""
     max_metadata_bytes: Annotated[int, Field(ge=0, le=MAX_METADATA_LENGTH)] = MAX_METADATA_LENGTH

@@ -139,11 +139,18 @@ class Provenance(NamedTuple):
     """What some of an object's trials have in common.
 
     ``gripper`` is one version, as in ``panda@1``; of a request perhaps an id alone, which means the newest.
+    ``engine`` is what simulated them, as in ``pybullet 3.2.7``.
     """
 
     gripper: str | None
     source: str | None
     protocol: str | None
+    engine: str | None = None
+
+    @property
+    def kin(self) -> Provenance:
+        """What it has in common with trials of other engines: questions are about all of them."""
+        return self._replace(engine=None)
 
 
 def gripper_parts(name: str) -> tuple[str, int | None]:

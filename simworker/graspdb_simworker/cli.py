@@ -81,6 +81,15 @@ EngineName = Annotated[
         help="Physics engine: pybullet where it is installed, else mujoco.",
     ),
 ]
+RunEngine = Annotated[
+    str | None,
+    typer.Option(
+        "--engine",
+        metavar="pybullet|mujoco|both",
+        help="Physics engine of chunks that name none: pybullet where it is installed, else mujoco. both: as"
+        " by default chunks of either are taken, and without both engines it does not start.",
+    ),
+]
 Protocol = Annotated[str, typer.Option(help="wrench, lift or shake.")]
 DecomposeSeconds = Annotated[
     float,
@@ -119,7 +128,7 @@ def run(
         bool, typer.Option(help="Stop when there is nothing left to simulate.")
     ] = False,
     once: Annotated[bool, typer.Option(help="Stop after one job for each process.")] = False,
-    engine: EngineName = None,
+    engine: RunEngine = None,
     decompose_seconds: DecomposeSeconds = 120.0,
     decompose_memory_mib: DecomposeMemory = 4096,
     api_key: ApiKey = None,
@@ -127,7 +136,8 @@ def run(
 ) -> None:
     """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked.
 
-    A chunk that names an engine is simulated with that one; --engine says which simulates the others.
+    A chunk that names an engine is simulated with that one; --engine says which simulates the others. Every
+    installed engine is offered, so that one worker that has both does both halves of a sweep of two engines.
     """
     chosen, engines = _engines(dask, engine)
     from graspdb_simworker.decomposition import supervisor as decomposition  # extra: sim
@@ -174,6 +184,10 @@ def run(
 
 def _engines(dask: str | None, engine: str | None) -> tuple[Engine | None, Sequence[Engine]]:
     """The engine that simulates chunks that name none, and those that chunks may name."""
+    if engine == "both":
+        for name in () if dask is not None else installed.ENGINES:
+            _require_physics(name)
+        return (None if dask is not None else installed.ENGINES[0]), installed.ENGINES
     if dask is None:
         return _require_physics(engine), installed.names()
     # What a cluster has nobody here knows: it is taken at the word of whoever names an engine.

@@ -18,7 +18,9 @@ from sqlalchemy import inspect, text
 from graspdb_service.storage import grippers, schema
 from graspdb_service.storage.database import Database, UnsupportedDatabase
 from graspdb_service.storage.tables import metadata
-from graspdb_service.storage.trials import findings
+from graspdb_service.storage.trials import findings, provenances
+from graspdb_service.storage.trials import rows as rows_of_trials
+from graspdb_service.trial_columns import Provenance
 from graspdb_service.usecases.trials import batches
 
 ROOT = Path(__file__).parents[2]
@@ -113,6 +115,71 @@ def test_data_of_every_earlier_version_is_read_on(empty_url: str, version: str) 
     assert gripper is not None
     assert (gripper.profile, gripper.versioned, gripper.changed) == ({"max_opening_m": 0.07}, "mine@1", None)
     batches.remove(database, "mug", KEY)
+    database.dispose()
+
+
+def test_rows_of_a_sweep_get_the_engine_that_simulated_all_of_it(empty_url: str) -> None:
+    """What several engines, or an unknown one, simulated stays of none; and all of it goes back."""
+    database = Database(empty_url)
+    schema.upgrade(database, "0014")
+    now = "'2026-01-01 00:00:00'"
+    statements = [
+        f"INSERT INTO objects (id, slug, revision, epoch, last_seq, created_at, updated_at)"
+        f" VALUES (1, 'mug', 9, 0, 6, {now}, {now})",
+        f"INSERT INTO grippers (id, builtin, created_at) VALUES ('mine', false, {now})",
+        "INSERT INTO provenances (object_id, gripper, gripper_version, source, protocol)"
+        " VALUES (1, 'mine', 1, 'simulation', 'wrench')",
+        "INSERT INTO tallies (provenance_id, outcome, row_count, packed_count)"
+        " VALUES (1, 1, 5, 0), (1, 2, 0, 7)",
+    ]
+    old, new = "'pybullet 3.2.7'", "'pybullet 3.2.8'"
+    engines = {"one": [old, old], "two": [old, new], "unknown": ["NULL", "NULL"]}
+    for place, (sweep, told) in enumerate(engines.items()):
+        first = 2 * place + 1
+        statements += [
+            "INSERT INTO sweeps (id, object_id, provenance_id, gripper, protocol, fidelity, purpose, plan,"
+            " request, snapshot, pose_count, chunk_poses, chunks, cancelled, created_at)"
+            f" VALUES ('{sweep}', 1, 1, 'mine', 'wrench', 'standard', 'collect', 'poses', '{{}}', '{{}}',"
+            f" 2, 1, 2, false, {now})",
+            "INSERT INTO batches"
+            " (id, key, object_id, sweep_id, revision, first_seq, last_seq, inserted, packed, created_at)"
+            f" VALUES ({place + 1}, '{sweep}', 1, '{sweep}', 1, {first}, {first + 1}, 2, 0, {now})",
+        ]
+        for number, engine in enumerate(told):
+            job = f"{sweep}-{number}"
+            # One of the rows was withdrawn: it counts in no tally.
+            withdrawn = "true" if job == "one-1" else "NULL"
+            statements += [
+                "INSERT INTO jobs"
+                " (id, kind, capability, object_id, sweep_id, number, start, stop, state, attempts)"
+                f" VALUES ('{job}', 'simulate', 'simulate', 1, '{sweep}', {number}, {number}, {number + 1},"
+                " 'done', 1)",
+                "INSERT INTO packed_outcomes (job_id, sweep_id, number, revision, outcomes, engine)"
+                f" VALUES ('{job}', '{sweep}', {number}, 1, '', {engine})",
+                "INSERT INTO trials (object_id, seq, revision, batch_id, provenance_id, outcome, withdrawn,"
+                " px, py, pz, qx, qy, qz, qw) VALUES"
+                f" (1, {first + number}, 1, {place + 1}, 1, 1, {withdrawn}, 0, 0, 0.1, 1, 0, 0, 0)",
+            ]
+    with database.write(audited=False) as tx:
+        for statement in statements:
+            tx.exec_driver_sql(statement)
+    schema.upgrade(database)
+    with database.read() as tx:
+        rows = rows_of_trials.page(tx, 1, after_seq=0, limit=10)
+        names = provenances.of_object(tx, 1)
+        tallies = provenances.tallies(tx, 1)
+    assert [names[number].engine for number in rows.provenance.tolist()] == ["pybullet 3.2.7"] * 2 + [
+        None
+    ] * 4
+    assert {name.kin for name in names.values()} == {Provenance("mine@1", "simulation", "wrench")}
+    named = next(number for number, name in names.items() if name.engine)
+    assert tallies == [(1, 1, 4, 0), (1, 2, 0, 7), (named, 1, 1, 0)]
+    with database.write(audited=False) as tx:
+        command.downgrade(schema.alembic_config(tx), "0014")
+    with database.read() as tx:
+        assert tx.scalars(text("SELECT DISTINCT provenance_id FROM trials")).all() == [1]
+        told = tx.execute(text("SELECT outcome, row_count, packed_count FROM tallies ORDER BY 1")).all()
+    assert [tuple(row) for row in told] == [(1, 5, 0), (2, 0, 7)]
     database.dispose()
 
 

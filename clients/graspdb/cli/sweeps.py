@@ -25,10 +25,16 @@ def sweep(
     wait: Annotated[bool, typer.Option("--wait", help="Stay until it has finished.")] = False,
     timeout: Annotated[float | None, typer.Option(help="Seconds to --wait at most.")] = None,
 ) -> None:
-    """Have workers simulate grasps of an object: the whole grid, or what the options say."""
+    """Have workers simulate grasps of an object: the whole grid, or what the options say.
+
+    With --engine both these are two sweeps; shown is that which stores trials, --wait is for both.
+    """
     made = state.db.objects.get(id).sweep(**options)
     if wait:
         _wait(state, made, timeout)
+        other = made.linked()
+        if other is not None:
+            _wait(state, other, timeout)
     _show(state, made)
 
 
@@ -49,6 +55,7 @@ def list_sweeps(
             "poses": lambda i: i.poses,
             "done": lambda i: f"{100 * i.poses_done / max(i.poses, 1):.0f} %",
             "successes": lambda i: i.outcomes.get("success", 0),
+            "engine": lambda i: ", ".join(i.engines) or i.engine,
             "purpose": lambda i: i.purpose,
             "created": lambda i: f"{i.created_at:%Y-%m-%d %H:%M}",
         },
@@ -80,13 +87,13 @@ def wait_for_sweep(
 
 @sweeps.command("cancel")
 def cancel_sweep(state: State, id: SweepId) -> None:
-    """Stop a sweep; what is stored stays."""
+    """Stop a sweep, and the one linked with it; what is stored stays."""
     _show(state, state.db.sweeps.get(id).cancel())
 
 
 @sweeps.command("retry")
 def retry_sweep(state: State, id: SweepId) -> None:
-    """Queue a sweep's failed chunks again."""
+    """Queue a sweep's failed chunks again, and those of the one linked with it."""
     _show(state, state.db.sweeps.get(id).retry())
 
 

@@ -33,6 +33,9 @@ def add_trials(
     gripper: Annotated[str | None, typer.Option(help="Gripper of all trials that name none.")] = None,
     source: Annotated[str | None, typer.Option(help="simulation, robot, human or import.")] = None,
     protocol: Annotated[str | None, typer.Option(help="How the trials were judged.")] = None,
+    engine: Annotated[
+        str | None, typer.Option(help="Physics engine that simulated them, as 'pybullet 3.2.7'.")
+    ] = None,
     answer: Annotated[
         str | None, typer.Option(help="Id or name of the answer that trials tried which name none.")
     ] = None,
@@ -46,8 +49,8 @@ def add_trials(
     """Store the trials of a file, and say what looks doubtful about them.
 
     CSV has the columns x,y,z,qx,qy,qz,qw,outcome and optionally gripper, source, protocol,
-    proposal_density, quality, width_m, measured_at, answer, achieved_x to achieved_qw for where the tool was
-    after all, and qualities.NAME for any number of named scores.
+    engine, proposal_density, quality, width_m, measured_at, answer, achieved_x to achieved_qw for where the
+    tool was after all, and qualities.NAME for any number of named scores.
     """
     records, shared = read_trials(file)
     try:
@@ -55,6 +58,7 @@ def add_trials(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     given = {"gripper": gripper, "source": source, "protocol": protocol, "answer": answer}
+    given["engine"] = engine
     given |= {"licence": licence, "citation": citation}
     shared |= {name: value for name, value in given.items() if value is not None}
     upload["progress"] = not state.json and len(records) > 1_000
@@ -86,6 +90,7 @@ def list_trials(
             "gripper": lambda t: t.gripper,
             "source": lambda t: t.source,
             "protocol": lambda t: t.protocol,
+            "engine": lambda t: t.engine,
             "batch": lambda t: t.batch,
             "answer": lambda t: t.answer,
         },

@@ -1,11 +1,11 @@
 """Trials and poses in files: JSON, NDJSON and CSV, and poses in .npy.
 
 CSV has a header line. A pose is ``x,y,z,qx,qy,qz,qw``; a trial adds ``outcome`` and, where wanted,
-``gripper``, ``source``, ``protocol``, ``proposal_density``, ``attempts``, ``successes``, ``quality``,
-``width_m``, ``measured_at``, ``answer``, the pose that was achieved as ``achieved_x`` to ``achieved_qw``, and
-named scores as ``qualities.NAME``; an empty cell is a value not given. JSON is what the HTTP interface takes:
-one trial, a list of trials, ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter two with values
-shared by all beside them.
+``gripper``, ``source``, ``protocol``, ``engine``, ``proposal_density``, ``attempts``, ``successes``,
+``quality``, ``width_m``, ``measured_at``, ``answer``, the pose that was achieved as ``achieved_x`` to
+``achieved_qw``, and named scores as ``qualities.NAME``; an empty cell is a value not given. JSON is what the
+HTTP interface takes: one trial, a list of trials, ``{"trials": [...]}`` or ``{"columns": {...}}``, the latter
+two with values shared by all beside them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from graspdb.poses import POSE_COLUMNS, as_poses
 
 OUTCOME_COLUMNS = ("outcome", "success", "label", "result", "held", "object_in_gripper")
 """What tables call the column of what became of a grasp; the first that is there counts."""
-_TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "measured_at", "answer"})
+_TEXT_COLUMNS = frozenset({"outcome", "gripper", "source", "protocol", "engine", "measured_at", "answer"})
 _ACHIEVED_COLUMNS = tuple(f"achieved_{name}" for name in POSE_COLUMNS)
 _COUNT_COLUMNS = frozenset({"attempts", "successes"})
 _NUMBER_COLUMNS = frozenset({"proposal_density", "quality", "width_m", *_COUNT_COLUMNS})

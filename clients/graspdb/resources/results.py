@@ -755,8 +755,8 @@ class TrialArrays(TriedPoses):
         )
 
     def _columns(self) -> dict[str, Any]:
-        names = ["gripper", "source", "protocol", "batch", "sweep", "pose_index", "quality", "width_m"]
-        names += ["proposal_density", "measured_at", "revision", "withdrawn", "answer"]
+        names = ["gripper", "source", "protocol", "engine", "batch", "sweep", "pose_index", "quality"]
+        names += ["width_m", "proposal_density", "measured_at", "revision", "withdrawn", "answer"]
         names += ["attempts", "successes"]
         columns = {"seq": self.seq, **pose_columns(self), "outcome": self.outcome}
         columns |= {f"achieved_{name}": x for name, x in pose_columns(self.achieved).items()}

@@ -67,10 +67,10 @@ class SweepOptions(PoseFrame, total=False):
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
     counter gravity in every direction), ``lift`` (still where it was after a lift) or ``shake`` (not lost
     when shaken without gravity); ``fidelity`` ``standard`` or ``fine`` (smaller time step); ``engine``
-    ``pybullet`` or ``mujoco``, by default that of whichever workers come; ``randomise`` what is drawn anew
-    in each of several simulations of a pose (:class:`graspdb.wire.Randomise`, a mapping or the number of
-    draws): a pose then succeeds k times of n; ``purpose``
-    ``collect``, or ``check``: outcomes are stored but enter no density.
+    ``pybullet``, ``mujoco`` or ``both`` (two sweeps: see :meth:`Sweep.linked`), by default that of whichever
+    workers come; ``randomise`` what is drawn anew in each of several simulations of a pose
+    (:class:`graspdb.wire.Randomise`, a mapping or the number of draws): a pose then succeeds k times of n;
+    ``purpose`` ``collect``, or ``check``: outcomes are stored but enter no density.
     """
 
     max_poses: Annotated[int | None, Option("A random part of the grid.", min=1)]
@@ -90,7 +90,7 @@ class SweepOptions(PoseFrame, total=False):
     gripper: Annotated[str | None, Option("Gripper profile [pg70].")]
     protocol: Annotated[str | None, Option("wrench, lift or shake [wrench].")]
     fidelity: Annotated[str | None, Option("standard or fine [standard].")]
-    engine: Annotated[str | None, Option("pybullet or mujoco [the workers' own].")]
+    engine: Annotated[str | None, Option("pybullet, mujoco or both [the workers' own].")]
     randomise: Annotated[
         Mapping[str, float] | int | str | None,
         Option(
@@ -127,12 +127,23 @@ class Sweep(Resource):
         """Ask the service how far it is."""
         return self._update(self._transport.json("GET", self._path))
 
+    def linked(self) -> Sweep | None:
+        """The sweep of the same poses with the other engine; None where one engine simulates them.
+
+        Of ``engine="both"`` the first sweep, with pybullet, alone stores trials; what the second says, with
+        mujoco, tells how far they can be believed. Each is waited for by itself.
+        """
+        if self.info.linked is None:
+            return None
+        path = f"/sweeps/{segment(self.info.linked)}"
+        return Sweep(self._transport, self._transport.model(wire.SweepInfo, "GET", path))
+
     def cancel(self) -> Sweep:
-        """Stop it; what is already stored stays."""
+        """Stop it and its linked sweep; what is already stored stays."""
         return self._update(self._transport.json("POST", f"{self._path}/cancel", idempotent=True))
 
     def retry(self) -> Sweep:
-        """Queue the failed and cancelled chunks again."""
+        """Queue the failed and cancelled chunks again, those of its linked sweep, too."""
         return self._update(self._transport.json("POST", f"{self._path}/retry", idempotent=True))
 
     def _update(self, answer: Any) -> Sweep:
@@ -249,6 +260,7 @@ class Sweep(Resource):
             "plan": f"{info.plan}, {info.protocol}, {info.fidelity}, {info.purpose}",
             "gripper": info.gripper,
             "engine": ", ".join(info.engines) or info.engine or "the workers' own",
+            **({} if info.linked is None else {"linked sweep": info.linked}),
             **({} if info.randomise is None else {"drawn": _drawn(info.randomise)}),
             "state": info.state,
             "poses": f"{info.poses_done:,} of {info.poses:,}",

@@ -135,6 +135,7 @@ class Trials(Resource):
         gripper: str | None = None,
         source: str | None = None,
         protocol: str | None = None,
+        engine: str | None = None,
         proposal_density: ArrayLike | None = None,
         attempts: ArrayLike | None = None,
         successes: ArrayLike | None = None,
@@ -159,7 +160,7 @@ class Trials(Resource):
         - ``poses``: tool frames, or ``frame``, in the object frame: (N, 4, 4) matrices or (N, 7) rows
           x y z qx qy qz qw, or one pose; a :class:`~graspdb.resources.results.Grasp` or samples go too.
         - ``outcomes``: (N,) booleans or outcome names; a single one goes for all poses.
-        - ``gripper``, ``source``, ``protocol``: of the whole upload.
+        - ``gripper``, ``source``, ``protocol``, ``engine`` (as in ``pybullet 3.2.7``): of the whole upload.
         - ``proposal_density``: 1/(m^3 rad^3), (N,) or one number: the density the poses were drawn from.
         - ``attempts``, ``successes``: (N,) or one whole number, NaN for once: how often a grasp was tried and
           succeeded. It counts as one attempt that succeeded by that share; from half on it is a success.
@@ -190,7 +191,7 @@ class Trials(Resource):
         if measured_at is not None:
             columns["measured_at"] = _times(measured_at, count)
         shared: dict[str, Any] = {"gripper": gripper, "source": source, "protocol": protocol}
-        shared |= {"licence": licence, "citation": citation}
+        shared |= {"engine": engine, "licence": licence, "citation": citation}
         if origin is not None:
             told = wire.Origin.model_validate(origin)
             shared["origin"] = told.model_dump(exclude_none=True)
@@ -229,8 +230,8 @@ class Trials(Resource):
         """Store trials given as mappings with the fields of the HTTP interface; sent as :meth:`add` does.
 
         ``shared`` stands once for all that do not say it themselves: ``gripper``, ``source``, ``protocol``,
-        ``proposal_density``, ``metadata``, ``answer``; and ``licence``, ``citation``, ``origin`` of the
-        batches. ``frame`` and ``convention`` are what all poses are of, those achieved, too.
+        ``engine``, ``proposal_density``, ``metadata``, ``answer``; and ``licence``, ``citation``, ``origin``
+        of the batches. ``frame`` and ``convention`` are what all poses are of, those achieved, too.
         """
         trials = [dict(record) for record in records]
         if not trials:

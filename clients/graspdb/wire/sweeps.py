@@ -37,6 +37,7 @@ from graspdb.wire.trials import ProposalDensity
 Protocol = Literal["wrench", "lift", "shake"]
 Fidelity = Literal["standard", "fine"]
 Engine = Literal["pybullet", "mujoco"]
+AskedEngine = Literal["pybullet", "mujoco", "both"]
 Purpose = Literal["collect", "check"]
 
 
@@ -147,9 +148,10 @@ class SweepCreate(Request):
     without gravity."""
     fidelity: Fidelity = "standard"
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
-    engine: Engine | None = None
-    """Physics engine that simulates it: only workers that have it take its chunks. Null for that of whichever
-    workers come."""
+    engine: AskedEngine | None = None
+    """Physics engine that simulates it: only workers that have it take its chunks. ``both``: two linked
+    sweeps over the same poses; the first, which is answered, has ``pybullet`` and alone stores trials, what
+    the second says with ``mujoco`` is compared. Null for the engine of whichever workers come."""
     randomise: Randomise | None = None
     """What is drawn anew in each of several simulations of every pose; null: one simulation of what is
     known."""
@@ -223,10 +225,13 @@ class SweepInfo(Response):
     engines: list[str] = Field(default_factory=list)
     """Engines that have simulated chunks of it, with their versions, as in ``pybullet 3.2.7``; none of chunks
     from before workers told."""
+    linked: str | None = None
+    """Id of the sweep that simulates the same poses with the other engine; null where one engine does."""
     randomise: Randomise | None = None
     """What is drawn anew in each of several simulations of a pose; null: each is simulated once."""
     purpose: str
-    """``collect``, or ``check``: outcomes enter no density."""
+    """``collect``; ``check``: outcomes enter no density; or ``compare``, of the second of two linked sweeps:
+    they are no trials, but say how far the first one's can be believed."""
     plan: Literal["grid", "poses", "sample"]
     """Whether it simulates a grid, given poses or draws from the density."""
     grid: GridSpec | None = None

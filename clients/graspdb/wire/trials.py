@@ -51,6 +51,8 @@ ProposalDensity = Annotated[float, Field(ge=1e-30, le=1e15)]
 Width = Annotated[float, Field(ge=0, le=10)]
 Attempts = Annotated[int, Field(ge=1, le=1_000_000)]
 Successes = Annotated[int, Field(ge=0, le=1_000_000)]
+EngineTold = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[a-z0-9_-]+( [\w.+-]+)?$")]
+"""A physics engine, with its version where that is known, as in ``pybullet 3.2.7``."""
 _Covariance = Annotated[float, Field(ge=-1e6, le=1e6)]
 Row6 = tuple[_Covariance, _Covariance, _Covariance, _Covariance, _Covariance, _Covariance]
 Matrix6 = tuple[Row6, Row6, Row6, Row6, Row6, Row6]
@@ -79,6 +81,9 @@ class TrialDefaults(Request):
     """Who tried: ``simulation``, ``robot``, ``human`` or ``import``; null if unknown."""
     protocol: Slug | None = None
     """How the outcome was judged, in the user's words or as sweeps do; null if unknown."""
+    engine: EngineTold | None = None
+    """Physics engine that simulated it, best with its version, as in ``pybullet 3.2.7``; null if unknown, or
+    none did."""
     proposal_density: ProposalDensity | None = None
     """Density that the pose was drawn with, 1/(m^3 rad^3), which weights the trial; null if unknown."""
     metadata: Metadata | None = None
@@ -154,6 +159,8 @@ class TrialColumns(Request):
     """Who tried each; null if unknown."""
     protocol: Annotated[list[Slug | None], MANY] | None = None
     """How each outcome was judged; null if unknown."""
+    engine: Annotated[list[EngineTold | None], MANY] | None = None
+    """Physics engine that simulated each, best with its version; null if unknown, or none did."""
     proposal_density: Annotated[list[ProposalDensity | None], MANY] | None = None
     """Density that each pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: Annotated[list[Quality | None], MANY] | None = None
@@ -215,6 +222,9 @@ class TrialOut(Response):
     """Who tried: ``simulation``, ``robot``, ``human`` or ``import``; null if unknown."""
     protocol: str | None = None
     """How the outcome was judged; null if unknown."""
+    engine: str | None = None
+    """Physics engine that simulated it, with its version where that is known, as in ``pybullet 3.2.7``; null
+    if unknown, or none did."""
     proposal_density: float | None = None
     """Density that the pose was drawn with, 1/(m^3 rad^3); null if unknown."""
     quality: float | None = None
@@ -347,7 +357,8 @@ class BatchInfo(Response):
     protocols: list[str] = Field(default_factory=list)
     """Protocols that its trials name."""
     engines: list[str] = Field(default_factory=list)
-    """Physics engines that simulated its trials, with their versions; none where that is not known."""
+    """Physics engines that simulated its trials, with their versions as far as these are known; none where
+    that is not known."""
     findings: list[Finding] = Field(default_factory=list)
     """What was doubtful about its trials when they came."""
     created_at: datetime

@@ -143,6 +143,7 @@ def _schema(qualities: Sequence[str], told: dict[str, Any]) -> Any:
             ("gripper_version", pa.int64()),
             ("source", pa.string()),
             ("protocol", pa.string()),
+            ("engine", pa.string()),
             *((name, pa.float64()) for name in SCALARS if name not in SEVERAL),
             *((name, pa.int32()) for name in SEVERAL),
             ("pose_covariance", pa.list_(pa.list_(pa.float64()))),

@@ -34,11 +34,14 @@ QUALITIES = "qualities."
 _SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _GRIPPER = re.compile(_SLUG.pattern + r"(@[1-9][0-9]{0,8})?")
 _GRIPPER_RULE = "a gripper's id, or one version of it, as in panda@1"
+_ENGINE = re.compile(r"(?=.{1,64}$)[a-z0-9_-]+( [\w.+-]+)?")
+_ENGINE_RULE = "a physics engine, perhaps with its version, as in 'pybullet 3.2.7'; at most 64 characters"
 _SLUG_RULE = "letters, digits, '.', '_', '-'; at most 64 characters, the first a letter or digit"
 _NAME_RULES = {
     "gripper": (_GRIPPER, _GRIPPER_RULE),
     "source": (re.compile("|".join(SOURCES)), f"one of {', '.join(SOURCES)}"),
     "protocol": (_SLUG, _SLUG_RULE),
+    "engine": (_ENGINE, _ENGINE_RULE),
     "answer": (_SLUG, _SLUG_RULE),
 }
 _QUALITY_NAME: TypeAdapter[str] = TypeAdapter(QualityName)
@@ -52,7 +55,8 @@ BLOCK = 16_384
 
 Place = Callable[[int, str], str]
 """What a field of a trial is called in the request."""
-#: Answers, and combinations of gripper, source and protocol, of one request, whatever the settings allow.
+#: Answers, and combinations of gripper, source, protocol and engine, of one request, whatever the settings
+#: allow.
 MOST_NAMES = 10_000
 
 
@@ -194,7 +198,7 @@ def _refuse_many_qualities(names: Collection[str], block: Fields) -> None:
 def _refuse_made_up_names(block: Fields, provenance: Ints, answer: Ints) -> None:
     """422, before later blocks cost any time, for more names than an object may have."""
     for what, field_name, places, told in (
-        ("provenances", "protocol", provenance, "combinations of gripper, source and protocol"),
+        ("provenances", "protocol", provenance, "combinations of gripper, source, protocol and engine"),
         ("answers", "answer", answer, "answers"),
     ):
         if places.max(initial=0) >= MOST_NAMES:

@@ -272,6 +272,7 @@ def columns_of(page: TrialPage) -> dict[str, Sequence[Any] | NDArray[Any]]:
         "gripper_version": [None if name is None else name[1] for name in named],
         "source": [item.source for item in provenances],
         "protocol": [item.protocol for item in provenances],
+        "engine": [item.engine for item in provenances],
         "proposal_density": columns.proposal_density,
         "quality": columns.quality,
         "width_m": columns.width_m,

@@ -139,7 +139,8 @@ objects = Table(
     info=WHOLLY_AUDITED,
 )
 
-# Which gripper, source and protocol a trial had, once per combination instead of once per row.
+# Which gripper, source, protocol and engine a trial had, once per combination instead of once per row. What
+# is packed counts under its sweep's, which names no engine.
 provenances = Table(
     "provenances",
     metadata,
@@ -149,6 +150,8 @@ provenances = Table(
     Column("source", String(16)),
     Column("protocol", String(64)),
     Column("gripper_version", Integer),
+    # What simulated it, with its version where that is known.
+    Column("engine", String(64)),
 )
 
 # Trials by provenance and outcome, kept in the transactions that change them: counting reads no trial.
@@ -186,6 +189,9 @@ sweeps = Table(
     Column("created_at", UtcDateTime, nullable=False),
     Column("started_at", UtcDateTime),
     Column("finished_at", UtcDateTime),
+    # The sweep of the other engine over the same plan, which names this one. No foreign key: both come and go
+    # with their object.
+    Column("linked", String(36)),
     info=AUDITED_AS_A_WHOLE,
 )
 
@@ -362,8 +368,7 @@ jobs = Table(
     ),
 )
 
-# One uint8 for every pose of a finished chunk, in the plan's order, and what physics measured for the
-# poses of a check, which never become trials.
+# One uint8 for every pose of a finished chunk, in the plan's order.
 packed_outcomes = Table(
     "packed_outcomes",
     metadata,
@@ -376,6 +381,9 @@ packed_outcomes = Table(
     Column("successes", LargeBinary),
     # What simulated it, with its version; null: the worker did not say.
     Column("engine", String(64)),
+    # Of a linked sweep what physics measured, which is compared: see
+    # graspdb_service.storage.simulation.linked.
+    Column("measured", LargeBinary),
 )
 
 workers = Table(

@@ -29,6 +29,7 @@ _MORE = (
     "gripper",
     "source",
     "protocol",
+    "engine",
     "proposal_density",
     "measured_at",
     "metadata",

@@ -10,8 +10,8 @@ from graspdb.files.trials import OUTCOME_COLUMNS
 
 #: Further columns of a trial, by their names on the wire.
 MORE = (
-    *("attempts", "successes", "width_m", "gripper", "source", "protocol", "proposal_density"),
-    *("measured_at", "answer", "metadata"),
+    *("attempts", "successes", "width_m", "gripper", "source", "protocol", "engine"),
+    *("proposal_density", "measured_at", "answer", "metadata"),
 )
 #: How often a grasp was tried and succeeded.
 _SEVERAL = {"attempts", "successes"}

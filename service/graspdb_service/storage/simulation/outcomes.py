@@ -1,7 +1,9 @@
 """Packed outcomes: one code for every pose of a finished chunk, and how much of each grid was tried.
 
-Outcomes of a sweep that checks are stored alike, and counted nowhere but in the reports that ask for them. A
-sweep without its batch is one whose outcomes were deleted.
+Outcomes of a sweep that checks or compares are stored alike, and counted nowhere but in the reports that ask
+for them; those that compare, in success probabilities, too
+(:mod:`graspdb_service.storage.simulation.linked`). A sweep without its batch is one whose outcomes were
+deleted.
 """
 
 from __future__ import annotations
@@ -43,9 +45,11 @@ def store(
     outcomes: bytes,
     successes: bytes | None,
     engine: str | None,
+    measured: bytes | None = None,
 ) -> None:
     """Keep a chunk's uint8 outcome codes, one for every pose of it, of several attempts how many succeeded,
-    and what simulated it."""
+    what simulated it, and of a linked sweep what it measured.
+    """
     tx.execute(
         insert(packed_outcomes).values(
             job_id=job_id,
@@ -55,6 +59,7 @@ def store(
             outcomes=outcomes,
             successes=successes,
             engine=engine,
+            measured=measured,
         )
     )
 

@@ -29,7 +29,9 @@ _WINDOW_S = 120.0
 
 @dataclass(frozen=True)
 class SweepRow:
-    """A sweep as it is stored. ``batch`` is null once its batch was deleted."""
+    """A sweep as it is stored. ``batch`` is null once its batch was deleted; ``linked`` is the sweep of the
+    other engine over the same plan.
+    """
 
     id: str
     object_id: int
@@ -50,9 +52,21 @@ class SweepRow:
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
+    linked: str | None
     object: str
     batch_id: int | None
     batch: str | None
+
+    @property
+    def collects(self) -> bool:
+        """Whether it stores trials."""
+        return self.purpose == "collect"
+
+    @property
+    def enters(self) -> bool:
+        """Whether what it finds enters estimates: as trials, or beside those of its linked sweep."""
+        compared: bool = self.purpose == "compare" and self.request["purpose"] == "collect"
+        return self.collects or compared
 
 
 @dataclass(frozen=True)

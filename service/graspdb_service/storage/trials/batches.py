@@ -185,8 +185,8 @@ def outcome_counts(tx: Tx, batch: BatchRow) -> dict[tuple[int, int], int]:
     counts = row_counts(tx, batch)
     if batch.sweep_id is not None and batch.provenance_id is not None:
         # Not every code of the packed outcomes: poses that another sweep had stored before count there.
-        check = batch.purpose == "check"
-        packed = _packed_codes(tx, batch.sweep_id) if check else outcomes.packed_counts(tx, batch.sweep_id)
+        own = batch.purpose != "collect"
+        packed = _packed_codes(tx, batch.sweep_id) if own else outcomes.packed_counts(tx, batch.sweep_id)
         for outcome, number in packed.items():
             place = batch.provenance_id, outcome
             counts[place] = counts.get(place, 0) + number

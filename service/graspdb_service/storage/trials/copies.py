@@ -84,15 +84,19 @@ def grippers_of(tx: Tx, object_id: int) -> list[str]:
 
 
 def copy_trials(tx: Tx, original: int, copy: int) -> None:
-    """Copy all trials, with their batches, history and findings, and what collecting sweeps have finished.
+    """Copy all trials, with their batches, history and findings, and what collecting sweeps, and those that
+    compare with them, have finished.
 
     Checks stay behind: they judge estimates of the object that they were made of.
     """
     numbers = _provenances(tx, original, copy)
     if not numbers:
         return
-    collected = sweeps.c.object_id == original, sweeps.c.purpose == "collect"
-    of_sweeps = select(sweeps.c.id).where(*collected)
+    collected = select(sweeps.c.id).where(sweeps.c.object_id == original, sweeps.c.purpose == "collect")
+    compared = and_(sweeps.c.purpose == "compare", sweeps.c.linked.in_(collected))
+    of_sweeps = select(sweeps.c.id).where(
+        sweeps.c.object_id == original, or_(sweeps.c.purpose == "collect", compared)
+    )
     kept = or_(batches.c.sweep_id.is_(None), batches.c.sweep_id.in_(of_sweeps))
     # Until the rows are there, a batch's key tells which one it was.
     _insert(
@@ -124,10 +128,12 @@ def copy_trials(tx: Tx, original: int, copy: int) -> None:
         tx, tallies, tallies, [tallies.c.provenance_id.in_(list(numbers))],
         provenance_id=case(numbers, value=tallies.c.provenance_id),
     )  # fmt: skip
-    for sweep_id in tx.scalars(of_sweeps).all():
-        sweep = sweep_rows.find(tx, sweep_id)
-        if sweep is not None and sweep.batch_id is not None:
-            _sweep(tx, sweep, copy, numbers[sweep.provenance_id])
+    found = sweep_rows.find_many(tx, tx.scalars(of_sweeps).all())
+    kept_sweeps = [sweep for sweep in found.values() if sweep.batch_id is not None]
+    names = {sweep.id: str(uuid.uuid4()) for sweep in kept_sweeps}
+    for sweep in kept_sweeps:
+        linked = None if sweep.linked is None else names.get(sweep.linked)
+        _sweep(tx, sweep, names[sweep.id], copy, numbers[sweep.provenance_id], linked)
     tx.execute(
         update(batches)
         .where(batches.c.object_id == copy, batches.c.sweep_id.is_(None))
@@ -151,14 +157,14 @@ def _provenances(tx: Tx, original: int, copy: int) -> dict[int, int]:
     return numbers
 
 
-def _sweep(tx: Tx, sweep: SweepRow, copy: int, provenance_id: int) -> None:
+def _sweep(tx: Tx, sweep: SweepRow, number: str, copy: int, provenance_id: int, linked: str | None) -> None:
     """Copy a sweep as far as it has come: its finished chunks, which are all that a copy can have of it."""
-    number, key = str(uuid.uuid4()), str(uuid.uuid4())
+    key = str(uuid.uuid4())
     unfinished = exists().where(jobs.c.sweep_id == sweep.id, jobs.c.state != JobState.DONE)
     _insert(
         tx, sweeps, sweeps, [sweeps.c.id == sweep.id],
         id=literal(number), object_id=literal(copy), provenance_id=literal(provenance_id),
-        cancelled=or_(sweeps.c.cancelled, unfinished),
+        cancelled=or_(sweeps.c.cancelled, unfinished), linked=literal(linked, String),
     )  # fmt: skip
     sweep_rows.keep_snapshot(tx, number, {**sweep.snapshot, "batch": key})
     marked = batches.c.key == f"{copy}-{sweep.batch_id}"

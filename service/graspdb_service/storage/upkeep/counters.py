@@ -55,7 +55,7 @@ class Survey:
     by_batch: dict[tuple[int, int], _Rows] = field(default_factory=lambda: defaultdict(_Rows))
     by_object: dict[int, _Rows] = field(default_factory=lambda: defaultdict(_Rows))
     by_provenance: dict[tuple[int, int], int] = field(default_factory=Counter)
-    #: Packed outcomes that count, by sweep; of a check all that it has.
+    #: Packed outcomes that count, by sweep; of one that collects nothing all that it has.
     packed: dict[str, int] = field(default_factory=Counter)
 
 
@@ -101,7 +101,7 @@ def survey(tx: Tx, object_id: int | None = None) -> Survey:
         chunks if object_id is None else chunks.where(sweeps.c.object_id == object_id)
     ):
         packed = {int(code): number for code, number in counts["packed"].items()}
-        found.packed[sweep] += size if purpose == "check" else sum(packed.values())
+        found.packed[sweep] += size if purpose != "collect" else sum(packed.values())
         for code, number in packed.items():
             found.tallies[provenance, code][1] += number
     return found

@@ -8,7 +8,7 @@ from graspdb_service.storage import grippers, objects
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.trials import provenances
-from graspdb_service.trial_columns import gripper_parts
+from graspdb_service.trial_columns import Provenance, gripper_parts
 from graspdb_service.usecases.reports.common import LEVEL, share
 from graspdb_service.usecases.trials.selection import outcome_counts, total
 
@@ -49,17 +49,21 @@ def summary(database: Database) -> SummaryReport:
 
 
 def _rows(tx: Tx, item: ObjectRow) -> list[SummaryRow]:
-    counts = outcome_counts(tx, item.id)
+    known = provenances.of_object(tx, item.id)
+    counts = outcome_counts(tx, item.id, known)
+    # Trials that differ by the engine alone are one row.
+    alike: dict[Provenance, list[dict[str, int]]] = {}
+    for number, origin in known.items():
+        if number in counts:
+            alike.setdefault(origin.kin, []).append(counts[number])
     symmetric: dict[str | None, bool] = {None: True}
     rows = []
-    for number, origin in provenances.of_object(tx, item.id).items():
-        if number not in counts:
-            continue
+    for origin, counted in alike.items():
         if origin.gripper not in symmetric:
             assert origin.gripper is not None
             gripper = grippers.find(tx, origin.gripper)
             symmetric[origin.gripper] = gripper is None or bool(gripper.profile.get("symmetric", True))
-        outcomes = total([counts[number]])
+        outcomes = total(counted)
         tried = sum(outcomes.values()) - outcomes.get(_NO_ATTEMPT, 0)
         won = outcomes.get("success", 0)
         twins = 2 if symmetric[origin.gripper] else 1

@@ -95,7 +95,7 @@ def _check(
         (
             "too-many-provenances",
             settings.max_object_provenances,
-            "combinations of gripper, source and protocol",
+            "combinations of gripper, source, protocol and engine",
             count,
             new.keys(),
         ),

@@ -18,6 +18,7 @@ from graspdb.wire import (
     Selection,
     SweepCreate,
 )
+from graspdb.wire.sweeps import Engine
 from graspdb_density.se3 import Poses
 from graspdb_service.problems import ProblemError, conflict, invalid
 from graspdb_service.storage.access import audit
@@ -37,6 +38,9 @@ from graspdb_service.usecases.simulation.sweeps import require_sweep, sweep_info
 from graspdb_service.usecases.trials import sweep_plan
 from graspdb_service.usecases.trials.pose_frames import pose_frame
 
+#: Of two linked sweeps: the engine whose trials are stored, and the one whose outcomes are compared.
+_STORING: Engine = "pybullet"
+_COMPARING: Engine = "mujoco"
 #: More chunks than this are bookkeeping without a use: no lab has so many workers.
 MAX_CHUNKS = 100_000
 #: A plan is cut into at least about this many chunks, so that several processes share a small one ...
@@ -98,10 +102,8 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
     world = _world(row, profile)
     plan = _plan(ctx, slug, spec, world, given)
     chunk = _chunk_size(ctx, spec, plan)
-    # In memory and in one go, before the transaction, that it may be short.
-    numbers = jobs.job_ids(created_ms, -(-plan.count // chunk), urgent=spec.purpose == "check")
     plan = replace(plan, warnings=[*plan.warnings, *decompositions.warnings(row)])
-    snapshot = _snapshot(world, plan, spec)
+    planned = _planned(spec, plan, world, chunk, created_ms)
 
     def store(tx: Tx) -> Created:
         locked = require(tx, slug, lock=True)
@@ -111,55 +113,109 @@ def create(ctx: Estimators, slug: str, spec: SweepCreate, sent: Sent, given: Giv
         waiting = locked.parts_sha256 is None
         if waiting:
             decompositions.ask(tx, locked, created_ms)
-        sweep_id = _new_id(created_ms)
-        provenance_id = provenances.ensure(
-            tx, locked.id, Provenance(gripper.versioned, "simulation", spec.protocol)
-        )
-        sweep = {
-            "id": sweep_id,
+        origin = Provenance(gripper.versioned, "simulation", spec.protocol)
+        shared = {
             "object_id": locked.id,
-            "provenance_id": provenance_id,
+            "provenance_id": provenances.ensure(tx, locked.id, origin),
             "gripper": gripper.id,
-            **spec.model_dump(include={"protocol", "fidelity", "purpose"}),
+            **spec.model_dump(include={"protocol", "fidelity"}),
             "plan": plan.kind,
-            "request": _request(spec, plan),
-            "snapshot": snapshot,
             "pose_count": plan.count,
             "chunk_poses": chunk,
         }
-        capability: str = "simulate" if spec.protocol == "wrench" else spec.protocol
-        if spec.randomise is not None:
-            capability = f"drawn-{spec.protocol}"
-        sweeps.create(tx, sweep, poses=plan.poses, job_ids=numbers, capability=capability, waiting=waiting)
-        if waiting:
-            # Until there are parts, it repeats no other's poses.
-            snapshot["repeat_key"] = sweep_id
-        audit.record(tx, "sweep.create", object=slug, subject=sweep_id)
-        _, batch = batches.create(tx, locked.id, revision=locked.revision, sweep_id=sweep_id)
-        sweeps.keep_snapshot(tx, sweep_id, {**snapshot, "batch": batch})
-        info = sweep_info(tx, require_sweep(tx, sweep_id))
-        return Created(info.model_dump(mode="json"), f"/sweeps/{sweep_id}", status=202, batch_key=batch)
+        # In the order of their making: who asked for two follows the last one.
+        made = [_create(tx, locked, each, shared, plan, waiting=waiting) for each in planned]
+        info = sweep_info(tx, require_sweep(tx, planned[-1].id))
+        return Created(info.model_dump(mode="json"), f"/sweeps/{info.id}", status=202, batch_key=made[-1])
 
     return replay_or(ctx.database, scope, sent, store)
 
 
-def _request(spec: SweepCreate, plan: _Plan) -> dict[str, Any]:
-    """What was asked for, defaults filled in; given poses are stored as the plan's."""
+@dataclass(frozen=True)
+class _Planned:
+    """A sweep that is to be made, and the ids of its jobs; of two that are linked each names the other."""
+
+    id: str
+    linked: str | None
+    purpose: str
+    request: dict[str, Any]
+    snapshot: dict[str, Any]
+    job_ids: list[str]
+
+
+def _planned(spec: SweepCreate, plan: _Plan, world: _World, chunk: int, created_ms: int) -> list[_Planned]:
+    """The sweep that was asked for, with two engines the last of two; in memory and in one go, before the
+    transaction, that this may be short.
+    """
+    halves: list[tuple[Engine | None, str]] = [(None, spec.purpose)]
+    if spec.engine == "both":
+        halves = [(_COMPARING, "compare"), (_STORING, spec.purpose)]
+    elif spec.engine is not None:
+        halves = [(spec.engine, spec.purpose)]
+    ids = [_new_id(created_ms + place) for place in range(len(halves))]
+    planned = []
+    for (engine, purpose), own, other in zip(halves, ids, reversed(ids), strict=True):
+        # What stores comes first to workers that have both.
+        jobs_ms = created_ms + (purpose == "compare")
+        count = -(-plan.count // chunk)
+        planned.append(
+            _Planned(
+                own,
+                other if len(halves) > 1 else None,
+                purpose,
+                _request(spec, plan, engine),
+                _snapshot(world, plan, spec, engine),
+                jobs.job_ids(jobs_ms, count, urgent=spec.purpose == "check"),
+            )
+        )
+    return planned
+
+
+def _create(
+    tx: Tx, row: ObjectRow, planned: _Planned, shared: dict[str, Any], plan: _Plan, *, waiting: bool
+) -> str:
+    """Store a sweep of an object (locked) with its batch, whose key is answered, and queue its jobs."""
+    snapshot = dict(planned.snapshot)
+    sweep = {**shared, **{name: getattr(planned, name) for name in ("id", "linked", "purpose", "request")}}
+    capability: str = "simulate" if sweep["protocol"] == "wrench" else sweep["protocol"]
+    if "randomise" in planned.request:
+        capability = f"drawn-{sweep['protocol']}"
+    sweeps.create(
+        tx,
+        {**sweep, "snapshot": snapshot},
+        poses=plan.poses,
+        job_ids=planned.job_ids,
+        capability=capability,
+        waiting=waiting,
+    )
+    if waiting:
+        # Until there are parts, it repeats no other's poses.
+        snapshot["repeat_key"] = planned.id
+    audit.record(tx, "sweep.create", object=row.slug, subject=planned.id)
+    _, batch = batches.create(tx, row.id, revision=row.revision, sweep_id=planned.id)
+    sweeps.keep_snapshot(tx, planned.id, {**snapshot, "batch": batch})
+    return batch
+
+
+def _request(spec: SweepCreate, plan: _Plan, engine: Engine | None) -> dict[str, Any]:
+    """What was asked for of this engine, defaults filled in; given poses are stored as the plan's."""
     apart = {"poses", "proposal_density", "frame", "convention"}
     asked = spec.model_dump(mode="json", exclude=apart, exclude_none=True)
+    if engine is not None:
+        asked["engine"] = engine
     if plan.grid is not None:
         asked["grid"] = (spec.grid or GridSpec()).model_dump(mode="json", exclude_none=True)
     return asked
 
 
-def _snapshot(world: _World, plan: _Plan, spec: SweepCreate) -> dict[str, Any]:
+def _snapshot(world: _World, plan: _Plan, spec: SweepCreate, engine: Engine | None) -> dict[str, Any]:
     """All that a sweep's results depend on, for good."""
     snapshot: dict[str, Any] = {"world": world.snapshot, "full_count": plan.full_count}
     if plan.grid is not None:
         snapshot["grid"] = plan.grid.model_dump(mode="json")
         drawn = None if spec.randomise is None else spec.randomise.model_dump(mode="json")
         snapshot["repeat_key"] = sweep_plan.repeat_key(
-            world.snapshot, spec.protocol, spec.fidelity, plan.grid, spec.engine, drawn
+            world.snapshot, spec.protocol, spec.fidelity, plan.grid, engine, drawn
         )
     if plan.warnings:
         snapshot["warnings"] = list(plan.warnings)

@@ -15,13 +15,13 @@ from graspdb_service.problems import busy, invalid
 from graspdb_service.storage import objects
 from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Tx
-from graspdb_service.storage.simulation import jobs, sweeps
+from graspdb_service.storage.simulation import jobs, linked, sweeps
 from graspdb_service.storage.simulation import outcomes as packed
 from graspdb_service.storage.simulation.jobs import JobRow
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import batches, provenances
 from graspdb_service.storage.trials import rows as trial_rows
-from graspdb_service.trial_columns import Bools, TrialColumns
+from graspdb_service.trial_columns import Bools, Provenance, TrialColumns
 from graspdb_service.usecases.geometry import decompositions, meshes
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.runtime.runtime import Runtime
@@ -68,7 +68,7 @@ def complete(ctx: Runtime, job_id: str, lease_id: str, body: bytes, result: Chun
             if sweep is None:
                 raise lost_lease(job)
             stored = sweep_plan.chunk_poses(tx, sweep, job.start, job.stop)
-            twins = sweeps.siblings(tx, sweep) if sweep.plan == "grid" and sweep.purpose == "collect" else {}
+            twins = sweeps.siblings(tx, sweep) if sweep.plan == "grid" and sweep.collects else {}
             ranges = packed.done_ranges(tx, list(twins))
             seen = packed.count_done(tx, list(twins))
         outcomes = _outcomes(result, job)
@@ -155,6 +155,7 @@ class _Chunk:
     engine: str | None
     packed: dict[int, int]
     counts: dict[str, dict[str, int]]
+    measured: bytes | None
 
 
 def _outcomes(result: ChunkResult, job: JobRow) -> npt.NDArray[np.uint8]:
@@ -238,17 +239,28 @@ def _chunk(
     )
     drawn = None if successes is None else successes.tobytes()
     columns = sweep_plan.with_draws(columns, sweep, drawn, kept)
-    packed = {} if sweep.purpose == "check" else _count(outcomes[fresh & ~is_row])
+    packed = _count(outcomes[fresh & ~is_row]) if sweep.collects else {}
     counts: dict[str, dict[str, int]] = {
         "all": {OUTCOMES[code]: number for code, number in _count(outcomes).items()},
         "packed": {str(code): number for code, number in packed.items()},
     }
-    return _Chunk(outcomes, successes, columns, result.engine, packed, counts)
+    measured = None if sweep.linked is None else linked.measured(place, result.quality, result.width_m)
+    return _Chunk(outcomes, successes, columns, result.engine, packed, counts, measured)
 
 
 def _count(codes: npt.NDArray[np.uint8]) -> dict[int, int]:
     found, numbers = np.unique(codes, return_counts=True)
     return dict(zip(found.tolist(), numbers.tolist(), strict=True))
+
+
+def _of_engine(tx: Tx, sweep: SweepRow, chunk: _Chunk) -> TrialColumns:
+    """A chunk's rows, of the provenance that names its engine; under the object's lock."""
+    if chunk.engine is None or not len(chunk.rows):
+        return chunk.rows
+    gripper = f"{sweep.gripper}@{sweep.gripper_version}"
+    origin = Provenance(gripper, "simulation", sweep.protocol, chunk.engine)
+    number = provenances.ensure(tx, sweep.object_id, origin)
+    return replace(chunk.rows, provenance=np.full(len(chunk.rows), number, dtype=np.int64))
 
 
 def _store(
@@ -261,10 +273,10 @@ def _store(
     twins: list[str],
     seen: int,
 ) -> ResultAccepted:
-    collects = sweep.purpose == "collect"
+    collects = sweep.collects
     with ctx.database.write() as tx:
         rows = len(chunk.rows) if collects else 0
-        if collects:
+        if sweep.enters:
             revision, first_seq = objects.advance(tx, sweep.object_id, rows=rows, append=True)
         else:
             unchanged, first_seq = sweeps.lock_object(tx, sweep.object_id), 0
@@ -287,15 +299,15 @@ def _store(
             outcomes=chunk.outcomes.tobytes(),
             successes=None if chunk.successes is None else chunk.successes.tobytes(),
             engine=chunk.engine,
+            measured=chunk.measured,
         )
         sweeps.note_finished(tx, sweep.id)
         batch = batches.of_sweep(tx, sweep.id)
         if batch is None:
             raise _LostLease
         if collects:
-            trial_rows.insert(
-                tx, sweep.object_id, batch.id, chunk.rows, revision=revision, first_seq=first_seq
-            )
+            columns = _of_engine(tx, sweep, chunk)
+            trial_rows.insert(tx, sweep.object_id, batch.id, columns, revision=revision, first_seq=first_seq)
             provenances.add_packed(tx, sweep.provenance_id, chunk.packed)
         batches.grow(
             tx,
@@ -304,7 +316,7 @@ def _store(
             last_seq=first_seq + rows - 1 if rows else None,
             inserted=rows,
             packed=sum(chunk.packed.values()) if collects else len(chunk.outcomes),
-            revision=revision if collects else None,
+            revision=revision if sweep.enters else None,
         )
         audit.record(tx, "job.result", object=sweep.object, subject=job.id)
         jobs.credit_worker(tx, job.worker, job.stop - job.start)

@@ -47,19 +47,22 @@ def listing(
 
 
 def cancel(database: Database, sweep_id: str) -> SweepInfo:
-    """Stop what is not finished; what is stored stays. A finished sweep is left as it is."""
+    """Stop what is not finished, of its linked sweep, too; what is stored stays. A finished sweep is left as
+    it is.
+    """
     with database.read() as tx:
         row = require_sweep(tx, sweep_id)
     with database.write() as tx:
         sweeps.lock_object(tx, row.object_id)
-        if sweeps.cancel(tx, sweep_id):
-            audit.record(tx, "sweep.cancel", object=row.object, subject=sweep_id)
+        for each in filter(None, (row.id, row.linked)):
+            if sweeps.cancel(tx, each):
+                audit.record(tx, "sweep.cancel", object=row.object, subject=each)
         decompositions.drop_unwanted(tx, row.object_id)
         return sweep_info(tx, require_sweep(tx, sweep_id))
 
 
 def retry(database: Database, sweep_id: str) -> SweepInfo:
-    """Queue failed and cancelled chunks again; without any it changes nothing.
+    """Queue failed and cancelled chunks again, of its linked sweep, too; without any it changes nothing.
 
     409 if the batch was deleted: what the sweep had found is gone, so the rest would mislead.
     """
@@ -70,14 +73,23 @@ def retry(database: Database, sweep_id: str) -> SweepInfo:
         row = require_sweep(tx, sweep_id)
         if row.batch is None:
             raise conflict("batch-deleted", "This sweep's batch was deleted: make a new sweep")
-        waiting = False
-        if row.finished_at is not None and decompositions.lacks_parts(row):
-            waiting = decompositions.again(
-                tx, require(tx, row.object), row, int(clock(tx).timestamp() * 1000)
-            )
-        if sweeps.retry(tx, sweep_id, waiting=waiting):
-            audit.record(tx, "sweep.retry", object=row.object, subject=sweep_id)
+        for each in filter(None, (row, _linked(tx, row))):
+            # What the other had found may be gone: it stays so.
+            if each.batch is not None:
+                _retry(tx, each)
         return sweep_info(tx, require_sweep(tx, sweep_id))
+
+
+def _retry(tx: Tx, row: SweepRow) -> None:
+    waiting = False
+    if row.finished_at is not None and decompositions.lacks_parts(row):
+        waiting = decompositions.again(tx, require(tx, row.object), row, int(clock(tx).timestamp() * 1000))
+    if sweeps.retry(tx, row.id, waiting=waiting):
+        audit.record(tx, "sweep.retry", object=row.object, subject=row.id)
+
+
+def _linked(tx: Tx, row: SweepRow) -> SweepRow | None:
+    return None if row.linked is None else sweeps.find(tx, row.linked)
 
 
 def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
@@ -113,6 +125,7 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
                 *feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
                 *row.snapshot.get("warnings", []),
                 *_without_engine(tx, row),
+                *_linked_without_engine(tx, row),
             ],
         }
     )
@@ -128,6 +141,12 @@ def _without_engine(tx: Tx, row: SweepRow) -> list[str]:
         f"no worker that has {engine} was here in the last {_LATELY_S / 60:.0f} minutes, and no other takes"
         f" what this sweep has left: pip install 'graspdb[{extras}]' on a worker, and start it again"
     ]
+
+
+def _linked_without_engine(tx: Tx, row: SweepRow) -> list[str]:
+    """What the second of two linked sweeps waits for: who asked for both follows the first."""
+    other = None if row.purpose == "compare" else _linked(tx, row)
+    return [] if other is None else [f"its linked sweep: {told}" for told in _without_engine(tx, other)]
 
 
 def _rate(row: SweepRow, done: Progress) -> float | None:

@@ -69,7 +69,7 @@ class Inheritance:
 def of(tx: Tx, batch: BatchRow) -> Inheritance | None:
     """What would be left of a batch; None where no other sweep holds a pose of it."""
     sweep = None if batch.sweep_id is None else sweeps.find(tx, batch.sweep_id)
-    if sweep is None or sweep.plan != "grid" or sweep.purpose != "collect":
+    if sweep is None or sweep.plan != "grid" or not sweep.collects:
         return None
     heirs, chunks = _chunks(tx, sweep)
     if not heirs:

@@ -12,6 +12,8 @@ from graspdb_service.storage.access import audit
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.storage.simulation import outcomes as packed
+from graspdb_service.storage.simulation import sweeps
+from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import batches, findings, provenances
 from graspdb_service.storage.trials.batches import BatchRow
 from graspdb_service.storage.trials.qualities import names_of
@@ -49,7 +51,8 @@ def page(
 def remove(database: Database, slug: str, key: str) -> None:
     """Delete a batch with its trials and packed outcomes; 409 while its sweep runs, which would write on.
 
-    Poses that another sweep over the same grid has simulated as well stay, as that sweep's.
+    What a linked sweep compares with these goes with them; deleted itself, it leaves them. Poses that another
+    sweep over the same grid has simulated as well stay, as that sweep's.
     """
     for _ in range(_MAX_LOOKS):
         with database.read() as tx:
@@ -57,28 +60,49 @@ def remove(database: Database, slug: str, key: str) -> None:
         with database.write() as tx:
             row = require(tx, slug, lock=True)
             batch = _require(tx, row.id, key)
-            if batch.sweep_id is not None and objects.has_running_sweep(tx, row.id, sweep_id=batch.sweep_id):
-                raise conflict(
-                    "sweep-running",
-                    f"The batch is being written by sweep {batch.sweep_id}:"
-                    f" cancel it (POST /sweeps/{batch.sweep_id}/cancel) or wait for its end",
-                )
+            sweep = None if batch.sweep_id is None else sweeps.find(tx, batch.sweep_id)
+            going = [batch, *_compared(tx, sweep)]
+            for each in going:
+                _refuse_running(tx, row, each)
             if left is not None and not left.holds(tx):
                 continue
-            if batch.purpose != "check":
+            if sweep is None or sweep.enters:
                 # The outcomes of a check never entered anything that a revision stands for.
                 objects.advance(tx, row.id, append=False)
             if left is not None:
                 left.hand_over(tx, batch)
-            batches.remove(tx, batch)
-            audit.record(tx, "batch.delete", object=slug, subject=key)
+            for each in going:
+                batches.remove(tx, each)
+                audit.record(tx, "batch.delete", object=slug, subject=each.key)
             return
     raise busy("Sweeps over the same grid keep finishing chunks meanwhile; send it again")
+
+
+def _compared(tx: Tx, sweep: SweepRow | None) -> list[BatchRow]:
+    """The batch of the linked sweep that compares with a sweep's outcomes, if it is still there."""
+    if sweep is None or sweep.linked is None or sweep.purpose == "compare":
+        return []
+    batch = batches.of_sweep(tx, sweep.linked)
+    return [] if batch is None else [batch]
+
+
+def _refuse_running(tx: Tx, row: ObjectRow, batch: BatchRow) -> None:
+    if batch.sweep_id is not None and objects.has_running_sweep(tx, row.id, sweep_id=batch.sweep_id):
+        raise conflict(
+            "sweep-running",
+            f"The batch is being written by sweep {batch.sweep_id}:"
+            f" cancel it (POST /sweeps/{batch.sweep_id}/cancel) or wait for its end",
+        )
 
 
 def _require(tx: Tx, object_id: int, key: str) -> BatchRow:
     batch = batches.find(tx, object_id, key) if is_uuid(key) else None
     return found(batch, "batch", key, "GET /objects/{id}/batches lists them")
+
+
+def _engines(tx: Tx, batch: BatchRow) -> list[str]:
+    """What simulated chunks of a sweep's batch."""
+    return [] if batch.sweep_id is None else packed.engines(tx, batch.sweep_id)
 
 
 def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInfo]:
@@ -104,7 +128,7 @@ def _infos(tx: Tx, row: ObjectRow, several: Sequence[BatchRow]) -> list[BatchInf
             "gripper_versions": distinct(item.gripper for item in items),
             "sources": distinct(item.source for item in items),
             "protocols": distinct(item.protocol for item in items),
-            "engines": [] if batch.sweep_id is None else packed.engines(tx, batch.sweep_id),
+            "engines": sorted({*distinct(item.engine for item in items), *_engines(tx, batch)}),
             "qualities": names_of(batch.quality_layout),
             "findings": words.of_batch(stored.get(batch.id, []), batch.inserted, keys),
         }

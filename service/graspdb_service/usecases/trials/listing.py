@@ -56,7 +56,7 @@ def pages(
         row = require(tx, slug)
         names = provenances.of_object(tx, row.id)
         # What can't be told is refused before the first page is on its way.
-        counts = outcome_counts(tx, row.id)
+        counts = outcome_counts(tx, row.id, names)
         wanted = counts.keys() & _passing(names, chosen)
         warned = warnings_of(frames_of(tx, names, wanted, frame).values())
 

@@ -1,4 +1,4 @@
-"""Which trials a question is about: by gripper, protocol and source."""
+"""Which trials a question is about: by gripper, protocol and source; of whichever engines."""
 
 from __future__ import annotations
 
@@ -177,11 +177,12 @@ def resolve(tx: Tx, row: ObjectRow, asked: TrialSelection) -> Selected:
     ``ambiguous-selection`` where several grippers or protocols are left and none is named.
     """
     named_gripper = None if asked.gripper is None else _gripper(tx, asked.gripper)
-    counts = outcome_counts(tx, row.id)
+    known = provenances.of_object(tx, row.id)
+    counts = outcome_counts(tx, row.id, known)
     # A provenance all of whose trials were deleted is none of the object's any more.
     candidates = {
         number: item
-        for number, item in provenances.of_object(tx, row.id).items()
+        for number, item in known.items()
         if number in counts
         and asked.source in (None, item.source)
         and (asked.gripper is None or item.gripper is None or is_gripper(item.gripper, asked.gripper))
@@ -275,13 +276,18 @@ def of_provenances(
     )
 
 
-def outcome_counts(tx: Tx, object_id: int) -> dict[int, dict[str, int]]:
-    """Trials by provenance and outcome, packed ones included; none of a provenance without any."""
+def outcome_counts(tx: Tx, object_id: int, known: Mapping[int, Provenance]) -> dict[int, dict[str, int]]:
+    """Trials by provenance, of those ``known`` of the object, and outcome, packed ones included.
+
+    A provenance without any is not among them, unless it differs from one that has some by the engine alone:
+    a sweep's own may have none, where rows of its chunks are all that there is.
+    """
     counts: dict[int, dict[str, int]] = {}
     for provenance, code, rows, packed in provenances.tallies(tx, object_id):
         if rows + packed:
             counts.setdefault(provenance, {})[OUTCOMES[code]] = rows + packed
-    return counts
+    there = {known[number].kin for number in counts}
+    return {number: counts.get(number, {}) for number, item in known.items() if item.kin in there}
 
 
 def total(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:

@@ -131,10 +131,11 @@ def real_trials(database: Database, chosen: Selected, source: str) -> Selected |
     None without trials.
     """
     with database.read() as tx:
-        counts = outcome_counts(tx, chosen.row.id)
+        known = provenances.of_object(tx, chosen.row.id)
+        counts = outcome_counts(tx, chosen.row.id, known)
         own = {
             number: item
-            for number, item in provenances.of_object(tx, chosen.row.id).items()
+            for number, item in known.items()
             if number in counts and item.source == source and _of_the_gripper(item, chosen)
         }
     if any(item.protocol == chosen.protocol for item in own.values()):

@@ -23,7 +23,8 @@ from graspdb_service.usecases.trials.findings.fingerprints import fingerprints
 
 #: Indices that a finding names.
 FIRST = 10
-#: More combinations of gripper, source and protocol in one batch are looked at together, without a gripper.
+#: More combinations of gripper, source, protocol and engine in one batch are looked at together, without a
+#: gripper.
 _MOST_PROVENANCES = 16
 #: Earlier batches with the same rows that are named.
 _MOST_BATCHES = 10
