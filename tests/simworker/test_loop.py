@@ -335,12 +335,29 @@ def test_a_sweep_is_simulated_by_the_engine_that_it_names(
     assert SweepInfo.model_validate(mixed).sole_engine is None
 
 
+def test_one_worker_simulates_both_halves_of_a_sweep(http: httpx.Client, url: str, plan: Plan) -> None:
+    first = plan(400, 200, engine="both")
+    with cli("run", "--url", url, "--exit-when-idle", "--engine", "both") as process:
+        _, said = process.communicate(timeout=60)
+    assert "4 jobs, 800 poses" in said
+    told = [http.get(f"/sweeps/{id}").json() for id in (first["id"], first["linked"])]
+    assert [item["engines"] for item in told] == [
+        [f"{engine} {version(engine)}"] for engine in ("pybullet", "mujoco")
+    ]
+    # What never met physics was judged by one collision test.
+    assert told[0]["outcomes"]["collision"] == told[1]["outcomes"]["collision"]
+    batch = {"batch": first["batch"]}
+    rows = http.get("/objects/mug/trials", params=batch).json()["items"]
+    assert {row["engine"] for row in rows} == set(told[0]["engines"])
+
+
 @pytest.mark.parametrize(
     ("missing", "asked", "remedy"),
     [
         (["pybullet", "mujoco"], [], "graspdb[sim,mujoco]"),
         (["pybullet"], ["--engine", "pybullet"], "x86-64"),
         (["mujoco"], ["--engine", "mujoco"], "graspdb[sim,mujoco]"),
+        (["mujoco"], ["--engine", "both"], "graspdb[sim,mujoco]"),
         ([], ["--engine", "drake"], "pybullet, mujoco"),
     ],
 )
