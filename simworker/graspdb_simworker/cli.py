@@ -86,8 +86,8 @@ RunEngine = Annotated[
     typer.Option(
         "--engine",
         metavar="pybullet|mujoco|both",
-        help="Physics engine of chunks that name none: pybullet where it is installed, else mujoco. both: as"
-        " by default chunks of either are taken, and without both engines it does not start.",
+        help="Physics engine of chunks that name none: pybullet where it is installed, else mujoco. Chunks that"
+        " name one are taken for every engine that is installed; with both it does not start without them.",
     ),
 ]
 Protocol = Annotated[str, typer.Option(help="wrench, lift or shake.")]
@@ -136,8 +136,7 @@ def run(
 ) -> None:
     """Claim jobs, simulate them, hand in the results; until stopped, or idle if so asked.
 
-    A chunk that names an engine is simulated with that one; --engine says which simulates the others. Every
-    installed engine is offered, so that one worker that has both does both halves of a sweep of two engines.
+    A chunk that names an installed engine is simulated with that one; --engine simulates the others.
     """
     chosen, engines = _engines(dask, engine)
     from graspdb_simworker.decomposition import supervisor as decomposition  # extra: sim
