@@ -86,8 +86,8 @@ RunEngine = Annotated[
     typer.Option(
         "--engine",
         metavar="pybullet|mujoco|both",
-        help="Physics engine of chunks that name none: pybullet where it is installed, else mujoco. Chunks that"
-        " name one are taken for every engine that is installed; with both it does not start without them.",
+        help="Physics engine of chunks that name none: pybullet where it is installed, else mujoco. Chunks"
+        " that name one are taken for every engine that is installed; both asks for all of these.",
     ),
 ]
 Protocol = Annotated[str, typer.Option(help="wrench, lift or shake.")]
