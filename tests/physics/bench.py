@@ -114,3 +114,12 @@ def wedge_label(friction: float, share: float, protocol: str, fidelity: str) -> 
     half_angle = share * math.atan(friction)
     part = closed_forms.wedge(half_angle)
     return closed_forms.simulate(part, (0.0, 0.0, 0.0), 0.02, friction, protocol=protocol, fidelity=fidelity)
+
+
+def tips_label(
+    friction: float, share: float, radius: float, engine: str, fidelity: str = "standard"
+) -> Label:
+    """Of a light cylinder on the fingers' tips, touched leaning by ``share`` of the angle of friction; by
+    ``wrench``."""
+    part, where = closed_forms.cylinder_on_the_tips(radius, share * math.atan(friction))
+    return closed_forms.simulate(part, where, 0.05, friction, fidelity=fidelity, engine=engine)

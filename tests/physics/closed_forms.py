@@ -152,6 +152,14 @@ def wedge(half_angle: float) -> Part:
     return _part(trimesh.convex.convex_hull(np.array(corners)))
 
 
+def cylinder_on_the_tips(radius: float, angle: float) -> tuple[Part, tuple[float, float, float]]:
+    """A cylinder along x with its middle so far beyond the fingertips that it touches their edges leaning by
+    ``angle`` (radians), and where it is held so."""
+    mesh = trimesh.creation.cylinder(radius, 0.03, sections=360)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5 * math.pi, (0, 1, 0)))
+    return _part(mesh), (0.0, 0.0, PG70.tip_offset_m + radius * math.sin(angle))
+
+
 # -- loads -------------------------------------------------------------------------------------------------
 
 

@@ -97,6 +97,19 @@ def test_a_wedge_is_held_up_to_the_angle_of_friction(friction: float, protocol: 
     assert bench.wedge_label(friction, 1.25, protocol, "standard").outcome is not Outcome.SUCCESS
 
 
+@pytest.mark.parametrize(
+    ("engine", "held"),
+    # Bullet's fingers act as if their edges were rounded: see docs/experiments.md.
+    [("pybullet", 0.6), ("mujoco", 0.8)],
+)
+@pytest.mark.parametrize("friction", [0.2, 0.7])
+def test_fingertips_hold_a_cylinder_up_to_the_angle_of_friction(
+    friction: float, engine: str, held: float
+) -> None:
+    assert bench.tips_label(friction, held, 0.02, engine).outcome is Outcome.SUCCESS
+    assert bench.tips_label(friction, 1.25, 0.02, engine).outcome is not Outcome.SUCCESS
+
+
 def test_what_slides_while_it_is_shaken_slides_as_far_as_friction_says() -> None:
     """At 1.25 times what two fingers hold, at either step, and then so much that it leaves them. A box that
     lies flat is closed on once more at the fine step: the motion is the same."""
