@@ -75,7 +75,7 @@ requirements:  ## Pin what pyproject.toml allows, for development and for the im
 	$(PIP_COMPILE) $(UPGRADE) --all-extras --output-file requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra service --extra postgres --extra plot --extra pictures --extra arrow --build-deps-for wheel \
 	  --output-file service/requirements.txt pyproject.toml
-	$(PIP_COMPILE) -c requirements.txt --extra sim --extra dask --build-deps-for wheel \
+	$(PIP_COMPILE) -c requirements.txt --extra sim --extra mujoco --extra dask --build-deps-for wheel \
 	  --output-file simworker/requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra view --build-deps-for wheel \
 	  --output-file clients/requirements.txt pyproject.toml

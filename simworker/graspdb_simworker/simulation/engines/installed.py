@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import os
 import platform
 from collections.abc import Sequence
 from typing import get_args
@@ -51,6 +52,8 @@ def version_of(engine: Engine) -> str:
 def world_of(engine: Engine) -> type[EngineWorld]:
     """What builds the worlds of an engine that is installed."""
     if engine == "mujoco":
+        # Nothing is drawn with it: no library of graphics is looked for.
+        os.environ.setdefault("MUJOCO_GL", "disable")
         from graspdb_simworker.simulation.engines.mujoco_world import MujocoWorld  # extra: mujoco
 
         return MujocoWorld
