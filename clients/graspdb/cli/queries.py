@@ -39,11 +39,17 @@ from graspdb.resources.results import (
     pose_columns,
 )
 from graspdb.resources.selection import Constraints, DrawSelection, LikelihoodSelection, Selection
-from graspdb.wire import SelectionInfo
+from graspdb.wire import DensityInfo, SelectionInfo
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")]
 Csv = Annotated[bool, typer.Option("--csv", help="CSV that `likelihood` and `sweep --poses` read.")]
+
+
+def _successes(found: DensityInfo) -> str:
+    """How many grasps a density is of, in words: some of them succeeded in few of several attempts only."""
+    few = found.size - found.outcomes.get("success", 0)
+    return f"{found.size:,}" + (f", {few:,} of them in less than half of their attempts" if few > 0 else "")
 
 
 def density(state: State, id: ObjectId, selection: Selection) -> None:
@@ -54,7 +60,7 @@ def density(state: State, id: ObjectId, selection: Selection) -> None:
         "kernel": f"{found.kernel.kind}, {widths(found.kernel)}",
         "widths": found.kernel.rule,
         "selection": ", ".join(x for x in (found.gripper, found.protocol, found.source) if x) or "all trials",
-        "successes": f"{found.size:,}",
+        "successes": _successes(found),
         "effective sample size": f"{found.effective_sample_size:,.0f}",
         "outcomes": ", ".join(f"{n:,} {name}" for name, n in found.outcomes.items()) or "none",
         "memory": f"{found.bytes / 2**20:.1f} MiB",

@@ -12,7 +12,7 @@ from graspdb.cli.options import Commands
 from graspdb.files.trials import as_stated, read_trials
 from graspdb.resources.selection import AnswerFrame
 from graspdb.resources.trials import DoubtfulTrials, TrialFilters, Upload
-from graspdb.wire import TrialInfo
+from graspdb.wire import TrialInfo, TrialOut
 
 trials = Commands(no_args_is_help=True, help="Add and list grasp trials.")
 batches = Commands(no_args_is_help=True, help="List and delete what arrived together.")
@@ -86,7 +86,7 @@ def list_trials(
             "seq": lambda t: t.seq,
             "position [m]": lambda t: numbers(t.position),
             "quaternion xyzw": lambda t: numbers(t.quaternion_xyzw),
-            "outcome": lambda t: f"{t.outcome} (withdrawn)" if t.withdrawn else t.outcome,
+            "outcome": _outcome,
             "gripper": lambda t: t.gripper,
             "source": lambda t: t.source,
             "protocol": lambda t: t.protocol,
@@ -128,6 +128,13 @@ def correct_trial(
         seq, outcome=outcome, withdrawn=False if reinstate else None, reason=reason, **pose_frame
     )
     _show_trial(state, found)
+
+
+def _outcome(trial: TrialOut) -> str:
+    told = trial.outcome
+    if trial.attempts is not None:
+        told += f", {trial.successes} of {trial.attempts}"
+    return f"{told} (withdrawn)" if trial.withdrawn else told
 
 
 def _show_trial(state: State, found: TrialInfo) -> None:

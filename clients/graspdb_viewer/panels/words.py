@@ -31,6 +31,7 @@ def story(trial: TrialOut) -> str:
         "protocol": trial.protocol,
         "source": trial.source,
         "measured": None if trial.measured_at is None else f"{trial.measured_at:%Y-%m-%d %H:%M:%S} UTC",
+        "attempts": None if trial.attempts is None else f"{trial.successes} of {trial.attempts} succeeded",
         "batch": trial.batch,
         "sweep": trial.sweep,
         "pose of the sweep": trial.pose_index,
