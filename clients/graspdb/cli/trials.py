@@ -131,7 +131,7 @@ def correct_trial(
 
 
 def _outcome(trial: TrialOut) -> str:
-    told = trial.outcome
+    told: str = trial.outcome
     if trial.attempts is not None:
         told += f", {trial.successes} of {trial.attempts}"
     return f"{told} (withdrawn)" if trial.withdrawn else told
