@@ -45,9 +45,9 @@ _JOINTS = (0, 1)
 
 _LIGHT = Stepping(1.0 / 120.0, 1.0 / 480.0, 50)
 _HEAVY = Stepping(1.0 / 120.0, 1.0 / 240.0, 80)
-"""What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each. Until both
-fingers press, more than half of all steps, steps of 1/120 s differ from the fine ones' labels as often as steps
-of 1/240 s do; of 1/80 s more often."""
+"""What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each. Until
+both fingers press, which takes more than half of all steps, 1/120 s differs from the fine step's labels as often
+as 1/240 s does, and 1/80 s more often."""
 _FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200)
 
 
