@@ -46,7 +46,7 @@ _JOINTS = (0, 1)
 _LIGHT = Stepping(1.0 / 120.0, 1.0 / 480.0, 50)
 _HEAVY = Stepping(1.0 / 120.0, 1.0 / 240.0, 80)
 """What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each. Until
-both fingers press, which takes more than half of all steps, 1/120 s differs from the fine step's labels as often
+both fingers press, more than half of all steps, 1/120 s differs from the labels of the fine step as often
 as 1/240 s does, and 1/80 s more often."""
 _FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200)
 
