@@ -194,6 +194,7 @@ def test_a_sweep_that_draws(http: httpx.Client, put_box: Put) -> None:
     sweep = http.post("/objects/box/sweeps", json={"poses": _poses(5, 6), "randomise": asked})
     assert sweep.status_code == 202, sweep.text
     told = sweep.json()["randomise"]
+    assert sweep.json()["chunks"] == 1
     assert told.items() >= asked.items()
     assert told["seed"] == 0
     # A worker that knows nothing of draws does not get it.
@@ -245,6 +246,17 @@ def test_a_sweep_that_draws(http: httpx.Client, put_box: Put) -> None:
     assert copy.is_success, copy.text
     again = http.get("/objects/box-2/trials").json()["items"]
     assert [t["successes"] for t in again] == [8, 3, 1]
+
+
+def test_chunks_that_draw_are_as_much_work(sqlite_http: httpx.Client, put_box: Put) -> None:
+    http = sqlite_http
+    http.post("/objects", json={"id": "box", "mass_kg": 0.2})
+    put_box(http, "box")
+    plain, drawn = (
+        http.post("/objects/box/sweeps", json={"grid": {"max_poses": 50_000}, **more}).json()
+        for more in ({}, {"randomise": {"draws": 10}})
+    )
+    assert drawn["chunks"] == pytest.approx(10 * plain["chunks"], rel=0.1)
 
 
 def test_what_is_drawn_has_to_be_something(http: httpx.Client, put_box: Put) -> None:

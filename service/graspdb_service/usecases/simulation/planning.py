@@ -346,6 +346,9 @@ def _chunk_size(ctx: Estimators, spec: SweepCreate, plan: _Plan) -> int:
         if plan.kind != "grid":
             most, least = min(most, MAX_POSES_CHUNK), MIN_POSES_CHUNK
         size = min(most, max(least, -(-plan.count // WANTED_CHUNKS)))
+        if spec.randomise is not None:
+            # A chunk that takes as long, as far as there may be so many.
+            size = max(1, size // spec.randomise.draws, -(-plan.count // MAX_CHUNKS))
     if plan.count > size * MAX_CHUNKS:
         raise invalid(
             "chunk_poses",
