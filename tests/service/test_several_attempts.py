@@ -248,7 +248,7 @@ def test_a_sweep_that_draws(http: httpx.Client, put_box: Put) -> None:
     assert [t["successes"] for t in again] == [8, 3, 1]
 
 
-def test_chunks_that_draw_are_as_much_work(sqlite_http: httpx.Client, put_box: Put) -> None:
+def test_chunks_that_draw_have_fewer_poses(sqlite_http: httpx.Client, put_box: Put) -> None:
     http = sqlite_http
     http.post("/objects", json={"id": "box", "mass_kg": 0.2})
     put_box(http, "box")
@@ -256,7 +256,7 @@ def test_chunks_that_draw_are_as_much_work(sqlite_http: httpx.Client, put_box: P
         http.post("/objects/box/sweeps", json={"grid": {"max_poses": 50_000}, **more}).json()
         for more in ({}, {"randomise": {"draws": 10}})
     )
-    assert drawn["chunks"] == pytest.approx(10 * plain["chunks"], rel=0.1)
+    assert drawn["chunks"] > 2 * plain["chunks"]
 
 
 def test_what_is_drawn_has_to_be_something(http: httpx.Client, put_box: Put) -> None:

@@ -348,7 +348,7 @@ def _chunk_size(ctx: Estimators, spec: SweepCreate, plan: _Plan) -> int:
         size = min(most, max(least, -(-plan.count // WANTED_CHUNKS)))
         if spec.randomise is not None:
             # A chunk that takes as long, as far as there may be so many.
-            size = max(1, size // spec.randomise.draws, -(-plan.count // MAX_CHUNKS))
+            size = max(min(least, size), size // spec.randomise.draws, -(-plan.count // MAX_CHUNKS))
     if plan.count > size * MAX_CHUNKS:
         raise invalid(
             "chunk_poses",
