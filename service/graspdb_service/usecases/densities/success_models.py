@@ -1,9 +1,10 @@
 """How likely a grasp is to succeed: models of all attempts, kept and extended like the densities.
 
 Every attempt counts, packed ones of sweeps included; ``simulation_error`` is none, and every other outcome
-but ``success`` is a failure; what was tried several times is one attempt that succeeded by its share. Where
-the geometry is known, a pose at which the open gripper collides has the
-probability 0 and attempts that collided tell nothing of the others; where it is not, they are failures.
+but ``success`` is a failure; what was tried several times is one attempt that succeeded by its share, and so
+is what two linked sweeps have simulated, whose disagreement widens the intervals. Where the geometry is
+known, a pose at which the open gripper collides has the probability 0 and attempts that collided tell nothing
+of the others; where it is not, they are failures.
 
 A probability is told only as far from the attempts as the model's own validated reach
 (:mod:`graspdb_density.success.reach`); it is validated with the model, and held with it.
@@ -32,6 +33,7 @@ from graspdb_density import (
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_service.storage.database import Database, Tx
+from graspdb_service.storage.simulation import linked
 from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest
@@ -103,12 +105,13 @@ class Estimates:
 @dataclass(frozen=True, eq=False)
 class _Members:
     """Which attempts there are: posted rows (N,) by sequence number, ascending, with their outcome codes, and
-    how many are of each chunk of a sweep.
+    how many are of each chunk of a sweep, by its sweep, number and whether it was compared with another
+    engine's.
     """
 
     seq: Ints
     outcome: NDArray[np.uint8]
-    chunks: Mapping[tuple[str, int], int]
+    chunks: Mapping[tuple[str, int, bool], int]
 
     @classmethod
     def of(cls, stored: Stored) -> _Members:
@@ -116,7 +119,7 @@ class _Members:
         for each in stored.swept:
             codes = np.frombuffer(each.chunk.outcomes, dtype=np.uint8)
             counted = len(codes) - int(np.isin(codes, stored.without).sum())
-            chunks[each.chunk.sweep_id, each.chunk.number] = counted
+            chunks[each.chunk.sweep_id, each.chunk.number, each.compared is not None] = counted
         return cls(stored.rows.seq, stored.rows.outcome, chunks)
 
     @property
@@ -281,6 +284,9 @@ class Successes:
             row = selected.row
             # A source whose first failure has come counts from now on with all it has posted.
             if before.epoch != row.epoch or before.tried != selected.tried:
+                before = _NONE
+            # Another engine may have spoken of attempts that are in the model.
+            if before.sweeps and linked.came_later(tx, row.id, after_revision=before.revision):
                 before = _NONE
             stored = _fetch(tx, selected, without, before)
             names = {**before.sweeps, **stored.repeat_keys}

@@ -15,7 +15,8 @@ from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage.database import Database, Tx
-from graspdb_service.storage.simulation import outcomes, sweeps
+from graspdb_service.storage.simulation import linked, outcomes, sweeps
+from graspdb_service.storage.simulation.linked import ComparedChunk
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.storage.trials import rows as trial_rows
@@ -27,6 +28,8 @@ COLLISION, NO_ATTEMPT = OUTCOME_CODES["collision"], OUTCOME_CODES["simulation_er
 _SUCCESS = OUTCOME_CODES["success"]
 #: Shares of success are told apart to so many'ths: of whatever n, models sort attempts by few different ones.
 _SHARES = 60
+#: Where two engines tried a pose several times, to fewer: shares and what they differ by make many pairs.
+_COMPARED_SHARES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,10 @@ class AllTrials:
     source; ``proposal`` is in 1/(m^3 rad^3), NaN where not known. ``keys`` (rotation, position) are equal
     where two poses of the one grid share them; None unless all are of one grid. ``left_out`` attempts that
     collided are not here, where fewer were asked for: those that are stand for all, each as much.
+
+    A pose that both of two linked sweeps have simulated is one attempt: ``share`` is the mean of what they
+    say, and ``spread`` half of what they differ by, None where no two have; both to within a 40th, and the
+    spread not less, where they tried it several times.
     """
 
     poses: Poses
@@ -50,6 +57,7 @@ class AllTrials:
     keys: tuple[Ints, Ints] | None
     left_out: int = 0
     share: Floats | None = None
+    spread: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.success)
@@ -77,7 +85,8 @@ class AllTrials:
     def added_to(self, model: SuccessModel, rows: Bools | Ints) -> SuccessModel:
         """A model with some of them more."""
         won = self.success if self.share is None else self.share
-        return model.extend(self.poses[rows], won[rows], self.symmetric[rows], self.weight[rows])
+        spread = None if self.spread is None else self.spread[rows]
+        return model.extend(self.poses[rows], won[rows], self.symmetric[rows], self.weight[rows], spread)
 
     def density(
         self, kernel: IsotropicKernel, rows: Bools | Ints, weights: ArrayLike | None = None
@@ -90,11 +99,14 @@ class AllTrials:
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """A finished chunk of a sweep; ``poses`` of a plan that is no grid, whose poses are computed."""
+    """A finished chunk of a sweep; ``poses`` of a plan that is no grid, whose poses are computed; what the
+    linked sweep says of it, if that has come.
+    """
 
     sweep: SweepRow
     chunk: PackedChunk
     poses: TrialColumns | None
+    compared: ComparedChunk | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +160,12 @@ def fetch(
         tx, selected.row.id, provenance_ids=selected.tried, after_revision=after_revision, grids=grids
     )
     known = sweeps.find_many(tx, sorted({chunk.sweep_id for chunk in chunks}))
+    compared = linked.compared(tx, chunks, known)
     swept = []
     for chunk in chunks:
         sweep = known[chunk.sweep_id]
-        swept.append(Swept(sweep, chunk, sweep_plan.chunk_poses(tx, sweep, chunk.start, chunk.stop)))
+        poses = sweep_plan.chunk_poses(tx, sweep, chunk.start, chunk.stop)
+        swept.append(Swept(sweep, chunk, poses, compared.get((sweep.id, chunk.number))))
     rows = trial_rows.posted(
         tx, selected.row.id, sorted(selected.tried), after_seq=after_seq, without=without
     )
@@ -185,6 +199,7 @@ def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
         return np.concatenate([getattr(part, name) for part in parts])
 
     code, provenance = column("outcome"), column("provenance")
+    share, spread = _shares(swept, parts, kept[1:])
     return AllTrials(
         poses=Poses(column("position"), column("quaternion_xyzw")),
         success=code == _SUCCESS,
@@ -195,12 +210,48 @@ def joined(stored: Stored, *, most_collided: int | None = None) -> AllTrials:
         proposal=column("proposal_density"),
         keys=_keys(stored, parts, grids),
         left_out=left_out,
-        share=np.round(column("share") * _SHARES) / _SHARES if any(len(p.attempts) for p in parts) else None,
+        share=share,
+        spread=spread,
     )
 
 
+def _shares(
+    swept: list[Swept], parts: list[TrialColumns], kept: list[Bools]
+) -> tuple[Floats | None, Floats | None]:
+    """By how much attempts of all ``parts`` succeeded, and half of what two engines differ by, each (n,);
+    None where that is known without. The first part is of no sweep; ``kept`` are those of each other's chunk.
+    """
+    compared = any(item.compared is not None for item in swept)
+    if not compared and not any(len(part.attempts) for part in parts):
+        return None, None
+    shares = [np.round(part.share * _SHARES) / _SHARES for part in parts]
+    spreads = [np.zeros(len(part)) for part in parts]
+    for place, (item, keep) in enumerate(zip(swept, kept, strict=True), 1):
+        if item.compared is not None:
+            shares[place], spreads[place] = _mean_of_both(parts[place], item.compared, item.sweep, keep)
+    return np.concatenate(shares), np.concatenate(spreads) if compared else None
+
+
+def _mean_of_both(
+    part: TrialColumns, compared: ComparedChunk, sweep: SweepRow, keep: Bools
+) -> tuple[Floats, Floats]:
+    """The mean of what two engines say of attempts, and half of what they differ by; the first alone says it
+    where the other broke off.
+    """
+    code = np.frombuffer(compared.outcomes, dtype=np.uint8)[keep]
+    other = sweep_plan.with_draws(replace(part, outcome=code), sweep, compared.successes, keep).share
+    other = np.where(code == NO_ATTEMPT, part.share, other)
+    mean, half = 0.5 * (part.share + other), 0.5 * np.abs(part.share - other)
+    share = np.round(mean * _COMPARED_SHARES) / _COMPARED_SHARES
+    # Rounded up: what either says lies within, whatever was rounded.
+    spread = np.ceil((half + np.abs(share - mean)) * _COMPARED_SHARES - 1e-6) / _COMPARED_SHARES
+    return share, spread
+
+
 def _drop_repeated(swept: list[Swept], indices: list[Ints | None], kept: list[Bools]) -> None:
-    """Two sweeps of one grid share poses, which count once: the first one stored."""
+    """Two sweeps of one grid share poses, which count once: of those that were compared with another engine's
+    the first one stored, else of all.
+    """
     together: dict[str, list[int]] = {}
     for place, item in enumerate(swept):
         if item.poses is None:
@@ -209,6 +260,7 @@ def _drop_repeated(swept: list[Swept], indices: list[Ints | None], kept: list[Bo
         # Chunks of one sweep share nothing.
         if len({swept[place].sweep.id for place in places}) < 2:
             continue
+        places.sort(key=lambda place: swept[place].compared is None)
         chosen = [np.flatnonzero(kept[place]) for place in places]
         index = np.concatenate(
             [
