@@ -213,6 +213,7 @@ class AsyncReports(Mirror[Reports]):
     kernel_similarity = _awaited(Reports.kernel_similarity)
     sources = _awaited(Reports.sources)
     promises = _awaited(Reports.promises)
+    engines = _awaited(Reports.engines)
     simulate = _mirrored(Reports.simulate, lambda sweeps: [AsyncSweep(sweep) for sweep in sweeps])
 
 

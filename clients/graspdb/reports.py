@@ -214,6 +214,15 @@ class Promises(Report[wire.reports.PromisesReport]):
         return self.raw.difference
 
 
+class Engines(Report[wire.reports.EnginesReport]):
+    """What two physics engines say of the same grasps."""
+
+    @property
+    def pairs(self) -> list[wire.reports.EnginePair]:
+        """Each pair of linked sweeps: how far they agree, and the grasps that hold in one engine only."""
+        return self.raw.pairs
+
+
 class Summary(Report[wire.reports.SummaryReport]):
     """Every object's trials by outcome, and success rates by each way of counting."""
 
@@ -301,6 +310,11 @@ class SourcesOptions(Waiting, total=False):
     sigma_rotation_deg: float | None
 
 
+class EnginesOptions(Waiting, total=False):
+    gripper: str | None
+    protocol: str | None
+
+
 class Reports(Resource):
     """``mug.reports``. They take the selection of trials, most of them the kernel, too: see
     :class:`Selection`; and how to wait for them: see :class:`Waiting`.
@@ -369,6 +383,13 @@ class Reports(Resource):
         tried something else.
         """
         return Promises(self._get(wire.reports.PromisesReport, PromisesOptions, options))
+
+    def engines(self, **options: Unpack[EnginesOptions]) -> Engines:
+        """How far two physics engines agree on the same grasps, on which they do not, and why.
+
+        Of sweeps with ``engine="both"``; Conflict where none of them has finished a chunk in both.
+        """
+        return Engines(self._get(wire.reports.EnginesReport, EnginesOptions, options))
 
     def simulate(self, calls: Iterable[wire.reports.CheckCall | Mapping[str, Any]]) -> list[Sweep]:
         """Make the sweeps that a report names as missing: checks, which enter no density.

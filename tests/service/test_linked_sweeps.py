@@ -14,6 +14,7 @@ from graspdb.wire import OUTCOME_CODES
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.settings import Settings
 from graspdb_service.storage.database import Database
+from graspdb_service.usecases.reports.engines import reasons
 from graspdb_service.usecases.upkeep import doctor
 
 GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "max_poses": 240, "seed": 1}
@@ -179,6 +180,114 @@ def test_attempts_count_where_all_of_them_are_rows(box: httpx.Client) -> None:
     likely = box.post("/objects/box/likelihood", json=asked).json()
     assert likely["support"]["nearest_attempt"]["position_m"][0] < 1e-9
     assert likely["support"]["effective_trials"][0] > 1.0
+
+
+def likelihood(http: httpx.Client, poses: list[dict[str, Any]], slug: str = "box") -> dict[str, np.ndarray]:
+    answer = http.post(f"/objects/{slug}/likelihood", json={"poses": poses, "gripper": "pg70"}).json()
+    low, high = (np.array(answer["interval"][end], dtype=float) for end in ("low", "high"))
+    told = {"low": low, "high": high, "p": np.array(answer["success_probability"], dtype=float)}
+    return told | {"revision": answer["revision"]}
+
+
+def test_disagreement_makes_a_probability_less_sure(
+    box: httpx.Client, make_object: Callable[..., str], put_box: Callable[..., Any]
+) -> None:
+    """One attempt a pose, whatever came first; and what either engine alone says lies within."""
+    sweep(box)
+    work(box, "pybullet")
+    asked = [{name: trial[name] for name in ("position", "quaternion_xyzw")} for trial in trials(box)[::10]]
+    before = likelihood(box, asked)
+    work(box, "mujoco", jobs=1)
+    some = likelihood(box, asked)
+    work(box, "mujoco")
+    after = likelihood(box, asked)
+    assert before["revision"] < some["revision"] < after["revision"]
+    for earlier, later in ((before, some), (some, after)):
+        assert (later["high"] - later["low"]).sum() > (earlier["high"] - earlier["low"]).sum()
+    # The same attempts in another order, and each engine alone.
+    told = {}
+    for slug, engine in (("other", "both"), ("alone-p", "pybullet"), ("alone-m", "mujoco")):
+        put_box(box, make_object(box, slug, mass_kg=0.2))
+        sweep(box, slug, engine=engine)
+        work(box, "mujoco")
+        work(box, "pybullet")
+        told[slug] = likelihood(box, asked, slug)
+    for name in ("low", "high", "p"):
+        np.testing.assert_allclose(told["other"][name], after[name], atol=1e-6)
+    assert (told["alone-p"]["p"] != told["alone-m"]["p"]).any()
+    for alone in ("alone-p", "alone-m"):
+        assert (after["low"] - 1e-9 <= told[alone]["p"]).all()
+        assert (told[alone]["p"] <= after["high"] + 1e-9).all()
+    np.testing.assert_allclose(told["alone-p"]["p"], before["p"], atol=1e-6)
+    np.testing.assert_allclose(told["alone-p"]["high"], before["high"], atol=1e-6)
+    mean = 0.5 * (told["alone-p"]["p"] + told["alone-m"]["p"])
+    np.testing.assert_allclose(after["p"], mean, atol=1e-6)
+
+
+def report(http: httpx.Client, slug: str = "box", **query: str) -> httpx.Response:
+    answer = http.get(f"/objects/{slug}/reports/engines", params=query)
+    while answer.status_code == 202:
+        run = http.get(answer.headers["location"]).json()
+        if run["state"] != "running":
+            answer = http.get(f"/objects/{slug}/reports/engines", params=query)
+    return answer
+
+
+def test_the_report_says_on_which_grasps_engines_differ_and_why(box: httpx.Client) -> None:
+    assert report(box).json()["type"].endswith(":linked-sweeps-needed")
+    first = sweep(box)
+    sweep(box, purpose="check", grid={**GRID, "max_poses": 60, "seed": 2})
+    work(box, "pybullet")
+    assert report(box).json()["type"].endswith(":linked-sweeps-needed")
+    work(box, "mujoco")
+    told = report(box).json()
+    pair = next(item for item in told["pairs"] if item["sweep"] == first["id"])
+    assert len(told["pairs"]) == 2
+    assert pair["engines"] + pair["other_engines"] == [*ENGINES.values()]
+    found = {
+        item: box.get(f"/sweeps/{item}/outcomes?limit=1000").json() for item in (first["id"], first["linked"])
+    }
+    ours, theirs = (np.array(item["outcome"]) for item in found.values())
+    same = (ours == "success") == (theirs == "success")
+    free = (ours != "collision") | (theirs != "collision")
+    assert (pair["poses"], pair["waiting"], pair["broken_off"]) == (240, 0, 0)
+    assert pair["agreement"]["value"] == pytest.approx(same.mean())
+    assert pair["agreement"]["low"] < same.mean() < pair["agreement"]["high"]
+    assert pair["physics"] == free.sum() < 240
+    assert pair["physics_agreement"]["value"] == pytest.approx(same[free].mean())
+    assert sum(item["poses"] for item in pair["outcomes"]) == 240
+    assert pair["disagreements"] == (~same).sum() == sum(item["poses"] for item in pair["reasons"])
+    # By 0.1 of the weight the qualities are far from the limit of `wrench`, 1.
+    assert {item["reason"] for item in pair["reasons"]} == {"edge", "unexplained"}
+    index = found[first["id"]]["pose_index"]
+    place = index.index(pair["first"][0]["pose_index"])
+    assert place == np.flatnonzero(~same)[0]
+    assert pair["first"][0]["position"] == pytest.approx(found[first["id"]]["position"][place])
+    assert (pair["first"][0]["outcome"], pair["first"][0]["other_outcome"]) == (ours[place], theirs[place])
+    assert pair["first"][0]["quality"] == pytest.approx(0.1)
+    assert sum(len(item["first"]) for item in told["pairs"]) <= 100
+    assert f"{same.mean():.1%}" in told["text"]
+    assert report(box, protocol="lift").json()["type"].endswith(":linked-sweeps-needed")
+    picture = box.get("/objects/box/reports/engines", headers={"Accept": "image/svg+xml"})
+    assert picture.content.startswith(b"<?xml")
+
+
+@pytest.mark.parametrize(
+    ("protocol", "failed", "qualities", "why"),
+    [
+        ("wrench", "wrench_insufficient", (1.1, 0.95), "margin"),
+        ("wrench", "wrench_insufficient", (2.0, 0.3), "unexplained"),
+        ("wrench", "slipped", (2.0, float("nan")), "edge"),
+        ("lift", "slipped", (0.9, -0.1), "margin"),
+        ("lift", "dropped", (0.9, -3.0), "edge"),
+        ("shake", "timeout", (0.1, 0.1), "timeout"),
+    ],
+)
+def test_reasons(protocol: str, failed: str, qualities: tuple[float, float], why: str) -> None:
+    one = reasons.Said("pybullet", "success", qualities[0], 0.03)
+    two = reasons.Said("mujoco", failed, qualities[1], float("nan"))
+    assert reasons.reason(protocol, one, two) == reasons.reason(protocol, two, one) == why
+    assert "success in pybullet" in reasons.words(protocol, one, two)
 
 
 def test_what_is_done_to_one_of_two_is_done_to_both(box: httpx.Client) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from graspdb import wire
-from graspdb.cli.common import ERRORS, ObjectId, State, out, run_bar, show_rows, show_table
+from graspdb.cli.common import ERRORS, ObjectId, State, numbers, out, run_bar, show_rows, show_table
 from graspdb.cli.wording import in_commands
 from graspdb.errors import ChecksNeeded, add_note
 from graspdb.figures import FILE_FORMATS
@@ -28,6 +28,8 @@ from graspdb.reports import (
 from graspdb.wire.reports import REPORT_NAMES, REPORTS, ReportRange
 
 _NAMES = ", ".join(REPORT_NAMES)
+#: Grasps that engines differ on which are shown of each pair of sweeps.
+_SHOWN = 20
 Columns = dict[str, Callable[[Any], Any]]
 Table = tuple[Sequence[Any], Columns]
 
@@ -266,6 +268,32 @@ def _promises(raw: wire.reports.PromisesReport) -> Iterator[Table]:
     yield [item for item in raw.bins if item.answers], columns
 
 
+def _engines(raw: wire.reports.EnginesReport) -> Iterator[Table]:
+    columns: Columns = {
+        "sweep": lambda p: p.sweep,
+        "protocol": lambda p: p.protocol,
+        "engines": lambda p: " and ".join([*p.engines, *p.other_engines]),
+        "poses": lambda p: f"{p.poses:,}",
+        "agree": lambda p: _range(p.agreement),
+        "rest on physics": lambda p: f"{p.physics:,}",
+        "of these agree": lambda p: _range(p.physics_agreement),
+    }
+    yield raw.pairs, columns
+    why: Columns = {"why": lambda r: r.reason, "poses": lambda r: r.poses, "": lambda r: r.text}
+    grasps: Columns = {
+        "pose": lambda d: d.pose_index,
+        "position [m]": lambda d: numbers(d.position),
+        "outcome": lambda d: d.outcome,
+        "other": lambda d: d.other_outcome,
+        "quality": lambda d: number(d.quality),
+        "other's": lambda d: number(d.other_quality),
+        "why": lambda d: d.reason,
+    }
+    for pair in raw.pairs:
+        yield pair.reasons, why
+        yield pair.first[:_SHOWN], grasps
+
+
 def _alike(found: wire.reports.SourceSimilarity | None) -> str:
     return "unknown" if found is None else f"{found.value:.2f} (chance alone {_range(found.expected)})"
 
@@ -293,6 +321,7 @@ _TABLES: dict[str, Callable[[Any], Iterator[Table]]] = {
     "bandwidth": _bandwidth,
     "calibration": _calibration,
     "convergence": _convergence,
+    "engines": _engines,
     "kernel-similarity": _kernel_similarity,
     "promises": _promises,
     "sources": _sources,

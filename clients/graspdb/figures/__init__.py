@@ -15,11 +15,12 @@ from graspdb.figures.anisotropy import draw_anisotropy
 from graspdb.figures.bandwidth import draw_bandwidth
 from graspdb.figures.calibration import draw_calibration
 from graspdb.figures.canvas import Figure
+from graspdb.figures.compared.engines import draw_engines
+from graspdb.figures.compared.promises import draw_promises
+from graspdb.figures.compared.sources import draw_sources
 from graspdb.figures.convergence import draw_convergence
 from graspdb.figures.kernel_similarity import draw_kernel_similarity
 from graspdb.figures.projection import draw_projection
-from graspdb.figures.promises import draw_promises
-from graspdb.figures.sources import draw_sources
 from graspdb.figures.summary import draw_summary
 from graspdb.wire import reports
 from graspdb.wire.reports import Report, SummaryReport
@@ -35,6 +36,7 @@ _DRAW: dict[type[Any], Callable[[Any], Figure]] = {
     reports.BandwidthReport: draw_bandwidth,
     reports.CalibrationReport: draw_calibration,
     reports.ConvergenceReport: draw_convergence,
+    reports.EnginesReport: draw_engines,
     reports.KernelSimilarityReport: draw_kernel_similarity,
     reports.ProjectionReport: draw_projection,
     reports.PromisesReport: draw_promises,

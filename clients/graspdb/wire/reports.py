@@ -28,6 +28,8 @@ from graspdb.wire.base import (
     Response,
     Revision,
     Slug,
+    ToolPosition,
+    ToolRotation,
     Triple,
     Warnings,
 )
@@ -44,6 +46,7 @@ ReportName = Literal[
     "kernel-similarity",
     "sources",
     "promises",
+    "engines",
 ]
 REPORT_NAMES: tuple[ReportName, ...] = get_args(ReportName)
 Method = Literal["empirical", "density"]
@@ -1003,6 +1006,124 @@ class PromisesReport(Report):
     """By what was promised, from 0 to 1."""
 
 
+class EnginesOptions(Request):
+    """Of which linked sweeps."""
+
+    gripper: GripperRef | None = None
+    """Only sweeps with this gripper; by default the one that the trials name."""
+    protocol: Slug | None = None
+    """Only sweeps judged by this protocol; by default the one that the trials name."""
+
+
+EngineReasonName = Literal["margin", "edge", "timeout", "unexplained", "broke-off"]
+
+
+class EngineReason(Response):
+    """Poses that engines differ on for one reason."""
+
+    reason: EngineReasonName
+    """``margin``: a quality within 0.2 of the limit; ``edge``: one missed it or lost it, far from the limit;
+    ``timeout``: one did not come to an end; ``unexplained``: none of these; ``broke-off``: one could not
+    simulate it, such as where a finger sank in, so that nothing is compared."""
+    poses: int
+    """How many."""
+    share: float
+    """Their share of all poses that engines differ on or that one broke off, 0 to 1."""
+    text: str
+    """What that means, in words."""
+
+
+class EngineOutcomes(Response):
+    """Poses of one pair of outcomes."""
+
+    outcome: str
+    """What the engine says whose trials are stored."""
+    other_outcome: str
+    """What the other says."""
+    poses: int
+    """Of how many poses."""
+
+
+class EngineDisagreement(Response):
+    """A grasp that holds in one engine only."""
+
+    pose_index: int
+    """Index of the pose in the sweeps' plan."""
+    position: ToolPosition
+    quaternion_xyzw: ToolRotation
+    outcome: str
+    """What the engine says whose trials are stored."""
+    other_outcome: str
+    """What the other says."""
+    quality: float | None
+    """The first's margin by the protocol, without a unit; null where physics measured none."""
+    other_quality: float | None
+    """The other's margin; null where physics measured none."""
+    width_m: float | None
+    """Distance between the fingers at the end in the first, metres; null where it was not measured."""
+    other_width_m: float | None
+    """The same in the other, metres; null where it was not measured."""
+    reason: EngineReasonName
+    """Why they differ, as far as the numbers tell."""
+    text: str
+    """The same in words, with the numbers."""
+
+
+class EnginePair(Response):
+    """Two linked sweeps."""
+
+    sweep: str
+    """Id of the sweep whose trials are stored."""
+    linked: str
+    """Id of the sweep that compares."""
+    protocol: str
+    """How outcomes were judged."""
+    fidelity: str
+    """Time step and iterations of the physics: ``standard``, or ``fine``."""
+    purpose: str
+    """``collect``, or ``check``: neither enters an estimate."""
+    engines: list[str]
+    """What simulated the first, with versions."""
+    other_engines: list[str]
+    """What simulated the other, with versions."""
+    poses: int
+    """How many poses both have simulated and judged."""
+    waiting: int
+    """How many poses of the plan only one or none has simulated so far."""
+    broken_off: int
+    """How many one could not simulate: they are not among ``poses``."""
+    agreement: ReportRange
+    """Share of poses that hold in both or in neither, with its interval, as of independent ones."""
+    physics: int
+    """How many of the poses rest on physics: where neither collides nor is empty between the fingers by
+    geometry alone, which both engines share and agree on trivially."""
+    physics_agreement: ReportRange
+    """The same share of these."""
+    outcomes: list[EngineOutcomes]
+    """How often each pair of outcomes came, the most frequent first."""
+    disagreements: int
+    """How many poses hold in one only."""
+    reasons: list[EngineReason]
+    """Why, the most frequent first."""
+    first: list[EngineDisagreement]
+    """The first of them by their place in the plan, of all pairs at most 100."""
+
+
+class EnginesReport(Report):
+    """What two physics engines say of the same poses: how often they agree, where not, and why."""
+
+    question: ClassVar[str] = (
+        "How far two physics engines agree on the same grasps of linked sweeps, on which they do not, and"
+        " why."
+    )
+    options: ClassVar[type[Request]] = EnginesOptions
+    report: Literal["engines"] = "engines"
+    """Name of the report, as in its path."""
+    level: IntervalLevel
+    pairs: list[EnginePair]
+    """Each pair of linked sweeps, in the order of their making."""
+
+
 REPORTS: Mapping[str, type[Report]] = {
     model.model_fields["report"].default: model
     for model in (
@@ -1014,6 +1135,7 @@ REPORTS: Mapping[str, type[Report]] = {
         KernelSimilarityReport,
         SourcesReport,
         PromisesReport,
+        EnginesReport,
     )
 }
 

@@ -16,7 +16,7 @@ from sqlalchemy import exists, select
 from graspdb_service.storage.database import Tx, all_as
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
-from graspdb_service.storage.tables import jobs, packed_outcomes, sweeps
+from graspdb_service.storage.tables import batches, jobs, packed_outcomes, sweeps
 from graspdb_service.trial_columns import Floats, Ints
 
 _MEASURED = np.dtype([("place", "<u4"), ("quality", "<f4"), ("width_m", "<f4")])
@@ -54,6 +54,63 @@ def compared(
         packed_outcomes.c.number.between(min(numbers), max(numbers)),
     )
     return {(of[chunk.sweep_id], chunk.number): chunk for chunk in all_as(tx, query, ComparedChunk)}
+
+
+@dataclass(frozen=True)
+class BothChunks:
+    """What two linked sweeps say of the places ``start`` to ``stop`` of their plan: outcome codes (uint8),
+    and what each measured (:func:`read_measured`).
+    """
+
+    start: int
+    stop: int
+    outcomes: bytes
+    measured: bytes | None
+    other_outcomes: bytes
+    other_measured: bytes | None
+
+
+def read_measured(content: bytes | None) -> tuple[Ints, Floats, Floats]:
+    """Places in their chunk, qualities and widths (n,) of the poses that met physics, as they were stored."""
+    table = np.frombuffer(content or b"", dtype=_MEASURED)
+    return (
+        table["place"].astype(np.int64),
+        table["quality"].astype(np.float64),
+        table["width_m"].astype(np.float64),
+    )
+
+
+def comparing(tx: Tx, object_id: int) -> list[str]:
+    """Ids of an object's sweeps that compare, in the order of their making; their batches are still there."""
+    query = (
+        select(sweeps.c.id)
+        .join(batches, batches.c.sweep_id == sweeps.c.id)
+        .where(sweeps.c.object_id == object_id, sweeps.c.purpose == "compare")
+    )
+    return [str(name) for name in tx.scalars(query.order_by(sweeps.c.id))]
+
+
+def both(tx: Tx, first: str, other: str) -> list[BothChunks]:
+    """The chunks that two linked sweeps have finished, in the plan's order."""
+    one, two = packed_outcomes.alias("one"), packed_outcomes.alias("two")
+    query = (
+        select(
+            jobs.c.start,
+            jobs.c.stop,
+            one.c.outcomes,
+            one.c.measured,
+            two.c.outcomes.label("other_outcomes"),
+            two.c.measured.label("other_measured"),
+        )
+        .select_from(
+            one.join(jobs, jobs.c.id == one.c.job_id).join(
+                two, (two.c.sweep_id == other) & (two.c.number == one.c.number)
+            )
+        )
+        .where(one.c.sweep_id == first)
+        .order_by(one.c.number)
+    )
+    return all_as(tx, query, BothChunks)
 
 
 def came_later(tx: Tx, object_id: int, *, after_revision: int) -> bool:

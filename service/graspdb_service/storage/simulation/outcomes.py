@@ -150,12 +150,14 @@ def _of_object(object_id: int, purpose: str) -> Select[Any]:
 
 
 def checks_stamp(tx: Tx, object_id: int) -> str:
-    """Another one whenever an object's finished checks change, which its revision does not tell."""
+    """Another one whenever what an object's checks, and the sweeps that compare, have finished changes, which
+    its revision does not tell.
+    """
     query = (
         select(sweeps.c.id, func.count())
         .join(batches, batches.c.sweep_id == sweeps.c.id)
         .join(packed_outcomes, packed_outcomes.c.sweep_id == sweeps.c.id)
-        .where(sweeps.c.object_id == object_id, sweeps.c.purpose == "check")
+        .where(sweeps.c.object_id == object_id, sweeps.c.purpose != "collect")
         .group_by(sweeps.c.id)
         .order_by(sweeps.c.id)
     )

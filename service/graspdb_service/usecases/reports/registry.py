@@ -25,6 +25,7 @@ from graspdb_service.usecases.reports.bandwidth import bandwidth_report
 from graspdb_service.usecases.reports.calibration import calibration_report
 from graspdb_service.usecases.reports.common import KeptCurves, ReportInputs
 from graspdb_service.usecases.reports.convergence import convergence_report
+from graspdb_service.usecases.reports.engines.report import engines_report
 from graspdb_service.usecases.reports.kernel_similarity import kernel_similarity_report
 from graspdb_service.usecases.reports.projection import projection_report
 from graspdb_service.usecases.reports.promises.report import promises_report
@@ -34,12 +35,13 @@ from graspdb_service.usecases.runtime.runs import Result, RunKind
 #: Kept convergence curves may take this part of what densities may.
 _CURVES_SHARE = 4
 #: Reports that say what became of simulated checks.
-_OF_CHECKS = ("bandwidth", "calibration")
+_OF_CHECKS = ("bandwidth", "calibration", "engines")
 _COMPUTE: Mapping[str, Callable[[ReportInputs, Built, Any, Progress], Report]] = {
     "anisotropy": anisotropy_report,
     "bandwidth": bandwidth_report,
     "calibration": calibration_report,
     "convergence": convergence_report,
+    "engines": engines_report,
     "kernel-similarity": kernel_similarity_report,
     "projection": projection_report,
     "promises": promises_report,

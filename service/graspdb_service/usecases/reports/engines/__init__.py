@@ -1,0 +1,1 @@
+"""What two engines say of the same poses, and why they differ."""
