@@ -20,10 +20,10 @@ from graspdb_service.usecases.upkeep import doctor
 GRID = {"position_step_m": 0.02, "rotation_step_deg": 60.0, "max_poses": 240, "seed": 1}
 DOWN = [1.0, 0.0, 0.0, 0.0]
 ENGINES = {"pybullet": "pybullet 3.2.7", "mujoco": "mujoco 3.3.1"}
-#: By the rest of the pose index by 6: what each engine says.
+#: By the rest of the pose index by 7: what each engine says.
 CODES = {
-    "pybullet": np.array([1, 1, 6, 1, 3, 2], dtype=np.uint8),
-    "mujoco": np.array([1, 6, 6, 1, 1, 2], dtype=np.uint8),
+    "pybullet": np.array([1, 1, 6, 1, 3, 2, 6], dtype=np.uint8),
+    "mujoco": np.array([1, 6, 6, 1, 1, 2, 6], dtype=np.uint8),
 }
 
 
@@ -37,7 +37,7 @@ def work(http: httpx.Client, *engines: str, jobs: int = 10_000) -> list[dict[str
             index = np.arange(payload["start"], payload["stop"])
             if payload["grid"]:
                 index = PoseGrid(**payload["grid"]).pose_indices(payload["start"], payload["stop"])
-            codes = CODES[payload["engine"] or "pybullet"][index % 6]
+            codes = CODES[payload["engine"] or "pybullet"][index % 7]
             rows = index[codes != OUTCOME_CODES["collision"]].tolist()
             body = {
                 "outcomes": base64.b64encode(codes.tobytes()).decode(),
