@@ -81,22 +81,32 @@ class _Engine:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two linked sweeps and what both say of the poses at these ``places`` (n,) of their plan."""
+    """Two linked sweeps and what both say of the poses (n,) of these ``chunks``, by start and stop."""
 
     sweep: SweepRow
     other: SweepRow
-    places: Ints
+    chunks: list[tuple[int, int]]
     one: _Engine
     two: _Engine
     stored: TrialColumns | None
 
     def poses(self, rows: Ints) -> TrialColumns:
         """Some of the poses, with their indices in the plan."""
+        ends = np.cumsum([stop - start for start, stop in self.chunks])
+        which = np.searchsorted(ends, rows, side="right")
+        index = np.empty(len(rows), dtype=np.int64)
+        for chunk in np.unique(which).tolist():
+            start, stop = self.chunks[chunk]
+            here = which == chunk
+            # A grid orders the poses of a chunk, not those of a plan.
+            places = np.arange(start, stop) if self.stored is not None else self._indices(start, stop)
+            index[here] = places[rows[here] - (ends[chunk] - (stop - start))]
         if self.stored is not None:
-            return self.stored[self.places[rows]]
-        grid = sweep_plan.grid_of(self.sweep)
-        index = [grid.pose_indices(place, place + 1)[0] for place in self.places[rows].tolist()]
-        return sweep_plan.grid_poses(grid, np.array(index, dtype=np.int64))
+            return self.stored[index]
+        return sweep_plan.grid_poses(sweep_plan.grid_of(self.sweep), index)
+
+    def _indices(self, start: int, stop: int) -> Ints:
+        return sweep_plan.grid_of(self.sweep).pose_indices(start, stop)
 
 
 def _pairs(tx: Tx, object_id: int, selected: Selected) -> list[_Pair]:
@@ -109,14 +119,13 @@ def _pairs(tx: Tx, object_id: int, selected: Selected) -> list[_Pair]:
         if sweep is None or not _is_of(sweep, selected):
             continue
         chunks = linked.both(tx, sweep.id, other.id)
-        places = [np.arange(chunk.start, chunk.stop) for chunk in chunks]
         one = [(chunk.outcomes, chunk.measured) for chunk in chunks]
         two = [(chunk.other_outcomes, chunk.other_measured) for chunk in chunks]
         found.append(
             _Pair(
                 sweep,
                 other,
-                np.concatenate([np.empty(0, dtype=np.int64), *places]),
+                [(chunk.start, chunk.stop) for chunk in chunks],
                 _engine(outcomes.engines(tx, sweep.id), one),
                 _engine(outcomes.engines(tx, other.id), two),
                 sweep_plan.chunk_poses(tx, sweep, 0, sweep.pose_count),
