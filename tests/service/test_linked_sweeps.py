@@ -285,6 +285,8 @@ def test_the_report_says_on_which_grasps_engines_differ_and_why(box: httpx.Clien
         ("wrench", "slipped", (2.0, float("nan")), "edge"),
         ("lift", "slipped", (0.9, -0.1), "margin"),
         ("lift", "dropped", (0.9, -3.0), "edge"),
+        # Squeezed out while the jaw closed: nothing was carried.
+        ("lift", "slipped", (0.9, 0.0), "edge"),
         ("shake", "timeout", (0.1, 0.1), "timeout"),
     ],
 )

@@ -39,7 +39,11 @@ class Said:
 
     def margin(self, protocol: str) -> float:
         """How far its quality is from the limit, from 0; infinite where it has none."""
-        return math.inf if math.isnan(self.quality) else abs(self.quality - _LIMITS.get(protocol, 0.0))
+        # Of a jaw that closed on nothing, 0 was measured of nothing: what was carried too far has less.
+        empty = self.outcome in ("missed", "slipped") and self.quality == 0.0
+        if empty or math.isnan(self.quality):
+            return math.inf
+        return abs(self.quality - _LIMITS.get(protocol, 0.0))
 
 
 def reason(protocol: str, one: Said, two: Said) -> EngineReasonName:
