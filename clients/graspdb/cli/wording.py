@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, str] = {
     "PUT /objects/OBJECT/convex-parts": "objects set-convex-parts OBJECT FILE",
     "GET /objects/OBJECT/trials": "trials list OBJECT",
     "POST /objects/OBJECT/trials": "trials add OBJECT FILE",
+    "DELETE /objects/OBJECT/trials/SEQ": "trials withdraw OBJECT SEQ",
     "GET /objects/OBJECT/batches": "batches list OBJECT",
     "DELETE /objects/OBJECT/batches/BATCH": "batches delete OBJECT BATCH",
     "POST /objects/OBJECT/best-grasp": "best-grasp OBJECT",
