@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, GridPlan
 from graspdb_service.storage.objects import ObjectRow
+from graspdb_service.storage.simulation.linked import ComparedChunk
 from graspdb_service.storage.simulation.outcomes import PackedChunk
 from graspdb_service.storage.simulation.sweeps import SweepRow
 from graspdb_service.trial_columns import TrialColumns
 from graspdb_service.usecases.trials import sweep_plan
-from graspdb_service.usecases.trials.attempts import NO_ATTEMPT, Stored, Swept, joined
+from graspdb_service.usecases.trials.attempts import NO_ATTEMPT, Stored, Swept, joined, mean_of_both
 from graspdb_service.usecases.trials.selection import Selected
 
 SUCCESS, MISSED, COLLISION = (OUTCOME_CODES[name] for name in ("success", "missed", "collision"))
@@ -34,7 +39,7 @@ def sweep_of(name: str, **options: Any) -> SweepRow:
         fidelity="standard", purpose="collect", plan="grid", request={},
         snapshot={"grid": plan.model_dump(), "repeat_key": "one grid"},
         pose_count=poses, chunk_poses=100, chunks=1, cancelled=False, made_by=None,
-        created_at=now, started_at=now, finished_at=now, object="thing", batch_id=1, batch="b",
+        created_at=now, started_at=now, finished_at=now, linked=None, object="thing", batch_id=1, batch="b",
     )  # fmt: skip
 
 
@@ -54,7 +59,7 @@ def stored(*sweeps: tuple[SweepRow, int], rows: int = 0) -> Stored:
             stop = min(start + 100, grid.total)
             codes = outcome_of(grid.pose_indices(start, stop), seed)
             chunks[-1].append(
-                Swept(row, PackedChunk(row.id, start // 100, start, stop, codes.tobytes()), None)
+                Swept(row, PackedChunk(row.id, start // 100, start, stop, codes.tobytes(), None), None)
             )
     turns = [part[i] for i in range(max(map(len, chunks))) for part in chunks if i < len(part)]
     rng = np.random.default_rng(1)
@@ -120,3 +125,44 @@ def test_fewer_that_collided_stand_for_all() -> None:
     again = joined(given, most_collided=10**6)
     np.testing.assert_array_equal(again.poses.positions, whole.poses.positions)
     assert again.left_out == 0
+
+
+def _drawn(outcomes: np.ndarray, won: np.ndarray | None) -> ComparedChunk:
+    successes = None if won is None else won.astype(np.uint8).tobytes()
+    return ComparedChunk("other", 0, outcomes.astype(np.uint8).tobytes(), successes)
+
+
+@given(
+    st.integers(1, 100),
+    st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)), min_size=1, max_size=30),
+)
+def test_what_either_engine_says_lies_within_the_spread_of_both(
+    draws: int, counts: list[tuple[int, int]]
+) -> None:
+    """Whatever is rounded; where each tried a pose once, nothing is."""
+    first, second = np.minimum(np.array(counts).T, draws)
+    poses = TrialColumns(np.zeros((len(counts), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(counts), 1)))
+    sweep = cast(SweepRow, SimpleNamespace(request={"randomise": {"draws": draws}} if draws > 1 else {}))
+    every = np.ones(len(counts), dtype=np.bool_)
+    labels = [np.where(2 * won >= draws, 1, 2) for won in (first, second)]
+    part = replace(poses, outcome=labels[0].astype(np.uint8))
+    if draws > 1:
+        part = sweep_plan.with_draws(part, sweep, first.astype(np.uint8).tobytes(), every)
+    compared = _drawn(labels[1], second if draws > 1 else None)
+    share, spread = mean_of_both(part, compared, sweep, every)
+    for won in (first, second):
+        assert (np.abs(won / draws - share) <= spread + 1e-6).all()
+    if draws == 1:
+        assert (share == (first + second) / 2).all()
+        assert (spread == np.abs(first - second) / 2).all()
+    assert (np.abs(share - (first + second) / (2 * draws)) <= 1 / 40 + 1e-9).all()
+
+
+def test_where_one_engine_broke_off_the_other_stands_alone() -> None:
+    poses = TrialColumns(
+        np.zeros((2, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), outcome=np.array([1, 3], "u1")
+    )
+    sweep = cast(SweepRow, SimpleNamespace(request={}))
+    compared = _drawn(np.array([NO_ATTEMPT, NO_ATTEMPT]), None)
+    share, spread = mean_of_both(poses, compared, sweep, np.ones(2, dtype=np.bool_))
+    assert (share.tolist(), spread.tolist()) == ([1.0, 0.0], [0.0, 0.0])

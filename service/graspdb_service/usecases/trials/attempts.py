@@ -228,11 +228,11 @@ def _shares(
     spreads = [np.zeros(len(part)) for part in parts]
     for place, (item, keep) in enumerate(zip(swept, kept, strict=True), 1):
         if item.compared is not None:
-            shares[place], spreads[place] = _mean_of_both(parts[place], item.compared, item.sweep, keep)
+            shares[place], spreads[place] = mean_of_both(parts[place], item.compared, item.sweep, keep)
     return np.concatenate(shares), np.concatenate(spreads) if compared else None
 
 
-def _mean_of_both(
+def mean_of_both(
     part: TrialColumns, compared: ComparedChunk, sweep: SweepRow, keep: Bools
 ) -> tuple[Floats, Floats]:
     """The mean of what two engines say of attempts, and half of what they differ by; the first alone says it
