@@ -49,7 +49,7 @@ NOT_IN_A_FRAME = {
         "Verdict.grasps",
     ),
     *("AnisotropyReport.grasps", "CheckedGrasps.grasps", "ProjectionReport.grasps", "SweepInfo.poses"),
-    "ConvergenceCurve.points",
+    *("ConvergenceCurve.points", "EngineOutcomes.poses", "EnginePair.poses", "EngineReason.poses"),
 }
 
 

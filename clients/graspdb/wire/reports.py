@@ -1026,7 +1026,7 @@ class EngineReason(Response):
     ``timeout``: one did not come to an end; ``unexplained``: none of these; ``broke-off``: one could not
     simulate it, such as where a finger sank in, so that nothing is compared."""
     poses: int
-    """How many."""
+    """How many poses they are."""
     share: float
     """Their share of all poses that engines differ on or that one broke off, 0 to 1."""
     text: str
