@@ -49,8 +49,8 @@ def add_trials(
     """Store the trials of a file, and say what looks doubtful about them.
 
     CSV has the columns x,y,z,qx,qy,qz,qw,outcome and optionally gripper, source, protocol,
-    engine, proposal_density, quality, width_m, measured_at, answer, achieved_x to achieved_qw for where the
-    tool was after all, and qualities.NAME for any number of named scores.
+    engine, proposal_density, attempts, successes, quality, width_m, measured_at, answer, achieved_x to
+    achieved_qw for where the tool was after all, and qualities.NAME for any number of named scores.
     """
     records, shared = read_trials(file)
     try:
