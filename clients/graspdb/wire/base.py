@@ -108,12 +108,12 @@ def _no_such_field(models: set[type[BaseModel]], place: Sequence[str | int]) -> 
     return no_such_field(name, {field for each in models for field in each.model_fields})
 
 
-def no_such_field(name: str, there: Iterable[str]) -> str:
-    """What is said of a field that is not among those there are."""
+def no_such_field(name: str, there: Iterable[str], *, listed: bool = True) -> str:
+    """What is said of a field that is not among those there are, which are ``listed``: of many once."""
     near = difflib.get_close_matches(name, there := sorted(there), n=1)
     if near:
         return f"there is no such field; did you mean {near[0]!r}?"
-    return f"there is no such field; there are {', '.join(there)}"
+    return "there is no such field" + (f"; there are {', '.join(there)}" if listed else "")
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:

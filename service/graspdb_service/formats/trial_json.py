@@ -140,7 +140,8 @@ def _from_columns(columns: Any, faults: Faults, limit: int) -> Iterator[Fields]:
         faults.raise_if_any()
     columns = _with_qualities(columns, faults)
     for name in sorted(name for name in columns if name not in NAMES and not name.startswith(QUALITIES)):
-        faults.add(f"columns.{name[:80]}", no_such_field(name[:80], NAMES).replace("field", "column"))
+        told = no_such_field(name[:80], NAMES, listed=not faults.found)
+        faults.add(f"columns.{name[:80]}", told.replace("field", "column"))
     lists: dict[str, list[Any] | LongArray] = {}
     for name in columns:
         if isinstance(columns[name], list | LongArray):
@@ -226,7 +227,9 @@ def _from_rows(rows: list[Any], faults: Faults, place: Place) -> Fields:
     if not names <= NAMES:
         for i, row in enumerate(rows):
             for name in sorted(row.keys() - NAMES):
-                told = _OF_BATCH if name in DEFAULTS else no_such_field(str(name), NAMES)
+                told = _OF_BATCH
+                if name not in DEFAULTS:
+                    told = no_such_field(str(name), NAMES, listed=not faults.found)
                 faults.add(place(i, str(name)), told)
     for name in REQUIRED:
         missing = [i for i, row in enumerate(rows) if row.get(name) is None]
