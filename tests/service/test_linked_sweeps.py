@@ -297,6 +297,14 @@ def test_reasons(protocol: str, failed: str, qualities: tuple[float, float], why
     assert "success in pybullet" in reasons.words(protocol, one, two)
 
 
+@pytest.mark.parametrize(("won", "other", "why"), [(5, 4, "draws"), (6, 4, "draws"), (9, 2, "edge")])
+def test_reasons_of_draws(won: int, other: int, why: str) -> None:
+    one = reasons.Said("pybullet", "success", 2.0, 0.03, won, 10)
+    two = reasons.Said("mujoco", "slipped", float("nan"), 0.01, other, 10)
+    assert reasons.reason("wrench", one, two) == why
+    assert f"({won} of 10" in reasons.words("wrench", one, two)
+
+
 def test_what_is_done_to_one_of_two_is_done_to_both(box: httpx.Client) -> None:
     first = sweep(box)
     place = f"/objects/box/batches/{first['batch']}"

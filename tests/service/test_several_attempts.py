@@ -198,7 +198,9 @@ def test_a_sweep_that_draws(http: httpx.Client, put_box: Put) -> None:
     assert told.items() >= asked.items()
     assert told["seed"] == 0
     # A worker that knows nothing of draws does not get it.
-    assert _claim(http, ["simulate", "pybullet", "decompose"]) is None or sweep.json()["waiting_for"]
+    assert _claim(http, ["simulate", "pybullet"]) is None
+    (told_of,) = http.get(f"/sweeps/{sweep.json()['id']}").json()["warnings"]
+    assert "can simulate a pose under what is drawn: they are of an older version" in told_of
     job = _claim(http, ["simulate", "drawn-wrench", "pybullet"])
     if job is None:
         pytest.fail(f"nothing to claim: {sweep.json()}")
@@ -242,6 +244,9 @@ def test_a_sweep_that_draws(http: httpx.Client, put_box: Put) -> None:
     density = http.get("/objects/box/density").json()
     assert density["size"] == 3
     assert density["effective_sample_size"] == pytest.approx((8 + 3 + 1) ** 2 / (64 + 9 + 1), rel=1e-4)
+    # What was simulated stays: that is said before what else is wrong with a correction.
+    refusal = http.patch("/objects/box/trials/1", json={"outcome": "dropped"})
+    assert (refusal.status_code, refusal.json()["type"].rpartition(":")[2]) == (409, "trial-of-a-sweep")
     copy = http.post("/objects/box/copies", json={"id": "box-2", "trials": True})
     assert copy.is_success, copy.text
     again = http.get("/objects/box-2/trials").json()["items"]

@@ -247,10 +247,10 @@ class WeightsInfo(Response):
     """How successes were weighted to undo how poses were chosen (eq 1)."""
 
     kind: Literal["equal", "mixture", "own", "balance"]
-    """``equal``; ``mixture``: 1 / sum n_k g_k(x) over grids of different regions or steps; ``own``: 1 / g of
-    each trial's own proposal density; ``balance``, where sources are mixed, or grids and
-    other trials: 1 / sum n_s g_s(x) over all that tried, g_s estimated from where the attempts
-    lie where it is not told."""
+    """Before what was tried several times weighs by its share of successes: ``equal``; ``mixture``:
+    1 / sum n_k g_k(x) over grids of different regions or steps; ``own``: 1 / g of each trial's own proposal
+    density; ``balance``, where sources are mixed, or grids and other trials: 1 / sum n_s g_s(x) over all that
+    tried, g_s estimated from where the attempts lie where it is not told."""
     rule: str
     """The same in words, with numbers."""
     poses_tried: int | None = None
@@ -273,7 +273,8 @@ class DensityInfo(Response):
     kernel: KernelInfo
     """The kernel about every success, and the rule that chose its widths."""
     size: int
-    """How many successes shape the density; twins by the jaw's symmetry are implicit and not counted."""
+    """How many successes shape the density, those in few of several attempts included; twins by the jaw's
+    symmetry are implicit and not counted."""
     outcomes: OutcomeCounts
     effective_sample_size: float
     """How many successes of equal weight would tell as much."""

@@ -1015,14 +1015,15 @@ class EnginesOptions(Request):
     """Only sweeps judged by this protocol; by default the one that the trials name."""
 
 
-EngineReasonName = Literal["margin", "edge", "timeout", "unexplained", "broke-off"]
+EngineReasonName = Literal["draws", "margin", "edge", "timeout", "unexplained", "broke-off"]
 
 
 class EngineReason(Response):
     """Poses that engines differ on for one reason."""
 
     reason: EngineReasonName
-    """``margin``: a quality within 0.2 of the limit; ``edge``: one missed it or lost it, far from the limit;
+    """``draws``: of poses simulated several times, they succeed in about as many, half lying between;
+    ``margin``: a quality within 0.2 of the limit; ``edge``: one missed it or lost it, far from the limit;
     ``timeout``: one did not come to an end; ``unexplained``: none of these; ``broke-off``: one could not
     simulate it, such as where a finger sank in, so that nothing is compared."""
     poses: int
@@ -1055,6 +1056,12 @@ class EngineDisagreement(Response):
     """What the engine says whose trials are stored."""
     other_outcome: str
     """What the other says."""
+    attempts: int | None = None
+    """How often each engine simulated it; null: once."""
+    successes: int | None = None
+    """How many of the first's attempts succeeded; null where it was simulated once."""
+    other_successes: int | None = None
+    """How many of the other's attempts succeeded; null where it was simulated once."""
     quality: float | None
     """The first's margin by the protocol, without a unit; null where physics measured none."""
     other_quality: float | None

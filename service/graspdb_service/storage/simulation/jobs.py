@@ -286,11 +286,11 @@ def worker_age(tx: Tx, name: str) -> float | None:
     return tx.scalar(select(unix_now() - workers.c.last_seen).where(workers.c.name == name))
 
 
-def someone_has(tx: Tx, engine: str, *, within_s: float) -> bool:
-    """Whether a worker that has this engine asked for jobs lately, or is at one."""
+def someone_has(tx: Tx, capability: str, *, within_s: float) -> bool:
+    """Whether a worker that has this capability asked for jobs lately, or is at one."""
     at_work = exists().where(jobs.c.state == JobState.LEASED, jobs.c.worker == workers.c.name)
     query = select(workers.c.capabilities).where(or_(workers.c.last_seen > unix_now() - within_s, at_work))
-    return any(engine in capabilities for capabilities in tx.scalars(query))
+    return any(capability in capabilities for capabilities in tx.scalars(query))
 
 
 def list_workers(tx: Tx, *, skip: int, limit: int) -> list[WorkerInfo]:

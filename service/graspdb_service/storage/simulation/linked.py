@@ -59,14 +59,16 @@ def compared(
 @dataclass(frozen=True)
 class BothChunks:
     """What two linked sweeps say of the places ``start`` to ``stop`` of their plan: outcome codes (uint8),
-    and what each measured (:func:`read_measured`).
+    of several draws how many succeeded (uint8), and what each measured (:func:`read_measured`).
     """
 
     start: int
     stop: int
     outcomes: bytes
+    successes: bytes | None
     measured: bytes | None
     other_outcomes: bytes
+    other_successes: bytes | None
     other_measured: bytes | None
 
 
@@ -98,8 +100,10 @@ def both(tx: Tx, first: str, other: str) -> list[BothChunks]:
             jobs.c.start,
             jobs.c.stop,
             one.c.outcomes,
+            one.c.successes,
             one.c.measured,
             two.c.outcomes.label("other_outcomes"),
+            two.c.successes.label("other_successes"),
             two.c.measured.label("other_measured"),
         )
         .select_from(

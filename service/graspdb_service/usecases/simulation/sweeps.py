@@ -125,6 +125,7 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
                 *feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
                 *row.snapshot.get("warnings", []),
                 *_without_engine(tx, row),
+                *_without_draws(tx, row),
                 *_linked_without_engine(tx, row),
             ],
         }
@@ -140,6 +141,22 @@ def _without_engine(tx: Tx, row: SweepRow) -> list[str]:
     return [
         f"no worker that has {engine} was here in the last {_LATELY_S / 60:.0f} minutes, and no other takes"
         f" what this sweep has left: pip install 'graspdb[{extras}]' on a worker, and start it again"
+    ]
+
+
+def _without_draws(tx: Tx, row: SweepRow) -> list[str]:
+    """What a sweep that draws waits for where workers are here, all of a version that can't."""
+    if not row.request.get("randomise") or row.finished_at is not None:
+        return []
+    plain = "simulate" if row.protocol == "wrench" else row.protocol
+    there, draws = (
+        jobs.someone_has(tx, name, within_s=_LATELY_S) for name in (plain, f"drawn-{row.protocol}")
+    )
+    if draws or not there:
+        return []
+    return [
+        f"no worker that was here in the last {_LATELY_S / 60:.0f} minutes can simulate a pose under what is"
+        " drawn: they are of an older version, update and start them again"
     ]
 
 

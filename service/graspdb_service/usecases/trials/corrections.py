@@ -45,13 +45,13 @@ def correct(
         after = _changed(before, given)
         different = {name for name in given if getattr(after, name) != getattr(before, name)}
         if different:
-            _check_several(seq, slug, before, after)
             if before.pose_index is not None:
                 raise conflict(
                     "trial-of-a-sweep",
                     f"Trial {seq} was simulated in a sweep: delete the sweep's batch instead"
                     f" (DELETE /objects/{slug}/batches/{{batch}}), or sweep again",
                 )
+            _check_several(seq, slug, before, after)
             revision, _ = objects.advance(tx, row.id, append=False)
             changes.change(
                 tx,

@@ -15,6 +15,7 @@ _LIMITS = {"wrench": 1.0}
 _LOST = ("missed", "slipped", "dropped")
 
 WORDS: dict[EngineReasonName, str] = {
+    "draws": f"they succeed in about as many draws, within {NEAR:.0%} of them, and half lies between",
     "margin": f"a quality lies within {NEAR:g} of the limit: they hold about as much, the limit between them",
     "edge": "one missed the object or lost it, far from the limit: the contact is thin, near an edge",
     "timeout": "one was still closing or carrying when its time was over",
@@ -26,12 +27,16 @@ WORDS: dict[EngineReasonName, str] = {
 
 @dataclass(frozen=True)
 class Said:
-    """What an engine says of a grasp; NaN where it measured nothing."""
+    """What an engine says of a grasp that it simulated so many times (``draws``); NaN where it measured
+    nothing.
+    """
 
     engine: str
     outcome: str
     quality: float
     width_m: float
+    successes: int = 0
+    draws: int = 1
 
     @property
     def holds(self) -> bool:
@@ -49,6 +54,8 @@ class Said:
 def reason(protocol: str, one: Said, two: Said) -> EngineReasonName:
     """Why two engines differ on a grasp that holds in one of them."""
     failed = two if one.holds else one
+    if one.draws > 1 and abs(one.successes - two.successes) <= max(1.0, NEAR * one.draws):
+        return "draws"
     if failed.outcome == "timeout":
         return "timeout"
     if min(one.margin(protocol), two.margin(protocol)) <= NEAR:
@@ -63,7 +70,7 @@ def words(protocol: str, one: Said, two: Said) -> str:
 
 
 def _opinion(said: Said) -> str:
-    numbers = []
+    numbers = [f"{said.successes} of {said.draws}"] if said.draws > 1 else []
     if not math.isnan(said.quality):
         numbers.append(f"quality {said.quality:.2f}")
     if not math.isnan(said.width_m):

@@ -60,12 +60,14 @@ def engines_report(
 
 @dataclass(frozen=True, eq=False)
 class _Engine:
-    """What one engine says of poses (n,): codes, whether they ``met`` physics, and qualities and widths, NaN
-    where it measured none.
+    """What one engine says of poses (n,): codes, in how many of the ``draws`` each succeeded, whether they
+    ``met`` physics, and qualities and widths, NaN where it measured none.
     """
 
     engines: list[str]
+    draws: int
     codes: Codes
+    successes: Codes
     met: Bools
     quality: Floats
     width_m: Floats
@@ -75,8 +77,14 @@ class _Engine:
         return self.engines[0].split()[0] if self.engines else "an unknown engine"
 
     def said(self, row: int) -> Said:
-        outcome = OUTCOMES[self.codes[row]]
-        return Said(self.name, outcome, float(self.quality[row]), float(self.width_m[row]))
+        return Said(
+            self.name,
+            OUTCOMES[self.codes[row]],
+            float(self.quality[row]),
+            float(self.width_m[row]),
+            int(self.successes[row]),
+            self.draws,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +127,16 @@ def _pairs(tx: Tx, object_id: int, selected: Selected) -> list[_Pair]:
         if sweep is None or not _is_of(sweep, selected):
             continue
         chunks = linked.both(tx, sweep.id, other.id)
-        one = [(chunk.outcomes, chunk.measured) for chunk in chunks]
-        two = [(chunk.other_outcomes, chunk.other_measured) for chunk in chunks]
+        one = [(chunk.outcomes, chunk.successes, chunk.measured) for chunk in chunks]
+        two = [(chunk.other_outcomes, chunk.other_successes, chunk.other_measured) for chunk in chunks]
+        draws = sweep_plan.draws(sweep)
         found.append(
             _Pair(
                 sweep,
                 other,
                 [(chunk.start, chunk.stop) for chunk in chunks],
-                _engine(outcomes.engines(tx, sweep.id), one),
-                _engine(outcomes.engines(tx, other.id), two),
+                _engine(outcomes.engines(tx, sweep.id), draws, one),
+                _engine(outcomes.engines(tx, other.id), draws, two),
                 sweep_plan.chunk_poses(tx, sweep, 0, sweep.pose_count),
             )
         )
@@ -140,17 +149,22 @@ def _is_of(sweep: SweepRow, selected: Selected) -> bool:
     return fits and selected.protocol in (None, sweep.protocol)
 
 
-def _engine(engines: list[str], chunks: list[tuple[bytes, bytes | None]]) -> _Engine:
-    codes = [np.empty(0, dtype=np.uint8)]
+def _engine(
+    engines: list[str], draws: int, chunks: list[tuple[bytes, bytes | None, bytes | None]]
+) -> _Engine:
+    codes, successes = [np.empty(0, dtype=np.uint8)], [np.empty(0, dtype=np.uint8)]
     measures = [np.empty((3, 0))]
-    for content, measured in chunks:
+    for content, drawn, measured in chunks:
         codes.append(np.frombuffer(content, dtype=np.uint8))
+        won = (codes[-1] == _SUCCESS).astype(np.uint8) if drawn is None else np.frombuffer(drawn, np.uint8)
+        successes.append(won)
         values = np.full((3, len(codes[-1])), np.nan)
         place, quality, width = linked.read_measured(measured)
         values[:, place] = np.ones(len(place)), quality, width
         measures.append(values)
     met, quality, width = np.concatenate(measures, axis=1)
-    return _Engine(engines, np.concatenate(codes), ~np.isnan(met), quality, width)
+    told = np.concatenate(codes), np.concatenate(successes)
+    return _Engine(engines, draws, *told, ~np.isnan(met), quality, width)
 
 
 def _compared(pair: _Pair, listed: int) -> EnginePair:
@@ -214,6 +228,9 @@ def _first(pair: _Pair, rows: Ints, reasons: list[EngineReasonName]) -> list[Eng
                 quaternion_xyzw=tuple(poses.quaternion_xyzw[place].tolist()),
                 outcome=one.outcome,
                 other_outcome=two.outcome,
+                attempts=one.draws if one.draws > 1 else None,
+                successes=one.successes if one.draws > 1 else None,
+                other_successes=two.successes if one.draws > 1 else None,
                 quality=finite(one.quality),
                 other_quality=finite(two.quality),
                 width_m=finite(one.width_m),
