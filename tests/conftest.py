@@ -16,6 +16,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -230,18 +231,26 @@ def serving(settings: Settings) -> Iterator[str]:
 Serve = Callable[..., str]
 
 
+def _started(running: ExitStack, url: str, **options: Any) -> str:
+    """The address of a service over a database; by default the kernel estimate answers always, so that the
+    same question has the same answer while nothing is posted.
+    """
+    settings = Settings.model_validate({"database_url": url, "learned_estimates": False, **options})
+    return running.enter_context(serving(settings))
+
+
 @pytest.fixture
 def serve() -> Iterator[Serve]:
     """Start the service: ``serve(database_url, **settings)`` returns its address; several may run."""
     with ExitStack() as running:
-        yield lambda url, **options: running.enter_context(serving(Settings(database_url=url, **options)))
+        yield partial(_started, running)
 
 
 @pytest.fixture(scope="module")
 def serve_module() -> Iterator[Serve]:
     """As ``serve``, for all tests of a module."""
     with ExitStack() as running:
-        yield lambda url, **options: running.enter_context(serving(Settings(database_url=url, **options)))
+        yield partial(_started, running)
 
 
 @pytest.fixture

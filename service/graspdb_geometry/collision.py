@@ -108,7 +108,7 @@ class Scene:
         def run(block: slice) -> None:
             convex.classify(p[block], q[block], boxes, self._model, True, codes[block], extents[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         half = shape.max_opening_m / 2.0
         travel = np.stack([half - extents[:, 1], half + extents[:, 0]], axis=-1)
         return codes, np.maximum(travel, 0.0)
@@ -145,7 +145,7 @@ class Scene:
         def run(block: slice) -> None:
             convex.classify(p[block], q[block], boxes, self._model, False, codes[block], extents[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         hits: npt.NDArray[np.bool_] = codes == COLLIDES
         return hits
 
@@ -164,7 +164,7 @@ class Scene:
         def run(block: slice) -> None:
             convex.classify(p[block], q[block], column, self._model, False, codes[block], unused[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         held: npt.NDArray[np.bool_] = codes == COLLIDES
         met = np.flatnonzero(held)
         if met.size:
@@ -186,7 +186,7 @@ class Scene:
         def run(block: slice) -> None:
             convex.classify(p[block], q[block], points, self._model, False, codes[block], unused[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         held: npt.NDArray[np.bool_] = codes == COLLIDES
         return held
 
@@ -212,7 +212,7 @@ class Scene:
         def run(block: slice) -> None:
             convex.classify(p[block], q[block], column, self._model, True, codes[block], extents[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         return extents
 
 
@@ -290,7 +290,7 @@ class Surface:
         def run(block: slice) -> None:
             surface.collides(p[block], q[block], boxes, self._tree, self.watertight, hits[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         if self._inside is not None and not self.watertight:
             # What meets no triangle is wholly inside or outside, its centre half as far off as it is thick.
             known = boxes[boxes[:, 1].min(axis=1) > self._inside_off_m]
@@ -308,7 +308,7 @@ class Surface:
         def run(block: slice) -> None:
             surface.collides(p[block], q[block], column, self._tree, False, met[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         return met & ~self.collides(poses, shape, threads=threads)
 
     def widths(self, poses: PoseArrays, shape: GripperShape, threads: int = 1) -> FloatArray:
@@ -329,7 +329,7 @@ class Surface:
         def run(block: slice) -> None:
             surface_extents(p[block], q[block], column, self._tree, extents[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         return extents
 
     def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -375,7 +375,7 @@ class PointCloud:
         def run(block: slice) -> None:
             surface.points_collide(p[block], q[block], boxes, self.points, self.radius_m, hits[block])
 
-        _in_blocks(run, len(p), threads)
+        in_blocks(run, len(p), threads)
         return hits
 
 
@@ -473,7 +473,7 @@ def _gripper_boxes(shape: GripperShape, opening_m: float | None, retreat_m: floa
     return np.ascontiguousarray(boxes)
 
 
-def _in_blocks(run: Callable[[slice], Any], count: int, threads: int) -> None:
+def in_blocks(run: Callable[[slice], Any], count: int, threads: int) -> None:
     if threads < 1:
         raise ValueError("threads must be at least 1")
     blocks = [slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK)]

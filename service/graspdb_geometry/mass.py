@@ -35,6 +35,12 @@ def area(corners: FloatArray) -> float:
     return 0.5 * float(np.linalg.norm(normals, axis=1).sum())
 
 
+def surface_centre(corners: FloatArray) -> FloatArray:
+    """Middle of the surface of triangles (F, 3, 3), weighed by area, (3,)."""
+    spans = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(np.average(corners.mean(axis=1), axis=0, weights=np.linalg.norm(spans, axis=1)))
+
+
 def mass_properties(corners: FloatArray) -> SolidMeasures:
     """Of the solid within outward triangles (F, 3, 3), metres.
 

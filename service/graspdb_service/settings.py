@@ -120,6 +120,9 @@ class Settings(BaseSettings):
     max_samples: Annotated[int, Field(ge=1)] = 1_000_000
     max_sweep_poses: Annotated[int, Field(ge=1)] = 100_000_000
     max_density_cache_bytes: Annotated[int, Field(ge=2**20)] = 2**30
+    learned_estimates: bool = True
+    """Whether success probabilities are learned in the background from enough attempts; else the kernel
+    estimate answers always."""
     max_answers: Annotated[int, Field(ge=1)] = 5_000
     """So many answers of each object and kind of question are kept, those given last, beside those that a
     name or a trial keeps; none is deleted within ten minutes."""

@@ -90,12 +90,23 @@ class ReachInfo(Response):
 
 
 class EstimatorInfo(Response):
-    """Who answered: ``kernel``, density and regression by kernels."""
+    """Who answered: ``kernel``, density and regression by kernels; ``stack``, success probabilities learned
+    from what the jaw closes on and stacked on those. Densities are by kernels always.
+    """
 
     name: str = "kernel"
-    """Name of the estimator."""
+    """Name of the estimator of success probabilities."""
     state: Literal["fitting", "ready"] = "ready"
     """``ready``; or ``fitting``, while the kernel estimate answers in its place."""
+    recalibrated: bool = False
+    """Whether probabilities were set right by attempts that were predicted without their block of space."""
+    attempts: int | None = None
+    """How many attempts it was learned from; null where nothing was learned."""
+    skill: float | None = None
+    """Its Brier skill on attempts whose block of space was left out: 1 perfect, 0 no better than always
+    saying their share of successes."""
+    kernel_skill: float | None = None
+    """The same of the plain kernel estimate."""
 
 
 class SelectedSource(Response):

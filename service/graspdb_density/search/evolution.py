@@ -71,12 +71,16 @@ class EvolutionSearch(MultiStart):
     resolution
         See `ranked_by_density_where_flat`; the density is the isotropic one that is started from, asked only
         where the best scores of the random search are equal.
+    rescored
+        So many of the best by ``rough`` are ranked by the score before some are chosen: for a score that may
+        rank otherwise.
     """
 
     score: Score
     rough: Score
     pull: Pull | None
     resolution: float = 0.0
+    rescored: int = 0
     flat: bool = field(default=False, init=False)
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
@@ -85,6 +89,9 @@ class EvolutionSearch(MultiStart):
         if not len(starts):
             return []
         passed = self.random_search(starts)
+        if self.rescored:
+            best = passed[: self.rescored]
+            passed = ScoredPoses(best.poses, self.values(self.score, best.poses)).ranked()
         self.flat = self.is_flat(passed.scores)
         if self.flat:
             passed = ScoredPoses(passed.poses, self.told_apart(passed.scores, passed.poses)).ranked()

@@ -110,6 +110,7 @@ class ModeSearch:
         rough: Score | None = None,
         pull: Pull | None = None,
         resolution: float = 0.0,
+        rescored: int = 0,
         threads: int = 1,
     ) -> list[Maximum]:
         """The ``count`` best distinct grasps, best first; fewer where there are no more, none where no centre
@@ -125,7 +126,7 @@ class ModeSearch:
             Called with K poses, answers (K,) bool. Never is a pose returned that it refused.
         score
             What is best. None: the density.
-        rough, pull, resolution
+        rough, pull, resolution, rescored
             See `EvolutionSearch`; where the density is best they say nothing.
         threads
 
@@ -148,7 +149,9 @@ class ModeSearch:
         if climbing:
             return MeanShiftSearch(*common).run(count, separation)
         score = score or log_density
-        return EvolutionSearch(*common, score, rough or score, pull, resolution).run(count, separation)
+        return EvolutionSearch(*common, score, rough or score, pull, resolution, rescored).run(
+            count, separation
+        )
 
     def global_maximum(self, threads: int = 1) -> Maximum:
         """The highest point of the whole density, computed once."""

@@ -44,8 +44,10 @@ from ..se3 import Floats, Poses
 __all__ = [
     "PRIOR_TRIALS",
     "SUCCESS_CUTOFF",
+    "Attempts",
     "NearestAttempts",
     "Part",
+    "Plain",
     "SuccessEstimate",
     "SuccessKernel",
     "SuccessModel",
@@ -59,6 +61,8 @@ PRIOR_TRIALS = 1.0
 SUCCESS_CUTOFF = 5.0
 #: Poses a thread takes at once.
 _ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _FAR_BLOCK = 256, 128, 16
+#: Shares of a sum in float32 that are its rounding.
+_ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,6 +111,32 @@ class SuccessEstimate:
     high: Floats
     effective_trials: Floats
     level: float
+
+
+class Attempts(NamedTuple):
+    """Attempts (N,) of a model, those of one outcome and weight in the order in which they came.
+
+    ``share`` by how much each succeeded, ``weight`` as how much of one it counts, ``symmetric`` whether its
+    jaw is mirror-symmetric.
+    """
+
+    poses: Poses
+    share: Floats
+    weight: Floats
+    symmetric: NDArray[np.bool_]
+
+
+class Plain(NamedTuple):
+    """The kernel estimate without its interval at M poses.
+
+    Probability, effective trials, and by how much it may be off where judges of attempts differ, each (M,);
+    and how far the nearest attempts are.
+    """
+
+    probability: Floats
+    trials: Floats
+    spread: Floats
+    nearest: NearestAttempts
 
 
 class Part(NamedTuple):
@@ -254,6 +284,40 @@ class SuccessModel:
             found.append((total, poses))
         return found
 
+    def attempts(self) -> Attempts:
+        """All of them, their poses as precise as they are held."""
+        if not self.parts:
+            raise ValueError("a model without attempts has none")
+        poses, symmetric = [], []
+        for part in self.parts:
+            came = np.argsort(part.cells.rows)
+            poses.append(part.cells.poses(came))
+            symmetric.append(part.cells.symmetric[came])
+        every = Poses.concatenate(poses)
+        if isinstance(self.kernel, DiagonalKernel):
+            every = self.kernel.back(every)
+        share, weight = (
+            np.concatenate([np.full(part.size, part[column]) for part in self.parts]) for column in (1, 2)
+        )
+        return Attempts(every, share, weight, np.concatenate(symmetric))
+
+    def without(self, others: SuccessModel, poses: Poses, *, threads: int = 1) -> tuple[Floats, Floats]:
+        """The probability and effective trials at M poses if ``others``, some of the attempts under the same
+        kernel, had not been tried; 0 trials where all that tell are of them.
+        """
+        mine, theirs = self._sums(poses, threads), others._sums(poses, threads)
+        # What is left of equal sums is their rounding.
+        some = mine.total - theirs.total > _ROUNDING * mine.total
+        won, total, squares = (
+            np.where(some, np.maximum(whole - part, 0.0), 0.0)
+            for whole, part in zip(mine[:3], theirs[:3], strict=True)
+        )
+        (won_all, worth), (won_part, worth_part) = self.worth, others.worth
+        prior = (won_all - won_part) / (worth - worth_part) if worth > worth_part else self.prior_share
+        squares = np.where(some, np.maximum(squares, _ROUNDING * total * total), 0.0)
+        probability, trials, _ = shrunk_share(np.minimum(won, total), total, squares, prior)
+        return probability, trials
+
     def evaluate(self, poses: Poses, *, level: float = 0.9, threads: int = 1) -> SuccessEstimate:
         """Success probability with its interval at M poses.
 
@@ -292,9 +356,17 @@ class SuccessModel:
 
         Those beyond the cut-off are only looked for ``everywhere``: else their distance is infinite.
         """
+        plain = self.without_quantiles(poses, everywhere=everywhere, threads=threads)
+        return plain.probability, plain.trials, plain.nearest
+
+    def without_quantiles(self, poses: Poses, *, everywhere: bool, threads: int) -> Plain:
+        """As `without_interval`, and what the interval is wider by: of the kernels alone, for estimates that
+        are made of it.
+        """
         sums = self._sums(poses, threads, nearest=True)
         probability, trials, _, _ = self._beta(sums)
-        return probability, trials, self._nearest(poses, sums, threads, everywhere=everywhere)
+        nearest = self._nearest(poses, sums, threads, everywhere=everywhere)
+        return Plain(probability, trials, _spread(sums), nearest)
 
     def lower_end(
         self,
@@ -312,10 +384,13 @@ class SuccessModel:
         low = np.maximum(_quantiles(alpha, beta, 0.5 * (1.0 - level), threads) - _spread(sums), 0.0)
         if near is None:
             return low
-        _, _, alpha, beta = self._beta(_Sums.zeros(1, 0))
-        untried = _quantiles(alpha, beta, 0.5 * (1.0 - level), 1)
         told = near(self._nearest(poses, sums, threads, everywhere=False))
-        return np.where(told, low, np.minimum(low, untried))
+        return np.where(told, low, np.minimum(low, self.untried_low(level)))
+
+    def untried_low(self, level: float) -> float:
+        """The lower end of the interval where nothing has been tried."""
+        _, _, alpha, beta = self._beta(_Sums.zeros(1, 0))
+        return float(_quantiles(alpha, beta, 0.5 * (1.0 - level), 1)[0])
 
     def _beta(self, sums: _Sums) -> tuple[Floats, Floats, Floats, Floats]:
         """Probability, effective trials and the parameters of the interval's Beta distribution, each (M,)."""

@@ -35,7 +35,7 @@ from ..se3 import Floats, Poses
 from .calibration import assign_blocks
 from .kernel_regression import SUCCESS_CUTOFF, NearestAttempts, SuccessModel, shrunk_share
 
-__all__ = ["Reach", "validate_reach"]
+__all__ = ["Reach", "least_mean", "validate_reach"]
 
 Bools = NDArray[np.bool_]
 
@@ -237,7 +237,7 @@ def _validated(judged: _Judged, sums: Floats) -> float | None:
         probability, _, _ = shrunk_share(successes, total, squares, share)
         gain = (share - won) ** 2 - (probability - won) ** 2
         known = total > 0.0
-        better = _least_mean(gain[known], judged.weight[known], block[known])
+        better = least_mean(gain[known], judged.weight[known], block[known])
         if better is None or better <= 0.0:
             # Nothing tells: that is no verdict where even the nearest are too few.
             return 0.0 if reached is None and better is not None else reached
@@ -245,7 +245,7 @@ def _validated(judged: _Judged, sums: Floats) -> float | None:
     return reached
 
 
-def _least_mean(values: Floats, weights: Floats, block: NDArray[np.int64]) -> float | None:
+def least_mean(values: Floats, weights: Floats, block: NDArray[np.int64]) -> float | None:
     """The lower end of the interval of a weighted mean whose values are alike within blocks; None for few.
 
     Student's t of as many degrees of freedom as there are blocks but one, by the blocks' summed deviations.

@@ -95,23 +95,24 @@ class MappedModel(SuccessModel):
 
     def __init__(self, model: SuccessModel, correction: SourceMap) -> None:
         super().__init__(model.kernel, model.parts)
+        self.model = model
         self.correction = correction
 
     def evaluate_near(
         self, poses: Poses, *, level: float = 0.9, threads: int = 1
     ) -> tuple[SuccessEstimate, NearestAttempts]:
-        found, nearest = super().evaluate_near(poses, level=level, threads=threads)
+        found, nearest = self.model.evaluate_near(poses, level=level, threads=threads)
         low, high = self.correction.interval(found.probability, found.low, found.high, level=level)
         p = self.correction.probability(found.probability)
         return SuccessEstimate(p, low, high, found.effective_trials, level), nearest
 
     def probability(self, poses: Poses, *, threads: int = 1) -> Floats:
-        return self.correction.probability(super().probability(poses, threads=threads))
+        return self.correction.probability(self.model.probability(poses, threads=threads))
 
     def without_interval(
         self, poses: Poses, *, everywhere: bool = False, threads: int = 1
     ) -> tuple[Floats, Floats, NearestAttempts]:
-        p, trials, nearest = super().without_interval(poses, everywhere=everywhere, threads=threads)
+        p, trials, nearest = self.model.without_interval(poses, everywhere=everywhere, threads=threads)
         return self.correction.probability(p), trials, nearest
 
     def lower_end(
@@ -122,8 +123,8 @@ class MappedModel(SuccessModel):
         near: Callable[[NearestAttempts], NDArray[np.bool_]] | None = None,
         threads: int = 1,
     ) -> Floats:
-        low = super().lower_end(poses, level=level, near=near, threads=threads)
-        p = super().probability(poses, threads=threads)
+        low = self.model.lower_end(poses, level=level, near=near, threads=threads)
+        p = self.model.probability(poses, threads=threads)
         return self.correction.interval(p, low, low, level=level)[0]
 
 

@@ -12,6 +12,7 @@ from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
+from graspdb_service.usecases.densities.learning import Learning
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -66,7 +67,12 @@ class Context(Asking):
             scenes=scenes,
             evidence=CollisionEvidence(scenes, compute),
             priors=Priors(compute, scenes),
-            successes=Successes(database, compute, settings.max_density_cache_bytes),
+            successes=Successes(
+                database,
+                compute,
+                Learning(database, scenes, enabled=settings.learned_estimates),
+                settings.max_density_cache_bytes,
+            ),
             answers=AnswerKeeper(database, most=settings.max_answers),
             pictures=pictures,
             reports=reports,
@@ -79,6 +85,7 @@ class Context(Asking):
     def close(self) -> None:
         self.answers.close()
         self.densities.widths.close()
+        self.successes.learning.close()
         self.health.close()
         self.upkeep.close()
         self.runs.close()

@@ -432,6 +432,21 @@ width_choices = Table(
     UniqueConstraint("object_id", "digest"),
 )
 
+# What estimators learned of an object's attempts: one row for a selection, kernel and geometry.
+learned_estimators = Table(
+    "learned_estimators",
+    metadata,
+    # In the order they were learned: the newest stay.
+    Column("number", BigId, primary_key=True, autoincrement=True),
+    Column("object_id", ForeignKey("objects.id", ondelete="CASCADE"), nullable=False),
+    Column("digest", String(64), nullable=False),
+    Column("epoch", BigInteger, nullable=False),
+    Column("attempts", BigInteger, nullable=False),
+    # Null where the attempts taught nothing.
+    Column("content", LargeBinary, nullable=True),
+    UniqueConstraint("object_id", "digest"),
+)
+
 # Reports that are computed or have been: one row for an object, revision and set of parameters, leased to
 # the process that computes it.
 report_runs = Table(

@@ -101,17 +101,16 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     before = _under_name(ctx, slug, "likelihood", request.name, question)
     if before is not None:
         return before
-    built, frame, reach, calibration, columns = likelihoods.likelihood(
-        ctx, slug, request, poses, request.include
-    )
-    head = _head(ctx, built, built.kernel, frame)
-    if reach is not None:
-        head["reach"] = reach.model_dump()
-    if calibration is not None:
-        head["calibration"] = calibration.model_dump()
-        head["warnings"] += doubts(calibration)
-    asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, EstimatorInfo())
-    return _in_columns(ctx, asked, few, head, columns)
+    found = likelihoods.likelihood(ctx, slug, request, poses, request.include)
+    built = found.built
+    head = _head(ctx, built, built.kernel, found.estimator, found.frame)
+    if found.reach is not None:
+        head["reach"] = found.reach.model_dump()
+    if found.calibration is not None:
+        head["calibration"] = found.calibration.model_dump()
+        head["warnings"] += doubts(found.calibration)
+    asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, found.estimator)
+    return _in_columns(ctx, asked, few, head, found.columns)
 
 
 def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
@@ -131,10 +130,16 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
     frame = frame_of(drawn.selected, request.frame, request.convention, request.near)
-    head = {**_head(ctx, drawn.built, drawn.kernel, frame), "seed": drawn.seed, "prior": drawn.prior, **more}
+    estimator = EstimatorInfo()
+    head = {
+        **_head(ctx, drawn.built, drawn.kernel, estimator, frame),
+        "seed": drawn.seed,
+        "prior": drawn.prior,
+        **more,
+    }
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
-    asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo(), seed)
+    asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, estimator, seed)
     return _in_columns(ctx, asked, few, head, drawn.columns(frame))
 
 
@@ -174,12 +179,14 @@ def _question(request: Selection) -> dict[str, Any]:
     }
 
 
-def _head(ctx: Asking, built: Built, kernel: KernelInfo, frame: PoseFrame) -> dict[str, Any]:
+def _head(
+    ctx: Asking, built: Built, kernel: KernelInfo, estimator: EstimatorInfo, frame: PoseFrame
+) -> dict[str, Any]:
     return {
         **frame.told(),
         "revision": built.revision,
         "kernel": kernel.model_dump(),
-        "estimator": EstimatorInfo().model_dump(),
+        "estimator": estimator.model_dump(),
         "selection": built.selection.model_dump(),
         "warnings": [
             *outage_warnings(built.revision),

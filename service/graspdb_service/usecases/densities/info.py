@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from graspdb.wire import DensityInfo, EstimatorInfo, Selection
+from graspdb.wire import DensityInfo, Selection
 from graspdb_density.kde.importance_weights import LOW_EFFECTIVE_SHARE
 from graspdb_service.storage.trials import findings
 from graspdb_service.storage.trials.findings import FindingTotal
@@ -48,7 +48,7 @@ def density_info(ctx: Estimators, slug: str, request: Selection) -> tuple[Densit
         bytes=built.nbytes,
         warnings=warnings,
         findings=of_selection(doubtful),
-        estimator=EstimatorInfo(),
+        estimator=ctx.successes.estimator(built, collisions_known=ctx.evidence.believed(built) is not None),
         stale=outage() is not None,
     )
     return info, selected

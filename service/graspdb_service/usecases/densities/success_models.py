@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from graspdb.wire import EstimatorInfo
 from graspdb.wire.queries import TrialSelection
 from graspdb_density import (
     DiagonalKernel,
@@ -32,10 +33,12 @@ from graspdb_density import (
 )
 from graspdb_density.se3 import Poses
 from graspdb_density.success.kernel_regression import SuccessKernel
+from graspdb_estimators import Stack
 from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.simulation import linked
 from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
+from graspdb_service.usecases.densities.learning import Learning, Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
@@ -77,19 +80,19 @@ class Estimates:
         enough = np.zeros(count, dtype=np.bool_)
         return cls(probability, low, high, np.zeros(count), nearest, enough, prior)
 
-    def put_support(self, part: slice, trials: Floats, nearest: NearestAttempts, reach: Reach) -> None:
+    def put_support(self, rows: Ints, trials: Floats, nearest: NearestAttempts, reach: Reach) -> None:
         """Fill in how far some of the poses are from the attempts of a model."""
-        self.effective_trials[part] = trials
-        self.enough[part] = reach.covers(nearest)
+        self.effective_trials[rows] = trials
+        self.enough[rows] = reach.covers(nearest)
         for name in ("position_m", "rotation", "position_widths", "rotation_widths"):
-            getattr(self.nearest, name)[part] = getattr(nearest, name)
+            getattr(self.nearest, name)[rows] = getattr(nearest, name)
 
-    def put(self, part: slice, answer: SuccessEstimate, nearest: NearestAttempts, reach: Reach) -> None:
+    def put(self, rows: Ints, answer: SuccessEstimate, nearest: NearestAttempts, reach: Reach) -> None:
         """Fill in what a model answers for some of the poses."""
-        self.put_support(part, answer.effective_trials, nearest, reach)
-        enough = self.enough[part]
+        self.put_support(rows, answer.effective_trials, nearest, reach)
+        enough = self.enough[rows]
         for column, values in zip(self._chances, (answer.probability, answer.low, answer.high), strict=True):
-            column[part] = np.where(enough, values, np.nan)
+            column[rows] = np.where(enough, values, np.nan)
 
     def without_collisions(self, free: Bools) -> None:
         """No chance where the open gripper collides."""
@@ -151,6 +154,7 @@ class _Attempts:
     ``reach`` was validated when the attempts were ``judged``; so many are ``others`` now.
     """
 
+    selected: Selected | None
     revision: int
     epoch: int
     last_seq: int
@@ -170,18 +174,7 @@ class _Attempts:
 
 
 _NOBODY = _Members(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.uint8), {})
-_NONE = _Attempts(0, 0, 0, frozenset(), {}, None, None, _NOBODY, None, None, 0)
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """All attempts, and the ones to search by: a random sample where all would take too long; how far from
-    them they tell.
-    """
-
-    whole: SuccessModel
-    quick: SuccessModel
-    reach: Reach
+_NONE = _Attempts(None, 0, 0, 0, frozenset(), {}, None, None, _NOBODY, None, None, 0)
 
 
 @dataclass(frozen=True)
@@ -191,14 +184,39 @@ class _Key:
     sigma_rotation_deg: float
     collisions_known: bool
     success_kernel: DiagonalKernel | None
+    by_default: bool
+
+    @property
+    def kernel(self) -> str:
+        """The kernel in words: equal where kernels are, and for whichever widths the default rule chose: what
+        was learned under them is nearly right under the next ones, until it is learned again.
+        """
+        if self.success_kernel is None:
+            if self.by_default:
+                return "default"
+            return f"{self.sigma_position_m!r} {self.sigma_rotation_deg!r}"
+        axes = self.success_kernel.axes
+        return f"{self.success_kernel.sigmas!r} {None if axes is None else np.asarray(axes).tolist()}"
+
+
+def _key(built: Built, collisions_known: bool) -> _Key:
+    return _Key(
+        built.selected.key,
+        built.kernel.sigma_position_m,
+        built.kernel.sigma_rotation_deg,
+        collisions_known,
+        built.success_kernel,
+        built.kernel.rule.startswith("default:"),
+    )
 
 
 class Successes:
     """The success models of one service process; as fresh and as bounded as the densities."""
 
-    def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
+    def __init__(self, database: Database, compute: Compute, learning: Learning, max_bytes: int) -> None:
         self._database = database
         self._compute = compute
+        self.learning = learning
         self.kept: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
     def model(self, built: Built, *, collisions_known: bool) -> Model | None:
@@ -206,21 +224,26 @@ class Successes:
 
         With ``collisions_known``, by geometry and gripper, attempts that collided are left out.
         """
-        key = _Key(
-            built.selected.key,
-            built.kernel.sigma_position_m,
-            built.kernel.sigma_rotation_deg,
-            collisions_known,
-            built.success_kernel,
-        )
+        key = _key(built, collisions_known)
         found = self.kept.get(
             key,
             lambda a: a.revision >= built.revision,
             lambda before: self._refresh(key, built.selected, before),
         )
-        if found.model is None or found.reach is None:
+        if found.model is None or found.reach is None or found.selected is None:
             return None
-        return Model(found.model, found.sample or found.model, found.reach)
+        plain = Model(found.model, found.sample or found.model, found.reach, EstimatorInfo())
+        return self.learning.improved(found.selected, key.kernel, plain, trees=collisions_known)
+
+    def learned(self, built: Built, *, collisions_known: bool) -> Stack | None:
+        """What was learned of a density's attempts and answers in their place; None where nothing does."""
+        key = _key(built, collisions_known)
+        return self.learning.held(built.selected, key.kernel, trees=collisions_known)
+
+    def estimator(self, built: Built, *, collisions_known: bool) -> EstimatorInfo:
+        """Who estimates success probabilities, without a look at any attempt."""
+        key = _key(built, collisions_known)
+        return self.learning.info(built.selected, key.kernel, trees=collisions_known)
 
     def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> Estimates:
         """Success probability of poses (n,) under a model from :meth:`model`.
@@ -229,26 +252,34 @@ class Successes:
         gripper is unknown.
         """
         estimates = Estimates.unknown(len(poses))
+        rows = np.arange(len(poses)) if free is None else np.flatnonzero(free)
         if model is not None:
             work = partial(model.whole.evaluate_near, level=LEVEL, threads=self._compute.threads)
             start = 0
-            for answer, nearest in self._compute.blocks(poses, work):
+            for answer, nearest in self._compute.blocks(poses[rows], work):
                 stop = start + len(answer.probability)
-                estimates.put(slice(start, stop), answer, nearest, model.reach)
+                estimates.put(rows[start:stop], answer, nearest, model.reach)
                 start = stop
         if free is not None:
+            if model is not None:
+                self._put_support(estimates, model, poses, np.flatnonzero(~free))
             estimates.without_collisions(free)
         return estimates
 
     def support(self, model: Model, poses: Poses) -> Estimates:
         """As :meth:`estimate`, how far poses are from the attempts alone."""
         estimates = Estimates.unknown(len(poses))
-        work = partial(model.whole.without_interval, everywhere=True, threads=self._compute.threads)
-        start = 0
-        for _, trials, nearest in self._compute.blocks(poses, work):
-            estimates.put_support(slice(start, start + len(trials)), trials, nearest, model.reach)
-            start += len(trials)
+        self._put_support(estimates, model, poses, np.arange(len(poses)))
         return estimates
+
+    def _put_support(self, estimates: Estimates, model: Model, poses: Poses, rows: Ints) -> None:
+        """Fill in how far some poses are from the attempts."""
+        work = partial(model.whole.without_quantiles, everywhere=True, threads=self._compute.threads)
+        start = 0
+        for plain in self._compute.blocks(poses[rows], work):
+            stop = start + len(plain.trials)
+            estimates.put_support(rows[start:stop], plain.trials, plain.nearest, model.reach)
+            start = stop
 
     def add_prior(
         self,
@@ -319,6 +350,7 @@ class Successes:
             reach = self._compute.run(lambda: validate_reach(model, threads=self._compute.threads))
             judged, others = members, 0
         return _Attempts(
+            selected=selected,
             revision=row.revision,
             epoch=row.epoch,
             last_seq=row.last_seq,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,11 @@ from graspdb.wire import GripperProfile
 from graspdb.wire.queries import PreOpening
 from graspdb_density.se3 import Poses
 from graspdb_geometry import meshes, openings
+from graspdb_geometry.closing import Closing
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.deviation import deviation
 from graspdb_geometry.grippers import GripperShape, shape_of
+from graspdb_geometry.mass import mass_properties, surface_centre
 from graspdb_geometry.openings import Values
 from graspdb_geometry.plausibility import Target
 from graspdb_geometry.poses import PoseArrays
@@ -31,6 +34,8 @@ from graspdb_service.usecases.trials.selection import Selected
 
 Floats = NDArray[np.float64]
 
+#: Hash of a mesh or of parts, how it is read, hash of parts beside it.
+_Content = tuple[str, MeshForm | str, str | None]
 Solid = Scene | Surface
 """An object's mesh, exactly; its convex parts, from which they may differ, where it has no mesh."""
 
@@ -125,6 +130,36 @@ class CollisionTest:
         return by_steps(partial(tested, shape), poses, _OF_ONE_JAW)
 
 
+class _Sized(Protocol):
+    @property
+    def nbytes(self) -> int: ...
+
+
+S = TypeVar("S", bound=_Sized)
+
+
+class _Prepared(Generic[S]):
+    """What is made of stored geometry, once for each content, form and content beside it."""
+
+    def __init__(self, database: Database, compute: Compute) -> None:
+        self._database = database
+        self._compute = compute
+        self._cache: SingleFlightCache[_Content, S] = SingleFlightCache(_MAX_BYTES, lambda made: made.nbytes)
+
+    def made(self, key: _Content, prepare: Callable[[list[bytes]], S]) -> S:
+        """What is made of the contents that a key names."""
+
+        def make(_: S | None) -> S:
+            with self._database.read() as tx:
+                found = [assets.get(tx, sha256) for sha256 in (key[0], key[2]) if sha256 is not None]
+            contents = [content for content, _ in filter(None, found)]
+            if len(contents) < len(found):
+                raise conflict("object-changed", "The object's geometry was replaced just now: ask again")
+            return self._compute.run(lambda: prepare(contents))
+
+        return self._cache.get(key, lambda _: True, make)
+
+
 class Scenes:
     """Prepared geometry, by content: the same mesh is prepared once, whichever object it belongs to.
 
@@ -133,12 +168,9 @@ class Scenes:
     """
 
     def __init__(self, database: Database, compute: Compute, features: Features) -> None:
-        self._database = database
-        self._compute = compute
         self.features = features
-        self._cache: SingleFlightCache[tuple[str, MeshForm | str, str | None], Solid] = SingleFlightCache(
-            _MAX_BYTES, lambda solid: solid.nbytes
-        )
+        self._solids: _Prepared[Solid] = _Prepared(database, compute)
+        self._closings: _Prepared[Closing] = _Prepared(database, compute)
 
     def test(self, selected: Selected, pre_opening_m: PreOpening = None) -> CollisionTest | None:
         """The collision test of a selection; None where geometry or gripper is not known.
@@ -164,6 +196,28 @@ class Scenes:
             raise _unknown(selected)
         return test
 
+    def closing(self, row: ObjectRow) -> Closing | None:
+        """What a jaw closes on, of the mesh or else the convex parts; None without either."""
+        parts, info = row.parts_sha256, row.mesh_info
+        if row.mesh_sha256 is not None and info is not None:
+            form, measured = form_of(row), info.get("centre_of_mass")
+
+            def of_mesh(found: list[bytes]) -> Closing:
+                mesh = form.read(found[0])
+                corners = mesh.vertices[mesh.faces]
+                # An open mesh encloses no mass: the middle of its surface is nearest to it.
+                return Closing(corners, surface_centre(corners) if measured is None else measured)
+
+            return self._closings.made((row.mesh_sha256, form, None), of_mesh)
+        if parts is None:
+            return None
+
+        def of_parts(found: list[bytes]) -> Closing:
+            corners = np.concatenate([v[f] for v, f in meshes.parts_from_glb(found[0])])
+            return Closing(corners, mass_properties(corners).centre)
+
+        return self._closings.made((parts, "parts", None), of_parts)
+
     def target(self, row: ObjectRow, profile: GripperProfile | None) -> Target | None:
         """The object for posted trials to be looked at against; None without mesh and parts. Its geometry is
         prepared where there is a gripper to test against it.
@@ -182,7 +236,7 @@ class Scenes:
         if row.mesh_sha256 is None or info is None:
             if parts is None:
                 return None
-            return self._prepared(
+            return self._solids.made(
                 (parts, "parts", None), lambda found: Scene(meshes.parts_from_glb(found[0]))
             )
         form, closed = form_of(row), bool(info["watertight"])
@@ -200,22 +254,7 @@ class Scenes:
             off = deviation(mesh, known).largest_m if off_m is None else float(off_m)
             return Surface(mesh.vertices, mesh.faces, watertight=False, inside=Scene(known), inside_off_m=off)
 
-        return self._prepared((row.mesh_sha256, form, inside), prepare)
-
-    def _prepared(
-        self, key: tuple[str, MeshForm | str, str | None], prepare: Callable[[list[bytes]], Solid]
-    ) -> Solid:
-        """What is made of the contents that a key names."""
-
-        def make(_: Solid | None) -> Solid:
-            with self._database.read() as tx:
-                found = [assets.get(tx, sha256) for sha256 in (key[0], key[2]) if sha256 is not None]
-            contents = [content for content, _ in filter(None, found)]
-            if len(contents) < len(found):
-                raise conflict("object-changed", "The object's geometry was replaced just now: ask again")
-            return self._compute.run(lambda: prepare(contents))
-
-        return self._cache.get(key, lambda _: True, make)
+        return self._solids.made((row.mesh_sha256, form, inside), prepare)
 
 
 def _check_pre_opening(selected: Selected, pre_opening_m: PreOpening) -> None:

@@ -71,7 +71,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         **frame.told(),
         "reference": "world" if limits.in_world else "object",
         "revision": built.revision,
-        "estimator": EstimatorInfo(),
+        "estimator": _estimator(question),
         "selection": built.selection,
         "stale": outage() is not None,
         "warnings": [
@@ -84,6 +84,11 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
         ],
     }
     return BestGrasps.model_validate({**told, **answer}), built.selected
+
+
+def _estimator(question: Question | None) -> EstimatorInfo:
+    """Who told the success probabilities, or would have."""
+    return EstimatorInfo() if question is None or question.model is None else question.model.estimator
 
 
 def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> dict[str, Any]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, ReachInfo
+from graspdb.wire import CalibrationInfo, EstimatorInfo, ReachInfo
 from graspdb.wire.queries import LikelihoodColumn, LikelihoodOptions, LikelihoodQuery, PreOpening
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
@@ -32,15 +32,27 @@ CHANCES = (
 )
 
 
+class Likelihood(NamedTuple):
+    """An answer: the density, the frame that poses were of, how far from an attempt success probabilities are
+    told, how they were calibrated, who estimated them, and the columns.
+    """
+
+    built: Built
+    frame: PoseFrame
+    reach: ReachInfo | None
+    calibration: CalibrationInfo | None
+    estimator: EstimatorInfo
+    columns: dict[str, Any]
+
+
 def likelihood(
     ctx: Estimators,
     slug: str,
     request: LikelihoodOptions | LikelihoodQuery,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> tuple[Built, PoseFrame, ReachInfo | None, CalibrationInfo | None, dict[str, Any]]:
-    """How likely poses (n,) in the object frame are under the density of the successes, that density, the
-    frame they were of, how far from an attempt success probabilities are told, how they were calibrated.
+) -> Likelihood:
+    """How likely poses (n,) in the object frame are under the density of the successes.
 
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
     is minus infinity where the density is exactly zero; NaN stands for not known.
@@ -50,7 +62,7 @@ def likelihood(
     request = of_simulation(request)
     source: str | None = getattr(request, "calibrated_for", None)
     pre_opening_m: PreOpening = getattr(request, "pre_opening_m", None)
-    calibration = None
+    calibration, estimator = None, EstimatorInfo()
 
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
@@ -76,6 +88,7 @@ def likelihood(
             if model is not None and source is not None:
                 model, calibration = calibrated(ctx, built, model, believed, source)
             reach = reach_info(model)
+            estimator = estimator if model is None else model.estimator
             estimates = ctx.successes.estimate(model, poses, None if believed is None else free)
             columns["success_probability"] = estimates.probability
             columns["interval"] = {"level": LEVEL, "low": estimates.low, "high": estimates.high}
@@ -89,7 +102,7 @@ def likelihood(
         if test is not None and pre_opening_m is not None:
             blocks = ctx.compute.blocks(poses, partial(test.openings, threads=threads))
             known["opening_m"] = np.concatenate(blocks)
-    return built, frame, reach, calibration, known
+    return Likelihood(built, frame, reach, calibration, estimator, known)
 
 
 def _densities(

@@ -11,9 +11,11 @@ from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, ModeSearch, PoseNoise, Reach, SuccessModel, expected
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Pull, Score
+from graspdb_estimators import StackedModel
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
-from graspdb_service.usecases.densities.success_models import LEVEL, Model
+from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.search import ScoreSearch
 from graspdb_service.usecases.runtime.compute import breathing
@@ -22,6 +24,8 @@ from graspdb_service.usecases.runtime.compute import breathing
 _NOISE_DRAWS, _FEW_DRAWS = 256, 16
 #: Differences of a success probability that mean nothing.
 _RESOLUTION = 1e-5
+#: The best by the kernel estimate that are ranked anew by what was learned.
+_RESCORED = 1_000
 
 
 def by_density(search: ModeSearch, threads: int) -> tuple[ScoreSearch, Ranking]:
@@ -38,7 +42,9 @@ def by_success(
     rough = score if model.quick is model.whole else lower_end_score(model.quick, model.reach, test, threads)
     told = f"lower end of the success probability's {LEVEL:.0%} interval"
     ranking = Ranking(objective="success_probability", score=told)
-    return ScoreSearch(search, threads, score, rough, pull, _RESOLUTION), ranking
+    # What was learned may rank otherwise than the kernel estimate, which leads to where it is high.
+    rescored = _RESCORED if isinstance(model.whole, StackedModel) else 0
+    return ScoreSearch(search, threads, score, rough, pull, _RESOLUTION, rescored), ranking
 
 
 def by_mean(

@@ -20,8 +20,8 @@ from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.evidence.calibrations import calibrated
+from graspdb_service.usecases.densities.learning import Model
 from graspdb_service.usecases.densities.prior import Prior
-from graspdb_service.usecases.densities.success_models import Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import objectives
 from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of, likely_enough

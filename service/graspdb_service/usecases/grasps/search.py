@@ -56,7 +56,8 @@ class Engine(Protocol):
 class ScoreSearch:
     """Where a score is highest, from the density's centres; without one the density's own modes, that of
     successes or a prior. ``rough`` is nearly the score and much faster. Differences of scores below
-    ``resolution`` mean nothing: there the density decides.
+    ``resolution`` mean nothing: there the density decides. So many of the best by ``rough`` as are
+    ``rescored`` are ranked by the score.
     """
 
     search: ModeSearch
@@ -65,6 +66,7 @@ class ScoreSearch:
     rough: Score | None = None
     pull: Pull | None = None
     resolution: float = 0.0
+    rescored: int = 0
 
     def with_breath(self) -> ScoreSearch:
         """The same, which lets other questions between its steps."""
@@ -88,6 +90,7 @@ class ScoreSearch:
             rough=self.rough,
             pull=self.pull,
             resolution=self.resolution,
+            rescored=self.rescored,
             threads=self.threads,
         )
 
@@ -97,6 +100,7 @@ class ScoreSearch:
 
     def shortlist(self, poses: Poses, most: int) -> Poses:
         """Only those that may be among the best are worth the score itself."""
+        most = max(most, self.rescored)
         if self.rough is None or self.rough is self.score or len(poses) <= most:
             return poses
         return poses[np.argsort(-self.rough(poses), kind="stable")[:most]]
