@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graspdb_density import se3
 from graspdb_density.se3 import Floats, Poses
-from graspdb_geometry.closing import DECREASING, FEATURES, INCREASING, Closing
+from graspdb_geometry.closing import DECREASING, FEATURES, INCREASING, ClosingGeometry
 from graspdb_geometry.grippers import GripperShape
 
 __all__ = ["GraspFeatures"]
@@ -28,7 +28,7 @@ class GraspFeatures:
 
     Attributes
     ----------
-    closing : Closing
+    closing : ClosingGeometry
     shape : GripperShape
     symmetric : bool
         Whether the jaw is mirror-symmetric: then both twins of a grasp have the same features.
@@ -36,7 +36,7 @@ class GraspFeatures:
         With the pose itself, which tells of this object alone; without, what may tell of others.
     """
 
-    closing: Closing
+    closing: ClosingGeometry
     shape: GripperShape
     symmetric: bool = True
     of_pose: bool = True

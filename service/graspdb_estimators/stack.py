@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, nnls
 from scipy.spatial import cKDTree
 from scipy.special import expit
+from scipy.stats import binom
 
 from graspdb_density import Reach, SuccessModel, se3
 from graspdb_density.se3 import Floats, Poses
@@ -35,7 +36,7 @@ from graspdb_density.success.reach import least_mean
 from .boosted_trees import BoostedTrees
 from .grasp_features import GraspFeatures
 
-__all__ = ["LEAST_ATTEMPTS", "LEAST_BLOCKS", "LEAST_OF_EACH", "Held", "Stack", "Verdict", "fit_stack"]
+__all__ = ["LEAST_ATTEMPTS", "LEAST_BLOCKS", "LEAST_OF_EACH", "LeftOut", "Stack", "Verdict", "fit_stack"]
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -67,7 +68,7 @@ _STEP = 0.25
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Held:
+class LeftOut:
     """Attempts (J) predicted without their block of space.
 
     Attributes
@@ -98,6 +99,24 @@ class Held:
         return "better" if least is not None and least > 0.0 else "no better"
 
     @property
+    def coverage(self) -> float:
+        """Share of the blocks, of those predicted between 0.05 and 0.95, whose successes lie within what the
+        intervals and chance explain, chance at the level of the intervals; nan without such blocks.
+        """
+        names, group, count = np.unique(self.block, return_inverse=True, return_counts=True)
+        group = group.reshape(-1)
+        mean, low, high, won = (
+            np.bincount(group, weights=column, minlength=len(names)) / count
+            for column in (self.learned, self.low, self.high, self.share)
+        )
+        uncertain = (mean > 0.05) & (mean < 0.95)
+        if not uncertain.any():
+            return math.nan
+        n, k = count[uncertain], won[uncertain] * count[uncertain]
+        least, most = binom.ppf(0.05, n, low[uncertain]), binom.ppf(0.95, n, high[uncertain])
+        return float(np.mean((least <= np.ceil(k)) & (np.floor(k) <= most)))
+
+    @property
     def skills(self) -> tuple[float, float]:
         """Brier skill of the stack and of the kernel estimate."""
         return tuple(  # type: ignore[return-value]
@@ -121,7 +140,7 @@ class Stack:
         Up to how many widths of position from an attempt it tells.
     attempts : int
         How many it was learned from.
-    held : Held
+    held : LeftOut
     """
 
     trees: BoostedTrees | None
@@ -129,7 +148,7 @@ class Stack:
     doubt: Floats
     reach_widths: float
     attempts: int
-    held: Held
+    held: LeftOut
 
     def reach(self, of_kernel: Reach) -> Reach:
         """How far it tells, where the kernel estimate tells so far."""
@@ -162,7 +181,7 @@ class Stack:
             "weights": self.weights,
             "doubt": self.doubt,
             "numbers": np.array([self.reach_widths, float(self.attempts)]),
-            **{f"held_{each.name}": getattr(self.held, each.name) for each in fields(Held)},
+            **{f"held_{each.name}": getattr(self.held, each.name) for each in fields(LeftOut)},
         }
         if self.trees is not None:
             arrays |= {f"trees_{name}": array for name, array in self.trees.arrays.items()}
@@ -176,7 +195,7 @@ class Stack:
         try:
             with np.load(BytesIO(content), allow_pickle=False) as found:
                 arrays = dict(found)
-            held = Held(*(arrays[f"held_{each.name}"] for each in fields(Held)))
+            held = LeftOut(*(arrays[f"held_{each.name}"] for each in fields(LeftOut)))
             trees = {
                 name.removeprefix("trees_"): a for name, a in arrays.items() if name.startswith("trees_")
             }
@@ -320,7 +339,7 @@ def _stacked(
     half = 1.6448536269514722 * np.sqrt(doubts @ doubt)
     inside = turned <= reach.rotation
     reached = max(reach.position, _reached(probability, told, widths, inside))
-    held = Held(
+    held = LeftOut(
         told.share, told.weight, told.block, expit(told.kernel), probability,
         expit(logit - half), expit(logit + half), inside & (widths <= reached),
     )  # fmt: skip
@@ -418,7 +437,7 @@ def _neighbours(poses: Poses, block: Ints, sigmas: tuple[float, float]) -> Ints:
     at = np.concatenate(
         [poses.positions / sigmas[0], turned[:, :, 2] / sigmas[1], y[:, a] * y[:, b] / sigmas[1]], axis=1
     )
-    _, near = cKDTree(at).query(at, k=min(1 + _NEIGHBOURS, len(at)))
+    near = np.asarray(cKDTree(at).query(at, k=min(1 + _NEIGHBOURS, len(at)))[1])
     pairs = np.stack([np.repeat(near[:, 0], near.shape[1] - 1), near[:, 1:].reshape(-1)], axis=1)
     pairs = np.unique(np.sort(pairs[block[pairs[:, 0]] == block[pairs[:, 1]]], axis=1), axis=0)
     return np.asarray(pairs[pairs[:, 0] < pairs[:, 1]], dtype=np.int64)

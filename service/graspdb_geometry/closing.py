@@ -17,7 +17,7 @@ from graspdb_geometry.collision import in_blocks
 from graspdb_geometry.grippers import GripperShape
 from graspdb_geometry.poses import PoseArrays, checked
 
-__all__ = ["DECREASING", "FEATURES", "INCREASING", "Closing"]
+__all__ = ["DECREASING", "FEATURES", "INCREASING", "ClosingGeometry"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -45,7 +45,7 @@ FEATURES: tuple[str, ...] = (
 INCREASING, DECREASING = ("least_aligned", "least_lines"), ("lever",)
 
 
-class Closing:
+class ClosingGeometry:
     """An object for jaws to close on: its triangles and its centre of mass; immutable, thread-safe.
 
     Parameters

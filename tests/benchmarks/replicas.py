@@ -34,7 +34,7 @@ from graspdb_density import choose_widths
 from graspdb_density.kde.rows import Rows
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
-from graspdb_service.storage.width_choices import ChosenWidths
+from graspdb_service.storage.derived.width_choices import ChosenWidths
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.widths.choosing import WidthChoosing
 

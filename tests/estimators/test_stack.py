@@ -13,7 +13,7 @@ from graspdb_density import IsotropicKernel, SuccessModel, se3, validate_reach
 from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import brier_skill, expected_calibration_error
 from graspdb_estimators import GraspFeatures, Stack, StackedModel, fit_stack
-from graspdb_geometry.closing import Closing
+from graspdb_geometry.closing import ClosingGeometry
 from graspdb_geometry.collision import box_part
 from known_jaws import PG70
 
@@ -21,10 +21,10 @@ Floats = NDArray[np.float64]
 KERNEL = IsotropicKernel(0.01, math.radians(15))
 
 
-def bar() -> Closing:
+def bar() -> ClosingGeometry:
     """A bar along x, 20 mm wide and high and 140 mm long."""
     vertices, faces = box_part((0.07, 0.01, 0.01), (0, 0, 0), (0, 0, 0, 1))
-    return Closing(np.asarray(vertices)[np.asarray(faces)], np.zeros(3))
+    return ClosingGeometry(np.asarray(vertices)[np.asarray(faces)], np.zeros(3))
 
 
 def attempts(count: int, seed: int) -> tuple[Poses, NDArray[np.bool_]]:

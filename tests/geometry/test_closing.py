@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from graspdb_geometry.closing import FEATURES, Closing
+from graspdb_geometry.closing import FEATURES, ClosingGeometry
 from graspdb_geometry.collision import box_part
 from graspdb_geometry.poses import ToolPoses
 from known_jaws import PG70
@@ -41,7 +41,7 @@ def column(features: Floats, name: str) -> Floats:
 def test_a_box_gripped_off_its_middle() -> None:
     # From above: tool z along -z, tool y along y; the tool 3 mm off along x, 2 mm along y, 1 mm below.
     turned = Rotation.from_euler("x", 180, degrees=True).as_quat()
-    found = Closing(box((0.03, 0.02, 0.05)), np.zeros(3)).features(
+    found = ClosingGeometry(box((0.03, 0.02, 0.05)), np.zeros(3)).features(
         ToolPoses(np.array([[0.003, 0.002, -0.001]]), turned[None]), PG70
     )
     assert column(found, "width") == pytest.approx(0.02)
@@ -66,7 +66,7 @@ def test_slanted_sides_are_seen_by_their_normals() -> None:
     high = low + np.array([0.0, 0.0, 0.1]) + np.sign(low) * np.array([0.0, lean, 0.0])
     v = np.concatenate([low, high])
     sides = [(0, 1, 5), (0, 5, 4), (2, 3, 7), (2, 7, 6)]
-    found = Closing(v[np.array(sides)], np.zeros(3)).features(
+    found = ClosingGeometry(v[np.array(sides)], np.zeros(3)).features(
         ToolPoses(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]])), PG70
     )
     for finger in ("first", "second"):
@@ -76,7 +76,7 @@ def test_slanted_sides_are_seen_by_their_normals() -> None:
 
 def test_nothing_between_the_fingers_is_not_known_but_for_the_mass() -> None:
     far = ToolPoses(np.array([[0.5, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
-    found = Closing(box((0.03, 0.02, 0.05)), np.zeros(3)).features(far, PG70)
+    found = ClosingGeometry(box((0.03, 0.02, 0.05)), np.zeros(3)).features(far, PG70)
     known = {name for name, value in zip(FEATURES, found[0], strict=True) if not np.isnan(value)}
     assert known == {"mass_x", "mass_z"}
 
@@ -84,28 +84,28 @@ def test_nothing_between_the_fingers_is_not_known_but_for_the_mass() -> None:
 @given(st.integers(0, 2**31 - 1))
 def test_twins_and_moved_objects_have_the_same_features(seed: int) -> None:
     asked, centre = poses(20, seed), np.array([0.004, 0.001, 0.009])
-    here = Closing(bent(), centre).features(asked, PG70)
+    here = ClosingGeometry(bent(), centre).features(asked, PG70)
     twins = (Rotation.from_quat(asked.quaternions_xyzw) * Rotation.from_euler("z", np.pi)).as_quat()
-    twin = Closing(bent(), centre).features(ToolPoses(asked.positions, twins), PG70)
+    twin = ClosingGeometry(bent(), centre).features(ToolPoses(asked.positions, twins), PG70)
     _alike(here, twin)
     turn, shift = Rotation.random(random_state=seed), np.random.default_rng(seed).normal(size=3)
     moved = ToolPoses(
         turn.apply(asked.positions) + shift, (turn * Rotation.from_quat(asked.quaternions_xyzw)).as_quat()
     )
     corners = turn.apply(bent().reshape(-1, 3)).reshape(-1, 3, 3) + shift
-    _alike(here, Closing(corners, turn.apply(centre) + shift).features(moved, PG70))
+    _alike(here, ClosingGeometry(corners, turn.apply(centre) + shift).features(moved, PG70))
 
 
 @given(st.integers(0, 2**31 - 1))
 def test_a_mirrored_grasp_of_the_mirrored_object_has_the_same_features(seed: int) -> None:
     asked, centre = poses(20, seed), np.array([0.004, 0.001, 0.009])
-    here = Closing(bent(), centre).features(asked, PG70)
+    here = ClosingGeometry(bent(), centre).features(asked, PG70)
     mirror = np.diag([1.0, -1.0, 1.0])
     # The reflected tool is a proper one again once its own x is reflected, which the jaw does not tell.
     turned = mirror @ Rotation.from_quat(asked.quaternions_xyzw).as_matrix() @ np.diag([-1.0, 1.0, 1.0])
     mirrored = ToolPoses(np.asarray(asked.positions) @ mirror, Rotation.from_matrix(turned).as_quat())
     corners = (bent() @ mirror)[:, ::-1]
-    _alike(here, Closing(corners, centre @ mirror).features(mirrored, PG70))
+    _alike(here, ClosingGeometry(corners, centre @ mirror).features(mirrored, PG70))
 
 
 def _alike(one: Floats, other: Floats) -> None:
@@ -116,4 +116,4 @@ def _alike(one: Floats, other: Floats) -> None:
 
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="triangle"):
-        Closing(np.empty((0, 3, 3)), np.zeros(3))
+        ClosingGeometry(np.empty((0, 3, 3)), np.zeros(3))

@@ -106,6 +106,7 @@ def test_from_enough_attempts_it_is_learned_and_better(
         again = ask(bar, (np.array([grasp["position"]]), np.array([grasp["quaternion_xyzw"]])))
         assert again["success_probability"][0] == pytest.approx(grasp["success_probability"])
     assert bar.get("/objects/bar/density").json()["estimator"] == told
+    _judged(bar, told)
     # Another replica, or this one restarted, has it at once.
     with httpx.Client(base_url=serve(database_url, learned_estimates=True), timeout=60) as there:
         other = ask(there, asked)
@@ -167,3 +168,17 @@ def test_what_can_not_be_read_is_learned_again_and_nothing_outlives_its_object(
 def _kept(database: Database) -> int:
     with database.read() as tx:
         return int(tx.execute(select(func.count()).select_from(learned_estimators)).scalar_one())
+
+
+def _judged(http: httpx.Client, told: dict[str, Any]) -> None:
+    """The report says how well what was learned predicts, by blocks that it had not seen."""
+    report = http.get("/objects/bar/reports/calibration").json()
+    found = report["learned"]
+    assert found["estimator"] == told
+    assert found["skill"]["value"] == pytest.approx(told["skill"], abs=1e-3)
+    assert found["skill"]["low"] < found["skill"]["value"] < found["skill"]["high"]
+    assert found["judged"] == sum(item["count"] for item in found["bins"]) == 440
+    assert 0.5 < found["told_share"] <= 1.0
+    assert found["coverage"] is None or found["coverage"] > 0.5
+    assert "Brier skill" in report["text"]
+    assert "learned" in report["text"]

@@ -144,6 +144,15 @@ def _scores(raw: wire.reports.CalibrationReport) -> dict[str, str]:
         "calibration error above 0.1": number(raw.ece),
         "AUC of probability and density": f"{number(raw.auc_probability)}, {number(raw.auc_density)}",
     }
+    learned = raw.learned
+    if learned is not None:
+        rows[f"learned ({learned.estimator.name}): Brier skill"] = (
+            f"{_range(learned.skill)}, the kernel estimate {number(learned.kernel_skill)}"
+        )
+        rows["learned: told within reach"] = (
+            f"{learned.told_share:.0%} of them, Brier skill {number(learned.told_skill)}"
+        )
+        rows["learned: blocks within their intervals"] = number(learned.coverage)
     checked = raw.checked
     if checked is not None:
         rows["simulated again"] = (

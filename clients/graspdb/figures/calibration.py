@@ -21,6 +21,10 @@ def draw_calibration(report: CalibrationReport) -> Figure:
     )
     label = f"held-out attempts, {report.level:.0%} intervals over {report.blocks} blocks"
     show_bins(top, report.bins, linewidth=1.5, label=label)
+    learned = report.learned
+    if learned is not None:
+        what = f"learned ({learned.estimator.name}), {learned.judged:,} that did not collide"
+        show_bins(top, learned.bins, linewidth=1.5, label=what, color=GREEN)
     again = report.checked
     if again is not None:
         show_ranges(
@@ -45,7 +49,7 @@ def show_bins(axes: Axes, bins: Sequence[CalibrationBin], **style: Any) -> list[
     observed = [ReportRange(value=item.observed, low=item.low, high=item.high) for item in known]
     predicted = [item.predicted for item in known]
     look: dict[str, Any] = {"color": BLUE, "linestyle": "-", "marker": "o", "markersize": 5, "capsize": 3}
-    show_ranges(axes, predicted, observed, **look, **style)
+    show_ranges(axes, predicted, observed, **{**look, **style})
     return known
 
 
@@ -54,6 +58,8 @@ def _scores(report: CalibrationReport) -> str:
     lines = [f"Brier skill {number(skill.value)} ({number(skill.low)} to {number(skill.high)})"]
     if report.free_skill is not None:
         lines.append(f"not colliding {number(report.free_skill.value)}")
+    if report.learned is not None:
+        lines.append(f"learned {number(report.learned.skill.value)}")
     lines.append(f"ECE above 0.1: {number(report.ece)}")
     lines.append(f"AUC: probability {number(report.auc_probability)}, density {number(report.auc_density)}")
     return "\n".join(lines)

@@ -36,6 +36,7 @@ from graspdb.wire.base import (
 from graspdb.wire.kernels import Alignment
 from graspdb.wire.queries import KernelInfo, SelectionQuery, TrialSelection, WidthDeg, WidthM
 from graspdb.wire.states import AnyRunState
+from graspdb.wire.support import EstimatorInfo
 
 ReportName = Literal[
     "convergence",
@@ -402,6 +403,38 @@ class CheckedGrasps(Response):
     """The same by prediction."""
 
 
+class LearnedCalibration(Response):
+    """Whether what an estimator learned can be believed: attempts that did not collide, predicted from those
+    of other blocks of space.
+    """
+
+    estimator: EstimatorInfo
+    """Who learned, and from how many attempts."""
+    judged: int
+    """How many attempts were left out and predicted."""
+    blocks: int
+    """How many blocks of space they lie in."""
+    skill: ReportRange
+    """Brier's skill: 1 perfect, 0 no better than the share of successes."""
+    kernel_skill: float | None
+    """Brier's skill of the plain kernel estimate on the same attempts."""
+    ece: float | None
+    """Expected calibration error over predictions above 0.1; null where there are none."""
+    auc: float | None
+    """Chance that a success ranks above a failure; null without both."""
+    coverage: float | None
+    """Share of the blocks, of those predicted between 0.05 and 0.95, whose successes the 90 % intervals and
+    chance explain; null where there are no such blocks."""
+    told_share: float
+    """Share of the attempts within reach of an attempt of another block: elsewhere probabilities are null."""
+    told_skill: float | None
+    """Brier's skill where they are within reach; null where all fared alike."""
+    untold_skill: float | None
+    """Brier's skill of what is not told, where none is within reach; null where all fared alike."""
+    bins: list[CalibrationBin]
+    """Predictions and how often they came true."""
+
+
 class CalibrationReport(Report):
     """Whether ``success_probability`` can be believed, on outcomes it has not seen (blocks left out)."""
 
@@ -447,6 +480,9 @@ class CalibrationReport(Report):
     checked: CheckedGrasps | None = None
     """Grasps whose poses were given to checks, as verified best grasps are; null where there are none, a
     warning says how to make some."""
+    learned: LearnedCalibration | None = None
+    """What was learned and answers in place of the kernel estimate; null where nothing was, or is no
+    better."""
 
 
 class ProjectionProfile(Response):

@@ -132,9 +132,7 @@ def _finger(
 
 
 @nb.njit(cache=True, nogil=True)
-def fingers(
-    positions: FloatArray, quaternions: FloatArray, column: FloatArray, tree: Tree, out: FloatArray
-) -> None:
+def fingers(p: FloatArray, q: FloatArray, column: FloatArray, tree: Tree, out: FloatArray) -> None:
     """Fill out (n, 2 * OF_A_FINGER + 4): what the finger at -y would touch, and the one at +y; the object's
     extent along y where both touch, how far its middle is off the jaw's, how many lines meet it, and their
     mean length in it; NaN where no line does.
@@ -147,11 +145,11 @@ def fingers(
     first = np.empty((2, ACROSS, ALONG))
     normals = np.zeros((2, ACROSS, ALONG, 3))
     r = np.empty((3, 3))
-    for i in range(positions.shape[0]):
-        _rotation(quaternions[i], r)
+    for i in range(p.shape[0]):
+        _rotation(q[i], r)
         first[0] = np.inf
         first[1] = -np.inf
-        _meet(positions[i], r, column, tree, first, normals)
+        _meet(p[i], r, column, tree, first, normals)
         low, high, met, inside = np.inf, -np.inf, 0, 0.0
         for a in range(ACROSS):
             for b in range(ALONG):

@@ -57,7 +57,9 @@ class Context(Asking):
         )
         scenes = Scenes(database, compute, features)
         pictures = Pictures(database, compute, scenes, densities.selections)
-        reports = Reports(settings, database, densities, scenes)
+        learning = Learning(database, scenes, enabled=settings.learned_estimates)
+        successes = Successes(database, compute, learning, settings.max_density_cache_bytes)
+        reports = Reports(settings, database, densities, scenes, successes)
         fits = fit.run_kind(densities, features, settings.threads)
         return cls(
             settings=settings,
@@ -67,12 +69,7 @@ class Context(Asking):
             scenes=scenes,
             evidence=CollisionEvidence(scenes, compute),
             priors=Priors(compute, scenes),
-            successes=Successes(
-                database,
-                compute,
-                Learning(database, scenes, enabled=settings.learned_estimates),
-                settings.max_density_cache_bytes,
-            ),
+            successes=successes,
             answers=AnswerKeeper(database, most=settings.max_answers),
             pictures=pictures,
             reports=reports,

@@ -27,9 +27,9 @@ from graspdb_density.bandwidth.selection import FIRST_CHOICE
 from graspdb_density.kde.rows import Rows
 from graspdb_density.kde.sample_kernel import MOST_COMPONENTS
 from graspdb_service.problems import ProblemError
+from graspdb_service.storage.derived.width_choices import ChosenWidths
 from graspdb_service.storage.kernels import KernelRow
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.storage.width_choices import ChosenWidths
 from graspdb_service.trial_columns import Bools, Floats, Ints, TrialColumns
 from graspdb_service.usecases.densities import stored_kernel
 from graspdb_service.usecases.densities.weighing import Weighing, weighed

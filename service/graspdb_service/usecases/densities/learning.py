@@ -27,9 +27,9 @@ from graspdb_estimators.stack import LEAST_ATTEMPTS, LEAST_OF_EACH
 from graspdb_geometry.closing import FEATURES
 from graspdb_geometry.grippers import shape_of
 from graspdb_service.problems import ProblemError
-from graspdb_service.storage import learned_estimators
 from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database
-from graspdb_service.storage.learned_estimators import LearnedRow
+from graspdb_service.storage.derived import learned_estimators
+from graspdb_service.storage.derived.learned_estimators import LearnedRow
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.trials.selection import Selected
 

@@ -235,10 +235,18 @@ class Successes:
         plain = Model(found.model, found.sample or found.model, found.reach, EstimatorInfo())
         return self.learning.improved(found.selected, key.kernel, plain, trees=collisions_known)
 
-    def learned(self, built: Built, *, collisions_known: bool) -> Stack | None:
-        """What was learned of a density's attempts and answers in their place; None where nothing does."""
+    def learned(
+        self, built: Built, *, collisions_known: bool, within_s: float
+    ) -> tuple[Stack | None, EstimatorInfo]:
+        """What was learned of a density's attempts and answers in their place, waited for; None where nothing
+        does, or it takes longer.
+        """
+        model = self.model(built, collisions_known=collisions_known)
+        if model is not None and model.estimator.state == "fitting":
+            self.learning.wait(within_s)
         key = _key(built, collisions_known)
-        return self.learning.held(built.selected, key.kernel, trees=collisions_known)
+        held = self.learning.held(built.selected, key.kernel, trees=collisions_known)
+        return held, self.estimator(built, collisions_known=collisions_known)
 
     def estimator(self, built: Built, *, collisions_known: bool) -> EstimatorInfo:
         """Who estimates success probabilities, without a look at any attempt."""

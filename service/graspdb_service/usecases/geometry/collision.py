@@ -14,7 +14,7 @@ from graspdb.wire import GripperProfile
 from graspdb.wire.queries import PreOpening
 from graspdb_density.se3 import Poses
 from graspdb_geometry import meshes, openings
-from graspdb_geometry.closing import Closing
+from graspdb_geometry.closing import ClosingGeometry
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.deviation import deviation
 from graspdb_geometry.grippers import GripperShape, shape_of
@@ -170,7 +170,7 @@ class Scenes:
     def __init__(self, database: Database, compute: Compute, features: Features) -> None:
         self.features = features
         self._solids: _Prepared[Solid] = _Prepared(database, compute)
-        self._closings: _Prepared[Closing] = _Prepared(database, compute)
+        self._closings: _Prepared[ClosingGeometry] = _Prepared(database, compute)
 
     def test(self, selected: Selected, pre_opening_m: PreOpening = None) -> CollisionTest | None:
         """The collision test of a selection; None where geometry or gripper is not known.
@@ -196,25 +196,25 @@ class Scenes:
             raise _unknown(selected)
         return test
 
-    def closing(self, row: ObjectRow) -> Closing | None:
+    def closing(self, row: ObjectRow) -> ClosingGeometry | None:
         """What a jaw closes on, of the mesh or else the convex parts; None without either."""
         parts, info = row.parts_sha256, row.mesh_info
         if row.mesh_sha256 is not None and info is not None:
             form, measured = form_of(row), info.get("centre_of_mass")
 
-            def of_mesh(found: list[bytes]) -> Closing:
+            def of_mesh(found: list[bytes]) -> ClosingGeometry:
                 mesh = form.read(found[0])
                 corners = mesh.vertices[mesh.faces]
                 # An open mesh encloses no mass: the middle of its surface is nearest to it.
-                return Closing(corners, surface_centre(corners) if measured is None else measured)
+                return ClosingGeometry(corners, surface_centre(corners) if measured is None else measured)
 
             return self._closings.made((row.mesh_sha256, form, None), of_mesh)
         if parts is None:
             return None
 
-        def of_parts(found: list[bytes]) -> Closing:
+        def of_parts(found: list[bytes]) -> ClosingGeometry:
             corners = np.concatenate([v[f] for v, f in meshes.parts_from_glb(found[0])])
-            return Closing(corners, mass_properties(corners).centre)
+            return ClosingGeometry(corners, mass_properties(corners).centre)
 
         return self._closings.made((parts, "parts", None), of_parts)
 

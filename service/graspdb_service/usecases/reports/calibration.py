@@ -6,7 +6,13 @@ import numpy as np
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb.wire.queries import SelectionQuery
-from graspdb.wire.reports import CalibrationBin, CalibrationReport, CheckedGrasps, ReportRange
+from graspdb.wire.reports import (
+    CalibrationBin,
+    CalibrationReport,
+    CheckedGrasps,
+    LearnedCalibration,
+    ReportRange,
+)
 from graspdb_density import importance_weights
 from graspdb_density.kde.weighted_sums import Progress
 from graspdb_density.se3 import Poses
@@ -15,6 +21,7 @@ from graspdb_density.success.calibration import (
     Calibration,
     area_under_curve,
     assign_blocks,
+    brier_skill,
     calibrate,
     reliability,
 )
@@ -46,6 +53,8 @@ _JUDGED_FREE, _JUDGED_COLLIDED = 20_000, 5_000
 _KEPT_COLLIDED = 100_000
 LEAST_ATTEMPTS, LEAST_FAILURES = 100, 20
 _FOLDS = 5
+#: How long a report waits for what is being learned.
+_LEARNED_WITHIN_S = 300.0
 #: Bins of grasps that were simulated again: there are few of them.
 _CHECKED_BINS = 5
 
@@ -81,6 +90,7 @@ def calibration_report(
             calibrate(predicted[free], won[free], weights=weights[free], blocks=block[free], level=LEVEL)
         )
     checked = _checked(inputs, built, everything, test)
+    learned = _learned(inputs, built, collisions_known=test is not None)
     report = CalibrationReport(
         **head(built),
         kernel=built.kernel,
@@ -100,6 +110,7 @@ def calibration_report(
         auc_density=finite(area_under_curve(ranked, won, weights=weights)),
         bins=[as_model(CalibrationBin, item) for item in whole.bins],
         checked=checked,
+        learned=learned,
         warnings=_warnings(built.object_row.slug, test, against, checked=checked is not None),
     )
     return report.model_copy(update={"text": _calibration_text(report)})
@@ -139,6 +150,37 @@ def _predictions(
     if free is not None:
         predicted[~free] = 0.0
     return predicted, ranked
+
+
+def _learned(inputs: ReportInputs, built: Built, *, collisions_known: bool) -> LearnedCalibration | None:
+    """How well what was learned predicts the blocks that it was judged on, if it is in use."""
+    stack, estimator = inputs.successes.learned(
+        built, collisions_known=collisions_known, within_s=_LEARNED_WITHIN_S
+    )
+    if stack is None:
+        return None
+    held = stack.held
+    whole = calibrate(held.learned, held.share, weights=held.weight, blocks=held.block, level=LEVEL)
+    inside, outside = (
+        finite(brier_skill(held.learned[rows], held.share[rows], weights=held.weight[rows]))
+        if rows.any()
+        else None
+        for rows in (held.told, ~held.told)
+    )
+    return LearnedCalibration(
+        estimator=estimator,
+        judged=len(held.share),
+        blocks=len(np.unique(held.block)),
+        skill=_skill(whole),
+        kernel_skill=finite(held.skills[1]),
+        ece=finite(whole.ece),
+        auc=finite(whole.auc),
+        coverage=finite(held.coverage),
+        told_share=float(np.average(held.told, weights=held.weight)),
+        told_skill=inside,
+        untold_skill=outside,
+        bins=[as_model(CalibrationBin, item) for item in whole.bins],
+    )
 
 
 def _skill(item: Calibration) -> ReportRange:
@@ -231,6 +273,13 @@ def _calibration_text(report: CalibrationReport) -> str:
             f" A success ranks above a failure with {report.auc_probability:.2f} by probability, with"
             f" {report.auc_density:.2f} by density."
         )
+    learned = report.learned
+    if learned is not None and learned.skill.value is not None:
+        text += (
+            f" What was learned ({learned.estimator.name}) answers in its place: Brier skill"
+            f" {learned.skill.value:.2f} on {learned.judged:,} attempts that did not collide"
+        )
+        text += "." if learned.kernel_skill is None else f", the kernel estimate {learned.kernel_skill:.2f}."
     again = report.checked
     if again is not None and again.rate.low is not None and again.rate.high is not None:
         text += (

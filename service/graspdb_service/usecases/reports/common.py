@@ -24,6 +24,7 @@ from graspdb_service.problems import conflict, too_few_trials
 from graspdb_service.storage.database import Database
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import Densities
+from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.trials.attempts import AllTrials
@@ -46,6 +47,7 @@ class ReportInputs:
     scenes: Scenes
     threads: int
     curves: KeptCurves
+    successes: Successes
 
 
 class KeptCurves:

@@ -19,6 +19,7 @@ from graspdb_service.storage.report_runs import RunKey, RunRow
 from graspdb_service.storage.simulation import outcomes
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.densities.cache import Densities, kernel_of
+from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.reports.anisotropy import anisotropy_report
 from graspdb_service.usecases.reports.bandwidth import bandwidth_report
@@ -52,9 +53,16 @@ _COMPUTE: Mapping[str, Callable[[ReportInputs, Built, Any, Progress], Report]] =
 class Reports:
     """What runs of reports are keyed by, and how they are computed."""
 
-    def __init__(self, settings: Settings, database: Database, densities: Densities, scenes: Scenes) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        database: Database,
+        densities: Densities,
+        scenes: Scenes,
+        successes: Successes,
+    ) -> None:
         curves = KeptCurves(settings.max_density_cache_bytes // _CURVES_SHARE)
-        self._inputs = ReportInputs(database, densities, scenes, settings.threads, curves)
+        self._inputs = ReportInputs(database, densities, scenes, settings.threads, curves, successes)
 
     def key(self, slug: str, report: str, options: ReportOptions) -> RunKey:
         """The run of a report, all of it resolved: the same parameters give the same report of a revision."""

@@ -12,9 +12,9 @@ import numpy as np
 from graspdb_density import choose_widths
 from graspdb_density.kde.rows import Rows
 from graspdb_service import __version__
-from graspdb_service.storage import width_choices
 from graspdb_service.storage.database import UNAVAILABLE, CommitUnknown, Database
-from graspdb_service.storage.width_choices import ChosenWidths
+from graspdb_service.storage.derived import width_choices
+from graspdb_service.storage.derived.width_choices import ChosenWidths
 
 log = logging.getLogger("graspdb")
 

@@ -1,0 +1,1 @@
+"""What follows from stored trials and is kept for all replicas: lost, it is made again."""
