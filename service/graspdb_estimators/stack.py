@@ -140,7 +140,7 @@ class Stack:
         Up to how many widths of position from an attempt it tells.
     attempts : int
         How many it was learned from.
-    held : LeftOut
+    left_out : LeftOut
     """
 
     trees: BoostedTrees | None
@@ -148,7 +148,7 @@ class Stack:
     doubt: Floats
     reach_widths: float
     attempts: int
-    held: LeftOut
+    left_out: LeftOut
 
     def reach(self, of_kernel: Reach) -> Reach:
         """How far it tells, where the kernel estimate tells so far."""
@@ -173,7 +173,7 @@ class Stack:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays held."""
-        return (0 if self.trees is None else self.trees.nbytes) + 57 * len(self.held.share)
+        return (0 if self.trees is None else self.trees.nbytes) + 57 * len(self.left_out.share)
 
     def to_bytes(self) -> bytes:
         """All of it, to be kept; `of_bytes` reads it again."""
@@ -181,7 +181,7 @@ class Stack:
             "weights": self.weights,
             "doubt": self.doubt,
             "numbers": np.array([self.reach_widths, float(self.attempts)]),
-            **{f"held_{each.name}": getattr(self.held, each.name) for each in fields(LeftOut)},
+            **{f"held_{each.name}": getattr(self.left_out, each.name) for each in fields(LeftOut)},
         }
         if self.trees is not None:
             arrays |= {f"trees_{name}": array for name, array in self.trees.arrays.items()}

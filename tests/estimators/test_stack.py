@@ -67,9 +67,9 @@ def test_it_predicts_what_it_has_not_seen_better_and_says_so(
     found = stacked.evaluate(poses)
     kernel = brier_skill(model.probability(poses), won)
     assert brier_skill(found.probability, won) > kernel + 0.05
-    assert stack.held.verdict == "better"
+    assert stack.left_out.verdict == "better"
     # What it says of itself is what it does, on harder questions: whole blocks are left out.
-    assert stack.held.skills[0] == pytest.approx(brier_skill(found.probability, won), abs=0.08)
+    assert stack.left_out.skills[0] == pytest.approx(brier_skill(found.probability, won), abs=0.08)
     assert expected_calibration_error(found.probability, won) < 0.05
     assert np.mean(np.abs(found.probability - truth(poses))) < 0.08
 
@@ -111,7 +111,7 @@ def test_it_is_kept_as_it_is(learned: tuple[SuccessModel, Stack, GraspFeatures])
     np.testing.assert_array_equal(one.probability, other.probability)
     np.testing.assert_array_equal(one.low, other.low)
     assert again.attempts == stack.attempts
-    assert again.held.skills == stack.held.skills
+    assert again.left_out.skills == stack.left_out.skills
     assert again.nbytes == stack.nbytes
 
 
@@ -154,7 +154,7 @@ def test_noise_is_no_better() -> None:
     model = SuccessModel.build(poses, won, kernel=KERNEL)
     stack = fit_stack(model, GraspFeatures(bar(), PG70), reach=validate_reach(model))
     assert stack is not None
-    assert stack.held.skills[0] < 0.05
+    assert stack.left_out.skills[0] < 0.05
     # Of what the kernel estimate makes of noise it may be the better; it must not say that it knows.
     found = StackedModel(model, stack, GraspFeatures(bar(), PG70)).probability(attempts(500, 10)[0])
     assert np.abs(found - 0.4).mean() < 0.12

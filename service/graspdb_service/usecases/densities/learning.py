@@ -71,7 +71,7 @@ class _Learned:
     def info(self) -> EstimatorInfo:
         if self.stack is None:
             return EstimatorInfo()
-        skill, of_kernel = self.stack.held.skills
+        skill, of_kernel = self.stack.left_out.skills
         return EstimatorInfo(
             name="kernel" if self.stack.trees is None else "stack",
             recalibrated=True,
@@ -248,7 +248,7 @@ class Learning:
         learned, keep = _Learned(task.epoch, task.attempts, None), True
         try:
             stack = fit_stack(task.model, task.features(), reach=task.reach, breathe=self._breathe)
-            if stack is not None and stack.held.verdict == "better":
+            if stack is not None and stack.left_out.verdict == "better":
                 learned = replace(learned, stack=stack)
         except _Stopped:
             raise

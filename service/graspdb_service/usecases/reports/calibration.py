@@ -159,7 +159,7 @@ def _learned(inputs: ReportInputs, built: Built, *, collisions_known: bool) -> L
     )
     if stack is None:
         return None
-    held = stack.held
+    held = stack.left_out
     whole = calibrate(held.learned, held.share, weights=held.weight, blocks=held.block, level=LEVEL)
     inside, outside = (
         finite(brier_skill(held.learned[rows], held.share[rows], weights=held.weight[rows]))
