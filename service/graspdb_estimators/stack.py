@@ -152,7 +152,9 @@ class Stack:
 
     def reach(self, of_kernel: Reach) -> Reach:
         """How far it tells, where the kernel estimate tells so far."""
-        return replace(of_kernel, position=max(of_kernel.position, self.reach_widths))
+        if self.reach_widths <= of_kernel.position:
+            return of_kernel
+        return replace(of_kernel, position=self.reach_widths, validated_position=self.reach_widths)
 
     def combined(self, kernel: Floats, trials: Floats, trees: Floats | None) -> tuple[Floats, Floats]:
         """Logit of success and its standard deviation, each (M,).

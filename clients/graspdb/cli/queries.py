@@ -39,7 +39,7 @@ from graspdb.resources.results import (
     pose_columns,
 )
 from graspdb.resources.selection import Constraints, DrawSelection, LikelihoodSelection, Selection
-from graspdb.wire import DensityInfo, SelectionInfo
+from graspdb.wire import DensityInfo, EstimatorInfo, SelectionInfo
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="The same seed gives the same poses.")]
@@ -187,6 +187,8 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
         ERRORS.print(f"The score that they are ranked by is the {found.ranking.score}.", soft_wrap=True)
     if found.reach is not None and any(g.support is not None and not g.support.enough for g in found):
         ERRORS.print(f"Success probabilities are told {found.reach.rule}.", soft_wrap=True)
+    if any(g.success_probability is not None for g in found):
+        _tell_estimator(found.estimator)
     if found[0].prior:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
@@ -262,8 +264,24 @@ def likelihood(
     _tell_frame(frame, convention)
     if found.reach is not None and found.support is not None and not found.support.enough.all():
         ERRORS.print(f"Success probabilities are told {found.reach.rule}.", soft_wrap=True)
+    if found.support is not None:
+        _tell_estimator(found.estimator)
     if len(poses) > limit:
         ERRORS.print(f"{len(poses) - limit:,} more; --limit shows them, --json and --csv give all.")
+
+
+def _tell_estimator(estimator: EstimatorInfo | None) -> None:
+    """Who told success probabilities, where it is more than the plain kernel estimate, or soon will be."""
+    if estimator is None:
+        return
+    if estimator.state == "fitting":
+        ERRORS.print("Better success probabilities are being learned: ask again in a minute.")
+    elif estimator.attempts is not None:
+        ERRORS.print(
+            f"Success probabilities were learned from {estimator.attempts:,} attempts ({estimator.name}): Brier"
+            f" skill on blocks left out {number(estimator.skill)}, by kernels {number(estimator.kernel_skill)}.",
+            soft_wrap=True,
+        )
 
 
 def _chance(found: LikelihoodArrays, row: int) -> str:
