@@ -278,8 +278,9 @@ def _tell_estimator(estimator: EstimatorInfo | None) -> None:
         ERRORS.print("Better success probabilities are being learned: ask again in a minute.")
     elif estimator.attempts is not None:
         ERRORS.print(
-            f"Success probabilities were learned from {estimator.attempts:,} attempts ({estimator.name}): Brier"
-            f" skill on blocks left out {number(estimator.skill)}, by kernels {number(estimator.kernel_skill)}.",
+            f"Success probabilities were learned from {estimator.attempts:,} attempts ({estimator.name}):"
+            f" Brier skill on left-out blocks {number(estimator.skill)}, of kernels"
+            f" {number(estimator.kernel_skill)}.",
             soft_wrap=True,
         )
 
