@@ -171,7 +171,8 @@ class _Surface:
         self.moments = np.einsum("n,ni,nj->ij", self.weights, self.nodes, self.nodes)
         # A box's side has this moment, by its length.
         self.tolerance = tolerance_of(math.sqrt(12.0 * float(np.linalg.eigvalsh(self.moments)[1])))
-        self._face, self._samples = surface_samples(self.triangles, DENSE_SAMPLES, rng)
+        count = max(DENSE_SAMPLES, 2 * len(areas))
+        self._face, self._samples = surface_samples(self.triangles, count, rng)
         self._tree = cKDTree(self._samples)
         chosen = rng.choice(len(areas), _POINTS, p=share)
         inside = rng.dirichlet(np.ones(3), _POINTS)

@@ -103,6 +103,12 @@ def test_a_notch_or_a_handle_takes_a_symmetry_away() -> None:
     assert len(found.planes) == 2
 
 
+def test_a_mesh_of_many_triangles_is_judged_alike() -> None:
+    egg = make.icosphere(6, 0.04)
+    egg.apply_scale((1.0, 1.0, 1.3))
+    assert orders(find_symmetry(corners(egg))) == [0]
+
+
 def test_an_open_surface_has_its_symmetry() -> None:
     can = make.cylinder(radius=0.03, height=0.1, sections=64)
     open_top = corners(can)[np.asarray(can.triangles_center)[:, 2] < 0.049]

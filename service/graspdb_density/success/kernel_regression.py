@@ -40,6 +40,7 @@ from ..kde.rows import Rows
 from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
+from .motions import Motions
 
 __all__ = [
     "PRIOR_TRIALS",
@@ -58,7 +59,9 @@ PRIOR_TRIALS = 1.0
 #: An attempt is within reach when position and rotation together are within this many standard deviations.
 SUCCESS_CUTOFF = 5.0
 #: Poses a thread takes at once.
-_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _FAR_BLOCK = 256, 128, 16
+_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _ORBIT_BLOCK, _FAR_BLOCK = 256, 128, 64, 16
+#: Poses whose images are looked at together.
+_IMAGED = 4_096
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -144,10 +147,14 @@ class _Sums(NamedTuple):
 class SuccessModel:
     """Attempts under a kernel, sorted for evaluation; immutable. Use `build` and `extend`."""
 
-    def __init__(self, kernel: SuccessKernel, parts: tuple[Part, ...] = ()) -> None:
+    def __init__(
+        self, kernel: SuccessKernel, parts: tuple[Part, ...] = (), motions: Motions | None = None
+    ) -> None:
         self.kernel = kernel
         #: The attempts by share of success, weight and spread, successes first.
         self.parts = parts
+        #: Of a symmetric object, by which each attempt tells of other poses, too.
+        self.motions = motions
 
     @classmethod
     def build(
@@ -208,7 +215,14 @@ class SuccessModel:
             )
         # Heaviest successes first, whatever came first.
         ordered = sorted(parts, reverse=True)
-        return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered))
+        return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered), self.motions)
+
+    def shared(self, motions: Motions) -> SuccessModel:
+        """The same attempts, each telling of every pose that a motion of the object takes its own to.
+
+        It stays one attempt wherever it tells of: one pose that it tells of by several motions has it once.
+        """
+        return SuccessModel(self.kernel, self.parts, motions)
 
     @property
     def size(self) -> int:
@@ -353,6 +367,9 @@ class SuccessModel:
     def _sums_of(self, cells: Cells, poses: Poses, columns: int, threads: int) -> Floats:
         radius, kernel = scaled_radius(SUCCESS_CUTOFF), self.kernel
         arrays = cells.arrays
+        if self.motions is not None:
+            work = partial(self._orbit_sums, self.motions, cells, radius)
+            return cells.at_poses(work, poses, columns=(columns,), block=_ORBIT_BLOCK, threads=threads)
         if isinstance(kernel, DiagonalKernel):
             half, turning, block = self.half(cells), self.turning, _DIAGONAL_BLOCK
 
@@ -366,21 +383,57 @@ class SuccessModel:
 
         return cells.at_poses(loop, self._along(poses), columns=(columns,), block=block, threads=threads)
 
+    def _orbit_sums(
+        self, motions: Motions, cells: Cells, radius: float, p: Floats, q: Floats, out: Floats
+    ) -> None:
+        """As `_sums_of`, of attempts that every motion of the object has taken elsewhere, too."""
+        kernel, images = self.kernel, motions.images(Poses(p, q))
+        shape = images.positions.shape[:2]
+        along = self._along(Poses(images.positions.reshape(-1, 3), images.quaternions_xyzw.reshape(-1, 4)))
+        diagonal.orbit_sums(
+            cells.arrays,
+            along.positions.reshape(*shape, 3),
+            along.quaternions_xyzw.reshape(*shape, 4),
+            self.half(cells),
+            kernel.kappa if isinstance(kernel, IsotropicKernel) else 0.0,
+            isinstance(kernel, IsotropicKernel) and kernel.sigma_rotation > TWIN_ROTATION,
+            self.turning,
+            radius,
+            out,
+        )
+
     def _nearest(self, poses: Poses, sums: _Sums, threads: int, *, everywhere: bool) -> NearestAttempts:
         """How far the nearest attempts are; those that no sum reached are looked for ``everywhere``."""
-        along = self._along(poses)
         best, places = sums.best, sums.places
         far = np.flatnonzero(places.max(axis=0, initial=-1.0) < 0.0)
         if everywhere and far.size:
-            best[:, far], places[:, far] = self._search(along[far], threads)
+            best[:, far], places[:, far] = self._search(poses[far], threads)
         distances = np.full((len(poses), 10), np.inf)
         nearer = np.argmax(best, axis=0) if self.parts else np.empty(0)
         for number, part in enumerate(self.parts):
             rows = np.flatnonzero((nearer == number) & (places[number] >= 0.0))
             if rows.size:
-                distances[rows] = self.displacements(part.cells, places[number, rows], along[rows])
+                distances[rows] = self._displaced(part.cells, places[number, rows], poses[rows])
         metres, radians, along, about = np.ascontiguousarray(distances[:, :4].T)
         return NearestAttempts(metres, radians, along, about, distances[:, 4:])
+
+    def _displaced(self, cells: Cells, places: Floats, poses: Poses) -> Floats:
+        """From sorted attempts to poses, or the image of each that is nearest to its attempt, (M, 10)."""
+        motions = self.motions
+        if motions is None:
+            return self.displacements(cells, places, self._along(poses))
+        found = np.empty((len(poses), 10))
+        for start in range(0, len(poses), _IMAGED):
+            some = slice(start, start + _IMAGED)
+            at, images = places[some], motions.images(poses[some])
+            for _ in range(2):
+                shape = images.positions.shape[:2]
+                flat = Poses(images.positions.reshape(-1, 3), images.quaternions_xyzw.reshape(-1, 4))
+                away = self.displacements(cells, np.repeat(at, shape[1]), self._along(flat))
+                nearer = np.argmin(np.hypot(away[:, 2], away[:, 3]).reshape(shape), axis=1)
+                chosen = np.arange(shape[0]) * shape[1] + nearer
+                found[some], images = away[chosen], motions.finer(flat[chosen])
+        return found
 
     def displacements(self, cells: Cells, places: Floats, along: Poses) -> Floats:
         """From sorted attempts to poses along the kernel's axes, (M, 10), as `diagonal.displacements`."""
@@ -389,9 +442,12 @@ class SuccessModel:
         diagonal.displacements(cells.arrays, at, *along, self.half(cells), self.turning, gripper, out)
         return out
 
-    def _search(self, along: Poses, threads: int) -> Floats:
+    def _search(self, poses: Poses, threads: int) -> Floats:
         """Largest exponents and their places in every part, however far, (2, P, M)."""
-        found = np.empty((2, len(self.parts), len(along)))
+        if self.motions is not None:
+            return self._search_images(self.motions.coarse, poses, threads)
+        along = self._along(poses)
+        found = np.empty((2, len(self.parts), len(poses)))
         kernel = self.kernel
         for number, part in enumerate(self.parts):
             arrays = part.cells.arrays
@@ -401,6 +457,19 @@ class SuccessModel:
                 loop = partial(_nearest_anywhere, arrays, kernel.kappa)
             best = part.cells.at_poses(loop, along, columns=(2,), block=_FAR_BLOCK, threads=threads)
             found[:, number] = best.T
+        return found
+
+    def _search_images(self, motions: Motions, poses: Poses, threads: int) -> Floats:
+        """As `_search`, the largest of all images of each pose."""
+        alone, images = SuccessModel(self.kernel, self.parts), motions.images(poses)
+        found = np.full((2, len(self.parts), len(poses)), -np.inf)
+        for number in range(len(motions)):
+            image = Poses(
+                np.ascontiguousarray(images.positions[:, number]),
+                np.ascontiguousarray(images.quaternions_xyzw[:, number]),
+            )
+            seen = alone._search(image, threads)
+            found = np.where(seen[0] > found[0], seen, found)
         return found
 
     @property
