@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from .isotropic import BLOCK, COUNT, OFFSET, TWIN, empty_runs, place, runs_within
 from .options import exact, inlined
 from .quaternions import relative, turned_back
@@ -19,7 +17,7 @@ __all__ = [
     "left_out_sums",
     "near_pairs",
     "nearest_anywhere",
-    "orbit_sums",
+    "rotation_vector",
     "square_sums",
 ]
 
@@ -28,7 +26,7 @@ _SAME = 0.5 * 0.05**2
 
 
 @inlined
-def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):
+def rotation_vector(ax, ay, az, aw, bx, by, bz, bw):
     """The shortest rotation vector of a^-1 b."""
     x, y, z, w = relative(ax, ay, az, aw, bx, by, bz, bw)
     if w < 0.0:
@@ -64,7 +62,7 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
                 if base > cut:
                     continue
                 k = 0.0
-                u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
+                u, v, t = rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
                 e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                 if e <= cut:
                     k = math.exp(-e)
@@ -72,7 +70,7 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
                         least, nearest = e, i
                 if runs[r, 2] > 0:
                     # The row turned about its z: q times (0, 0, 1, 0).
-                    u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
+                    u, v, t = rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
                     e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                     if e <= cut:
                         k += math.exp(-e)
@@ -114,9 +112,9 @@ def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest,
             own = abs(ax * bx + ay * by + az * bz + aw * bw)
             other = abs(ay * bx - ax * by + aw * bz - az * bw)
             if symmetric[i] and other > own:
-                u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
+                u, v, t = rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
             else:
-                u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
+                u, v, t = rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
             if e + b * (u * u + v * v + t * t) > cut:
                 continue
             if count < room:
@@ -159,10 +157,10 @@ def _displaced(data, i, twin, at, half, turning):
     x, y, z = dx, dy, dz
     if turning:
         x, y, z = turned_back(ax, ay, az, aw, dx, dy, dz)
-    u, v, t = _rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
+    u, v, t = rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
     turned = half[3] * u * u + half[4] * v * v + half[5] * t * t
     if twin:
-        b, c, d = _rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
+        b, c, d = rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
         other = half[3] * b * b + half[4] * c * c + half[5] * d * d
         if other < turned:
             u, v, t, turned = b, c, d, other
@@ -263,76 +261,3 @@ def left_out_sums(
                         row[0] += share * k
                         row[1] += k
                         row[2] += k * k
-
-
-@exact
-def orbit_sums(cells, positions, quaternions, half, kappa, wide, turning, radius, out):
-    """As `square_sums` at the images (M, n, 3), (M, n, 4) of every pose, of which an attempt's kernels add up
-    to one: k^2 is the square of its sum. One attempt is one, however many images it tells of.
-
-    Where ``kappa`` is positive the kernel is `isotropic.square_sums`' with this concentration instead.
-    """
-    runs, cut, data = empty_runs(cells, BLOCK), radius * radius, cells.data
-    summed = np.zeros(data.shape[1])
-    reached = np.empty(data.shape[1], dtype=np.int64)
-    for j in range(positions.shape[0]):
-        count, least, nearest = 0, 1e30, -1
-        for s in range(positions.shape[1]):
-            at = place(cells, positions[j, s], quaternions[j, s], 1.0)
-            bx, by, bz, bw = at.qx, at.qy, at.qz, at.qw
-            for r in range(runs_within(cells, at, radius, BLOCK, runs)):
-                for i in range(runs[r, 0], runs[r, 1]):
-                    x, y, z = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
-                    ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
-                    twin = runs[r, 2] > 0
-                    k = 0.0
-                    if kappa > 0.0:
-                        base = x * x + y * y + z * z + kappa
-                        if base - kappa > cut:
-                            continue
-                        own = abs(ax * bx + ay * by + az * bz + aw * bw)
-                        other = abs(ax * by - ay * bx + az * bw - aw * bz) if twin else 0.0
-                        large, small = kappa * max(own, other), kappa * min(own, other)
-                        e = base - large
-                        if e > cut:
-                            continue
-                        k = math.exp(-e)
-                        if wide:
-                            k += math.exp(-base - large)
-                            if twin:
-                                k += math.exp(small - base) + math.exp(-small - base)
-                        if e < least:
-                            least, nearest = e, i
-                    else:
-                        if turning:
-                            x, y, z = turned_back(ax, ay, az, aw, x, y, z)
-                        base = half[0] * x * x + half[1] * y * y + half[2] * z * z
-                        if base > cut:
-                            continue
-                        u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
-                        e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
-                        if e <= cut:
-                            k = math.exp(-e)
-                            if e < least:
-                                least, nearest = e, i
-                        if twin:
-                            u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
-                            e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
-                            if e <= cut:
-                                k += math.exp(-e)
-                                if e < least:
-                                    least, nearest = e, i
-                    if k > 0.0:
-                        if summed[i] == 0.0:
-                            reached[count] = i
-                            count += 1
-                        summed[i] += k
-        total, squares = 0.0, 0.0
-        for c in range(count):
-            k = summed[reached[c]]
-            total += k
-            squares += k * k
-            summed[reached[c]] = 0.0
-        out[j, 0], out[j, 1] = total, squares
-        if out.shape[1] > 2:
-            out[j, 2], out[j, 3] = -least, nearest

@@ -130,6 +130,12 @@ class Cells:
         quaternions = arrays.data[3:7, places].T.astype(np.float64)
         return Poses(np.ascontiguousarray(positions), np.ascontiguousarray(quaternions))
 
+    @property
+    def symmetric(self) -> NDArray[np.bool_]:
+        """Whether each sorted kernel's jaw is mirror-symmetric, (N,)."""
+        table = self.arrays.table
+        return np.repeat(table[:, c.TWIN] > 0.0, table[:, c.COUNT].astype(np.int64))
+
     def visiting_order(self, positions: Floats) -> NDArray[np.intp]:
         """An order in which neighbours follow each other, so that kernels stay in the processor's cache."""
         edge = self.arrays.table[0, c.EDGE] / self.arrays.scale

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
-from .._compiled import diagonal, isotropic, nearest
+from .._compiled import diagonal, isotropic, nearest, orbits
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
@@ -60,8 +60,6 @@ PRIOR_TRIALS = 1.0
 SUCCESS_CUTOFF = 5.0
 #: Poses a thread takes at once.
 _ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _ORBIT_BLOCK, _FAR_BLOCK = 256, 128, 64, 16
-#: Poses whose images are looked at together.
-_IMAGED = 4_096
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -220,9 +218,25 @@ class SuccessModel:
     def shared(self, motions: Motions) -> SuccessModel:
         """The same attempts, each telling of every pose that a motion of the object takes its own to.
 
-        It stays one attempt wherever it tells of: one pose that it tells of by several motions has it once.
+        It stays one attempt wherever it tells of. Under an axis of revolution, widths along fixed axes of the
+        object become one that takes as much room.
         """
-        return SuccessModel(self.kernel, self.parts, motions)
+        if motions.upright is None:
+            return SuccessModel(self.kernel, self.parts, motions)
+        kernel = self.kernel
+        if isinstance(kernel, DiagonalKernel) and kernel.axes is not None:
+            even = math.prod(kernel.sigmas[:3]) ** (1.0 / 3.0)
+            kernel = DiagonalKernel.of([even, even, even, *kernel.sigmas[3:]])
+        parts = []
+        for part in self.parts:
+            poses = part.cells.poses(np.arange(part.size))
+            if isinstance(self.kernel, DiagonalKernel):
+                poses = self.kernel.back(poses)
+            flat = motions.in_half_plane(poses)
+            rows = Rows(flat, np.ones(part.size), part.cells.symmetric)
+            widest = SuccessModel(kernel).widest_m
+            parts.append(part._replace(cells=Cells.build(rows, widest)))
+        return SuccessModel(kernel, tuple(parts), motions)
 
     @property
     def size(self) -> int:
@@ -263,7 +277,9 @@ class SuccessModel:
                 most = math.ceil(count * counts / total)
                 drawn.append(part.cells.poses(rng.permutation(part.size)[:most]))
             poses = Poses.concatenate(drawn)
-            if isinstance(self.kernel, DiagonalKernel):
+            if self.motions is not None and self.motions.upright is not None:
+                poses = self.motions.from_half_plane(poses)
+            elif isinstance(self.kernel, DiagonalKernel):
                 poses = self.kernel.back(poses)
             found.append((total, poses))
         return found
@@ -387,20 +403,30 @@ class SuccessModel:
         self, motions: Motions, cells: Cells, radius: float, p: Floats, q: Floats, out: Floats
     ) -> None:
         """As `_sums_of`, of attempts that every motion of the object has taken elsewhere, too."""
-        kernel, images = self.kernel, motions.images(Poses(p, q))
+        positions, quaternions = self._seen(motions, Poses(p, q))
+        half, kappa = self.half(cells), self._kappa
+        if motions.upright is not None:
+            orbits.revolution_sums(
+                cells.arrays, positions, quaternions, half, kappa, self.turning, radius, out
+            )
+            return
+        wide = kappa > 0.0 and 2.0 / math.sqrt(kappa) > TWIN_ROTATION
+        orbits.image_sums(cells.arrays, positions, quaternions, half, kappa, wide, self.turning, radius, out)
+
+    def _seen(self, motions: Motions, poses: Poses) -> Poses:
+        """The images (M, n) of poses as the sorted attempts lie."""
+        images = motions.images(poses)
+        if motions.upright is not None:
+            return motions.in_half_plane(images)
         shape = images.positions.shape[:2]
-        along = self._along(Poses(images.positions.reshape(-1, 3), images.quaternions_xyzw.reshape(-1, 4)))
-        diagonal.orbit_sums(
-            cells.arrays,
-            along.positions.reshape(*shape, 3),
-            along.quaternions_xyzw.reshape(*shape, 4),
-            self.half(cells),
-            kernel.kappa if isinstance(kernel, IsotropicKernel) else 0.0,
-            isinstance(kernel, IsotropicKernel) and kernel.sigma_rotation > TWIN_ROTATION,
-            self.turning,
-            radius,
-            out,
-        )
+        flat = Poses(images.positions.reshape(-1, 3), images.quaternions_xyzw.reshape(-1, 4))
+        along = self._along(flat)
+        return Poses(along.positions.reshape(*shape, 3), along.quaternions_xyzw.reshape(*shape, 4))
+
+    @property
+    def _kappa(self) -> float:
+        """The concentration of an isotropic kernel, 0 of another."""
+        return self.kernel.kappa if isinstance(self.kernel, IsotropicKernel) else 0.0
 
     def _nearest(self, poses: Poses, sums: _Sums, threads: int, *, everywhere: bool) -> NearestAttempts:
         """How far the nearest attempts are; those that no sum reached are looked for ``everywhere``."""
@@ -422,18 +448,17 @@ class SuccessModel:
         motions = self.motions
         if motions is None:
             return self.displacements(cells, places, self._along(poses))
-        found = np.empty((len(poses), 10))
-        for start in range(0, len(poses), _IMAGED):
-            some = slice(start, start + _IMAGED)
-            at, images = places[some], motions.images(poses[some])
-            for _ in range(2):
-                shape = images.positions.shape[:2]
-                flat = Poses(images.positions.reshape(-1, 3), images.quaternions_xyzw.reshape(-1, 4))
-                away = self.displacements(cells, np.repeat(at, shape[1]), self._along(flat))
-                nearer = np.argmin(np.hypot(away[:, 2], away[:, 3]).reshape(shape), axis=1)
-                chosen = np.arange(shape[0]) * shape[1] + nearer
-                found[some], images = away[chosen], motions.finer(flat[chosen])
-        return found
+        seen = self._seen(motions, poses)
+        if motions.upright is not None:
+            out, at = np.empty((len(poses), 10)), places.astype(np.int64)
+            half, kappa = self.half(cells), self._kappa
+            orbits.revolution_displacements(cells.arrays, at, *seen, half, kappa, self.turning, out)
+            return out
+        shape = seen.positions.shape[:2]
+        flat = Poses(seen.positions.reshape(-1, 3), seen.quaternions_xyzw.reshape(-1, 4))
+        away = self.displacements(cells, np.repeat(places, shape[1]), flat)
+        nearer = np.argmin(np.hypot(away[:, 2], away[:, 3]).reshape(shape), axis=1)
+        return np.asarray(away.reshape(*shape, 10)[np.arange(len(poses)), nearer])
 
     def displacements(self, cells: Cells, places: Floats, along: Poses) -> Floats:
         """From sorted attempts to poses along the kernel's axes, (M, 10), as `diagonal.displacements`."""
@@ -444,10 +469,17 @@ class SuccessModel:
 
     def _search(self, poses: Poses, threads: int) -> Floats:
         """Largest exponents and their places in every part, however far, (2, P, M)."""
-        if self.motions is not None:
-            return self._search_images(self.motions.coarse, poses, threads)
-        along = self._along(poses)
-        found = np.empty((2, len(self.parts), len(poses)))
+        motions = self.motions
+        if motions is not None:
+            seen = self._seen(motions, poses)
+            return self._search_images(
+                seen if motions.upright is None else motions.turned_about(seen), threads
+            )
+        return self._search_along(self._along(poses), threads)
+
+    def _search_along(self, along: Poses, threads: int) -> Floats:
+        """As `_search`, as the sorted attempts lie."""
+        found = np.empty((2, len(self.parts), len(along)))
         kernel = self.kernel
         for number, part in enumerate(self.parts):
             arrays = part.cells.arrays
@@ -459,16 +491,12 @@ class SuccessModel:
             found[:, number] = best.T
         return found
 
-    def _search_images(self, motions: Motions, poses: Poses, threads: int) -> Floats:
-        """As `_search`, the largest of all images of each pose."""
-        alone, images = SuccessModel(self.kernel, self.parts), motions.images(poses)
-        found = np.full((2, len(self.parts), len(poses)), -np.inf)
-        for number in range(len(motions)):
-            image = Poses(
-                np.ascontiguousarray(images.positions[:, number]),
-                np.ascontiguousarray(images.quaternions_xyzw[:, number]),
-            )
-            seen = alone._search(image, threads)
+    def _search_images(self, images: Poses, threads: int) -> Floats:
+        """As `_search`, the largest of all images (M, n) of each pose."""
+        found = np.full((2, len(self.parts), len(images)), -np.inf)
+        for number in range(images.positions.shape[1]):
+            p, q = (np.ascontiguousarray(part[:, number]) for part in images)
+            seen = self._search_along(Poses(p, q), threads)
             found = np.where(seen[0] > found[0], seen, found)
         return found
 

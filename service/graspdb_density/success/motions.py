@@ -6,8 +6,9 @@ has two, across its x-z plane (the fingers change places) and across its y-z pla
 one of them gives is the other's twin. N here is the first, diag(1, -1, 1). M and N are both of determinant
 -1, so that M R N is a rotation again.
 
-The kernel of an attempt is carried along: K(T) = sum over S of k(S^-1 T), for an axis of revolution over
-equal turns that are so fine that the sum is the integral to within :data:`SHORT` of itself.
+An attempt tells of a pose by the image of it that is nearest, in the kernel's measure: k is the largest of
+k(S^-1 T). So it counts once, however many of its images lie near a pose. About an axis of revolution the
+nearest turn is found for every attempt, exactly.
 """
 
 from __future__ import annotations
@@ -16,21 +17,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .. import se3
 from ..se3 import UNIT_TOLERANCE, Floats, Poses
 
-__all__ = ["SHORT", "Motions"]
+__all__ = ["Motions"]
 
-#: Turns are this many widths of what the kernel sees of a turn; the sum of a Gaussian at such steps differs
-#: from its integral by the share 2 exp(-2 pi^2 / step^2).
-_STEP = 1.5
-SHORT = 2.0 * math.exp(-2.0 * math.pi**2 / _STEP**2)
-#: Turns at most, for kernels that are narrow beside the object.
-_MOST = 180
-#: Finer turns by which the nearest attempt is measured, between two.
-_FINER = 17
+#: Turns about an axis by which attempts far away are looked for.
+_COARSE = 24
 #: The half turn about the tool's y axis, by which a mirrored rotation is one: -N.
 _HALF_TURN = np.array([0.0, 1.0, 0.0, 0.0])
 
@@ -46,38 +41,23 @@ class Motions:
     quaternions : (n, 4)
         The inverse turns; of a mirror M that of -M.
     mirrors : (n,) bool
-    axis : (3,) or None
-        Of revolution, about which the motions are ``turns`` equal ones of a few kinds.
-    turns : int
+    upright : (4,) or None
+        The turn that takes an axis of revolution to z: every motion may be followed by any turn about it.
     """
 
     centre: Floats
     quaternions: Floats
-    mirrors: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    axis: Floats | None = None
-    turns: int = 1
+    mirrors: NDArray[np.bool_]
+    upright: Floats | None = None
 
     @classmethod
-    def of(
-        cls,
-        elements: ArrayLike,
-        centre: ArrayLike,
-        *,
-        axis: ArrayLike | None = None,
-        sigma_position_m: float = 1.0,
-        sigma_rotation: float = 1.0,
-        farthest_m: float = 0.0,
-    ) -> Motions:
+    def of(cls, elements: ArrayLike, centre: ArrayLike, *, axis: ArrayLike | None = None) -> Motions:
         """From orthogonal matrices (n, 3, 3) about a centre (3,) in the object frame, the identity first.
 
         Parameters
         ----------
         axis : (3,) or None
-            Unit vector of an axis of revolution through the centre, which every element is turned about.
-        sigma_position_m, sigma_rotation
-            The kernel's least widths, metres and radians; only with an axis.
-        farthest_m
-            How far from the axis attempts lie.
+            Unit vector of an axis of revolution through the centre, about which all else may be turned.
 
         Raises
         ------
@@ -95,29 +75,12 @@ class Motions:
         ):
             raise ValueError("elements are orthogonal, and the first is the identity")
         mirrors = np.linalg.det(matrices) < 0.0
-        proper = np.where(mirrors[:, None, None], -matrices, matrices)
-        inverse = se3.conjugate(se3.from_matrix(proper))
-        if axis is None:
-            return cls(middle, inverse, mirrors)
-        along = np.asarray(axis, dtype=np.float64)
-        width = 1.0 / math.hypot(farthest_m / sigma_position_m, 1.0 / sigma_rotation)
-        turns = min(max(math.ceil(math.tau / (_STEP * width)), 4), _MOST)
-        angles = -np.arange(turns) * (math.tau / turns)
-        turned = se3.from_rotation_vector(angles[:, None] * along)
-        every = se3.multiply(inverse[None, :], turned[:, None]).reshape(-1, 4)
-        return cls(middle, every, np.tile(mirrors, turns), along, turns)
+        inverse = se3.conjugate(se3.from_matrix(np.where(mirrors[:, None, None], -matrices, matrices)))
+        upright = None if axis is None else _to_z(np.asarray(axis, dtype=np.float64))
+        return cls(middle, inverse, mirrors, upright)
 
     def __len__(self) -> int:
         return len(self.quaternions)
-
-    @property
-    def coarse(self) -> Motions:
-        """The same with fewer turns, for what lies far away."""
-        if self.axis is None or self.turns < 8:
-            return self
-        kinds = len(self) // self.turns
-        rows = (np.arange(0, self.turns, 4)[:, None] * kinds + np.arange(kinds)).ravel()
-        return Motions(self.centre, self.quaternions[rows], self.mirrors[rows])
 
     def images(self, poses: Poses) -> Poses:
         """Poses (M) as attempts see them after each motion: S^-1 T, (M, n)."""
@@ -130,11 +93,39 @@ class Motions:
             turned[:, self.mirrors] = se3.multiply(turned[:, self.mirrors], _HALF_TURN)
         return Poses(moved, turned)
 
-    def finer(self, poses: Poses) -> Poses:
-        """Poses (M) turned about the axis by up to half a step either way, (M, k); k is 1 without an axis."""
-        if self.axis is None:
-            return Poses(poses.positions[:, None], poses.quaternions_xyzw[:, None])
-        angles = np.linspace(-0.5, 0.5, _FINER) * (math.tau / self.turns)
-        turns = se3.from_rotation_vector(angles[:, None] * self.axis)
-        moved = self.centre + se3.rotate(turns, (poses.positions - self.centre)[:, None])
-        return Poses(moved, se3.multiply(turns, poses.quaternions_xyzw[:, None]))
+    def in_half_plane(self, poses: Poses) -> Poses:
+        """Poses (..., 3), (..., 4) turned about the axis of revolution until x points away from it, z along
+        it, seen from the centre.
+        """
+        assert self.upright is not None
+        away = se3.rotate(self.upright, poses.positions - self.centre)
+        azimuth = np.arctan2(away[..., 1], away[..., 0])
+        flat = np.stack([np.hypot(away[..., 0], away[..., 1]), np.zeros_like(azimuth), away[..., 2]], axis=-1)
+        back = np.zeros((*azimuth.shape, 4))
+        back[..., 2], back[..., 3] = -np.sin(0.5 * azimuth), np.cos(0.5 * azimuth)
+        return Poses(flat, se3.multiply(se3.multiply(back, self.upright), poses.quaternions_xyzw))
+
+    def from_half_plane(self, poses: Poses) -> Poses:
+        """What `in_half_plane` made of poses (M), in the object frame, at some turn about the axis."""
+        assert self.upright is not None
+        down = se3.conjugate(self.upright)
+        return Poses(
+            self.centre + se3.rotate(down, poses.positions),
+            se3.multiply(down, poses.quaternions_xyzw),
+        )
+
+    def turned_about(self, poses: Poses) -> Poses:
+        """Poses (M, n) of the half-plane at some turns about the axis, (M, n k)."""
+        turns = se3.from_rotation_vector(
+            np.arange(_COARSE)[:, None] * (math.tau / _COARSE) * np.array([0.0, 0.0, 1.0])
+        )
+        moved = se3.rotate(turns, poses.positions[:, :, None])
+        turned = se3.multiply(turns, poses.quaternions_xyzw[:, :, None])
+        return Poses(moved.reshape(len(moved), -1, 3), turned.reshape(len(turned), -1, 4))
+
+
+def _to_z(axis: Floats) -> Floats:
+    """The turn (4,) that takes a unit vector to z."""
+    if axis[2] < -1.0 + 1e-9:
+        return np.array([1.0, 0.0, 0.0, 0.0])
+    return se3.normalise(np.array([axis[1], -axis[0], 0.0, 1.0 + axis[2]]))
