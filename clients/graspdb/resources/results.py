@@ -316,6 +316,7 @@ class Grasps(Sequence[Grasp]):
         self.warnings = list(answer.warnings)
         self.selection = answer.selection
         self.calibration = answer.calibration
+        self.symmetry = answer.symmetry
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
         self.stale = answer.stale
@@ -540,6 +541,7 @@ class LikelihoodArrays(Columns):
     stale: bool = False
     selection: wire.SelectionInfo | None = None
     calibration: wire.CalibrationInfo | None = None
+    symmetry: wire.SymmetryInfo | None = None
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -565,6 +567,7 @@ class LikelihoodArrays(Columns):
             warnings=answers[-1].warnings,
             selection=answers[-1].selection,
             calibration=answers[-1].calibration,
+            symmetry=answers[-1].symmetry,
             interval=interval,
             answer=answers[0].answer if len(answers) == 1 else None,
             newer_revision=answers[-1].newer_revision,

@@ -215,27 +215,34 @@ class SuccessModel:
         ordered = sorted(parts, reverse=True)
         return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered), self.motions)
 
-    def shared(self, motions: Motions) -> SuccessModel:
+    def shared(self, motions: Motions, *, most: int | None = None) -> SuccessModel:
         """The same attempts, each telling of every pose that a motion of the object takes its own to.
 
-        It stays one attempt wherever it tells of. Under an axis of revolution, widths along fixed axes of the
-        object become one that takes as much room.
+        It stays one attempt wherever it tells of. Of more than ``most`` attempts so many, drawn at random,
+        are taken. Under an axis of revolution, widths along fixed axes of the object become one that takes as
+        much room.
         """
-        if motions.upright is None:
-            return SuccessModel(self.kernel, self.parts, motions)
-        kernel = self.kernel
-        if isinstance(kernel, DiagonalKernel) and kernel.axes is not None:
+        kernel, size = self.kernel, self.size
+        thinned = most is not None and size > most
+        if motions.upright is None and not thinned:
+            return SuccessModel(kernel, self.parts, motions)
+        if motions.upright is not None and isinstance(kernel, DiagonalKernel) and kernel.axes is not None:
             even = math.prod(kernel.sigmas[:3]) ** (1.0 / 3.0)
             kernel = DiagonalKernel.of([even, even, even, *kernel.sigmas[3:]])
-        parts = []
+        found = SuccessModel(kernel, (), motions)
+        rng, parts = np.random.default_rng(0), []
         for part in self.parts:
-            poses = part.cells.poses(np.arange(part.size))
-            if isinstance(self.kernel, DiagonalKernel):
-                poses = self.kernel.back(poses)
-            flat = motions.in_half_plane(poses)
-            rows = Rows(flat, np.ones(part.size), part.cells.symmetric)
-            widest = SuccessModel(kernel).widest_m
-            parts.append(part._replace(cells=Cells.build(rows, widest)))
+            # In the order that they came in, which does not depend on how they were added.
+            places = np.argsort(part.cells.rows, kind="stable")
+            if thinned and most is not None:
+                places = places[rng.permutation(part.size)[: math.ceil(most * part.size / size)]]
+            poses = part.cells.poses(places)
+            if motions.upright is not None:
+                if isinstance(self.kernel, DiagonalKernel):
+                    poses = self.kernel.back(poses)
+                poses = motions.in_half_plane(poses)
+            rows = Rows(poses, np.ones(len(places)), part.cells.symmetric[places])
+            parts.append(part._replace(cells=Cells.build(rows, found.widest_m)))
         return SuccessModel(kernel, tuple(parts), motions)
 
     @property

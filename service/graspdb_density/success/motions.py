@@ -114,6 +114,21 @@ class Motions:
             se3.multiply(down, poses.quaternions_xyzw),
         )
 
+    def spread(self, poses: Poses, turns: int) -> Poses:
+        """Poses (M) and where the motions take them, about an axis of revolution by equal turns, (M n,)."""
+        kinds = self if self.upright is None else self.turned(turns)
+        # The motions are a group, so that their inverses are the motions.
+        p, q = kinds.images(poses)
+        return Poses(p.reshape(-1, 3), q.reshape(-1, 4))
+
+    def turned(self, turns: int) -> Motions:
+        """The motions without the axis of revolution, but with equal turns about it."""
+        assert self.upright is not None
+        axis = se3.rotate(se3.conjugate(self.upright), np.array([0.0, 0.0, 1.0]))
+        about = se3.from_rotation_vector(np.arange(turns)[:, None] * (math.tau / turns) * axis)
+        every = se3.multiply(self.quaternions[None, :], about[:, None]).reshape(-1, 4)
+        return Motions(self.centre, every, np.tile(self.mirrors, turns))
+
     def turned_about(self, poses: Poses) -> Poses:
         """Poses (M, n) of the half-plane at some turns about the axis, (M, n k)."""
         turns = se3.from_rotation_vector(

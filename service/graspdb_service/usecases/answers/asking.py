@@ -101,15 +101,14 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     before = _under_name(ctx, slug, "likelihood", request.name, question)
     if before is not None:
         return before
-    built, frame, reach, calibration, columns = likelihoods.likelihood(
-        ctx, slug, request, poses, request.include
-    )
-    head = _head(ctx, built, built.kernel, frame)
-    if reach is not None:
-        head["reach"] = reach.model_dump()
-    if calibration is not None:
-        head["calibration"] = calibration.model_dump()
-        head["warnings"] += doubts(calibration)
+    judged, columns = likelihoods.likelihood(ctx, slug, request, poses, request.include)
+    built = judged.built
+    head = _head(ctx, built, built.kernel, judged.frame)
+    for key in ("reach", "calibration", "symmetry"):
+        info = getattr(judged, key)
+        if info is not None:
+            head[key] = info.model_dump()
+    head["warnings"] += doubts(judged.calibration)
     asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, EstimatorInfo())
     return _in_columns(ctx, asked, few, head, columns)
 
@@ -132,6 +131,8 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
     frame = frame_of(drawn.selected, request.frame, request.convention, request.near)
     head = {**_head(ctx, drawn.built, drawn.kernel, frame), "seed": drawn.seed, "prior": drawn.prior, **more}
+    if drawn.symmetry is not None:
+        head["symmetry"] = drawn.symmetry.model_dump()
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
     asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo(), seed)

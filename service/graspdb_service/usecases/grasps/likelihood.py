@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, ReachInfo
+from graspdb.wire import CalibrationInfo, ReachInfo, SymmetryInfo
 from graspdb.wire.queries import LikelihoodColumn, LikelihoodOptions, LikelihoodQuery, PreOpening
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
@@ -32,15 +33,27 @@ CHANCES = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What likelihoods are of: the density of the successes, the frame that poses were of, how far from an
+    attempt success probabilities are told, and how those were calibrated and shared by symmetry.
+    """
+
+    built: Built
+    frame: PoseFrame
+    reach: ReachInfo | None
+    calibration: CalibrationInfo | None
+    symmetry: SymmetryInfo | None
+
+
 def likelihood(
     ctx: Estimators,
     slug: str,
     request: LikelihoodOptions | LikelihoodQuery,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> tuple[Built, PoseFrame, ReachInfo | None, CalibrationInfo | None, dict[str, Any]]:
-    """How likely poses (n,) in the object frame are under the density of the successes, that density, the
-    frame they were of, how far from an attempt success probabilities are told, how they were calibrated.
+) -> tuple[Judged, dict[str, Any]]:
+    """How likely poses (n,) in the object frame are under the density of the successes, and by what.
 
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
     is minus infinity where the density is exactly zero; NaN stands for not known.
@@ -50,7 +63,7 @@ def likelihood(
     request = of_simulation(request)
     source: str | None = getattr(request, "calibrated_for", None)
     pre_opening_m: PreOpening = getattr(request, "pre_opening_m", None)
-    calibration = None
+    calibration = symmetry = None
 
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
@@ -73,6 +86,7 @@ def likelihood(
             believed = ctx.evidence.believed(built)
             believed = None if believed is None else believed.preshaped(pre_opening_m)
             model = ctx.successes.model(built, collisions_known=believed is not None)
+            model, symmetry = ctx.symmetries.applied(request, built, model)
             if model is not None and source is not None:
                 model, calibration = calibrated(ctx, built, model, believed, source)
             reach = reach_info(model)
@@ -89,7 +103,7 @@ def likelihood(
         if test is not None and pre_opening_m is not None:
             blocks = ctx.compute.blocks(poses, partial(test.openings, threads=threads))
             known["opening_m"] = np.concatenate(blocks)
-    return built, frame, reach, calibration, known
+    return Judged(built, frame, reach, calibration, symmetry), known
 
 
 def _densities(
