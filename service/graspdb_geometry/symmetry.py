@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from graspdb_geometry.deviation import DENSE_SAMPLES, distances, surface_samples, to_triangles
 from graspdb_geometry.mesh_reading.content import FloatArray
 
-__all__ = ["Axis", "Plane", "Symmetry", "find_symmetry", "tolerance_of"]
+__all__ = ["Axis", "MirrorPlane", "Symmetry", "find_symmetry", "tolerance_of"]
 
 #: A symmetry holds up to the larger of these, metres and a share of the surface's middle size ...
 TOLERANCE_M, TOLERANCE_SHARE = 0.5e-3, 0.005
@@ -62,7 +62,7 @@ class Axis:
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class MirrorPlane:
     """A mirror plane through the centre: unit ``normal`` (3,), and the deviation as an `Axis` has it."""
 
     normal: FloatArray
@@ -89,7 +89,7 @@ class Symmetry:
 
     centre: FloatArray
     axes: tuple[Axis, ...]
-    planes: tuple[Plane, ...]
+    planes: tuple[MirrorPlane, ...]
     ball: bool
     tolerance_m: float
 
@@ -144,7 +144,9 @@ def find_symmetry(corners: npt.ArrayLike, *, seed: int = 0) -> Symmetry:
     surface = _Surface(triangles, np.random.default_rng(seed))
     if surface.is_ball():
         up = np.array([0.0, 0.0, 1.0])
-        return Symmetry(surface.centre, (Axis(up, None, 0.0),), (Plane(up, 0.0),), True, surface.tolerance)
+        return Symmetry(
+            surface.centre, (Axis(up, None, 0.0),), (MirrorPlane(up, 0.0),), True, surface.tolerance
+        )
     axes, planes = _found(surface)
     ordered = sorted(axes, key=lambda axis: -math.inf if axis.order is None else -axis.order)
     return Symmetry(surface.centre, tuple(ordered), tuple(planes), False, surface.tolerance)
@@ -206,7 +208,7 @@ class _Surface:
         return np.asarray(best)
 
 
-def _found(surface: _Surface) -> tuple[list[Axis], list[Plane]]:
+def _found(surface: _Surface) -> tuple[list[Axis], list[MirrorPlane]]:
     """Axes and planes of a surface that is no ball."""
     values, vectors = np.linalg.eigh(surface.moments)
     alike = [values[k + 1] - values[k] <= _EQUAL * values[k + 1] for k in range(2)]
@@ -217,7 +219,7 @@ def _found(surface: _Surface) -> tuple[list[Axis], list[Plane]]:
     else:
         candidates = [vectors[:, 2] if alike[0] else vectors[:, 0]]
     axes: list[Axis] = []
-    planes: list[Plane] = []
+    planes: list[MirrorPlane] = []
     group = [np.eye(3)]
     looked_at: list[FloatArray] = []
     for direction in candidates:
@@ -234,7 +236,7 @@ def _found(surface: _Surface) -> tuple[list[Axis], list[Plane]]:
     return axes, planes
 
 
-def _about_each(surface: _Surface, directions: FloatArray) -> tuple[list[Axis], list[Plane]]:
+def _about_each(surface: _Surface, directions: FloatArray) -> tuple[list[Axis], list[MirrorPlane]]:
     """Of moments that differ: half turns and planes, for no other turn keeps them."""
     axes, planes = [], []
     for direction in directions:
@@ -243,16 +245,16 @@ def _about_each(surface: _Surface, directions: FloatArray) -> tuple[list[Axis], 
             axes.append(Axis(direction, 2, off))
         off = surface.deviation([_mirror(direction)])
         if off is not None:
-            planes.append(Plane(direction, off))
+            planes.append(MirrorPlane(direction, off))
     return axes, planes
 
 
-def _about(surface: _Surface, direction: FloatArray) -> tuple[list[Axis], list[Plane]]:
+def _about(surface: _Surface, direction: FloatArray) -> tuple[list[Axis], list[MirrorPlane]]:
     """What a direction is the axis of, the plane across it, and what lies across."""
     axes, planes = [], []
     off = surface.deviation([_mirror(direction)])
     if off is not None:
-        planes.append(Plane(direction, off))
+        planes.append(MirrorPlane(direction, off))
     off = surface.deviation([_turn(direction, turn) for turn in _TURNS])
     if off is not None:
         return [Axis(direction, None, off)], planes
@@ -264,7 +266,7 @@ def _about(surface: _Surface, direction: FloatArray) -> tuple[list[Axis], list[P
     across = _across_by_harmonics(surface, direction)
     for off, normal in _that_keep(surface, across, _mirror):
         if _new(normal, [plane.normal for plane in planes]):
-            planes.append(Plane(normal, off))
+            planes.append(MirrorPlane(normal, off))
     for off, normal in _that_keep(surface, across, _half_turn):
         if _new(normal, [axis.direction for axis in axes]):
             axes.append(Axis(normal, 2, off))
@@ -377,7 +379,7 @@ def _quadrature(triangles: FloatArray, share: FloatArray) -> tuple[FloatArray, F
     return nodes.reshape(-1, 3), np.outer(share, factors).ravel()
 
 
-def _generators(axes: Sequence[Axis], planes: Sequence[Plane]) -> list[FloatArray]:
+def _generators(axes: Sequence[Axis], planes: Sequence[MirrorPlane]) -> list[FloatArray]:
     turns = [_turn(axis.direction, math.tau / axis.order) for axis in axes if axis.order]
     return [*turns, *(_mirror(plane.normal) for plane in planes)]
 

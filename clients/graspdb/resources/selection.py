@@ -82,15 +82,18 @@ class AnswerFrame(PoseFrame, total=False):
     ]
 
 
+Symmetry = Annotated[
+    str | None,
+    Option("auto: attempts tell of where the mesh's symmetries take them, too; by default off."),
+]
+
+
 class DrawSelection(Selection, AnswerFrame, total=False):
     """A :class:`Selection` to draw from, and what the draws are of (:class:`AnswerFrame`); ``symmetry`` as in
     :class:`Constraints`, of their support and of what is uncertain.
     """
 
-    symmetry: Annotated[
-        str | None,
-        Option("auto: attempts tell of where the mesh's symmetries take them, too; by default off."),
-    ]
+    symmetry: Symmetry
 
 
 def answer_frame(frame: str | None, convention: str | None, near: ArrayLike | None) -> dict[str, str]:
@@ -104,10 +107,6 @@ def near_of(near: ArrayLike) -> list[float]:
     return vector("near", near, "qx, qy, qz, qw")
 
 
-Symmetry = Annotated[
-    str | None,
-    Option("auto: attempts tell of where the mesh's symmetries take them, too; by default off."),
-]
 CalibratedFor = Annotated[
     str | None,
     Option("Correct simulated success probabilities for these real trials: robot, human or import."),

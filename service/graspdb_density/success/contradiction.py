@@ -6,9 +6,10 @@ share where outcomes change, and by another amount where other poses were tried;
 than :data:`_TRIALS`, and differences of about a tenth are none.
 
 The symmetry is refused where a single place differs (Bonferroni), or those together of which no motion takes
-one to another (Fisher's combination): a handle that the mesh lacks is in one place, a centre of mass off the
-middle tells a little everywhere. Both are asked under the kernel and one twice as wide, under which few
-attempts tell more; all together refuse a symmetric object no more often than :data:`CHANCE`.
+one to another (Fisher's combination), or by their side of the object: a handle that the mesh lacks is in one
+place, a centre of mass off the middle tells a little everywhere. All are asked under the kernel and one twice
+as wide, under which few attempts tell more; together they refuse a symmetric object no more often than
+:data:`CHANCE`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from ..se3 import Floats, Poses
 from .kernel_regression import SuccessKernel, SuccessModel
 from .motions import Motions
 
-__all__ = ["CHANCE", "Contradiction", "Place", "contradiction"]
+__all__ = ["CHANCE", "Place", "SymmetryVerdict", "contradiction"]
 
 #: How often a symmetric object with noisy outcomes is refused, at most.
 CHANCE = 0.05
@@ -41,6 +42,8 @@ _TRIALS, _LEAST, _ENOUGH = 40.0, 0.9, 8.0
 _AGAINST = 0.05
 #: Widths at which they are compared, in kernel widths, and the widest rotation, radians.
 _SCALES, _WIDEST = (1.0, 2.0), math.radians(45.0)
+#: Fewest places of which sides are told, and how little attempts may be spread along one beside the others.
+_FEWEST, _FLAT = 10, 1e-3
 #: From so many motions on, each place is compared with many others.
 _MANY = 6
 #: Farther than any attempt, metres.
@@ -63,7 +66,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Contradiction:
+class SymmetryVerdict:
     """What outcomes say of a symmetry.
 
     Attributes
@@ -88,7 +91,7 @@ class Contradiction:
 
 def contradiction(
     model: SuccessModel, motions: Motions, *, threads: int = 1, chance: float = CHANCE
-) -> Contradiction:
+) -> SymmetryVerdict:
     """What a model's own outcomes say of motions; the same for the same attempts in the same order.
 
     Parameters
@@ -104,10 +107,10 @@ def contradiction(
     return next((each for each in told if each.refused), told[0])
 
 
-def _compared(model: SuccessModel, motions: Motions, threads: int, chance: float) -> Contradiction:
+def _compared(model: SuccessModel, motions: Motions, threads: int, chance: float) -> SymmetryVerdict:
     """As `contradiction`, under one kernel."""
     asked = Poses.concatenate([poses for _, poses in model.drawn(_LOOKED_AT // 2, np.random.default_rng(0))])
-    nothing = Contradiction((), False, False)
+    nothing = SymmetryVerdict((), False, False)
     if not len(asked):
         return nothing
     other_motions = _Elsewhere.of_model(model, motions, asked)
@@ -129,8 +132,29 @@ def _compared(model: SuccessModel, motions: Motions, threads: int, chance: float
     places.sort(key=lambda place: place.chance)
     logs = np.log(np.maximum(chances[single], 1e-300))
     together = float(chi2.sf(-2.0 * logs.sum(), 2 * len(logs)))
-    refused = min(together, len(chosen) * float(chances[chosen].min())) <= 0.5 * chance
-    return Contradiction(tuple(places), True, refused)
+    sided = _sided(asked[single], motions.centre, shares[:, single], np.minimum(trials[:, single], _TRIALS))
+    refused = min(together, sided, len(chosen) * float(chances[chosen].min())) <= chance / 3.0
+    return SymmetryVerdict(tuple(places), True, refused)
+
+
+def _sided(asked: Poses, centre: Floats, shares: Floats, trials: Floats) -> float:
+    """How probable it is by chance alone that attempts fare so much better to one side of the object, or from
+    one direction: a score test of the differences (2, K) of shares along position and approach.
+    """
+    won, total = (shares * trials).sum(axis=0), trials.sum(axis=0)
+    pooled = (won + 0.5) / (total + 1.0)
+    weight = 1.0 / (pooled * (1.0 - pooled) * (1.0 / trials).sum(axis=0))
+    away = asked.positions - centre
+    size = math.sqrt(float(np.mean(away * away))) or 1.0
+    approach = se3.rotate(asked.quaternions_xyzw, np.array([0.0, 0.0, 1.0]))
+    sides = np.concatenate([away / size, approach], axis=1)
+    score = sides.T @ (weight * (shares[0] - shares[1]))
+    values, vectors = np.linalg.eigh((sides * weight[:, None]).T @ sides)
+    told = values > _FLAT * values.max(initial=0.0)
+    if not told.any() or len(weight) < _FEWEST:
+        return 1.0
+    along = vectors.T @ score
+    return float(chi2.sf(np.sum(along[told] ** 2 / values[told]), int(told.sum())))
 
 
 def _widened(model: SuccessModel, scale: float) -> SuccessModel:

@@ -32,7 +32,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
-from .._compiled import diagonal, isotropic, nearest, orbits
+from .._compiled import diagonal, isotropic, nearest
+from .._compiled.orbits.images import image_sums
+from .._compiled.orbits.revolution import revolution_displacements, revolution_sums
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
@@ -413,12 +415,10 @@ class SuccessModel:
         positions, quaternions = self._seen(motions, Poses(p, q))
         half, kappa = self.half(cells), self._kappa
         if motions.upright is not None:
-            orbits.revolution_sums(
-                cells.arrays, positions, quaternions, half, kappa, self.turning, radius, out
-            )
+            revolution_sums(cells.arrays, positions, quaternions, half, kappa, self.turning, radius, out)
             return
         wide = kappa > 0.0 and 2.0 / math.sqrt(kappa) > TWIN_ROTATION
-        orbits.image_sums(cells.arrays, positions, quaternions, half, kappa, wide, self.turning, radius, out)
+        image_sums(cells.arrays, positions, quaternions, half, kappa, wide, self.turning, radius, out)
 
     def _seen(self, motions: Motions, poses: Poses) -> Poses:
         """The images (M, n) of poses as the sorted attempts lie."""
@@ -459,7 +459,7 @@ class SuccessModel:
         if motions.upright is not None:
             out, at = np.empty((len(poses), 10)), places.astype(np.int64)
             half, kappa = self.half(cells), self._kappa
-            orbits.revolution_displacements(cells.arrays, at, *seen, half, kappa, self.turning, out)
+            revolution_displacements(cells.arrays, at, *seen, half, kappa, self.turning, out)
             return out
         shape = seen.positions.shape[:2]
         flat = Poses(seen.positions.reshape(-1, 3), seen.quaternions_xyzw.reshape(-1, 4))

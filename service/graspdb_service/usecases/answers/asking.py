@@ -27,6 +27,7 @@ from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.answers.references import answer_id
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence import symmetries
 from graspdb_service.usecases.densities.evidence.calibrations import doubts
 from graspdb_service.usecases.grasps import answer, proposals, samples
 from graspdb_service.usecases.grasps import likelihood as likelihoods
@@ -108,7 +109,7 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
         info = getattr(judged, key)
         if info is not None:
             head[key] = info.model_dump()
-    head["warnings"] += doubts(judged.calibration)
+    head["warnings"] += [*doubts(judged.calibration), *symmetries.doubts(judged.symmetry)]
     asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, EstimatorInfo())
     return _in_columns(ctx, asked, few, head, columns)
 
@@ -133,6 +134,7 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
     head = {**_head(ctx, drawn.built, drawn.kernel, frame), "seed": drawn.seed, "prior": drawn.prior, **more}
     if drawn.symmetry is not None:
         head["symmetry"] = drawn.symmetry.model_dump()
+        head["warnings"] += symmetries.doubts(drawn.symmetry)
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
     asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, EstimatorInfo(), seed)

@@ -24,6 +24,7 @@ from graspdb.wire.base import Quadruple
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence import symmetries
 from graspdb_service.usecases.densities.evidence.calibrations import doubts, of_simulation
 from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
 from graspdb_service.usecases.densities.support import reach_info, support_of
@@ -80,6 +81,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *outage_warnings(built.revision),
             *ctx.evidence.warnings(built),
             *doubts(None if question is None else question.calibration),
+            *symmetries.doubts(None if question is None else question.symmetry),
             *frame.warnings,
             *_far_off(limits),
             *([NO_TWINS] if request.near is not None and near is None else []),

@@ -34,7 +34,7 @@ CHANCES = (
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Basis:
     """What likelihoods are of: the density of the successes, the frame that poses were of, how far from an
     attempt success probabilities are told, and how those were calibrated and shared by symmetry.
     """
@@ -52,7 +52,7 @@ def likelihood(
     request: LikelihoodOptions | LikelihoodQuery,
     poses: Poses,
     include: Collection[LikelihoodColumn] | None,
-) -> tuple[Judged, dict[str, Any]]:
+) -> tuple[Basis, dict[str, Any]]:
     """How likely poses (n,) in the object frame are under the density of the successes, and by what.
 
     Columns (n,) in the poses' order, by their names in an answer: those asked for and known. ``log_density``
@@ -103,7 +103,7 @@ def likelihood(
         if test is not None and pre_opening_m is not None:
             blocks = ctx.compute.blocks(poses, partial(test.openings, threads=threads))
             known["opening_m"] = np.concatenate(blocks)
-    return Judged(built, frame, reach, calibration, symmetry), known
+    return Basis(built, frame, reach, calibration, symmetry), known
 
 
 def _densities(

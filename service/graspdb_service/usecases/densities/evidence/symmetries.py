@@ -10,7 +10,7 @@ import numpy as np
 
 from graspdb.wire import Selection, SymmetryAxis, SymmetryInfo, SymmetryPlane
 from graspdb_density import GraspDensity, ModeSearch, SuccessModel
-from graspdb_density.success.contradiction import Contradiction, contradiction
+from graspdb_density.success.contradiction import SymmetryVerdict, contradiction
 from graspdb_density.success.motions import Motions
 from graspdb_geometry.symmetry import Symmetry
 from graspdb_service.problems import ProblemError, conflict
@@ -35,7 +35,7 @@ class _Shared:
     """What is made of a model: it shared, or why its outcomes refuse that."""
 
     model: Model
-    verdict: Contradiction
+    verdict: SymmetryVerdict
 
 
 class Symmetries:
@@ -110,6 +110,13 @@ class Symmetries:
         return known
 
 
+def doubts(symmetry: SymmetryInfo | None) -> list[str]:
+    """Warnings of symmetries that share nothing, or that nothing has tested."""
+    if symmetry is None or (symmetry.applied and symmetry.tested):
+        return []
+    return [f"symmetry=auto: {symmetry.reason}"]
+
+
 def motions_of(found: Symmetry, selected: Selected) -> Motions | None:
     """The motions that share a selection's attempts; None where there is none but the identity.
 
@@ -173,7 +180,7 @@ def _reason(found: Symmetry, selected: Selected, model: Model, shared: _Shared) 
     return f"{told}; outcomes at {len(verdict.places)} places do not contradict it"
 
 
-def _refused(selected: Selected, verdict: Contradiction) -> ProblemError:
+def _refused(selected: Selected, verdict: SymmetryVerdict) -> ProblemError:
     """409 that says how many attempts speak against a symmetry, and where."""
     against = verdict.against or verdict.places[:1]
     trials = sum(place.trials for place in against)
