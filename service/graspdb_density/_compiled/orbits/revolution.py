@@ -27,7 +27,7 @@ __all__ = ["revolution_displacements", "revolution_sums"]
 _PARABOLAS, _APART = 2, 0.02
 
 
-@inlined
+@exact
 def _displaced(r, s, dz, ax, ay, az, aw, bx, by, bz, bw, psi, half, turning):
     """From a row that is turned by 2 psi about the axis to a pose: translation (3), rotation vector (3), and
     the exponents of either.
@@ -63,7 +63,7 @@ def _turned(r, s, a, b, weight, kappa):
     return apart, away, along
 
 
-@inlined
+@exact
 def _nearest_along_axes(r, s, dz, ax, ay, az, aw, bx, by, bz, bw, psi, half, turning):
     """Half the turn near ``psi`` at which a row is nearest under widths for every axis, and the exponent."""
     e = 1e30
@@ -89,7 +89,7 @@ def _bounds(half, kappa):
     return min(half[0], min(half[1], half[2])), 8.0 * min(half[3], min(half[4], half[5]))
 
 
-@inlined
+@exact
 def _nearest(at, r, i, data, s, twin, half, kappa, weight, concentration, cut, turning):
     """The least exponent of a row, or of its twin, over all turns, half that turn, and whether it is the
     twin's; 1e30 beyond the cut.
