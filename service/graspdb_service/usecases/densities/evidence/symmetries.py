@@ -32,8 +32,9 @@ _NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """What is made of a model: it shared, or why its outcomes refuse that."""
+    """What is made of a model, by the motions of a mesh: it shared, or why its outcomes refuse that."""
 
+    motions: Motions
     model: Model
     verdict: SymmetryVerdict
 
@@ -45,6 +46,8 @@ class Symmetries:
         self._shapes = shapes
         self._compute = compute
         self._shared: WeakKeyDictionary[SuccessModel, _Shared] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[Symmetry, dict[bool, Motions | None]] = WeakKeyDictionary()
+        self._searches: WeakKeyDictionary[Built, tuple[Motions, ModeSearch]] = WeakKeyDictionary()
         self._lock = threading.Lock()
 
     def applied(
@@ -59,7 +62,7 @@ class Symmetries:
             return model, None
         selected = built.selected
         found = self._shapes.of(selected.row)
-        motions = motions_of(found, selected)
+        motions = self._motions(found, selected)
         info = _told(found)
         if not found:
             told = f"no symmetry of the mesh was found within {_mm(found.tolerance_m)}"
@@ -86,9 +89,13 @@ class Symmetries:
         density = built.density
         if getattr(request, "symmetry", None) != "auto" or density is None:
             return search
-        motions = motions_of(self._shapes.of(built.selected.row), built.selected)
+        motions = self._motions(self._shapes.of(built.selected.row), built.selected)
         if motions is None:
             return search
+        with self._lock:
+            known = self._searches.get(built)
+        if known is not None and known[0] is motions:
+            return known[1]
 
         def spread() -> ModeSearch:
             rows = np.random.default_rng(0).permutation(density.size)
@@ -98,12 +105,25 @@ class Symmetries:
             symmetric = bool(density.symmetric.all())
             return ModeSearch(GraspDensity.build(images, kernel=density.kernel, symmetric=symmetric))
 
-        return self._compute.run(spread)
+        found = self._compute.run(spread)
+        with self._lock:
+            self._searches[built] = motions, found
+        return found
+
+    def _motions(self, found: Symmetry, selected: Selected) -> Motions | None:
+        """The same ones for the same mesh and kind of jaw, as long as it is kept."""
+        mirrors = _mirrored(selected)
+        with self._lock:
+            known = self._known.setdefault(found, {})
+            if mirrors not in known:
+                known[mirrors] = motions_of(found, mirrors=mirrors)
+            return known[mirrors]
 
     def _of(self, model: Model, motions: Motions) -> _Shared:
         with self._lock:
             known = self._shared.get(model.whole)
-        if known is None:
+        # A copy may have got another mesh, and its trials may be the same.
+        if known is None or known.motions is not motions:
             known = self._compute.run(lambda: _share(model, motions, self._compute.threads))
             with self._lock:
                 self._shared[model.whole] = known
@@ -117,14 +137,15 @@ def doubts(symmetry: SymmetryInfo | None) -> list[str]:
     return [f"symmetry=auto: {symmetry.reason}"]
 
 
-def motions_of(found: Symmetry, selected: Selected) -> Motions | None:
-    """The motions that share a selection's attempts; None where there is none but the identity.
+def _mirrored(selected: Selected) -> bool:
+    """Whether mirrors share a selection's attempts: the jaw is its own mirror image, of each of them."""
+    return selected.jaw_symmetric and all(selected.provenances.values())
 
-    Mirrors take a jaw that is its own mirror image, of every attempt.
-    """
+
+def motions_of(found: Symmetry, *, mirrors: bool) -> Motions | None:
+    """The motions of a mesh, with its mirrors or without; None where there is none but the identity."""
     if not found:
         return None
-    mirrors = selected.jaw_symmetric and all(selected.provenances.values())
     elements = found.elements(mirrors=mirrors)
     axis = found.axis
     if axis is None and len(elements) == 1:
@@ -135,13 +156,13 @@ def motions_of(found: Symmetry, selected: Selected) -> Motions | None:
 def _share(model: Model, motions: Motions, threads: int) -> _Shared:
     verdict = contradiction(model.quick, motions, threads=threads)
     if verdict.refused:
-        return _Shared(model, verdict)
+        return _Shared(motions, model, verdict)
     most = _SHARED // len(motions)
     whole = model.whole.shared(motions, most=most)
     quick = whole
     if whole.size > _QUICK // len(motions):
         quick = model.quick.shared(motions, most=_QUICK // len(motions))
-    return _Shared(replace(model, whole=whole, quick=quick), verdict)
+    return _Shared(motions, replace(model, whole=whole, quick=quick), verdict)
 
 
 def _told(found: Symmetry) -> SymmetryInfo:
@@ -168,7 +189,7 @@ def _reason(found: Symmetry, selected: Selected, model: Model, shared: _Shared) 
     by = "every turn about the axis" if found.axis is not None else "its turns"
     if found.ball:
         by = "every turn about one axis of the ball's"
-    mirrors = selected.jaw_symmetric and all(selected.provenances.values())
+    mirrors = _mirrored(selected)
     by += ", and its mirror images" if mirrors and (found.planes or found.axis) else ""
     told = f"an attempt tells of {by}, too, and stays one attempt"
     if not mirrors and (found.planes or found.axis):
