@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel, se3
 from graspdb_density.se3 import Poses
+from graspdb_density.success.fuller import FullerModel
 from graspdb_density.success.motions import Motions
 
 Floats = NDArray[np.float64]
@@ -148,3 +149,24 @@ def test_matrices_that_are_no_motions_are_refused() -> None:
     for wrong in (np.eye(3)[None] * 2.0, MIRROR[None], np.empty((0, 3, 3)), np.eye(3)):
         with pytest.raises(ValueError, match=r"elements"):
             Motions.of(wrong, CENTRE)
+
+
+def test_of_a_sample_that_is_shared_what_all_attempts_tell_is_not_lost() -> None:
+    tried = poses(9_000, 21, 0.05)
+    tried = tried[tried.positions[:, 1] > CENTRE[1] + 0.025]
+    won = tried.positions[:, 2] > CENTRE[2]
+    own = SuccessModel.build(tried, won, kernel=ISOTROPIC)
+    motions = Motions.of(np.array([np.eye(3), MIRROR]), CENTRE)
+    model = FullerModel(own.shared(motions, most=800), own)
+    assert model.size == len(tried)
+    here, there = tried[:50], moved(MIRROR, tried[:50])
+    told, alone = model.evaluate_near(here), own.evaluate_near(here)
+    assert (told[0].effective_trials >= alone[0].effective_trials).all()
+    assert (told[1].widths <= alone[1].widths + 1e-9).all()
+    mirrored, blind = model.evaluate_near(there), own.evaluate_near(there)
+    assert np.median(mirrored[0].effective_trials) > 2.0 * np.median(blind[0].effective_trials)
+    assert mirrored[1].widths.mean() < blind[1].widths.mean()
+    for asked, found in ((here, told[0]), (there, mirrored[0])):
+        assert model.probability(asked) == pytest.approx(found.probability)
+        assert model.lower_end(asked) == pytest.approx(found.low)
+        assert model.without_interval(asked)[1] == pytest.approx(found.effective_trials)

@@ -11,6 +11,7 @@ import numpy as np
 from graspdb.wire import Selection, SymmetryAxis, SymmetryInfo, SymmetryPlane
 from graspdb_density import GraspDensity, ModeSearch, SuccessModel
 from graspdb_density.success.contradiction import SymmetryVerdict, contradiction
+from graspdb_density.success.fuller import FullerModel
 from graspdb_density.success.motions import Motions
 from graspdb_geometry.symmetry import Symmetry
 from graspdb_service.problems import ProblemError, conflict
@@ -157,12 +158,17 @@ def _share(model: Model, motions: Motions, threads: int) -> _Shared:
     verdict = contradiction(model.quick, motions, threads=threads)
     if verdict.refused:
         return _Shared(motions, model, verdict)
-    most = _SHARED // len(motions)
-    whole = model.whole.shared(motions, most=most)
+    whole = _of_many(model.whole, motions, _SHARED // len(motions))
     quick = whole
-    if whole.size > _QUICK // len(motions):
-        quick = model.quick.shared(motions, most=_QUICK // len(motions))
+    if model.quick.size > _QUICK // len(motions):
+        quick = _of_many(model.quick, motions, _QUICK // len(motions))
     return _Shared(motions, replace(model, whole=whole, quick=quick), verdict)
+
+
+def _of_many(model: SuccessModel, motions: Motions, most: int) -> SuccessModel:
+    """A model that is shared, as a sample where it has many attempts, beside all of them in their places."""
+    shared = model.shared(motions, most=most)
+    return shared if model.size <= most else FullerModel(shared, model)
 
 
 def _told(found: Symmetry) -> SymmetryInfo:
@@ -194,8 +200,10 @@ def _reason(found: Symmetry, selected: Selected, model: Model, shared: _Shared) 
     told = f"an attempt tells of {by}, too, and stays one attempt"
     if not mirrors and (found.planes or found.axis):
         told += "; mirror planes are left out, for the jaw is not its own mirror image"
-    if shared.model.whole.size < model.whole.size:
-        told += f"; of {model.whole.size:,} attempts {shared.model.whole.size:,} drawn at random are shared"
+    if isinstance(shared.model.whole, FullerModel):
+        told += (
+            f"; of {model.whole.size:,} attempts {shared.model.whole.sampled:,} drawn at random are shared"
+        )
     if not verdict.told:
         return f"{told}; too few attempts lie where others are taken to tell whether outcomes agree"
     return f"{told}; outcomes at {len(verdict.places)} places do not contradict it"
