@@ -30,7 +30,7 @@ class StackedModel(SuccessModel):
     """
 
     def __init__(self, model: SuccessModel, stack: Stack, features: GraspFeatures | None) -> None:
-        super().__init__(model.kernel, model.parts)
+        super().__init__(model.kernel, model.parts, model.motions)
         self.stack = stack
         self.features = features
 
@@ -54,6 +54,10 @@ class StackedModel(SuccessModel):
     ) -> tuple[Floats, Floats, NearestAttempts]:
         kernel = self.without_quantiles(poses, everywhere=everywhere, threads=threads)
         return expit(self._learned(kernel, poses, 0.9, threads)[0]), kernel.trials, kernel.nearest
+
+    def support(self, poses: Poses, *, threads: int = 1) -> tuple[Floats, NearestAttempts]:
+        kernel = self.without_quantiles(poses, everywhere=True, threads=threads)
+        return kernel.trials, kernel.nearest
 
     def lower_end(
         self,

@@ -76,7 +76,7 @@ def deviation(mesh: Mesh, parts: Sequence[Part], *, seed: int = 0) -> Deviation:
     corners = [vertices[faces] for vertices, faces in parts]
     triangles = np.concatenate(corners)
     owner = np.repeat(np.arange(len(parts)), [len(own) for own in corners])
-    face, points = _samples(triangles, DENSE_SAMPLES, rng)
+    face, points = surface_samples(triangles, DENSE_SAMPLES, rng)
     outer = ~_covered(points, owner[face], parts, planes, 1e-4 * extent)
     left = np.flatnonzero(outer)
     before = points[left] + crack * _normals(triangles)[face[left]]
@@ -84,13 +84,13 @@ def deviation(mesh: Mesh, parts: Sequence[Part], *, seed: int = 0) -> Deviation:
     if not np.any(outer):
         return Deviation(extent, extent)
     skin = mesh.vertices[mesh.faces]
-    skin_face, skin_points = _samples(skin, DENSE_SAMPLES, rng)
+    skin_face, skin_points = surface_samples(skin, DENSE_SAMPLES, rng)
     some = rng.permutation(np.flatnonzero(outer))[:SAMPLES]
-    bulge = _distances(points[some], skin, skin_face, skin_points)
+    bulge = distances(points[some], skin, skin_face, skin_points)
     some = rng.permutation(len(skin_points))[:SAMPLES]
     nobody = np.full(len(some), -1)
     out = skin_points[some][~_covered(skin_points[some], nobody, parts, planes, 0.0)]
-    gap = _distances(out, triangles, face[outer], points[outer])
+    gap = distances(out, triangles, face[outer], points[outer])
     return Deviation(float(np.max(bulge)), float(np.max(gap, initial=0.0)))
 
 
@@ -168,7 +168,7 @@ def united_volume(parts: Sequence[Part]) -> float:
     return float(manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add).volume())
 
 
-def _distances(
+def distances(
     points: FloatArray, triangles: FloatArray, sample_face: npt.NDArray[np.int64], samples: FloatArray
 ) -> FloatArray:
     """From points (n, 3) to the surface of triangles (F, 3, 3), through the triangles of the nearest samples
@@ -177,7 +177,7 @@ def _distances(
         return np.empty(0)
     _, nearest = cKDTree(samples).query(points, k=min(_NEAREST, len(samples)))
     candidates = triangles[sample_face[nearest.reshape(len(points), -1)]]
-    best = _to_triangles(points[:, None], candidates).min(axis=1)
+    best = to_triangles(points[:, None], candidates).min(axis=1)
     if len(triangles) > _MAX_EXACT:
         return np.asarray(best)
     # A triangle's bounding sphere rules out most of those that no sample has found.
@@ -190,11 +190,11 @@ def _distances(
         row, face = np.nonzero(low < best[first : first + block, None])
         for part in range(0, len(row), 500_000):
             rows, faces = row[part : part + 500_000], face[part : part + 500_000]
-            np.minimum.at(best, first + rows, _to_triangles(some[rows], triangles[faces]))
+            np.minimum.at(best, first + rows, to_triangles(some[rows], triangles[faces]))
     return np.asarray(best)
 
 
-def _to_triangles(p: FloatArray, triangles: FloatArray) -> FloatArray:
+def to_triangles(p: FloatArray, triangles: FloatArray) -> FloatArray:
     """Distance of points (..., 3) to triangles (..., 3, 3): to the plane where the foot is inside, else the
     nearest edge."""
     a, b, c = (triangles[..., k, :] for k in range(3))
@@ -225,7 +225,7 @@ def _areas(corners: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.linalg.norm(normals, axis=1))
 
 
-def _samples(
+def surface_samples(
     corners: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], FloatArray]:
     """Points (count, 3) on triangles (F, 3, 3), half by area and half as many for each, and whose each is."""

@@ -117,7 +117,7 @@ def best_grasp(
         ERRORS.print(f"The best grasp, drawn: {escape(str(picture))}", highlight=False, soft_wrap=True)
     if state.json:
         head = ("frame", "convention", "reference", "status", "ranking", "revision", "kernel", "selection")
-        names = (*head, "calibration", "warnings", "answer", "newer_revision", "stale")
+        names = (*head, "calibration", "symmetry", "warnings", "answer", "newer_revision", "stale")
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())

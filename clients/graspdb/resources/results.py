@@ -316,6 +316,7 @@ class Grasps(Sequence[Grasp]):
         self.warnings = list(answer.warnings)
         self.selection = answer.selection
         self.calibration = answer.calibration
+        self.symmetry = answer.symmetry
         self.answer = answer.answer
         self.newer_revision = answer.newer_revision
         self.stale = answer.stale
@@ -540,6 +541,7 @@ class LikelihoodArrays(Columns):
     stale: bool = False
     selection: wire.SelectionInfo | None = None
     calibration: wire.CalibrationInfo | None = None
+    symmetry: wire.SymmetryInfo | None = None
 
     @classmethod
     def from_wire(cls, answers: Sequence[wire.Likelihoods]) -> LikelihoodArrays:
@@ -565,6 +567,7 @@ class LikelihoodArrays(Columns):
             warnings=answers[-1].warnings,
             selection=answers[-1].selection,
             calibration=answers[-1].calibration,
+            symmetry=answers[-1].symmetry,
             interval=interval,
             answer=answers[0].answer if len(answers) == 1 else None,
             newer_revision=answers[-1].newer_revision,
@@ -653,7 +656,8 @@ class SampledPoses(PoseArrays):
     says whose trials count. ``answer`` is the id that the service keeps them under, None where it does not;
     ``newer_revision`` the object's revision now, where a name keeps them of an older one; ``stale``: the
     database did not answer, so they are from what the service had read before. ``opening_m`` (N,) is the
-    opening to command at each proposal, metres, where ``pre_opening_m`` asked for it.
+    opening to command at each proposal, metres, where ``pre_opening_m`` asked for it; ``symmetry`` says which
+    symmetries share attempts, where that was asked.
     """
 
     proposal_density: Floats
@@ -668,6 +672,7 @@ class SampledPoses(PoseArrays):
     stale: bool = False
     selection: wire.SelectionInfo | None = None
     opening_m: Floats | None = None
+    symmetry: wire.SymmetryInfo | None = None
 
     @classmethod
     def from_wire(cls, answer: wire.Samples) -> SampledPoses:
@@ -689,6 +694,7 @@ class SampledPoses(PoseArrays):
             newer_revision=answer.newer_revision,
             stale=answer.stale,
             selection=answer.selection,
+            symmetry=answer.symmetry,
             opening_m=None if openings is None else np.array(openings, dtype=np.float64),
         )
 

@@ -82,8 +82,18 @@ class AnswerFrame(PoseFrame, total=False):
     ]
 
 
+Symmetry = Annotated[
+    str | None,
+    Option("auto: attempts tell of where the mesh's symmetries take them, too; by default off."),
+]
+
+
 class DrawSelection(Selection, AnswerFrame, total=False):
-    """A :class:`Selection` to draw from, and what the draws are of (:class:`AnswerFrame`)."""
+    """A :class:`Selection` to draw from, and what the draws are of (:class:`AnswerFrame`); ``symmetry`` as in
+    :class:`Constraints`, of their support and of what is uncertain.
+    """
+
+    symmetry: Symmetry
 
 
 def answer_frame(frame: str | None, convention: str | None, near: ArrayLike | None) -> dict[str, str]:
@@ -115,10 +125,11 @@ class LikelihoodSelection(Selection, PoseFrame, total=False):
     are then selected, are corrected for.
 
     ``pre_opening_m``: how far open the jaw comes, as in :class:`Constraints`; ``opening_m`` of the answer
-    tells it.
+    tells it. ``symmetry``: ``auto`` shares attempts by the mesh's symmetries, as there.
     """
 
     calibrated_for: CalibratedFor
+    symmetry: Symmetry
     pre_opening_m: PreOpening
 
 
@@ -149,6 +160,8 @@ class Constraints(Selection, total=False):
       effective trials; one too far from every attempt for a success probability fails either.
     - ``calibrated_for``: the source of real trials, such as ``robot``, that success probabilities of
       simulated trials, which are then selected, are corrected for; ``calibration`` says whether that helped.
+    - ``symmetry``: ``auto`` has an attempt tell of every pose that a symmetry of the object's mesh takes its
+      own to; ``symmetry`` of the answer says which were found, `Conflict` that outcomes contradict them.
     - ``candidates``: rank these poses, (N, 4, 4) or (N, 7), as they are; ``grasp.candidate`` is its place.
       Of grasps and samples the gripper and protocol go along where none is named.
     - ``exclude``: poses to stay away from, by the separation; as candidates, of ``frame`` in ``reference``.
@@ -170,6 +183,7 @@ class Constraints(Selection, total=False):
     """
 
     calibrated_for: CalibratedFor
+    symmetry: Symmetry
     objective: Annotated[
         str | None, Option("density, success_probability (its interval's lower end) or robust.")
     ]

@@ -95,6 +95,9 @@ from graspdb.wire.support import SelectedSource as SelectedSource
 from graspdb.wire.support import SelectionInfo as SelectionInfo
 from graspdb.wire.support import Support as Support
 from graspdb.wire.support import SupportColumns as SupportColumns
+from graspdb.wire.support import SymmetryAxis as SymmetryAxis
+from graspdb.wire.support import SymmetryInfo as SymmetryInfo
+from graspdb.wire.support import SymmetryPlane as SymmetryPlane
 from graspdb.wire.sweeps import GridSpec as GridSpec
 from graspdb.wire.sweeps import Randomise as Randomise
 from graspdb.wire.sweeps import Region as Region

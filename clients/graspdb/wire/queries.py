@@ -59,6 +59,7 @@ from graspdb.wire.support import (
     SelectionInfo,
     Support,
     SupportColumns,
+    SymmetryInfo,
 )
 from graspdb.wire.trials import Finding
 
@@ -97,6 +98,18 @@ CalibratedFor = Annotated[
 CalibrationField = Annotated[
     CalibrationInfo | None,
     Field(description="How success probabilities were corrected; null unless ``calibrated_for`` asks."),
+]
+Symmetry = Annotated[
+    Literal["off", "auto"] | None,
+    Field(
+        description="``auto``: an attempt tells of every pose that a symmetry of the object's mesh takes its"
+        " own to, in success probabilities and their support; 409 where outcomes contradict that. By default"
+        " ``off``."
+    ),
+]
+SymmetryField = Annotated[
+    SymmetryInfo | None,
+    Field(description="Which symmetries share attempts; null unless ``symmetry=auto`` asks."),
 ]
 SelectionField = Annotated[
     SelectionInfo | None,
@@ -345,6 +358,7 @@ class LikelihoodRequest(Selection):
     pre_opening_m: PreOpeningField = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    symmetry: Symmetry = None
     timeout_s: TimeoutS = None
 
 
@@ -410,6 +424,7 @@ class Likelihoods(Response):
     newer_revision: NewerRevision = None
     stale: Stale = False
     calibration: CalibrationField = None
+    symmetry: SymmetryField = None
     selection: SelectionField = None
 
 
@@ -589,6 +604,7 @@ class GraspConstraints(Selection):
     """Grasps are distinct from this angle between them on, degrees; by default 20."""
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    symmetry: Symmetry = None
     timeout_s: TimeoutS = None
 
     @property
@@ -723,6 +739,7 @@ class BestGrasps(Response):
     newer_revision: NewerRevision = None
     stale: Stale = False
     calibration: CalibrationField = None
+    symmetry: SymmetryField = None
     selection: SelectionField = None
 
 
@@ -737,6 +754,7 @@ class SamplesRequest(Selection):
     convention: AskedConvention = None
     near: AskedNear = None
     name: AnswerName = None
+    symmetry: Symmetry = None
     timeout_s: TimeoutS = None
 
 
@@ -764,6 +782,7 @@ class Samples(Response):
     answer: AnswerId = None
     newer_revision: NewerRevision = None
     stale: Stale = False
+    symmetry: SymmetryField = None
     selection: SelectionField = None
 
 
@@ -816,6 +835,7 @@ class LikelihoodQuery(SelectionQuery):
     pre_opening_m: PreOpeningField = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    symmetry: Symmetry = None
     timeout_s: TimeoutS = None
 
 
@@ -872,6 +892,7 @@ class LikelihoodOptions(Selection):
     pre_opening_m: PreOpeningField = None
     name: AnswerName = None
     calibrated_for: CalibratedFor = None
+    symmetry: Symmetry = None
     timeout_s: TimeoutS = None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from graspdb.wire.base import ChosenGripper, ChosenProtocol, Response
+from graspdb.wire.base import ChosenGripper, ChosenProtocol, Response, Triple
 
 
 class NearestAttempt(Response):
@@ -133,6 +133,50 @@ class SelectionInfo(Response):
     sources: dict[str, SelectedSource]
     """The sources of the trials by their name, ``unspecified`` for trials that name none; those that a weight
     was asked for, too."""
+
+
+class SymmetryAxis(Response):
+    """An axis of symmetry of an object, in the frame of its mesh."""
+
+    origin: Triple
+    """A point of it, metres: the centroid of the surface."""
+    direction: Triple
+    """Unit vector along it, either way."""
+    turns: int | None = None
+    """By how many equal turns the object comes to lie on itself; null for any turn: an axis of revolution."""
+
+
+class SymmetryPlane(Response):
+    """A mirror plane of an object, in the frame of its mesh: n.x = d."""
+
+    normal: Triple
+    """Unit vector across it, n, either way."""
+    offset_m: float
+    """How far it is from the origin along the normal, d, metres."""
+
+
+class SymmetryInfo(Response):
+    """Which symmetries of the object share its attempts."""
+
+    axes: list[SymmetryAxis]
+    """The axes that the mesh has, one of revolution first."""
+    planes: list[SymmetryPlane]
+    """The mirror planes that the mesh has; beside an axis of revolution only the one across it: every plane
+    through the axis is one, too."""
+    every_axis: bool = False
+    """Whether every line through the centre is an axis: the object is a ball, of which one axis is used."""
+    tolerance_m: float
+    """Up to where the mesh must lie on itself again, for all but a hundredth of its surface, metres."""
+    applied: bool
+    """Whether attempts tell of where the symmetries take them."""
+    tested: bool = False
+    """Whether there are enough attempts to tell that outcomes do not contradict it."""
+    places: int = 0
+    """At how many places attempts were compared with those that symmetries take there."""
+    against: int = 0
+    """At how many of them outcomes differ by more than one in twenty would by chance."""
+    reason: str
+    """The same in words."""
 
 
 class CalibrationInfo(Response):

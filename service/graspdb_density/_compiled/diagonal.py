@@ -11,14 +11,22 @@ from .isotropic import BLOCK, COUNT, OFFSET, TWIN, empty_runs, place, runs_withi
 from .options import exact, inlined
 from .quaternions import relative, turned_back
 
-__all__ = ["displacements", "held_out_sums", "left_out_sums", "near_pairs", "nearest_anywhere", "square_sums"]
+__all__ = [
+    "displacements",
+    "held_out_sums",
+    "left_out_sums",
+    "near_pairs",
+    "nearest_anywhere",
+    "rotation_vector",
+    "square_sums",
+]
 
 #: Rows with a smaller exponent are at one pose, tried again.
 _SAME = 0.5 * 0.05**2
 
 
 @inlined
-def _rotation_vector(ax, ay, az, aw, bx, by, bz, bw):
+def rotation_vector(ax, ay, az, aw, bx, by, bz, bw):
     """The shortest rotation vector of a^-1 b."""
     x, y, z, w = relative(ax, ay, az, aw, bx, by, bz, bw)
     if w < 0.0:
@@ -54,7 +62,7 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
                 if base > cut:
                     continue
                 k = 0.0
-                u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
+                u, v, t = rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
                 e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                 if e <= cut:
                     k = math.exp(-e)
@@ -62,7 +70,7 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
                         least, nearest = e, i
                 if runs[r, 2] > 0:
                     # The row turned about its z: q times (0, 0, 1, 0).
-                    u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
+                    u, v, t = rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
                     e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
                     if e <= cut:
                         k += math.exp(-e)
@@ -104,9 +112,9 @@ def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest,
             own = abs(ax * bx + ay * by + az * bz + aw * bw)
             other = abs(ay * bx - ax * by + aw * bz - az * bw)
             if symmetric[i] and other > own:
-                u, v, t = _rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
+                u, v, t = rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
             else:
-                u, v, t = _rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
+                u, v, t = rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
             if e + b * (u * u + v * v + t * t) > cut:
                 continue
             if count < room:
@@ -149,10 +157,10 @@ def _displaced(data, i, twin, at, half, turning):
     x, y, z = dx, dy, dz
     if turning:
         x, y, z = turned_back(ax, ay, az, aw, dx, dy, dz)
-    u, v, t = _rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
+    u, v, t = rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
     turned = half[3] * u * u + half[4] * v * v + half[5] * t * t
     if twin:
-        b, c, d = _rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
+        b, c, d = rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
         other = half[3] * b * b + half[4] * c * c + half[5] * d * d
         if other < turned:
             u, v, t, turned = b, c, d, other

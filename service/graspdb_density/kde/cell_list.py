@@ -132,9 +132,9 @@ class Cells:
 
     @property
     def symmetric(self) -> NDArray[np.bool_]:
-        """Whether the jaw of every sorted kernel is mirror-symmetric, (N,)."""
-        first, last, twins = self.arrays.blocks.T
-        return np.repeat(twins.astype(np.bool_), last - first)
+        """Whether each sorted kernel's jaw is mirror-symmetric, (N,)."""
+        table = self.arrays.table
+        return np.repeat(table[:, c.TWIN] > 0.0, table[:, c.COUNT].astype(np.int64))
 
     def visiting_order(self, positions: Floats) -> NDArray[np.intp]:
         """An order in which neighbours follow each other, so that kernels stay in the processor's cache."""

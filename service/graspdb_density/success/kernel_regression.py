@@ -33,6 +33,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import betaincinv
 
 from .._compiled import diagonal, isotropic, nearest
+from .._compiled.orbits.images import image_sums
+from .._compiled.orbits.revolution import revolution_displacements, revolution_sums
 from .._compiled.threads import for_blocks
 from ..kde.cell_list import Cells
 from ..kde.isotropic import TWIN_ROTATION, scaled_radius
@@ -40,6 +42,7 @@ from ..kde.rows import Rows
 from ..kernels.diagonal import DiagonalKernel
 from ..kernels.isotropic import IsotropicKernel
 from ..se3 import Floats, Poses
+from .motions import Motions
 
 __all__ = [
     "PRIOR_TRIALS",
@@ -60,7 +63,7 @@ PRIOR_TRIALS = 1.0
 #: An attempt is within reach when position and rotation together are within this many standard deviations.
 SUCCESS_CUTOFF = 5.0
 #: Poses a thread takes at once.
-_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _FAR_BLOCK = 256, 128, 16
+_ISOTROPIC_BLOCK, _DIAGONAL_BLOCK, _ORBIT_BLOCK, _FAR_BLOCK = 256, 128, 64, 16
 #: Shares of a sum in float32 that are its rounding.
 _ROUNDING = 1e-5
 
@@ -174,10 +177,14 @@ class _Sums(NamedTuple):
 class SuccessModel:
     """Attempts under a kernel, sorted for evaluation; immutable. Use `build` and `extend`."""
 
-    def __init__(self, kernel: SuccessKernel, parts: tuple[Part, ...] = ()) -> None:
+    def __init__(
+        self, kernel: SuccessKernel, parts: tuple[Part, ...] = (), motions: Motions | None = None
+    ) -> None:
         self.kernel = kernel
         #: The attempts by share of success, weight and spread, successes first.
         self.parts = parts
+        #: Of a symmetric object, by which each attempt tells of other poses, too.
+        self.motions = motions
 
     @classmethod
     def build(
@@ -238,7 +245,37 @@ class SuccessModel:
             )
         # Heaviest successes first, whatever came first.
         ordered = sorted(parts, reverse=True)
-        return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered))
+        return SuccessModel(self.kernel, tuple(Part(parts[key], *key) for key in ordered), self.motions)
+
+    def shared(self, motions: Motions, *, most: int | None = None) -> SuccessModel:
+        """The same attempts, each telling of every pose that a motion of the object takes its own to.
+
+        It stays one attempt wherever it tells of. Of more than ``most`` attempts so many, drawn at random,
+        are taken. Under an axis of revolution, widths along fixed axes of the object become one that takes as
+        much room.
+        """
+        kernel, size = self.kernel, self.size
+        thinned = most is not None and size > most
+        if motions.upright is None and not thinned:
+            return SuccessModel(kernel, self.parts, motions)
+        if motions.upright is not None and isinstance(kernel, DiagonalKernel) and kernel.axes is not None:
+            even = math.prod(kernel.sigmas[:3]) ** (1.0 / 3.0)
+            kernel = DiagonalKernel.of([even, even, even, *kernel.sigmas[3:]])
+        found = SuccessModel(kernel, (), motions)
+        rng, parts = np.random.default_rng(0), []
+        for part in self.parts:
+            # In the order that they came in, which does not depend on how they were added.
+            places = np.argsort(part.cells.rows, kind="stable")
+            if thinned and most is not None:
+                places = places[rng.permutation(part.size)[: math.ceil(most * part.size / size)]]
+            poses = part.cells.poses(places)
+            if motions.upright is not None:
+                if isinstance(self.kernel, DiagonalKernel):
+                    poses = self.kernel.back(poses)
+                poses = motions.in_half_plane(poses)
+            rows = Rows(poses, np.ones(len(places)), part.cells.symmetric[places])
+            parts.append(part._replace(cells=Cells.build(rows, found.widest_m)))
+        return SuccessModel(kernel, tuple(parts), motions)
 
     @property
     def size(self) -> int:
@@ -279,7 +316,9 @@ class SuccessModel:
                 most = math.ceil(count * counts / total)
                 drawn.append(part.cells.poses(rng.permutation(part.size)[:most]))
             poses = Poses.concatenate(drawn)
-            if isinstance(self.kernel, DiagonalKernel):
+            if self.motions is not None and self.motions.upright is not None:
+                poses = self.motions.from_half_plane(poses)
+            elif isinstance(self.kernel, DiagonalKernel):
                 poses = self.kernel.back(poses)
             found.append((total, poses))
         return found
@@ -359,6 +398,11 @@ class SuccessModel:
         plain = self.without_quantiles(poses, everywhere=everywhere, threads=threads)
         return plain.probability, plain.trials, plain.nearest
 
+    def support(self, poses: Poses, *, threads: int = 1) -> tuple[Floats, NearestAttempts]:
+        """Effective trials at M poses, and how far the nearest attempts are, however far."""
+        _, trials, nearest = self.without_interval(poses, everywhere=True, threads=threads)
+        return trials, nearest
+
     def without_quantiles(self, poses: Poses, *, everywhere: bool, threads: int) -> Plain:
         """As `without_interval`, and what the interval is wider by: of the kernels alone, for estimates that
         are made of it.
@@ -428,6 +472,9 @@ class SuccessModel:
     def _sums_of(self, cells: Cells, poses: Poses, columns: int, threads: int) -> Floats:
         radius, kernel = scaled_radius(SUCCESS_CUTOFF), self.kernel
         arrays = cells.arrays
+        if self.motions is not None:
+            work = partial(self._orbit_sums, self.motions, cells, radius)
+            return cells.at_poses(work, poses, columns=(columns,), block=_ORBIT_BLOCK, threads=threads)
         if isinstance(kernel, DiagonalKernel):
             half, turning, block = self.half(cells), self.turning, _DIAGONAL_BLOCK
 
@@ -441,21 +488,64 @@ class SuccessModel:
 
         return cells.at_poses(loop, self._along(poses), columns=(columns,), block=block, threads=threads)
 
+    def _orbit_sums(
+        self, motions: Motions, cells: Cells, radius: float, p: Floats, q: Floats, out: Floats
+    ) -> None:
+        """As `_sums_of`, of attempts that every motion of the object has taken elsewhere, too."""
+        positions, quaternions = self._seen(motions, Poses(p, q))
+        half, kappa = self.half(cells), self._kappa
+        if motions.upright is not None:
+            revolution_sums(cells.arrays, positions, quaternions, half, kappa, self.turning, radius, out)
+            return
+        wide = kappa > 0.0 and 2.0 / math.sqrt(kappa) > TWIN_ROTATION
+        image_sums(cells.arrays, positions, quaternions, half, kappa, wide, self.turning, radius, out)
+
+    def _seen(self, motions: Motions, poses: Poses) -> Poses:
+        """The images (M, n) of poses as the sorted attempts lie."""
+        images = motions.images(poses)
+        if motions.upright is not None:
+            return motions.in_half_plane(images)
+        shape = images.positions.shape[:2]
+        flat = Poses(images.positions.reshape(-1, 3), images.quaternions_xyzw.reshape(-1, 4))
+        along = self._along(flat)
+        return Poses(along.positions.reshape(*shape, 3), along.quaternions_xyzw.reshape(*shape, 4))
+
+    @property
+    def _kappa(self) -> float:
+        """The concentration of an isotropic kernel, 0 of another."""
+        return self.kernel.kappa if isinstance(self.kernel, IsotropicKernel) else 0.0
+
     def _nearest(self, poses: Poses, sums: _Sums, threads: int, *, everywhere: bool) -> NearestAttempts:
         """How far the nearest attempts are; those that no sum reached are looked for ``everywhere``."""
-        along = self._along(poses)
         best, places = sums.best, sums.places
         far = np.flatnonzero(places.max(axis=0, initial=-1.0) < 0.0)
         if everywhere and far.size:
-            best[:, far], places[:, far] = self._search(along[far], threads)
+            best[:, far], places[:, far] = self._search(poses[far], threads)
         distances = np.full((len(poses), 10), np.inf)
         nearer = np.argmax(best, axis=0) if self.parts else np.empty(0)
         for number, part in enumerate(self.parts):
             rows = np.flatnonzero((nearer == number) & (places[number] >= 0.0))
             if rows.size:
-                distances[rows] = self.displacements(part.cells, places[number, rows], along[rows])
+                distances[rows] = self._displaced(part.cells, places[number, rows], poses[rows])
         metres, radians, along, about = np.ascontiguousarray(distances[:, :4].T)
         return NearestAttempts(metres, radians, along, about, distances[:, 4:])
+
+    def _displaced(self, cells: Cells, places: Floats, poses: Poses) -> Floats:
+        """From sorted attempts to poses, or the image of each that is nearest to its attempt, (M, 10)."""
+        motions = self.motions
+        if motions is None:
+            return self.displacements(cells, places, self._along(poses))
+        seen = self._seen(motions, poses)
+        if motions.upright is not None:
+            out, at = np.empty((len(poses), 10)), places.astype(np.int64)
+            half, kappa = self.half(cells), self._kappa
+            revolution_displacements(cells.arrays, at, *seen, half, kappa, self.turning, out)
+            return out
+        shape = seen.positions.shape[:2]
+        flat = Poses(seen.positions.reshape(-1, 3), seen.quaternions_xyzw.reshape(-1, 4))
+        away = self.displacements(cells, np.repeat(places, shape[1]), flat)
+        nearer = np.argmin(np.hypot(away[:, 2], away[:, 3]).reshape(shape), axis=1)
+        return np.asarray(away.reshape(*shape, 10)[np.arange(len(poses)), nearer])
 
     def displacements(self, cells: Cells, places: Floats, along: Poses) -> Floats:
         """From sorted attempts to poses along the kernel's axes, (M, 10), as `diagonal.displacements`."""
@@ -464,8 +554,18 @@ class SuccessModel:
         diagonal.displacements(cells.arrays, at, *along, self.half(cells), self.turning, gripper, out)
         return out
 
-    def _search(self, along: Poses, threads: int) -> Floats:
+    def _search(self, poses: Poses, threads: int) -> Floats:
         """Largest exponents and their places in every part, however far, (2, P, M)."""
+        motions = self.motions
+        if motions is not None:
+            seen = self._seen(motions, poses)
+            return self._search_images(
+                seen if motions.upright is None else motions.turned_about(seen), threads
+            )
+        return self._search_along(self._along(poses), threads)
+
+    def _search_along(self, along: Poses, threads: int) -> Floats:
+        """As `_search`, as the sorted attempts lie."""
         found = np.empty((2, len(self.parts), len(along)))
         kernel = self.kernel
         for number, part in enumerate(self.parts):
@@ -476,6 +576,15 @@ class SuccessModel:
                 loop = partial(_nearest_anywhere, arrays, kernel.kappa)
             best = part.cells.at_poses(loop, along, columns=(2,), block=_FAR_BLOCK, threads=threads)
             found[:, number] = best.T
+        return found
+
+    def _search_images(self, images: Poses, threads: int) -> Floats:
+        """As `_search`, the largest of all images (M, n) of each pose."""
+        found = np.full((2, len(self.parts), len(images)), -np.inf)
+        for number in range(images.positions.shape[1]):
+            p, q = (np.ascontiguousarray(part[:, number]) for part in images)
+            seen = self._search_along(Poses(p, q), threads)
+            found = np.where(seen[0] > found[0], seen, found)
         return found
 
     @property

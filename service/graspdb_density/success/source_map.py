@@ -94,7 +94,7 @@ class MappedModel(SuccessModel):
     """A success model whose probabilities are corrected, their intervals wider by the map's uncertainty."""
 
     def __init__(self, model: SuccessModel, correction: SourceMap) -> None:
-        super().__init__(model.kernel, model.parts)
+        super().__init__(model.kernel, model.parts, model.motions)
         self.model = model
         self.correction = correction
 

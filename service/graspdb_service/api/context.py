@@ -12,12 +12,14 @@ from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
+from graspdb_service.usecases.densities.evidence.symmetries import Symmetries
 from graspdb_service.usecases.densities.learning import Learning
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.geometry.features import Features
 from graspdb_service.usecases.geometry.pictures import Pictures
+from graspdb_service.usecases.geometry.symmetries import ShapeSymmetries
 from graspdb_service.usecases.kernels import fit
 from graspdb_service.usecases.reports.registry import Reports
 from graspdb_service.usecases.runtime.compute import Compute
@@ -68,6 +70,7 @@ class Context(Asking):
             densities=densities,
             scenes=scenes,
             evidence=CollisionEvidence(scenes, compute),
+            symmetries=Symmetries(ShapeSymmetries(database, compute), compute),
             priors=Priors(compute, scenes),
             successes=successes,
             answers=AnswerKeeper(database, most=settings.max_answers),

@@ -27,6 +27,7 @@ from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.answers.references import answer_id
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence import symmetries
 from graspdb_service.usecases.densities.evidence.calibrations import doubts
 from graspdb_service.usecases.grasps import answer, proposals, samples
 from graspdb_service.usecases.grasps import likelihood as likelihoods
@@ -104,11 +105,11 @@ def likelihood(ctx: Asking, slug: str, request: LikelihoodOptions | LikelihoodQu
     found = likelihoods.likelihood(ctx, slug, request, poses, request.include)
     built = found.built
     head = _head(ctx, built, built.kernel, found.estimator, found.frame)
-    if found.reach is not None:
-        head["reach"] = found.reach.model_dump()
-    if found.calibration is not None:
-        head["calibration"] = found.calibration.model_dump()
-        head["warnings"] += doubts(found.calibration)
+    for key in ("reach", "calibration", "symmetry"):
+        info = getattr(found, key)
+        if info is not None:
+            head[key] = info.model_dump()
+    head["warnings"] += [*doubts(found.calibration), *symmetries.doubts(found.symmetry)]
     asked = _Asked("likelihood", request.name, question, built.selected, built.kernel, found.estimator)
     return _in_columns(ctx, asked, few, head, found.columns)
 
@@ -137,6 +138,9 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
         "prior": drawn.prior,
         **more,
     }
+    if drawn.symmetry is not None:
+        head["symmetry"] = drawn.symmetry.model_dump()
+        head["warnings"] += symmetries.doubts(drawn.symmetry)
     seed = None if "seed" in question else "seed"
     question = {**question, "seed": drawn.seed}
     asked = _Asked(kind, request.name, question, drawn.selected, drawn.kernel, estimator, seed)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
+from graspdb_service.usecases.densities.evidence.symmetries import Symmetries
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes
@@ -19,5 +20,6 @@ class Estimators(Runtime):
     densities: Densities
     scenes: Scenes
     evidence: CollisionEvidence
+    symmetries: Symmetries
     priors: Priors
     successes: Successes

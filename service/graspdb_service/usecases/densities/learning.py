@@ -50,13 +50,15 @@ _NICE = 10
 @dataclass(frozen=True, eq=False)
 class Model:
     """All attempts, and the ones to search by: a random sample where all would take too long, and the kernel
-    estimate where what was learned takes longer; how far from them they tell; who estimates.
+    estimate where what was learned takes longer; how far from them they tell; who estimates; ``plain`` is the
+    kernel estimate alone, None where this is it.
     """
 
     whole: SuccessModel
     quick: SuccessModel
     reach: Reach
     estimator: EstimatorInfo
+    plain: Model | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,7 @@ class Learning:
             return plain
         features_now = self._features(selected) if known.stack.trees is not None else None
         whole = StackedModel(plain.whole, known.stack, features_now)
-        return Model(whole, plain.quick, known.stack.reach(plain.reach), known.info)
+        return Model(whole, plain.quick, known.stack.reach(plain.reach), known.info, plain)
 
     def held(self, selected: Selected, kernel: str, *, trees: bool) -> Stack | None:
         """What was learned last of a selection's attempts and is in use; None where nothing was."""

@@ -282,11 +282,11 @@ class Successes:
 
     def _put_support(self, estimates: Estimates, model: Model, poses: Poses, rows: Ints) -> None:
         """Fill in how far some poses are from the attempts."""
-        work = partial(model.whole.without_quantiles, everywhere=True, threads=self._compute.threads)
+        work = partial(model.whole.support, threads=self._compute.threads)
         start = 0
-        for plain in self._compute.blocks(poses[rows], work):
-            stop = start + len(plain.trials)
-            estimates.put_support(rows[start:stop], plain.trials, plain.nearest, model.reach)
+        for trials, nearest in self._compute.blocks(poses[rows], work):
+            stop = start + len(trials)
+            estimates.put_support(rows[start:stop], trials, nearest, model.reach)
             start = stop
 
     def add_prior(

@@ -24,11 +24,13 @@ from graspdb.wire.base import Quadruple
 from graspdb_density import Maximum, Separation, se3
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
+from graspdb_service.usecases.densities.evidence import symmetries
 from graspdb_service.usecases.densities.evidence.calibrations import doubts, of_simulation
 from graspdb_service.usecases.densities.success_models import LEVEL, Estimates
 from graspdb_service.usecases.densities.support import reach_info, support_of
 from graspdb_service.usecases.grasps.conflict import Conflict, conflict_of
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
+from graspdb_service.usecases.grasps.likelihood import log_density
 from graspdb_service.usecases.grasps.question import Question, asks_chance, question_of
 from graspdb_service.usecases.grasps.search import ScoreSearch, closest
 from graspdb_service.usecases.runtime.asked import outage, outage_warnings
@@ -61,6 +63,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "ranking": question.ranking,
                 "reach": reach_info(question.model),
                 "calibration": question.calibration,
+                "symmetry": question.symmetry,
                 **_answer(ctx, request, question),
             }
     near = request.near if selected.jaw_symmetric else None
@@ -78,6 +81,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *outage_warnings(built.revision),
             *ctx.evidence.warnings(built),
             *doubts(None if question is None else question.calibration),
+            *symmetries.doubts(None if question is None else question.symmetry),
             *frame.warnings,
             *_far_off(limits),
             *([NO_TWINS] if request.near is not None and near is None else []),
@@ -130,7 +134,7 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
         engine = other.engine
         if limits.candidates is None and not by_chance:
             # Whether there is a grasp does not depend on what ranks it, and the density is found fastest.
-            engine = ScoreSearch(other.search, ctx.compute.threads)
+            engine = ScoreSearch(other.wide, ctx.compute.threads)
         found = ctx.compute.run(lambda: engine.best(other.bounds))
         return next(iter(_described(ctx, other, found)), None)
 
@@ -146,6 +150,9 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
         np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
     )
     logs = np.array([item.log_density for item in found])
+    if question.wide is not question.search:
+        # Of the density of the successes alone, whatever was looked through.
+        logs = log_density(ctx, question.search.density, poses, None)
 
     def known() -> tuple[Any, Any, Any, list[list[int]], Any]:
         """Whether they are free, how far open the jaw comes and is on the object, the sequence numbers of the
@@ -171,7 +178,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     reach = reach_info(question.model)
     grasps = []
     for i, item in enumerate(found):
-        density = math.exp(item.log_density)
+        density = math.exp(logs[i])
         grasps.append(
             Grasp.model_validate(
                 {
@@ -180,7 +187,7 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
                     "world": _world(limits, se3.Poses(item.position, item.quaternion_xyzw)),
                     "score": density if question.ranking.objective == "density" else item.score,
                     "density": density,
-                    "log_density": item.log_density,
+                    "log_density": float(logs[i]),
                     "relative": float(relative[i]),
                     **({} if estimates is None else _chances(estimates, i, reach)),
                     "collision_free": None if free is None else bool(free[i]),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, EstimatorInfo, ReachInfo
+from graspdb.wire import CalibrationInfo, EstimatorInfo, ReachInfo, SymmetryInfo
 from graspdb.wire.queries import LikelihoodColumn, LikelihoodOptions, LikelihoodQuery, PreOpening
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_density.se3 import Poses
@@ -34,13 +34,14 @@ CHANCES = (
 
 class Likelihood(NamedTuple):
     """An answer: the density, the frame that poses were of, how far from an attempt success probabilities are
-    told, how they were calibrated, who estimated them, and the columns.
+    told, how they were calibrated and shared by symmetry, who estimated them, and the columns.
     """
 
     built: Built
     frame: PoseFrame
     reach: ReachInfo | None
     calibration: CalibrationInfo | None
+    symmetry: SymmetryInfo | None
     estimator: EstimatorInfo
     columns: dict[str, Any]
 
@@ -62,7 +63,8 @@ def likelihood(
     request = of_simulation(request)
     source: str | None = getattr(request, "calibrated_for", None)
     pre_opening_m: PreOpening = getattr(request, "pre_opening_m", None)
-    calibration, estimator = None, EstimatorInfo()
+    calibration = symmetry = None
+    estimator = EstimatorInfo()
 
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
@@ -85,6 +87,7 @@ def likelihood(
             believed = ctx.evidence.believed(built)
             believed = None if believed is None else believed.preshaped(pre_opening_m)
             model = ctx.successes.model(built, collisions_known=believed is not None)
+            model, symmetry = ctx.symmetries.applied(request, built, model)
             if model is not None and source is not None:
                 model, calibration = calibrated(ctx, built, model, believed, source)
             reach = reach_info(model)
@@ -102,7 +105,7 @@ def likelihood(
         if test is not None and pre_opening_m is not None:
             blocks = ctx.compute.blocks(poses, partial(test.openings, threads=threads))
             known["opening_m"] = np.concatenate(blocks)
-    return Likelihood(built, frame, reach, calibration, estimator, known)
+    return Likelihood(built, frame, reach, calibration, symmetry, estimator, known)
 
 
 def _densities(

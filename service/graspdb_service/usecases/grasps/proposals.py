@@ -85,6 +85,7 @@ def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
             raise samples.no_successes(slug)
         test = ctx.scenes.test(built.selected, request.pre_opening_m)
         model = ctx.successes.model(built, collisions_known=ctx.evidence.believed(built) is not None)
+        model, _ = ctx.symmetries.applied(request, built, model)
         if model is None:
             raise conflict(
                 "no-attempts",
@@ -98,7 +99,7 @@ def _uncertain(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
                 "nothing-uncertain",
                 "Every pose near the successes collides or is known: use strategy=density, or sweep a grid",
             )
-        return samples.drawn_from(ctx, proposal, built, built.kernel, request.count, request.seed)
+        return samples.drawn_from(ctx, proposal, built, built.kernel, request.count, request.seed, request)
 
 
 def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
@@ -111,7 +112,7 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         prior = ctx.priors.get(selected, choice, request.pre_opening_m)
         built = ctx.densities.get(selected, KernelChoice())
         return samples.drawn_from(
-            ctx, prior.density, built, prior.kernel, request.count, request.seed, prior=True
+            ctx, prior.density, built, prior.kernel, request.count, request.seed, request, prior=True
         )
 
 

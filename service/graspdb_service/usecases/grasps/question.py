@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, GraspConstraints, KernelInfo, Ranking
+from graspdb.wire import CalibrationInfo, GraspConstraints, KernelInfo, Ranking, SymmetryInfo
 from graspdb.wire.queries import PreOpening
 from graspdb_density import ModeSearch, Separation
 from graspdb_density.se3 import Poses
@@ -40,11 +40,13 @@ class Question:
 
     ``test`` says what collides, ``believed`` the same where success probabilities may rest on it. ``search``
     and ``kernel`` are of the density of successes, or before any of the prior of the object's edges;
+    ``wide`` is where grasps are looked for: ``search``, or where symmetries take the successes, too.
     ``chances``: whether grasps are told with their success probability, by ``model`` if there is one.
     """
 
     built: Built
     search: ModeSearch
+    wide: ModeSearch
     kernel: KernelInfo
     limits: Constraints
     test: CollisionTest | None
@@ -55,6 +57,7 @@ class Question:
     engine: Engine
     ranking: Ranking
     calibration: CalibrationInfo | None
+    symmetry: SymmetryInfo | None
     pre_opening_m: PreOpening
 
     @property
@@ -86,7 +89,7 @@ def question_of(
     if source is None or source.search is None:
         return None
     chances = _wants_chances(request, built)
-    believed, model, calibration = _chances(ctx, request, built) if chances else (None, None, None)
+    believed, model, calibration, symmetry = _chances(ctx, request, built) if chances else 4 * (None,)
     by_success = _by_success(request, model)
     if (by_success or asks_chance(request)) and model is None:
         if built.search is None:
@@ -97,16 +100,19 @@ def question_of(
             "Only successes are known, so no success probability: post failures, too, or rank by the density",
         )
     search, kernel, threads = source.search, source.kernel, ctx.compute.threads
-    near = NearSuccesses(search.centres)
+    wide = search
+    if by_success and symmetry is not None and symmetry.applied:
+        wide = ctx.symmetries.search(request, built, search)
+    near = NearSuccesses(wide.centres)
 
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if request.objective == "robust":
             value = None if chance is None else success_score(chance.quick, believed, threads)
             pull = None if chance is None else near.pull
-            return objectives.by_mean(request, row, search, value, pull, threads)
+            return objectives.by_mean(request, row, wide, value, pull, threads)
         if chance is not None:
-            return objectives.by_success(search, chance, believed, near.pull, threads)
+            return objectives.by_success(wide, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)
 
     def complete() -> Question:
@@ -117,22 +123,25 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
-        found = built, search, kernel, limits, test, believed, chances, model, bounds
-        return Question(*found, engine, ranking, calibration, request.pre_opening_m)
+        found = built, search, wide, kernel, limits, test, believed, chances, model, bounds
+        return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m)
 
     return ctx.compute.run(complete)
 
 
 def _chances(
     ctx: Estimators, request: GraspConstraints, built: Built
-) -> tuple[CollisionTest | None, Model | None, CalibrationInfo | None]:
-    """What success probabilities rest on: geometry where it is believed, attempts, and a correction."""
+) -> tuple[CollisionTest | None, Model | None, CalibrationInfo | None, SymmetryInfo | None]:
+    """What success probabilities rest on: geometry where it is believed, attempts, also where symmetries take
+    them, and a correction.
+    """
     believed = ctx.evidence.believed(built)
     believed = None if believed is None else believed.preshaped(request.pre_opening_m)
     model = ctx.successes.model(built, collisions_known=believed is not None)
+    model, symmetry = ctx.symmetries.applied(request, built, model)
     if model is None or request.calibrated_for is None:
-        return believed, model, None
-    return believed, *calibrated(ctx, built, model, believed, request.calibrated_for)
+        return believed, model, None, symmetry
+    return believed, *calibrated(ctx, built, model, believed, request.calibrated_for), symmetry
 
 
 def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | None:
@@ -146,7 +155,9 @@ def _prior(ctx: Estimators, request: GraspConstraints, built: Built) -> Prior | 
 
 def _wants_chances(request: GraspConstraints, built: Built) -> bool:
     """Whether grasps come with a success probability; the same for the same request and revision."""
-    if request.objective == "success_probability" or asks_chance(request) or request.calibrated_for:
+    if request.objective == "success_probability" or asks_chance(request):
+        return True
+    if request.calibrated_for or request.symmetry == "auto":
         return True
     if request.objective == "robust" and request.robust_of != "density":
         return True

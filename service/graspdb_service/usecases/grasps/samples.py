@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from graspdb.wire import KernelInfo, Selection
+from graspdb.wire import KernelInfo, Selection, SymmetryInfo
 from graspdb_density import se3
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_service.problems import ProblemError, conflict
@@ -32,7 +32,7 @@ class Draw:
 
     ``selected`` are the trials that it is about; ``support``: columns of how far the draws are from what was
     tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial. ``opening_m`` (n,)
-    is how far open the jaw comes to each, where that was asked.
+    is how far open the jaw comes to each, where that was asked; ``symmetry`` what shares attempts.
     """
 
     built: Built
@@ -44,6 +44,7 @@ class Draw:
     support: dict[str, Any] | None = None
     prior: bool = False
     opening_m: Floats | None = None
+    symmetry: SymmetryInfo | None = None
 
     @property
     def selected(self) -> Selected:
@@ -77,7 +78,8 @@ def draw(
         built = ctx.densities.requested(slug, selection)
         if built.asked is None:
             raise no_successes(slug)
-        return drawn_from(ctx, built.asked, built, built.kernel, count, seed, support=support)
+        asking = selection if support else None
+        return drawn_from(ctx, built.asked, built, built.kernel, count, seed, asking)
 
 
 def drawn_from(
@@ -87,13 +89,16 @@ def drawn_from(
     kernel: KernelInfo,
     count: int,
     seed: int | None,
+    asking: Selection | None,
     *,
     prior: bool = False,
-    support: bool = True,
 ) -> Draw:
-    """Draws from a density of an object as it was at a revision; ``built`` are its trials."""
+    """Draws from a density of an object as it was at a revision; ``built`` are its trials. Without ``asking``
+    (the request) it is not told how far they are from those.
+    """
     chosen = secrets.randbits(63) if seed is None else seed
     poses = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
+    support, symmetry = (None, None) if asking is None else _support(ctx, built, poses, asking)
     return Draw(
         built=built,
         kernel=kernel,
@@ -101,18 +106,25 @@ def drawn_from(
         position=poses.positions,
         quaternion_xyzw=se3.canonical(poses.quaternions_xyzw),
         proposal_density=np.exp(log_density(ctx, density, poses, _CUTOFF)),
-        support=_support(ctx, built, poses) if support else None,
+        support=support,
         prior=prior,
+        symmetry=symmetry,
     )
 
 
-def _support(ctx: Estimators, built: Built, poses: se3.Poses) -> dict[str, Any] | None:
-    """How far draws are from what was tried; None without attempts, and with too many to read at once."""
+def _support(
+    ctx: Estimators, built: Built, poses: se3.Poses, asking: Selection
+) -> tuple[dict[str, Any] | None, SymmetryInfo | None]:
+    """How far draws are from what was tried, also by symmetry; None without attempts, and with too many to
+    read at once.
+    """
     if sum(built.selected.outcomes.values()) > FEW_ATTEMPTS:
-        return None
+        return None, None
     known = ctx.evidence.believed(built) is not None
     model = ctx.successes.model(built, collisions_known=known)
-    return None if model is None else support_columns(ctx.successes.support(model, poses))
+    model, symmetry = ctx.symmetries.applied(asking, built, model)
+    support = None if model is None else support_columns(ctx.successes.support(model, poses))
+    return support, symmetry
 
 
 def check_count(ctx: Estimators, count: int) -> None:

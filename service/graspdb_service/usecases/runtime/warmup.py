@@ -25,6 +25,7 @@ from graspdb_density import (
 )
 from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
+from graspdb_density.success.motions import Motions
 from graspdb_geometry.collision import Scene, Surface
 from graspdb_geometry.grippers import shape_of
 from graspdb_service.trial_columns import Bools
@@ -107,3 +108,5 @@ def _exercise() -> None:
     density.nearest_rows(poses[0], 5)
     density.nearest_each(poses[:5], within=2.0)
     model.lower_end(poses[:5])
+    for axis in (None, (0.0, 0.0, 1.0)):
+        model.shared(Motions.of(np.eye(3)[None], np.zeros(3), axis=axis)).evaluate_near(poses[:5])
