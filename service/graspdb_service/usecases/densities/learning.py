@@ -43,6 +43,8 @@ _CHANGED = 0.25
 _MOST_HELD, _MOST_WAITING = 256, 16
 #: How long it is relied on that no replica has learned anything either.
 _LOOK_AGAIN_S = 1.0
+#: How long a service that stops waits for what is being fitted.
+_ENDS_WITHIN_S = 2.0
 #: Below other threads, which answer.
 _NICE = 10
 
@@ -155,10 +157,11 @@ class Learning:
         known = self._held[_digest(selected, kernel, trees)]
         return known.info
 
-    def wait(self, timeout_s: float) -> bool:
-        """Until nothing is left to learn; False where that takes longer."""
+    def wait(self, selected: Selected, kernel: str, *, trees: bool, within_s: float) -> bool:
+        """Until what is being learned of a selection's attempts is; False where that takes longer."""
+        digest = _digest(selected, kernel, trees)
         with self._changed:
-            return self._changed.wait_for(lambda: not self._waiting, timeout_s)
+            return self._changed.wait_for(lambda: digest not in self._waiting or self._closed, within_s)
 
     def close(self) -> None:
         """Stop; what is half learned is learned again by whoever needs it."""
@@ -167,7 +170,8 @@ class Learning:
             thread = self._thread
             self._changed.notify_all()
         if thread is not None:
-            thread.join()
+            # What scikit-learn fits is not ended: nothing of it is lost that the next start can't learn.
+            thread.join(_ENDS_WITHIN_S)
 
     def _features(self, selected: Selected) -> GraspFeatures | None:
         if selected.profile is None:

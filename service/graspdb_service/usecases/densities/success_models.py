@@ -241,10 +241,9 @@ class Successes:
         """What was learned of a density's attempts and answers in their place, waited for; None where nothing
         does, or it takes longer.
         """
-        model = self.model(built, collisions_known=collisions_known)
+        model, key = self.model(built, collisions_known=collisions_known), _key(built, collisions_known)
         if model is not None and model.estimator.state == "fitting":
-            self.learning.wait(within_s)
-        key = _key(built, collisions_known)
+            self.learning.wait(built.selected, key.kernel, trees=collisions_known, within_s=within_s)
         held = self.learning.held(built.selected, key.kernel, trees=collisions_known)
         return held, self.estimator(built, collisions_known=collisions_known)
 
