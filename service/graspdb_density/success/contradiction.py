@@ -35,7 +35,9 @@ __all__ = ["CHANCE", "Place", "SymmetryVerdict", "contradiction"]
 #: How often a symmetric object with noisy outcomes is refused, at most.
 CHANCE = 0.05
 #: Attempts at which sides are compared, places that are left of them, and how far those are apart, in widths.
-_LOOKED_AT, _PLACES, _APART = 300, 100, 3.0
+_LOOKED_AT, _PLACES, _APART = 200, 70, 3.0
+#: Most attempts that are compared: of more, so many drawn at random.
+_COMPARED = 10_000
 #: Most trials that a side counts for, fewest of either side that are compared, and fewest in all that tell.
 _TRIALS, _LEAST, _ENOUGH = 40.0, 0.9, 8.0
 #: A place speaks against it from this probability on.
@@ -43,7 +45,7 @@ _AGAINST = 0.05
 #: Widths at which they are compared, in kernel widths, and the widest rotation, radians.
 _SCALES, _WIDEST = (1.0, 2.0), math.radians(45.0)
 #: Fewest places of which sides are told, and how little attempts may be spread along one beside the others.
-_FEWEST, _FLAT = 10, 1e-3
+_FEWEST, _FLAT, _STRICTER = 10, 1e-3, 3.0
 #: From so many motions on, each place is compared with many others.
 _MANY = 6
 #: Farther than any attempt, metres.
@@ -133,7 +135,9 @@ def _compared(model: SuccessModel, motions: Motions, threads: int, chance: float
     logs = np.log(np.maximum(chances[single], 1e-300))
     together = float(chi2.sf(-2.0 * logs.sum(), 2 * len(logs)))
     sided = _sided(asked[single], motions.centre, shares[:, single], np.minimum(trials[:, single], _TRIALS))
-    refused = min(together, sided, len(chosen) * float(chances[chosen].min())) <= chance / 3.0
+    # Of few trials a place the score is no normal deviate: it gets a smaller share of the chance.
+    least = min(together, _STRICTER * sided, len(chosen) * float(chances[chosen].min()))
+    refused = least <= chance / 3.0
     return SymmetryVerdict(tuple(places), True, refused)
 
 
@@ -158,8 +162,9 @@ def _sided(asked: Poses, centre: Floats, shares: Floats, trials: Floats) -> floa
 
 
 def _widened(model: SuccessModel, scale: float) -> SuccessModel:
-    """The same attempts under a kernel that is so many times as wide."""
-    if scale == 1.0:
+    """The same attempts, or a sample of many, under a kernel that is so many times as wide."""
+    share = _COMPARED / max(model.size, 1)
+    if scale == 1.0 and share >= 1.0:
         return model
     kernel: SuccessKernel
     if isinstance(model.kernel, IsotropicKernel):
@@ -168,12 +173,14 @@ def _widened(model: SuccessModel, scale: float) -> SuccessModel:
     else:
         kernel = replace(model.kernel, sigmas=tuple(scale * sigma for sigma in model.kernel.sigmas))
     wider = SuccessModel(kernel)
-    parts = []
+    parts, rng = [], np.random.default_rng(0)
     for part in model.parts:
-        # Along the axes that they lie along already.
-        poses = part.cells.poses(np.argsort(part.cells.rows, kind="stable"))
-        symmetric = part.cells.symmetric[np.argsort(part.cells.rows, kind="stable")]
-        rows = Rows(poses, np.ones(part.size), symmetric)
+        # In the order that they came in, along the axes that they lie along already.
+        places = np.argsort(part.cells.rows, kind="stable")
+        if share < 1.0:
+            places = places[rng.permutation(part.size)[: math.ceil(share * part.size)]]
+        symmetric = part.cells.symmetric[places]
+        rows = Rows(part.cells.poses(places), np.ones(len(places)), symmetric)
         parts.append(part._replace(cells=Cells.build(rows, wider.widest_m)))
     return SuccessModel(kernel, tuple(parts))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -27,6 +28,8 @@ _SHARED, _QUICK = 200_000, 20_000
 #: Successes about whose images a search looks for grasps, times those images; turns about an axis of which
 #: images are made, so that kernels of 15 degrees overlap.
 _CENTRES, _TURNS = 100_000, 36
+#: A verdict stands until such a share of the attempts is new, of few every time; so many are kept.
+_CHANGED, _FEW, _VERDICTS = 0.25, 200, 1_024
 #: Places that a refusal names.
 _NAMED = 3
 
@@ -49,6 +52,7 @@ class Symmetries:
         self._shared: WeakKeyDictionary[SuccessModel, _Shared] = WeakKeyDictionary()
         self._known: WeakKeyDictionary[Symmetry, dict[bool, Motions | None]] = WeakKeyDictionary()
         self._searches: WeakKeyDictionary[Built, tuple[Motions, ModeSearch]] = WeakKeyDictionary()
+        self._judged: OrderedDict[object, tuple[Motions, int, int, SymmetryVerdict]] = OrderedDict()
         self._lock = threading.Lock()
 
     def applied(
@@ -75,7 +79,7 @@ class Symmetries:
             return model, info.model_copy(update={"reason": "there is no attempt to share"})
         # What was learned tells of places that were not tried by itself: kernels alone share.
         model = model.plain or model
-        shared = self._of(model, motions)
+        shared = self._of(built, model, motions)
         verdict = shared.verdict
         if verdict.refused:
             raise _refused(selected, verdict)
@@ -122,15 +126,35 @@ class Symmetries:
                 known[mirrors] = motions_of(found, mirrors=mirrors)
             return known[mirrors]
 
-    def _of(self, model: Model, motions: Motions) -> _Shared:
+    def _of(self, built: Built, model: Model, motions: Motions) -> _Shared:
         with self._lock:
             known = self._shared.get(model.whole)
         # A copy may have got another mesh, and its trials may be the same.
         if known is None or known.motions is not motions:
-            known = self._compute.run(lambda: _share(model, motions, self._compute.threads))
+            verdict = self._verdict(built, model, motions)
+            known = self._compute.run(lambda: _share(model, motions, verdict))
             with self._lock:
                 self._shared[model.whole] = known
         return known
+
+    def _verdict(self, built: Built, model: Model, motions: Motions) -> SymmetryVerdict:
+        """What outcomes say of it, judged anew once a quarter of the attempts are others."""
+        key = (*built.selected.key, built.kernel.sigma_position_m, built.kernel.sigma_rotation_deg)
+        size, epoch = model.whole.size, built.object_row.epoch
+        with self._lock:
+            judged = self._judged.get(key)
+        if judged is not None:
+            of, then, at, verdict = judged
+            if of is motions and at == epoch and size > _FEW and then <= size <= (1.0 + _CHANGED) * then:
+                return verdict
+        threads = self._compute.threads
+        verdict = self._compute.run(lambda: contradiction(model.quick, motions, threads=threads))
+        with self._lock:
+            self._judged[key] = motions, size, epoch, verdict
+            self._judged.move_to_end(key)
+            while len(self._judged) > _VERDICTS:
+                self._judged.popitem(last=False)
+        return verdict
 
 
 def doubts(symmetry: SymmetryInfo | None) -> list[str]:
@@ -156,8 +180,7 @@ def motions_of(found: Symmetry, *, mirrors: bool) -> Motions | None:
     return Motions.of(elements, found.centre, axis=None if axis is None else axis.direction)
 
 
-def _share(model: Model, motions: Motions, threads: int) -> _Shared:
-    verdict = contradiction(model.quick, motions, threads=threads)
+def _share(model: Model, motions: Motions, verdict: SymmetryVerdict) -> _Shared:
     if verdict.refused:
         return _Shared(motions, model, verdict)
     whole = _of_many(model.whole, motions, _SHARED // len(motions))
