@@ -70,7 +70,7 @@ SUNK_M = 0.002
 """A finger this deep in the object is passing through it: Bullet's contacts of single points may rock a flat
 object from corner to corner at every step and never stop the jaw. What turns as it is squeezed is up to
 1.6 mm deep for a while, and comes out again."""
-STALLED_SUNK_M, CARRIED_SUNK_M = 0.0008, 0.0002
+STALLED_SUNK_M, CARRIED_SUNK_M = 0.0005, 0.0002
 """Nor has a jaw stalled soundly this deep in it, whose forces are rated, or whose patches are to carry: what
 is firmly held is 0.02 mm deep. Of 63 closings of a screwdriver that were 0.8 mm deep on the way, or 0.2 when
 stalled, the fine step called 62 what they were called before."""
@@ -312,7 +312,8 @@ class GraspWorld:
                 if not carried:
                     ratings.append(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction))
                 if len(contacts) == len(ages) or (
-                    depth <= deepest and (ratings[-1] >= NO_DOUBT[len(contacts) - 1] or settled(ratings))
+                    depth <= (deepest if len(contacts) > 1 else CARRIED_SUNK_M)
+                    and (ratings[-1] >= NO_DOUBT[len(contacts) - 1] or settled(ratings))
                 ):
                     if not finer or not contradictory(ratings):
                         end = End.STALLED
