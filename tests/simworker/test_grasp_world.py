@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb.wire import SimulatePayload
 from graspdb_geometry import collision
 from graspdb_geometry.poses import ToolPoses
+from graspdb_simworker.simulation import grasp_world
 from graspdb_simworker.simulation.bodies import Closing, End
 from graspdb_simworker.simulation.chunks import Workpiece, prepare
 from graspdb_simworker.simulation.grasp_world import GraspWorld
-from graspdb_simworker.simulation.labels import Outcome, label_of
+from graspdb_simworker.simulation.labels import RATED, Outcome, label_of
 
 GetWorkpiece = Callable[..., Workpiece]
 FindPoses = Callable[[str, int], list[tuple[Any, Any]]]
@@ -63,12 +66,13 @@ def test_the_rim_of_a_mug_is_held(
     assert label.outcome is Outcome.SUCCESS
     # The wall is 4 mm; across a finger's width it bulges by 2 mm.
     assert 0.0045 < label.width_m < 0.0070
-    # Both fingers press with the closing force, one against the other.
+    # Both fingers press with the closing force, one against the other; what is out of all doubt is read while
+    # it still swings a little.
     last = held.contacts[-1]
     for finger, sign in ((0, 1.0), (1, -1.0)):
         on = last.fingers == finger
         along = (last.forces[on, None] * last.normals[on])[:, 1].sum()
-        assert sign * along == pytest.approx(workpiece.gripper.closing_force_n, rel=0.15)
+        assert sign * along == pytest.approx(workpiece.gripper.closing_force_n, rel=0.2)
 
 
 def test_nothing_to_close_on_is_a_miss(
@@ -140,6 +144,40 @@ def test_labels_do_not_depend_on_order_or_world(
     other.close_world()
     assert all(same(a, b) for a, b in zip(forward[:20], reversed(fresh), strict=True))
     assert len({closing.end for closing in forward}) > 1, "the sample must hold more than one kind of end"
+
+
+@pytest.mark.parametrize(
+    ("doubt", "end"),
+    [(("SUNK_M", -1.0), End.SUNK), (("contradictory", lambda ratings: True), End.STALLED)],
+    ids=["sunk", "contradictory"],
+)
+def test_finer_steps_leave_no_trace(
+    workpiece_of: GetWorkpiece,
+    grasps: dict[str, tuple[Any, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    doubt: tuple[str, Any],
+    end: End,
+    engine: str,
+) -> None:
+    world = workpiece_of("mug", engine=engine).world
+    before = world.close(*grasps["rim"])
+    with monkeypatch.context() as doubted:
+        doubted.setattr(grasp_world, *doubt)
+        finer = world.close(*grasps["rim"])
+        assert finer.end is end
+        assert finer.steps > before.steps or end is End.SUNK
+    assert same(before, world.close(*grasps["rim"]))
+
+
+@given(st.lists(st.floats(0.0, 10.0), max_size=8))
+def test_which_readings_count(ratings: list[float]) -> None:
+    counted = list(grasp_world.counted(ratings))
+    assert counted == ratings[len(ratings) - len(counted) :]
+    assert len(counted) == min(max(len(ratings) - 1, min(len(ratings), 1)), RATED)
+    contradict = any(a < 1.0 <= b for a in counted for b in counted)
+    assert grasp_world.contradictory(ratings) == contradict
+    if grasp_world.settled(ratings):
+        assert 1.0 < min(ratings[-2:]) <= max(ratings[-2:]) < 1.05 * min(ratings[-2:])
 
 
 def outcomes(workpiece: Workpiece, poses: list[tuple[Any, Any]]) -> np.ndarray:

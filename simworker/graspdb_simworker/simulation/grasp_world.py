@@ -43,14 +43,17 @@ from graspdb_simworker.simulation.labels import RATED
 APPROACH_GAP_M = 0.0005
 """The fingers start this far before their first contact: nothing can happen on the way there."""
 STALL_PROGRESS_M = 5e-5
-"""The jaw has stalled once it closed less than this by the ages below: 5 mm at full speed by the first."""
-READING_AGES_S = (0.040, 0.060, 0.080, 0.100, 0.120, 0.200, 0.280)
+"""The jaw has stalled once it closed less than this by the ages below: 3 mm at full speed by the first."""
+READING_AGES_S = (0.025, 0.040, 0.060, 0.080, 0.100, 0.120, 0.200, 0.280)
 """Contacts are read at these ages of the stall, until a reading leaves no doubt."""
-NO_DOUBT = (1.8, 1.6, 1.5, 1.4, 1.2, 1.2, 1.2)
-"""A reading from here on is the last one; 1 is the least that holds the weight. Lower ones are waited
-with: a heavy object often still creeps into a better hold, what moves between the fingers makes the forces
-ring, and a low reading may be an instant at which the fingers hardly touch. The median of the last
-:data:`graspdb_simworker.simulation.labels.RATED` counts."""
+NO_DOUBT = (4.0, 1.8, 1.6, 1.5, 1.4, 1.2, 1.2, 1.2)
+"""A reading from here on is the last one; 1 is the least that holds the weight. Lower ones are waited with: a
+heavy object often still creeps into a better hold, what moves between the fingers makes the forces ring, and
+a low reading may be an instant at which the fingers hardly touch. The median of the last
+:data:`graspdb_simworker.simulation.labels.RATED` counts, the very first reading only if it is the last."""
+SETTLED = 1.02
+"""Two readings in a row that differ by less than this factor, and hold what the last one must, are the last,
+too: the forces have settled."""
 DAMPING = 0.4
 """Rate at which the object's motion is damped while the jaw closes, over sqrt(closing force / mass / 1 m),
 which is the pace of its swing between the fingers: about 2 per second for 1.6 kg at 40 N, 5 for 75 g at
@@ -61,16 +64,17 @@ SLACK_S = 1.0
 """A closing may last this much longer than the fingers need to meet at full speed."""
 MOVED_AFTER_S = 0.100
 """This long after the stall the jaw begins to move: what it holds has nearly stopped swinging by then."""
+DOUBTED = (End.SUNK, End.TIMEOUT)
+"""What ends so at the ordinary step may be a matter of the step, and is closed on once more in finer ones."""
 SUNK_M = 0.002
 """A finger this deep in the object is passing through it: Bullet's contacts of single points may rock a flat
 object from corner to corner at every step and never stop the jaw. What turns as it is squeezed is up to
 1.6 mm deep for a while, and comes out again."""
-STALLED_SUNK_M, CARRIED_SUNK_M = 0.0008, 0.0002
+STALLED_SUNK_M, CARRIED_SUNK_M = 0.0005, 0.0002
 """Nor has a jaw stalled soundly this deep in it, whose forces are rated, or whose patches are to carry: what
 is firmly held is 0.02 mm deep. Of 63 closings of a screwdriver that were 0.8 mm deep on the way, or 0.2 when
 stalled, the fine step called 62 what they were called before."""
-_EMPTY_CHECK_STEPS = 10
-_SUNK_CHECK_STEPS = 3
+_EMPTY_CHECK_LOOKS = 10
 _SURELY_BETWEEN = 0.8
 """An object that no point of which moved by this share of its depth between the fingers is still there."""
 
@@ -90,12 +94,27 @@ CARRYING: Mapping[Fidelity, Carrying] = {
 }
 
 
-def doubtful(closing: Closing) -> bool:
-    """Whether a closing can't be believed at the ordinary step: the fingers sank into the object, or the
-    readings that count contradict each other, some hold the weight and some do not. What is slippery or light
+def counted(ratings: Sequence[float]) -> Sequence[float]:
+    """The readings that count."""
+    return (ratings[1:] or ratings)[-RATED:]
+
+
+def settled(ratings: Sequence[float]) -> bool:
+    """Whether the forces have settled, in a hold beyond doubt."""
+    two = ratings[-2:]
+    return len(two) == 2 and min(two) >= NO_DOUBT[-1] and max(two) < SETTLED * min(two)
+
+
+def contradictory(ratings: Sequence[float]) -> bool:
+    """Whether of the readings that count some hold the weight and some do not. What is slippery or light
     makes the forces ring, and the median of what rings is no measure."""
-    counted = closing.ratings[-RATED:]
-    return closing.end is End.SUNK or (bool(counted) and min(counted) < 1.0 <= max(counted))
+    rated = counted(ratings)
+    return bool(rated) and min(rated) < 1.0 <= max(rated)
+
+
+def _pace(stepping: Stepping, squeezing: bool) -> tuple[float, int]:
+    """The length of a step, and after how many to look."""
+    return (stepping.squeeze_dt_s, stepping.look_steps) if squeezing else (stepping.approach_dt_s, 1)
 
 
 class Moment(NamedTuple):
@@ -143,9 +162,8 @@ class GraspWorld:
         self.engine = f"{name} {installed.version_of(name)}"
         """The engine and its version."""
         self._engine = world_of(parts, mass, friction, gripper, visible=visible)
-        self._stepping = self._engine.stepping(fidelity, mass.mass_kg)
+        self._stepping = self._engine.stepping(fidelity, mass.mass_kg, carried=motion is not None)
         self._running = self._stepping
-        self._fine = self._engine.stepping("fine", mass.mass_kg)
         self._visible = visible
         self._film_every_s = film_every_s
         self._filmed_s = 0.0
@@ -180,12 +198,15 @@ class GraspWorld:
         """Close the jaw at a tool pose in the object frame, until it stalls, is empty or times out.
 
         Each finger can close by ``travel_m`` before the first of the two touches, by the exact geometry.
+        Where the fingers sink into the object, or never stall, it is closed on once more in finer steps.
         """
         stepping = self._stepping
         try:
             closing = self._close(position, quaternion_xyzw, travel_m)
-            if stepping != self._fine and doubtful(closing):
-                self._step_by(self._fine)
+            for finer in self._finer_than(stepping):
+                if closing.end not in DOUBTED:
+                    break
+                self._step_by(finer)
                 closing = self._close(position, quaternion_xyzw, travel_m)
             if self._moments_every_s < math.inf and self.moments[-1].time_s < self._time_s:
                 self.moments.append(self._moment())
@@ -195,12 +216,20 @@ class GraspWorld:
         finally:
             self._step_by(stepping)
 
+    def _finer_than(self, stepping: Stepping) -> list[Stepping]:
+        """What an engine has for what can't be believed."""
+        return [finer for finer in self._engine.finer if finer.squeeze_dt_s < stepping.squeeze_dt_s]
+
     def _step_by(self, stepping: Stepping) -> None:
         """Leave the running grasp, and cut time so in the next."""
+        self._cut(stepping)
+        self._engine.park()
+
+    def _cut(self, stepping: Stepping) -> None:
+        """Cut time so in what comes next."""
         if stepping is not self._running:
             self._running = stepping
             self._engine.cut(stepping)
-        self._engine.park()
 
     def _watch(self, dt: float) -> None:
         """Keep a moment, and take a picture, when it is time for the next."""
@@ -235,8 +264,9 @@ class GraspWorld:
         if self._visible:
             engine.aim()
 
-        dt = stepping.approach_dt_s
-        touched = False
+        dt, look, looks = stepping.approach_dt_s, 1, 0
+        finer = self._finer_than(stepping)
+        touched = squeezing = False
         elapsed = 0.0
         limit = 2.0 * start / gripper.max_speed_m_s + SLACK_S
         opening = 2.0 * start
@@ -248,42 +278,63 @@ class GraspWorld:
         end = End.TIMEOUT
         # What is done at every step costs as much as the physics of a light one: names looked up once.
         advance, watched = engine.advance, self._watched
-        ages = READING_AGES_S if self._carrier is None else (MOVED_AFTER_S,)
+        carried = self._carrier is not None
+        ages = (MOVED_AFTER_S,) if carried else READING_AGES_S
+        deepest = CARRIED_SUNK_M if carried else STALLED_SUNK_M
         while elapsed < limit:
-            opening = advance()
-            steps += 1
-            elapsed += dt
+            opening = advance(look)
+            steps += look
+            elapsed += look * dt
             if watched:
-                self._watch(dt)
+                self._watch(look * dt)
             if not 0.0 < opening < math.inf:
                 end = End.EMPTY if math.isfinite(opening) else End.UNSTABLE
                 break
-            if not touched and engine.pressed():
-                touched = True
-                dt = stepping.squeeze_dt_s
-                if dt != stepping.approach_dt_s:
+            pressing, depth = engine.touching()
+            if squeezing != (pressing == 2):
+                # What one finger pushes, or none, needs no finer steps than what none has touched yet.
+                squeezing = not squeezing
+                before = dt
+                dt, look = _pace(stepping, squeezing)
+                if dt != before:
                     engine.drive(dt)
-                mark_opening, mark_time = opening, elapsed
-                contacts.clear()
-                ratings.clear()
+                if squeezing and not touched:
+                    touched = True
+                    mark_opening, mark_time = opening, elapsed
+                    contacts.clear()
+                    ratings.clear()
             if mark_opening - opening > STALL_PROGRESS_M:
                 mark_opening, mark_time = opening, elapsed
                 contacts.clear()
                 ratings.clear()
             elif elapsed - mark_time >= ages[len(contacts)] - 1e-9:
                 contacts.append(engine.contacts())
-                if self._carrier is None:
+                if not carried:
                     ratings.append(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction))
-                if len(contacts) == len(ages) or ratings[-1] >= NO_DOUBT[len(contacts) - 1]:
-                    end = End.STALLED
-                    break
-            if steps % _EMPTY_CHECK_STEPS == 0 and not self._between():
+                if len(contacts) == len(ages) or (
+                    depth <= (deepest if len(contacts) > 1 else CARRIED_SUNK_M)
+                    and (ratings[-1] >= NO_DOUBT[len(contacts) - 1] or settled(ratings))
+                ):
+                    if not finer or not contradictory(ratings):
+                        end = End.STALLED
+                        break
+                    # It stays where it is: what its forces are, finer steps tell.
+                    stepping = finer.pop(0)
+                    self._cut(stepping)
+                    dt, look = _pace(stepping, squeezing)
+                    engine.drive(dt)
+                    limit = elapsed + SLACK_S
+                    mark_opening, mark_time = opening, elapsed
+                    contacts.clear()
+                    ratings.clear()
+            looks += 1
+            if looks % _EMPTY_CHECK_LOOKS == 0 and not self._between():
                 end = End.EMPTY
                 break
-            if touched and steps % _SUNK_CHECK_STEPS == 0 and engine.sunk(SUNK_M):
+            if touched and depth > SUNK_M:
                 end = End.SUNK
                 break
-        if end is End.STALLED and engine.sunk(STALLED_SUNK_M if self._carrier is None else CARRIED_SUNK_M):
+        if end is End.STALLED and depth > deepest:
             end = End.SUNK
         closing = self._closing(end, touched, opening, contacts, ratings, steps)
         if self._carrier is not None and closing.end is End.STALLED:
@@ -341,5 +392,5 @@ class GraspWorld:
             end = End.UNSTABLE
         elif end is End.STALLED:
             opening -= 2.0 * self._engine.inflated_m
-        held, rated = (tuple(contacts), tuple(ratings)) if end is End.STALLED else ((), ())
+        held, rated = (tuple(contacts), tuple(counted(ratings))) if end is End.STALLED else ((), ())
         return Closing(end, touched, opening, held, position, quaternion, steps, ratings=rated)

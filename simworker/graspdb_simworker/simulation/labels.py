@@ -2,7 +2,7 @@
 
 **wrench**: can the contact forces hold the object, whichever way down is (:mod:`.force_test`)? Where the
 forces ring because the object still moves, several instants of the stalled jaw are rated and the median of
-the last five counts. If some of these hold the weight and some do not, the closing is simulated finer.
+the last five counts. If some of these hold the weight and some do not, the closing goes on in finer steps.
 
 **lift**: is the object still held, and where it was, after the jaw lifted and shook it? **shake**: is it
 still held after the jaw shook it, nothing weighing? Motions, and how far an object may move in the jaw, are

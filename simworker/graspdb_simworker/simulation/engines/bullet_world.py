@@ -43,11 +43,16 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 _ANY_LINK = -2
 _JOINTS = (0, 1)
 
-_LIGHT = Stepping(1.0 / 120.0, 1.0 / 480.0, 50)
-_HEAVY = Stepping(1.0 / 120.0, 1.0 / 240.0, 80)
-"""What is heavy moves slowly: longer steps do, if the solver takes the trouble to converge in each. Until
-both fingers press, more than half of all steps, 1/120 s differs from the labels of the fine step as often
-as 1/240 s does, and 1/80 s more often."""
+_LIGHT = Stepping(1.0 / 120.0, 1.0 / 360.0, 80, look_steps=3, residual=1e-6)
+_HEAVY = Stepping(1.0 / 120.0, 1.0 / 180.0, 80, look_steps=2, residual=1e-6)
+"""Long steps do, if the solver takes the trouble to converge in each; what is heavy moves slowly. Where fewer
+than two fingers press, half of the time and more, 1/120 s differs from the labels of the fine step as often
+as 1/240 s does, and 1/80 s more often. See docs/experiments.md."""
+_LIGHT_CARRIED = Stepping(1.0 / 120.0, 1.0 / 480.0, 50)
+_HEAVY_CARRIED = Stepping(1.0 / 120.0, 1.0 / 240.0, 80)
+"""What is to be carried: the longer the steps, the deeper the fingers are in it when they stall, and then it
+is closed on once more."""
+_MIDDLE = Stepping(1.0 / 480.0, 1.0 / 1000.0, 100, look_steps=4)
 _FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200)
 
 
@@ -69,6 +74,7 @@ class BulletWorld(EngineWorld):
     light one: it calls pybullet itself, with arguments without their names."""
 
     inflated_m = COLLISION_MARGIN_M
+    finer = (_MIDDLE, _FINE)
 
     def __init__(
         self, parts: Sequence[Part], mass: MassProperties, friction: float, gripper: Gripper, *, visible: bool
@@ -87,9 +93,11 @@ class BulletWorld(EngineWorld):
         self._finish_bodies(math.sqrt(friction))
 
     @staticmethod
-    def stepping(fidelity: Fidelity, mass_kg: float) -> Stepping:
+    def stepping(fidelity: Fidelity, mass_kg: float, *, carried: bool) -> Stepping:
         if fidelity == "fine":
             return _FINE
+        if carried:
+            return _HEAVY_CARRIED if mass_kg >= HEAVY_KG else _LIGHT_CARRIED
         return _HEAVY if mass_kg >= HEAVY_KG else _LIGHT
 
     def close_world(self) -> None:
@@ -97,7 +105,9 @@ class BulletWorld(EngineWorld):
 
     def cut(self, stepping: Stepping) -> None:
         self._approach_dt = stepping.approach_dt_s
-        self._bullet.setPhysicsEngineParameter(numSolverIterations=stepping.iterations)
+        self._bullet.setPhysicsEngineParameter(
+            numSolverIterations=stepping.iterations, solverResidualThreshold=stepping.residual
+        )
 
     def damp(self, rate: float) -> None:
         self._bullet.changeDynamics(self._object, -1, linearDamping=rate, angularDamping=rate)
@@ -117,18 +127,21 @@ class BulletWorld(EngineWorld):
         for joint in _JOINTS:
             pybullet.resetJointState(jaw, joint, finger_m, speed, physicsClientId=client)
 
-    def advance(self) -> float:
+    def advance(self, steps: int) -> float:
         client = self._client
-        pybullet.stepSimulation(client)
+        for _ in range(steps):
+            pybullet.stepSimulation(client)
         first, second = pybullet.getJointStates(self._jaw, _JOINTS, client)
         return float(first[0] + second[0])
 
-    def pressed(self) -> bool:
-        pressing = 0
+    def touching(self) -> tuple[int, float]:
+        first = second = False
+        nearest = 0.0
         for contact in pybullet.getContactPoints(self._jaw, self._object, _ANY_LINK, _ANY_LINK, self._client):
             if contact[9] > 0.0:
-                pressing |= 1 << (contact[3] + 1)
-        return pressing & 0b110 == 0b110
+                first, second = first or contact[3] == 0, second or contact[3] == 1
+            nearest = min(nearest, contact[8])
+        return first + second, -nearest
 
     def contacts(self) -> Contacts:
         contacts = [c for c in self._bullet.getContactPoints(self._jaw, self._object) if c[9] > 0.0]
@@ -138,10 +151,6 @@ class BulletWorld(EngineWorld):
             np.array([contact[9] for contact in contacts], dtype=np.float64),
             np.array([contact[3] for contact in contacts], dtype=np.int64),
         )
-
-    def sunk(self, depth_m: float) -> bool:
-        touching = pybullet.getContactPoints(self._jaw, self._object, _ANY_LINK, _ANY_LINK, self._client)
-        return any(contact[8] < -depth_m for contact in touching)
 
     def body(self) -> tuple[Vector, Quaternion]:
         where, orientation = pybullet.getBasePositionAndOrientation(self._object, self._client)

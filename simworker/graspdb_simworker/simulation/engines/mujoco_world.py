@@ -38,7 +38,7 @@ _BODY, _SPIN = slice(2, 9), slice(2, 8)
 _CONTACT = 'solref="0.0005 3" solimp="0.99 0.999 0.0001 0.5 2"'
 """MuJoCo raises the time constant, half a millisecond, to two steps."""
 
-_STANDARD = Stepping(1.0 / 480.0, 1.0 / 960.0, 50)
+_STANDARD = Stepping(1.0 / 480.0, 1.0 / 960.0, 50, look_steps=4)
 _FINE = Stepping(1.0 / 2000.0, 1.0 / 2000.0, 200)
 
 
@@ -46,6 +46,7 @@ class MujocoWorld(EngineWorld):
     """A world of MuJoCo's, without pictures."""
 
     inflated_m = 0.0
+    finer = (_FINE,)
 
     def __init__(
         self, parts: Sequence[Part], mass: MassProperties, friction: float, gripper: Gripper, *, visible: bool
@@ -63,7 +64,7 @@ class MujocoWorld(EngineWorld):
         self._step = mujoco.mj_step
 
     @staticmethod
-    def stepping(fidelity: Fidelity, mass_kg: float) -> Stepping:
+    def stepping(fidelity: Fidelity, mass_kg: float, *, carried: bool) -> Stepping:
         return _FINE if fidelity == "fine" else _STANDARD
 
     def close_world(self) -> None:
@@ -85,19 +86,20 @@ class MujocoWorld(EngineWorld):
         self._data.qpos[:] = (finger_m, finger_m, *where, w, x, y, z)
         self._data.qvel[:2] = -self.gripper.max_speed_m_s
 
-    def advance(self) -> float:
+    def advance(self, steps: int) -> float:
         data = self._data
-        self._step(self._model, data)
+        self._step(self._model, data, steps)
         first, second = data.qpos[:2].tolist()
         return float(first + second)
 
-    def pressed(self) -> bool:
+    def touching(self) -> tuple[int, float]:
         data = self._data
-        if data.ncon < 2:
-            return False
+        if data.ncon == 0:
+            return 0, 0.0
         jaw, _, forces = self._touching()
         pressing = set(jaw[forces > 0.0].tolist())
-        return _FIRST_FINGER in pressing and _SECOND_FINGER in pressing
+        fingers = (_FIRST_FINGER in pressing) + (_SECOND_FINGER in pressing)
+        return fingers, max(0.0, -float(data.contact.dist.min()))
 
     def contacts(self) -> Contacts:
         jaw, normals, forces = self._touching()
@@ -112,9 +114,6 @@ class MujocoWorld(EngineWorld):
         # Boxes come before meshes in a pair, and the normal points from the first to the second.
         forces = np.where(address >= 0, self._data.efc_force[address], 0.0)
         return geoms[:, 0], contact.frame[:, :3], forces
-
-    def sunk(self, depth_m: float) -> bool:
-        return self._data.ncon > 0 and bool(self._data.contact.dist.min() < -depth_m)
 
     def depth_between(self) -> float:
         model, data = self._model, self._data

@@ -22,12 +22,15 @@ from graspdb_simworker.simulation.bodies import (
 
 @dataclass(frozen=True)
 class Stepping:
-    """How an engine cuts time, until both fingers touch and from then on; ``iterations`` of its solver at
-    most."""
+    """How an engine cuts time, while fewer than two fingers press and while both do; ``iterations`` of its
+    solver at most, and no more once one changes no velocity by more than the root of ``residual``, m/s, where
+    an engine can be told that. While both press, the jaw is looked at after every ``look_steps``."""
 
     approach_dt_s: float
     squeeze_dt_s: float
     iterations: int
+    look_steps: int = 1
+    residual: float = 1e-7
 
 
 class EngineWorld(Protocol):
@@ -39,6 +42,9 @@ class EngineWorld(Protocol):
 
     inflated_m: float
     """How much thicker than it is the engine takes the object to be, on every side."""
+    finer: tuple[Stepping, ...]
+    """In which steps to go on where forces ring, or to close once more where a closing can't be believed, one
+    after the other until it can."""
 
     def __init__(
         self, parts: Sequence[Part], mass: MassProperties, friction: float, gripper: Gripper, *, visible: bool
@@ -46,11 +52,11 @@ class EngineWorld(Protocol):
         """``parts`` are convex, in the object frame; ``visible``: build what can be seen."""
 
     @staticmethod
-    def stepping(fidelity: Fidelity, mass_kg: float) -> Stepping:
-        """How finely to simulate an object of this mass."""
+    def stepping(fidelity: Fidelity, mass_kg: float, *, carried: bool) -> Stepping:
+        """How finely to close on an object of this mass, which is carried afterwards or not."""
 
     def cut(self, stepping: Stepping) -> None:
-        """Cut time so from the next :meth:`park` on."""
+        """Cut time so from the next :meth:`drive` or :meth:`park` on."""
 
     def damp(self, rate: float) -> None:
         """Damp the object's motion at this rate, 1/s."""
@@ -61,17 +67,14 @@ class EngineWorld(Protocol):
     def place(self, where: Vector, orientation: Quaternion, finger_m: float) -> None:
         """The object here, at rest, and each finger so far from the middle, already closing."""
 
-    def advance(self) -> float:
-        """Make a step; how far the fingers are apart then, metres."""
+    def advance(self, steps: int) -> float:
+        """Make so many steps; how far the fingers are apart then, metres."""
 
-    def pressed(self) -> bool:
-        """Whether both fingers press on the object."""
+    def touching(self) -> tuple[int, float]:
+        """How many fingers press on the object, and how deep the jaw is in it, metres, not below 0."""
 
     def contacts(self) -> Contacts:
         """What presses on the object."""
-
-    def sunk(self, depth_m: float) -> bool:
-        """Whether the jaw is deeper in the object than this."""
 
     def depth_between(self) -> float:
         """How deep the object is in the space between the open fingers, metres; minus infinity outside.
