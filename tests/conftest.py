@@ -16,7 +16,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +54,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     # A developer's own service, key and settings are no part of any test.
     for name in [name for name in os.environ if name.startswith("GRASPDB_") and "_TEST_" not in name]:
         del os.environ[name]
+    # The same question has the same answer while nothing is posted; what is learned has tests of its own.
+    os.environ["GRASPDB_LEARNED_ESTIMATES"] = "false"
     if getattr(session.config.option, "numprocesses", None):
         subprocess.run([sys.executable, "-c", _COMPILE], check=True)
 
@@ -231,26 +232,18 @@ def serving(settings: Settings) -> Iterator[str]:
 Serve = Callable[..., str]
 
 
-def _started(running: ExitStack, url: str, **options: Any) -> str:
-    """The address of a service over a database; by default the kernel estimate answers always, so that the
-    same question has the same answer while nothing is posted.
-    """
-    settings = Settings.model_validate({"database_url": url, "learned_estimates": False, **options})
-    return running.enter_context(serving(settings))
-
-
 @pytest.fixture
 def serve() -> Iterator[Serve]:
     """Start the service: ``serve(database_url, **settings)`` returns its address; several may run."""
     with ExitStack() as running:
-        yield partial(_started, running)
+        yield lambda url, **options: running.enter_context(serving(Settings(database_url=url, **options)))
 
 
 @pytest.fixture(scope="module")
 def serve_module() -> Iterator[Serve]:
     """As ``serve``, for all tests of a module."""
     with ExitStack() as running:
-        yield partial(_started, running)
+        yield lambda url, **options: running.enter_context(serving(Settings(database_url=url, **options)))
 
 
 @pytest.fixture

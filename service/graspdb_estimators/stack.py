@@ -243,43 +243,61 @@ def fit_stack(
     learned, _ = _sample(succeeded, every.weight, _LEARNED, rng)
     judged, weight = _sample(succeeded, every.weight, _JUDGED, rng)
     breathe()
-    described = None if features is None else _described(features, every.poses, learned, judged, threads)
-    # Drawn by outcome, attempts weigh otherwise than they stand for: to the trees that is a constant of the
-    # logit, which the stack has.
-    worth = None if np.ptp(every.weight) == 0.0 else every.weight[learned]
-    kernel, trials, trees, widths, turned = (np.empty(len(judged)) for _ in range(5))
+    lesson = _Lesson.of(every, learned, features, threads)
+    kernel, trials, widths, turned = (np.empty(len(judged)) for _ in range(4))
+    trees = np.empty(len(judged)) if features is not None else None
     for number in range(blocks.folds):
         rows = np.flatnonzero(blocks.fold[judged] == number)
         if not rows.size:
             continue
-        poses = every.poses[judged[rows]]
+        poses, rest = every.poses[judged[rows]], blocks.fold[learned] != number
         out = _model(model, every, np.flatnonzero(blocks.fold == number))
         kernel[rows], trials[rows] = model.without(out, poses, threads=threads)
         breathe()
-        rest = blocks.fold[learned] != number
-        near = _model(model, every, learned[rest]).without_interval(poses, everywhere=True, threads=threads)[
-            2
-        ]
+        near = _model(model, every, learned[rest]).support(poses, threads=threads)[1]
         widths[rows], turned[rows] = near.position_widths, near.rotation_widths
-        if features is not None and described is not None:
-            breathe()
-            fold = BoostedTrees.fit(
-                described[0][rest],
-                every.share[learned[rest]],
-                None if worth is None else worth[rest],
-                monotonic=features.monotonic,
-            )
-            trees[rows] = fold.logit(described[1][rows])
+        breathe()
+        fold = lesson.learned(rest)
+        if trees is not None and features is not None and fold is not None:
+            trees[rows] = fold.logit(features.at(poses, threads))
         breathe()
     told = _Predicted(
-        _logit(kernel), trials / (1.0 + trials), None if features is None else trees,
+        _logit(kernel), trials / (1.0 + trials), trees,
         every.share[judged], weight, blocks.block[judged], blocks.fold[judged],
         _neighbours(every.poses[judged], blocks.fold[judged], (model.widest_m, max(model.sigmas[3:]))),
     )  # fmt: skip
-    final = None
-    if features is not None and described is not None:
-        final = BoostedTrees.fit(described[0], every.share[learned], worth, monotonic=features.monotonic)
-    return _stacked(told, final, reach, widths, turned, model.size)
+    return _stacked(told, lesson.learned(None), reach, widths, turned, model.size)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lesson:
+    """What trees learn from: features (N, F), None without shapes; by how much attempts (N,) succeeded, and
+    their weights, None where they weigh alike. (Drawn by outcome, they weigh otherwise than they stand for:
+    to trees that is a constant of the logit, which the stack has.)
+    """
+
+    features: GraspFeatures | None
+    described: NDArray[np.float32] | None
+    share: Floats
+    weight: Floats | None
+
+    @classmethod
+    def of(cls, every: Attempts, rows: Ints, features: GraspFeatures | None, threads: int) -> _Lesson:
+        described = None if features is None else features.at(every.poses[rows], threads).astype(np.float32)
+        weight = None if np.ptp(every.weight) == 0.0 else every.weight[rows]
+        return cls(features, described, every.share[rows], weight)
+
+    def learned(self, rows: Bools | None) -> BoostedTrees | None:
+        """Trees of some of the attempts, None: of all; None without shapes."""
+        if self.features is None or self.described is None:
+            return None
+        some = slice(None) if rows is None else rows
+        return BoostedTrees.fit(
+            self.described[some],
+            self.share[some],
+            None if self.weight is None else self.weight[some],
+            monotonic=self.features.monotonic,
+        )
 
 
 def _blocks(positions: Floats, edge: float) -> Blocks | None:
@@ -359,14 +377,6 @@ def _sample(succeeded: Bools, weight: Floats, most: int, rng: np.random.Generato
         rows.append(drawn)
         stands_for.append(weight[drawn] * (len(members) / count))
     return np.concatenate(rows), np.concatenate(stands_for)
-
-
-def _described(
-    features: GraspFeatures, poses: Poses, learned: Ints, judged: Ints, threads: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Features of either sample; most rows of the smaller are in the other, but they are few."""
-    one, other = (features.at(poses[rows], threads).astype(np.float32) for rows in (learned, judged))
-    return one, other
 
 
 def _model(like: SuccessModel, every: Attempts, rows: Ints) -> SuccessModel:

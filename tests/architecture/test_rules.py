@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = (
     "service/graspdb_density",
     "service/graspdb_geometry",
+    "service/graspdb_estimators",
     "service/graspdb_service",
     "simworker/graspdb_simworker",
     "clients/graspdb",
@@ -43,6 +44,8 @@ OPTIONAL = {
     "mcp_types",
     "mujoco",
     "opentelemetry",
+    "sklearn",
+    "threadpoolctl",
     "pandas",
     "PIL",
     "psycopg",

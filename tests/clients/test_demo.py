@@ -55,7 +55,11 @@ def test_from_nothing_to_checked_grasps_and_kept_until_ctrl_c(
 ) -> None:
     arguments = ["demo", "--keep", "--folder", str(tmp_path), "--max-poses", "20000"]
     process = subprocess.Popen(
-        [GRASPDB, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [GRASPDB, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "GRASPDB_LEARNED_ESTIMATES": "true"},
     )
     assert process.stdout is not None
     out = ""
