@@ -26,6 +26,7 @@ demo: install  ## Real physics on the mug: from nothing to a best grasp (KEEP=1 
 
 test: chromium check  ## Every check and every test, on SQLite and on a real PostgreSQL
 	@sh .ci/faketime
+	-@sh .ci/nginx
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not long" --ignore tests/architecture
 
 chromium:

@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {
     "graspdb",
     "graspdb_density",
+    "graspdb_estimators",
     "graspdb_geometry",
     "graspdb_service",
     "graspdb_simworker",
