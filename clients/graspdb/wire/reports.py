@@ -417,7 +417,7 @@ class LearnedCalibration(Response):
     skill: ReportRange
     """Brier's skill: 1 perfect, 0 no better than the share of successes."""
     kernel_skill: float | None
-    """Brier's skill of the plain kernel estimate on the same attempts."""
+    """Brier's skill of the plain kernel estimate on the same attempts; null where all fared alike."""
     ece: float | None
     """Expected calibration error over predictions above 0.1; null where there are none."""
     auc: float | None

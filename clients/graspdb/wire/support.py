@@ -104,9 +104,9 @@ class EstimatorInfo(Response):
     """How many attempts it was learned from; null where nothing was learned."""
     skill: float | None = None
     """Its Brier skill on attempts whose block of space was left out: 1 perfect, 0 no better than always
-    saying their share of successes."""
+    saying their share of successes; null where nothing was learned."""
     kernel_skill: float | None = None
-    """The same of the plain kernel estimate."""
+    """The same of the plain kernel estimate; null where nothing was learned."""
 
 
 class SelectedSource(Response):
@@ -139,9 +139,9 @@ class SymmetryAxis(Response):
     """An axis of symmetry of an object, in the frame of its mesh."""
 
     origin: Triple
-    """A point of it, metres: the centroid of the surface."""
+    """A point of it, object frame, metres: the centroid of the surface."""
     direction: Triple
-    """Unit vector along it, either way."""
+    """Unit vector along it, object frame, either way."""
     turns: int | None = None
     """By how many equal turns the object comes to lie on itself; null for any turn: an axis of revolution."""
 
@@ -150,7 +150,7 @@ class SymmetryPlane(Response):
     """A mirror plane of an object, in the frame of its mesh: n.x = d."""
 
     normal: Triple
-    """Unit vector across it, n, either way."""
+    """Unit vector across it, n, object frame, either way."""
     offset_m: float
     """How far it is from the origin along the normal, d, metres."""
 
