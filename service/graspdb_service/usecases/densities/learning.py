@@ -143,19 +143,16 @@ class Learning:
         whole = StackedModel(plain.whole, known.stack, features_now)
         return Model(whole, plain.quick, known.stack.reach(plain.reach), known.info, plain)
 
-    def held(self, selected: Selected, kernel: str, *, trees: bool) -> Stack | None:
-        """What was learned last of a selection's attempts and is in use; None where nothing was."""
-        if not self._enabled:
-            return None
-        known = self._known(selected.row.id, _digest(selected, kernel, trees), selected.row.epoch, 0)
-        return None if known is None or known.epoch != selected.row.epoch else known.stack
-
-    def info(self, selected: Selected, kernel: str, *, trees: bool) -> EstimatorInfo:
-        """Who estimates a selection's success probabilities, as far as that is known."""
-        if self.held(selected, kernel, trees=trees) is None:
-            return EstimatorInfo()
-        known = self._held[_digest(selected, kernel, trees)]
-        return known.info
+    def held(self, selected: Selected, kernel: str, *, trees: bool) -> tuple[Stack | None, EstimatorInfo]:
+        """What was learned last of a selection's attempts and is in use, None where nothing is; who estimates
+        success probabilities, as far as that is known without a look at any attempt.
+        """
+        known = None
+        if self._enabled:
+            digest, epoch = _digest(selected, kernel, trees), selected.row.epoch
+            known = self._known(selected.row.id, digest, epoch, attempts=None)
+            known = None if known is None or known.epoch != epoch else known
+        return (None, EstimatorInfo()) if known is None else (known.stack, known.info)
 
     def wait(self, selected: Selected, kernel: str, *, trees: bool, within_s: float) -> bool:
         """Until what is being learned of a selection's attempts is; False where that takes longer."""
@@ -183,14 +180,14 @@ class Learning:
             else GraspFeatures(closing, shape_of(selected.profile), symmetric=selected.jaw_symmetric)
         )
 
-    def _known(self, object_id: int, digest: str, epoch: int, attempts: int) -> _Learned | None:
-        """What this process has learned, or another one meanwhile."""
+    def _known(self, object_id: int, digest: str, epoch: int, attempts: int | None) -> _Learned | None:
+        """What this process has learned, or another one meanwhile: of so many attempts, or of whichever."""
         now = time.monotonic()
         with self._changed:
             known = self._held.get(digest)
             if known is not None:
                 self._held.move_to_end(digest)
-                if known.is_of(epoch, attempts or known.attempts):
+                if known.is_of(epoch, known.attempts if attempts is None else attempts):
                     return known
             if now - self._looked.get(digest, -_LOOK_AGAIN_S) < _LOOK_AGAIN_S:
                 return known

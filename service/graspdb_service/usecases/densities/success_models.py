@@ -244,13 +244,12 @@ class Successes:
         model, key = self.model(built, collisions_known=collisions_known), _key(built, collisions_known)
         if model is not None and model.estimator.state == "fitting":
             self.learning.wait(built.selected, key.kernel, trees=collisions_known, within_s=within_s)
-        held = self.learning.held(built.selected, key.kernel, trees=collisions_known)
-        return held, self.estimator(built, collisions_known=collisions_known)
+        return self.learning.held(built.selected, key.kernel, trees=collisions_known)
 
     def estimator(self, built: Built, *, collisions_known: bool) -> EstimatorInfo:
         """Who estimates success probabilities, without a look at any attempt."""
-        key = _key(built, collisions_known)
-        return self.learning.info(built.selected, key.kernel, trees=collisions_known)
+        kernel = _key(built, collisions_known).kernel
+        return self.learning.held(built.selected, kernel, trees=collisions_known)[1]
 
     def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> Estimates:
         """Success probability of poses (n,) under a model from :meth:`model`.
