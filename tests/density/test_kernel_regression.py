@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from graspdb_density import IsotropicKernel, SuccessModel, se3
+from graspdb_density import DiagonalKernel, IsotropicKernel, SuccessModel, se3
 from graspdb_density.se3 import Poses
 
 Pair = tuple[se3.Floats, se3.Floats]
@@ -221,3 +221,42 @@ def test_what_either_judge_says_lies_within_the_interval(seed: int) -> None:
         slack = abs(won.mean() - agreed.prior_share) / (1.0 + found.effective_trials)
         assert (found.low - slack - 1e-9 <= told).all()
         assert (told <= found.high + slack + 1e-9).all()
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_attempts_are_told_as_they_came_and_some_are_left_out_as_if_they_had_not_come(fixed: bool) -> None:
+    rng = np.random.default_rng(3)
+    poses = Poses(rng.normal(0, 0.02, (300, 3)), se3.random_quaternions(300, rng))
+    share = rng.choice([0.0, 0.5, 1.0], 300)
+    weights = rng.choice([0.5, 1.0], 300)
+    symmetric = rng.random(300) < 0.7
+    kernel = (
+        DiagonalKernel.of([0.01, 0.02, 0.03, 0.3, 0.3, 0.4], np.eye(3)[[1, 2, 0]])
+        if fixed
+        else IsotropicKernel(0.02, 0.3)
+    )
+    model = SuccessModel.build(poses, share, kernel=kernel, symmetric=symmetric, weights=weights)
+    told = model.attempts()
+    order = np.lexsort(told.poses.positions.T)
+    mine = np.lexsort(poses.positions.T)
+    np.testing.assert_allclose(told.poses.positions[order], poses.positions[mine], atol=1e-7)
+    for found, posted in ((told.share, share), (told.weight, weights), (told.symmetric, symmetric)):
+        np.testing.assert_array_equal(found[order], posted[mine])
+    out = rng.random(300) < 0.3
+
+    def of(rows: NDArray[np.bool_]) -> SuccessModel:
+        return SuccessModel.build(
+            poses[rows], share[rows], kernel=kernel, symmetric=symmetric[rows], weights=weights[rows]
+        )
+
+    asked = poses[:50]
+    p, n = model.without(of(out), asked)
+    rest = of(~out).evaluate(asked)
+    np.testing.assert_allclose(p, rest.probability, atol=2e-3)
+    np.testing.assert_allclose(n, rest.effective_trials, rtol=2e-3, atol=1e-3)
+    # Where all that tell are left out nothing does.
+    far = Poses(np.full((1, 3), 5.0), np.array([[0.0, 0, 0, 1]]))
+    lone = model.extend(far, np.array([1.0]))
+    p, n = lone.without(SuccessModel.build(far, np.array([1.0]), kernel=kernel), far)
+    assert n[0] == 0.0
+    assert p[0] == pytest.approx(model.prior_share)
