@@ -117,13 +117,24 @@ def best_grasp(
         ERRORS.print(f"The best grasp, drawn: {escape(str(picture))}", highlight=False, soft_wrap=True)
     if state.json:
         head = ("frame", "convention", "reference", "status", "ranking", "revision", "kernel", "selection")
-        names = (*head, "calibration", "symmetry", "warnings", "answer", "newer_revision", "stale")
+        names = (
+            *head,
+            "estimator",
+            "calibration",
+            "symmetry",
+            "warnings",
+            "answer",
+            "newer_revision",
+            "stale",
+        )
         out({**{name: getattr(found, name) for name in names}, "grasps": list(found)})
     elif csv:
         out_csv(found.columns())
     elif count == 1:
         show_rows({**found[0].summary(), **_ranked_by(found)})
         _tell_kept(found)
+        if found[0].success_probability is not None:
+            _tell_estimator(found.estimator)
     else:
         _show_grasps(found, in_world=found[0].world is not None and found.reference == "world")
     if not state.json:
