@@ -32,20 +32,15 @@ class GraspFeatures:
     shape : GripperShape
     symmetric : bool
         Whether the jaw is mirror-symmetric: then both twins of a grasp have the same features.
-    of_pose : bool
-        With the pose itself, which tells of this object alone; without, what may tell of others.
     """
 
     closing: ClosingGeometry
     shape: GripperShape
     symmetric: bool = True
-    of_pose: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the columns."""
-        if not self.of_pose:
-            return FEATURES
         return FEATURES + _PLACE + (_LINE if self.symmetric else _AXIS)
 
     @cached_property
@@ -63,8 +58,6 @@ class GraspFeatures:
             poses = poses.turned(other)
             turned[other, :, :2] *= -1.0
         closed = self.closing.features(poses, self.shape, threads)
-        if not self.of_pose:
-            return closed
         y = turned[:, :, 1]
         a, b = _UPPER
         axis = y[:, a] * y[:, b] if self.symmetric else y

@@ -358,7 +358,10 @@ def _stacked(
     doubt = _variances(probability, doubts, told)
     half = 1.6448536269514722 * np.sqrt(doubts @ doubt)
     inside = turned <= reach.rotation
-    reached = max(reach.position, _reached(probability, told, widths, inside))
+    # What kernels alone tell of the far side of what was tried, their own reach has judged.
+    reached = reach.position
+    if told.trees is not None:
+        reached = max(reached, _reached(probability, told, widths, inside))
     held = LeftOut(
         told.share, told.weight, told.block, expit(told.kernel), probability,
         expit(logit - half), expit(logit + half), inside & (widths <= reached),

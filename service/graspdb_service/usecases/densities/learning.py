@@ -39,8 +39,10 @@ log = logging.getLogger("graspdb")
 _FORMAT = "1"
 #: Learned again once so large a share of the attempts are others.
 _CHANGED = 0.25
-#: What is held in memory, and how many objects wait to be learned of, those asked for last.
-_MOST_HELD, _MOST_WAITING = 256, 16
+#: What is held in memory takes so much, that asked for last; and how much waits to be learned of.
+_MAX_BYTES, _MOST_WAITING = 64 * 2**20, 16
+#: Looks at the database are remembered so many.
+_MOST_LOOKS = 1_024
 #: How long it is relied on that no replica has learned anything either.
 _LOOK_AGAIN_S = 1.0
 #: How long a service that stops waits for what is being fitted.
@@ -83,6 +85,10 @@ class _Learned:
             skill=round(skill, 3),
             kernel_skill=round(of_kernel, 3),
         )
+
+    @property
+    def nbytes(self) -> int:
+        return 1_024 + (0 if self.stack is None else self.stack.nbytes)
 
     def is_of(self, epoch: int, attempts: int) -> bool:
         """Whether nearly the same attempts would teach it."""
@@ -191,13 +197,16 @@ class Learning:
                     return known
             if now - self._looked.get(digest, -_LOOK_AGAIN_S) < _LOOK_AGAIN_S:
                 return known
-            if len(self._looked) > 4 * _MOST_HELD:
+            if len(self._looked) > _MOST_LOOKS:
                 self._looked.clear()
             self._looked[digest] = now
         found = None
         with contextlib.suppress(*UNAVAILABLE), self._database.read() as tx:
             found = learned_estimators.find(tx, object_id, digest)
-        if found is None or (known is not None and found.attempts == known.attempts):
+        if found is None:
+            return known
+        if known is not None and (found.epoch, found.attempts) <= (known.epoch, known.attempts):
+            # As old, or older: what this process learned last could not be kept.
             return known
         try:
             stack = None if found.content is None else Stack.of_bytes(found.content)
@@ -210,8 +219,9 @@ class Learning:
         with self._changed:
             self._held[digest] = learned
             self._held.move_to_end(digest)
-            while len(self._held) > _MOST_HELD:
-                self._held.popitem(last=False)
+            bytes_held = sum(each.nbytes for each in self._held.values())
+            while bytes_held > _MAX_BYTES and len(self._held) > 1:
+                bytes_held -= self._held.popitem(last=False)[1].nbytes
         return learned
 
     def _learn(self, task: _Task) -> None:

@@ -39,7 +39,7 @@ _Content = tuple[str, MeshForm | str, str | None]
 Solid = Scene | Surface
 """An object's mesh, exactly; its convex parts, from which they may differ, where it has no mesh."""
 
-_MAX_BYTES = 256 * 2**20
+_SOLIDS_BYTES, _CLOSINGS_BYTES = 192 * 2**20, 64 * 2**20
 #: How much wider than it needs the jaw is with ``auto``: half of that beside either finger.
 CLEARANCE_M = 0.01
 #: What reaches less far between the fingers is grazed: no gripper is placed more exactly.
@@ -141,10 +141,10 @@ S = TypeVar("S", bound=_Sized)
 class _Prepared(Generic[S]):
     """What is made of stored geometry, once for each content, form and content beside it."""
 
-    def __init__(self, database: Database, compute: Compute) -> None:
+    def __init__(self, database: Database, compute: Compute, max_bytes: int) -> None:
         self._database = database
         self._compute = compute
-        self._cache: SingleFlightCache[_Content, S] = SingleFlightCache(_MAX_BYTES, lambda made: made.nbytes)
+        self._cache: SingleFlightCache[_Content, S] = SingleFlightCache(max_bytes, lambda made: made.nbytes)
 
     def made(self, key: _Content, prepare: Callable[[list[bytes]], S]) -> S:
         """What is made of the contents that a key names."""
@@ -169,8 +169,8 @@ class Scenes:
 
     def __init__(self, database: Database, compute: Compute, features: Features) -> None:
         self.features = features
-        self._solids: _Prepared[Solid] = _Prepared(database, compute)
-        self._closings: _Prepared[ClosingGeometry] = _Prepared(database, compute)
+        self._solids: _Prepared[Solid] = _Prepared(database, compute, _SOLIDS_BYTES)
+        self._closings: _Prepared[ClosingGeometry] = _Prepared(database, compute, _CLOSINGS_BYTES)
 
     def test(self, selected: Selected, pre_opening_m: PreOpening = None) -> CollisionTest | None:
         """The collision test of a selection; None where geometry or gripper is not known.
