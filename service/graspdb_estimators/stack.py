@@ -3,7 +3,9 @@
 ``logit p = a + b t + s (c k + d)``: t is the logit of boosted trees on what the jaw closes on, k that of the
 kernel estimate, and s = n / (1 + n) how much there is near, n the effective trials (Wolpert 1992, Breiman
 1996). Without trees ``logit p = a + c k`` sets the kernel estimate right: its averages blur the edges of
-success (Platt 1999). b and c are not negative, so that no order is turned round.
+success (Platt 1999). b and c are not negative, so that no order is turned round. Where even the surest
+succeed no more often than some share, or the worst as often as another, p lies between these two: chance that
+no pose explains.
 
 Both are learned from predictions of attempts whose block of space was left out. So is what they may be off
 by: neighbours err alike, by a normal deviation of the logit, whose variance grows with what the kernel
@@ -57,6 +59,9 @@ _MANY_BLOCKS = 40
 _CLIP = 1e-3
 #: Precision of the prior of the weights of the stack about "trees alone" or "the kernel estimate as it is".
 _PRECISION = 1.0
+#: How far the limits of probability may be from 0 and 1, what that costs in nats, and probabilities nearer to
+#: 0 or 1 than can be told.
+_MOST_CHANCE, _COST, _LEAST_CHANCE = 0.3, 10.0, 1e-6
 #: Least variance of the logit where nothing is near.
 _LEAST_DOUBT = 0.5
 #: Neighbours by which errors are judged, and the least p (1 - p) that they are counted by.
@@ -134,6 +139,8 @@ class Stack:
         None where geometry is not known.
     weights : (4,)
         a, b, c and d.
+    limits : (2,)
+        The least and the greatest probability there is.
     doubt : (3,)
         Variance of the logit: everywhere, by 1 - s, and by (k - t)^2 s.
     reach_widths : float
@@ -145,6 +152,7 @@ class Stack:
 
     trees: BoostedTrees | None
     weights: Floats
+    limits: Floats
     doubt: Floats
     reach_widths: float
     attempts: int
@@ -170,7 +178,7 @@ class Stack:
         k = _logit(kernel)
         logit = _terms(k, near, trees) @ (self.weights if trees is not None else self.weights[[0, 2]])
         spread = np.sqrt(_doubts(k, near, trees) @ self.doubt)
-        return np.asarray(logit), np.asarray(spread)
+        return _within(logit, self.limits), np.asarray(spread)
 
     @property
     def nbytes(self) -> int:
@@ -181,6 +189,7 @@ class Stack:
         """All of it, to be kept; `of_bytes` reads it again."""
         arrays: dict[str, NDArray[Any]] = {
             "weights": self.weights,
+            "limits": self.limits,
             "doubt": self.doubt,
             "numbers": np.array([self.reach_widths, float(self.attempts)]),
             **{f"held_{each.name}": getattr(self.left_out, each.name) for each in fields(LeftOut)},
@@ -203,7 +212,8 @@ class Stack:
             }
             made = BoostedTrees.of_arrays(trees) if trees else None
             reach, attempts = arrays["numbers"].tolist()
-            return cls(made, arrays["weights"], arrays["doubt"], reach, int(attempts), held)
+            weights, limits, doubt = (arrays[name] for name in ("weights", "limits", "doubt"))
+            return cls(made, weights, limits, doubt, reach, int(attempts), held)
         except (ValueError, TypeError, AttributeError, KeyError, EOFError, OSError, BadZipFile) as error:
             raise ValueError(f"these bytes are no stack: {error}") from None
 
@@ -349,8 +359,9 @@ def _stacked(
     # What it predicts of a fold is weighed by the others, too.
     for number in np.unique(told.fold):
         out = told.fold == number
-        logit[out] = terms[out] @ _weighed(terms[~out], told.share[~out], told.weight[~out])
-    weights = _weighed(terms, told.share, told.weight)
+        weights, limits = _weighed(terms[~out], told.share[~out], told.weight[~out])
+        logit[out] = _within(terms[out] @ weights, limits)
+    weights, limits = _weighed(terms, told.share, told.weight)
     if told.trees is None:
         weights = np.array([weights[0], 0.0, weights[1], 0.0])
     probability = expit(logit)
@@ -366,7 +377,7 @@ def _stacked(
         told.share, told.weight, told.block, expit(told.kernel), probability,
         expit(logit - half), expit(logit + half), inside & (widths <= reached),
     )  # fmt: skip
-    return Stack(trees, weights, doubt, reached, attempts, held)
+    return Stack(trees, weights, limits, doubt, reached, attempts, held)
 
 
 def _sample(succeeded: Bools, weight: Floats, most: int, rng: np.random.Generator) -> tuple[Ints, Floats]:
@@ -413,19 +424,35 @@ def _doubts(kernel: Floats, near: Floats, trees: Floats | None) -> Floats:
     return np.stack([np.ones(len(kernel)), 1.0 - near, differ], axis=1)
 
 
-def _weighed(terms: Floats, share: Floats, weight: Floats) -> Floats:
-    """Weights of the terms by the log loss, near "trees alone" or "the kernel as it is"."""
+def _within(logit: Floats, limits: Floats) -> Floats:
+    """Logits (M,) of probabilities brought between limits."""
+    least, greatest = limits
+    p = np.clip(least + (greatest - least) * expit(logit), _LEAST_CHANCE, 1.0 - _LEAST_CHANCE)
+    return np.asarray(np.log(p) - np.log1p(-p))
+
+
+def _weighed(terms: Floats, share: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Weights of the terms, near "trees alone" or "the kernel as it is", and limits, by the log loss."""
     mean = np.array([0.0, 1.0, 0.0, 0.0]) if terms.shape[1] == 4 else np.array([0.0, 1.0])
-    lowest = [None, 0.0, 0.0, None][: len(mean)]
+    count = len(mean)
+    lowest = [None, 0.0, 0.0, None][:count]
     scaled = weight / weight.mean()
 
     def loss(at: Floats) -> tuple[float, Floats]:
-        z = terms @ at
-        value = scaled @ (np.logaddexp(0.0, z) - share * z) + 0.5 * _PRECISION * np.sum((at - mean) ** 2)
-        return float(value), terms.T @ (scaled * (expit(z) - share)) + _PRECISION * (at - mean)
+        weights, (below, above) = at[:count], at[count:]
+        s = expit(terms @ weights)
+        room = 1.0 - below - above
+        p = np.clip(below + room * s, _LEAST_CHANCE, 1.0 - _LEAST_CHANCE)
+        value = -scaled @ (share * np.log(p) + (1.0 - share) * np.log1p(-p))
+        slope = scaled * (p - share) / (p * (1.0 - p))
+        along = terms.T @ (slope * room * s * (1.0 - s)) + _PRECISION * (weights - mean)
+        value += 0.5 * _PRECISION * np.sum((weights - mean) ** 2) + _COST * (below + above)
+        return float(value), np.append(along, [slope @ (1.0 - s) + _COST, _COST - slope @ s])
 
-    found = minimize(loss, mean, jac=True, method="L-BFGS-B", bounds=[(low, None) for low in lowest])
-    return np.asarray(found.x, dtype=np.float64)
+    bounds = [*((low, None) for low in lowest), (0.0, _MOST_CHANCE), (0.0, _MOST_CHANCE)]
+    start = np.append(mean, [_COST / len(terms) * 0.1] * 2)
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    return np.asarray(found[:count]), np.array([found[count], 1.0 - found[count + 1]])
 
 
 def _variances(p: Floats, doubts: Floats, told: _Predicted) -> Floats:

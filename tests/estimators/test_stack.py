@@ -171,3 +171,19 @@ def test_shares_and_weights_count() -> None:
     asked, _ = attempts(500, 12)
     found = StackedModel(model, stack, GraspFeatures(bar(), PG70)).probability(asked)
     assert np.abs(found - truth(asked)).mean() < 0.08
+
+
+def test_no_pose_is_surer_than_the_surest_turn_out() -> None:
+    """A robot drops a fifth of whatever it holds: no grasp is told to succeed much more often."""
+    poses, won = attempts(1_500, 13)
+    won &= np.random.default_rng(14).random(1_500) < 0.8
+    model = SuccessModel.build(poses, won, kernel=KERNEL)
+    features = GraspFeatures(bar(), PG70)
+    stack = fit_stack(model, features, reach=validate_reach(model))
+    assert stack is not None
+    asked, _ = attempts(1_000, 15)
+    found = StackedModel(model, stack, features).evaluate(asked)
+    assert found.probability.max() < 0.9
+    sure = truth(asked) > 0.99
+    assert found.probability[sure].mean() == pytest.approx(0.8, abs=0.05)
+    assert ((found.low < 0.8) & (found.high > 0.8))[sure].mean() > 0.9

@@ -32,7 +32,9 @@ def find(tx: Tx, object_id: int, digest: str) -> LearnedRow | None:
 
 def put(tx: Tx, object_id: int, digest: str, row: LearnedRow) -> None:
     """Keep it in place of what was learned before, unless its object is gone; and the object's newest."""
-    if tx.execute(select(objects.c.id).where(objects.c.id == object_id)).first() is None:
+    # The object first, as who deletes it does: else each would wait for the other.
+    object_row = select(objects.c.id).where(objects.c.id == object_id)
+    if tx.execute(object_row.with_for_update(read=True, key_share=True)).first() is None:
         return
     of_object = learned_estimators.c.object_id == object_id
     tx.execute(delete(learned_estimators).where(of_object, learned_estimators.c.digest == digest))

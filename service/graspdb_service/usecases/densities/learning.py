@@ -36,7 +36,7 @@ from graspdb_service.usecases.trials.selection import Selected
 log = logging.getLogger("graspdb")
 
 #: Another one whenever what is kept is not what an earlier version learned.
-_FORMAT = "1"
+_FORMAT = "2"
 #: Learned again once so large a share of the attempts are others.
 _CHANGED = 0.25
 #: What is held in memory takes so much, that asked for last; and how much waits to be learned of.
