@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,7 +14,7 @@ from graspdb_density.se3 import Floats, Poses
 from graspdb_geometry.closing import DECREASING, FEATURES, INCREASING, ClosingGeometry
 from graspdb_geometry.grippers import GripperShape
 
-__all__ = ["GraspFeatures"]
+__all__ = ["GraspFeatures", "monotonic_of"]
 
 _UPPER = np.triu_indices(3)
 _PLACE = tuple(f"{name}_{axis}" for name in ("position", "approach") for axis in "xyz")
@@ -46,8 +47,7 @@ class GraspFeatures:
     @cached_property
     def monotonic(self) -> NDArray[np.int8]:
         """1 where mechanics has success never fall with a column, -1 where never rise, else 0."""
-        ways = [1 if name in INCREASING else -1 if name in DECREASING else 0 for name in self.names]
-        return np.array(ways, dtype=np.int8)
+        return monotonic_of(self.names)
 
     def at(self, poses: Poses, threads: int = 1) -> Floats:
         """Features (n, F) of grasps with the tool at poses (n); NaN where the jaw closes on nothing."""
@@ -62,3 +62,9 @@ class GraspFeatures:
         a, b = _UPPER
         axis = y[:, a] * y[:, b] if self.symmetric else y
         return np.concatenate([closed, poses.positions, turned[:, :, 2], axis], axis=1)
+
+
+def monotonic_of(names: Sequence[str]) -> NDArray[np.int8]:
+    """Which way success goes with features (F,), as `GraspFeatures.monotonic`."""
+    ways = [1 if name in INCREASING else -1 if name in DECREASING else 0 for name in names]
+    return np.array(ways, dtype=np.int8)

@@ -76,8 +76,8 @@ class StackedModel(SuccessModel):
 
     def _learned(self, kernel: Plain, poses: Poses, level: float, threads: int) -> tuple[Floats, Floats]:
         """Logit of success, and half the length of its interval, (M,)."""
-        trees = None
+        described = None
         if self.stack.trees is not None and self.features is not None:
-            trees = self.stack.trees.logit(self.features.at(poses, threads))
-        logit, spread = self.stack.combined(kernel.probability, kernel.trials, trees)
+            described = self.features.at(poses, threads)
+        logit, spread = self.stack.combined(kernel.probability, kernel.trials, described)
         return logit, float(ndtri(0.5 + 0.5 * level)) * spread

@@ -143,7 +143,7 @@ def line(data: Labelled, cubes: bool, learn: int, split: int, shapes: bool) -> s
     reach = validate_reach(model)
     features = data.features if shapes else None
     started = time.process_time()
-    stack = fit_stack(model, features, reach=reach)
+    stack = fit_stack(model, features, reach=reach, own_widths=True)
     seconds = time.process_time() - started
     asked, won = data.poses[judged], data.held[judged]
     block = assign_blocks(asked.positions, edge_m=CUBE_M if cubes else 0.015).block
@@ -151,6 +151,9 @@ def line(data: Labelled, cubes: bool, learn: int, split: int, shapes: bool) -> s
     text = f"{len(rows):6} {scores(plain, reach.covers(near), won, block)}  |"
     if stack is None or stack.left_out.verdict != "better":
         return f"{text} as the kernel estimate: nothing shows that more would be better"
+    if stack.kernel is not None:
+        model = SuccessModel.build(poses, held, kernel=stack.kernel)
+        reach = validate_reach(model)
     found, near = StackedModel(model, stack, features).evaluate_near(asked)
     return f"{text} {scores(found, stack.reach(reach).covers(near), won, block)}  {seconds:5.0f} s"
 

@@ -90,6 +90,8 @@ from graspdb.wire.support import CalibrationInfo as CalibrationInfo
 from graspdb.wire.support import EstimatorInfo as EstimatorInfo
 from graspdb.wire.support import NearestAttempt as NearestAttempt
 from graspdb.wire.support import NearestAttemptColumns as NearestAttemptColumns
+from graspdb.wire.support import OwnWidths as OwnWidths
+from graspdb.wire.support import PriorEstimator as PriorEstimator
 from graspdb.wire.support import ReachInfo as ReachInfo
 from graspdb.wire.support import SelectedSource as SelectedSource
 from graspdb.wire.support import SelectionInfo as SelectionInfo

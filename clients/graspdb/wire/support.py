@@ -89,9 +89,38 @@ class ReachInfo(Response):
     """How the limits came about, in words."""
 
 
+class OwnWidths(Response):
+    """Widths of the kernel of success probabilities that attempts chose themselves, for they predict attempts
+    whose block of space was left out better than the density's."""
+
+    sigma_position_m: list[float]
+    """Standard deviations along x, y and z of ``axes``, metres."""
+    sigma_rotation_deg: list[float]
+    """Standard deviations about x, y and z of the gripper, degrees."""
+    axes: Literal["gripper", "object"]
+    """Along whose axes positions are."""
+
+
+class PriorEstimator(Response):
+    """Who says how likely grasps succeed where no attempt is near."""
+
+    name: Literal["edges", "transfer"]
+    """``edges``: as many as of the object's attempts that closed on something (half before any), none where
+    the jaw closes on nothing; ``transfer``: by what the jaw closes on, learned from attempts at other objects
+    with the gripper."""
+    objects: int | None = None
+    """How many other objects it was learned from; null for edges."""
+    attempts: int | None = None
+    """How many attempts at them; null for edges."""
+    skill: float | None = None
+    """Its Brier skill on objects that were left out, whole: 1 perfect, 0 no better than knowing the share of
+    their successes, which edges do not; null for edges."""
+
+
 class EstimatorInfo(Response):
     """Who answered: ``kernel``, density and regression by kernels; ``stack``, success probabilities learned
-    from what the jaw closes on and stacked on those. Densities are by kernels always.
+    from what the jaw closes on and stacked on those; ``transfer``, the same learned from other objects, for
+    one with few attempts. Densities are by kernels always.
     """
 
     name: str = "kernel"
@@ -107,6 +136,13 @@ class EstimatorInfo(Response):
     saying their share of successes; null where nothing was learned."""
     kernel_skill: float | None = None
     """The same of the plain kernel estimate; null where nothing was learned."""
+    objects: int | None = None
+    """How many other objects ``transfer`` was learned from; its skills are of objects that were left out,
+    whole, but for some first attempts. Null for others."""
+    widths: OwnWidths | None = None
+    """The widths of the kernel, where attempts chose them; null where it has the density's."""
+    prior: PriorEstimator | None = None
+    """Who tells ``prior_success_probability``; null where it was not asked for or nobody can."""
 
 
 class SelectedSource(Response):

@@ -55,6 +55,8 @@ class AxisBandwidths:
         The best isotropic kernel, chosen the same way.
     log_loss, isotropic_log_loss : float
         Nats an attempt.
+    present_log_loss : float
+        The same of the kernel that they are to replace; nan without one.
     skill, isotropic_skill : float
         Brier's: 1 perfect, 0 no better than the share of successes; nan where all fared alike.
     attempts, judged : int
@@ -65,6 +67,7 @@ class AxisBandwidths:
     isotropic: IsotropicKernel
     log_loss: float
     isotropic_log_loss: float
+    present_log_loss: float
     skill: float
     isotropic_skill: float
     attempts: int
@@ -77,6 +80,7 @@ def fit_axis_bandwidths(
     *,
     axes: ArrayLike | None = None,
     symmetric: ArrayLike | bool = True,
+    present: IsotropicKernel | None = None,
 ) -> AxisBandwidths:
     """Bandwidths for a `SuccessModel`, by the log loss of attempts in blocks of space left out.
 
@@ -87,6 +91,8 @@ def fit_axis_bandwidths(
     success : (N,) bool
     axes : (3, 3) or None
         Columns are the axes of translations, object frame; None: each gripper's.
+    present : IsotropicKernel or None
+        A kernel to judge on the same attempts.
 
     Raises
     ------
@@ -114,11 +120,16 @@ def fit_axis_bandwidths(
         isotropic=IsotropicKernel(float(alike[0]), float(alike[3])),
         log_loss=loss,
         isotropic_log_loss=alike_loss,
+        present_log_loss=math.nan if present is None else held.verdict(_widths_of(present))[0],
         skill=skill,
         isotropic_skill=alike_skill,
         attempts=len(kept),
         judged=int((~held.choosing).sum()),
     )
+
+
+def _widths_of(kernel: IsotropicKernel) -> Floats:
+    return np.repeat([kernel.sigma_position_m, kernel.sigma_rotation], 3)
 
 
 class _HeldOut:

@@ -13,7 +13,7 @@ from graspdb_service.usecases.answers.keeping import AnswerKeeper
 from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
 from graspdb_service.usecases.densities.evidence.symmetries import Symmetries
-from graspdb_service.usecases.densities.learning import Learning
+from graspdb_service.usecases.densities.learned.learning import Learning
 from graspdb_service.usecases.densities.prior import Priors
 from graspdb_service.usecases.densities.success_models import Successes
 from graspdb_service.usecases.geometry.collision import Scenes

@@ -447,6 +447,20 @@ learned_estimators = Table(
     UniqueConstraint("object_id", "digest"),
 )
 
+# What was learned of all objects that a gripper tried: one row for a gripper and which trials count.
+learned_transfers = Table(
+    "learned_transfers",
+    metadata,
+    # AUTOINCREMENT: what was learned anew is never taken for what is known.
+    Column("number", BigId, primary_key=True, autoincrement=True),
+    Column("digest", String(64), nullable=False, unique=True),
+    # Epoch and attempts of every object that it was learned of, by the object's id.
+    Column("objects", JSON, nullable=False),
+    # Null where they taught nothing.
+    Column("content", LargeBinary, nullable=True),
+    sqlite_autoincrement=True,
+)
+
 # Reports that are computed or have been: one row for an object, revision and set of parameters, leased to
 # the process that computes it.
 report_runs = Table(

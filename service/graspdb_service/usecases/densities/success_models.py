@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -38,7 +38,8 @@ from graspdb_service.storage.database import Database, Tx
 from graspdb_service.storage.simulation import linked
 from graspdb_service.trial_columns import Bools, Floats, Ints
 from graspdb_service.usecases.densities.build import Built
-from graspdb_service.usecases.densities.learning import Learning, Model
+from graspdb_service.usecases.densities.learned.learning import Learning, Lookup, Model
+from graspdb_service.usecases.densities.untried import UntriedChance
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
 from graspdb_service.usecases.runtime.compute import Compute
@@ -49,8 +50,8 @@ from graspdb_service.usecases.trials.selection import Selected, as_of
 LEVEL = 0.9
 #: Attempts of the random sample that searches feel their way by where a model has far more of them.
 _SAMPLE, _LARGE = 100_000, 400_000
-#: Attempts of either outcome by which geometry is judged.
-_HELD = 256
+#: How often a model is looked for again where attempts choose another kernel meanwhile.
+_TRIES = 3
 #: A reach is validated anew once so large a share of the attempts are others; of few ones, every time.
 _CHANGED, _FEW = 0.25, 2_000
 
@@ -186,17 +187,25 @@ class _Key:
     success_kernel: DiagonalKernel | None
     by_default: bool
 
-    @property
-    def kernel(self) -> str:
-        """The kernel in words: equal where kernels are, and for whichever widths the default rule chose: what
-        was learned under them is nearly right under the next ones, until it is learned again.
+    def under(self, own: DiagonalKernel | None) -> _Key:
+        """The same under a kernel that the attempts chose; None: as asked for."""
+        return self if own is None else replace(self, success_kernel=own)
+
+    def lookup(self, selected: Selected) -> Lookup:
+        """By what is known what was learned: the kernel in words, equal where kernels are, and for whichever
+        widths the default rule chose, for what was learned under them is nearly right under the next ones,
+        until it is learned again.
         """
-        if self.success_kernel is None:
-            if self.by_default:
-                return "default"
-            return f"{self.sigma_position_m!r} {self.sigma_rotation_deg!r}"
-        axes = self.success_kernel.axes
-        return f"{self.success_kernel.sigmas!r} {None if axes is None else np.asarray(axes).tolist()}"
+        own, default = self.success_kernel, None
+        if own is not None:
+            axes = None if own.axes is None else np.asarray(own.axes).tolist()
+            told = f"{own.sigmas!r} {axes}"
+        elif self.by_default:
+            told = "default"
+            default = IsotropicKernel(self.sigma_position_m, math.radians(self.sigma_rotation_deg))
+        else:
+            told = f"{self.sigma_position_m!r} {self.sigma_rotation_deg!r}"
+        return Lookup(selected, told, default, self.collisions_known)
 
 
 def _key(built: Built, collisions_known: bool) -> _Key:
@@ -220,20 +229,36 @@ class Successes:
         self.kept: SingleFlightCache[_Key, _Attempts] = SingleFlightCache(max_bytes, lambda a: a.nbytes)
 
     def model(self, built: Built, *, collisions_known: bool) -> Model | None:
-        """The model of all attempts under the kernel of a density, at least as new; None before any attempt.
+        """The model of all attempts under the kernel of a density, or the one that they chose themselves, at
+        least as new; None before any attempt.
 
         With ``collisions_known``, by geometry and gripper, attempts that collided are left out.
         """
-        key = _key(built, collisions_known)
-        found = self.kept.get(
+        asked = _key(built, collisions_known)
+        plain = None
+        for _ in range(_TRIES):
+            own = self.learning.own_kernel(asked.lookup(built.selected))
+            found = self._attempts(asked.under(own), built)
+            if found.model is None or found.reach is None or found.selected is None:
+                return None
+            plain = Model(found.model, found.sample or found.model, found.reach, EstimatorInfo())
+            improved = self.learning.improved(
+                asked.lookup(found.selected), plain, lambda kernel: self._prepare(asked.under(kernel), built)
+            )
+            if improved is not None:
+                return improved
+        return plain
+
+    def _attempts(self, key: _Key, built: Built) -> _Attempts:
+        return self.kept.get(
             key,
             lambda a: a.revision >= built.revision,
             lambda before: self._refresh(key, built.selected, before),
         )
-        if found.model is None or found.reach is None or found.selected is None:
-            return None
-        plain = Model(found.model, found.sample or found.model, found.reach, EstimatorInfo())
-        return self.learning.improved(found.selected, key.kernel, plain, trees=collisions_known)
+
+    def _prepare(self, key: _Key, built: Built) -> None:
+        """Sort the attempts for a kernel before anybody asks for them under it."""
+        self._attempts(key, built)
 
     def learned(
         self, built: Built, *, collisions_known: bool, within_s: float
@@ -241,15 +266,21 @@ class Successes:
         """What was learned of a density's attempts and answers in their place, waited for; None where nothing
         does, or it takes longer.
         """
-        model, key = self.model(built, collisions_known=collisions_known), _key(built, collisions_known)
+        model = self.model(built, collisions_known=collisions_known)
+        of = _key(built, collisions_known).lookup(built.selected)
         if model is not None and model.estimator.state == "fitting":
-            self.learning.wait(built.selected, key.kernel, trees=collisions_known, within_s=within_s)
-        return self.learning.held(built.selected, key.kernel, trees=collisions_known)
+            self.learning.wait(of, within_s)
+        return self.learning.held(of)
 
     def estimator(self, built: Built, *, collisions_known: bool) -> EstimatorInfo:
         """Who estimates success probabilities, without a look at any attempt."""
-        kernel = _key(built, collisions_known).kernel
-        return self.learning.held(built.selected, kernel, trees=collisions_known)[1]
+        return self.learning.estimator(_key(built, collisions_known).lookup(built.selected))
+
+    def untried(self, selected: Selected, test: CollisionTest | None) -> UntriedChance | None:
+        """How likely grasps succeed where no attempt is near; None without a collision test to believe."""
+        if test is None:
+            return None
+        return UntriedChance(self._compute, test, self.learning.untried(selected))
 
     def estimate(self, model: Model | None, poses: Poses, free: Bools | None) -> Estimates:
         """Success probability of poses (n,) under a model from :meth:`model`.
@@ -286,28 +317,6 @@ class Successes:
             stop = start + len(trials)
             estimates.put_support(rows[start:stop], trials, nearest, model.reach)
             start = stop
-
-    def add_prior(
-        self,
-        estimates: Estimates,
-        model: Model | None,
-        poses: Poses,
-        test: CollisionTest | None,
-        free: Bools | None,
-    ) -> None:
-        """What geometry tells of poses too far from every attempt, where it can be known."""
-        far = ~estimates.enough
-        if test is None or free is None or not far.any():
-            return
-        estimates.prior[far] = 0.0
-        # What collides holds nothing: only the others are worth closing the jaw on.
-        rows = np.flatnonzero(far & free)
-        if not rows.size:
-            return
-        threads = self._compute.threads
-        share = self._compute.run(lambda: _share_of_held(model, test, threads))
-        held = np.concatenate(self._compute.blocks(poses[rows], partial(test.holds, threads=threads)))
-        estimates.prior[rows[held]] = share
 
     def _refresh(
         self, key: _Key, selected: Selected, known: _Attempts | None, *, anew: bool = False
@@ -369,20 +378,6 @@ class Successes:
             judged=judged,
             others=others,
         )
-
-
-def _share_of_held(model: Model | None, test: CollisionTest, threads: int) -> float:
-    """The share of successes among attempts that hold something by geometry, with half a success in one more.
-
-    Of a few hundred of either outcome, drawn at random, each weighing what it stands for.
-    """
-    if model is None:
-        return 0.5
-    held = [
-        size * float(test.holds(poses, threads).mean()) if len(poses) else 0.0
-        for size, poses in model.whole.drawn(_HELD, np.random.default_rng(0))
-    ]
-    return (held[0] + 0.5) / (sum(held) + 1.0)
 
 
 def _fetch(tx: Tx, selected: Selected, without: Sequence[int], before: _Attempts) -> Stored:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graspdb.wire import NearestAttempt, ReachInfo, Support
 from graspdb_density import IsotropicKernel
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.densities.success_models import Estimates
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ from graspdb_geometry.grippers import GripperShape
 from graspdb_geometry.openings import STEP_M, at_each
 from graspdb_geometry.poses import PoseArrays
 from graspdb_service.trial_columns import Bools
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.constraints import Constraints
 from graspdb_service.usecases.runtime.compute import breathing

@@ -92,7 +92,11 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
 
 def _estimator(question: Question | None) -> EstimatorInfo:
     """Who told the success probabilities, or would have."""
-    return EstimatorInfo() if question is None or question.model is None else question.model.estimator
+    if question is None:
+        return EstimatorInfo()
+    told = EstimatorInfo() if question.model is None else question.model.estimator
+    untried = question.untried
+    return told if untried is None else told.model_copy(update={"prior": untried.info})
 
 
 def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> dict[str, Any]:
@@ -174,7 +178,8 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     if question.chances:
         believed = question.believed
         estimates = ctx.successes.estimate(question.model, poses, None if believed is None else free)
-        ctx.successes.add_prior(estimates, question.model, poses, believed, free)
+        if question.untried is not None and free is not None:
+            estimates.prior[:] = question.untried.told(poses, ~estimates.enough, free, question.model)
     reach = reach_info(question.model)
     grasps = []
     for i, item in enumerate(found):

@@ -97,9 +97,11 @@ def likelihood(
             columns["interval"] = {"level": LEVEL, "low": estimates.low, "high": estimates.high}
             columns["effective_trials"] = estimates.effective_trials
             columns["support"] = support_columns(estimates)
-            if believed is not None and asked("prior_success_probability"):
-                ctx.successes.add_prior(estimates, model, poses, believed, free)
-                columns["prior_success_probability"] = estimates.prior
+            untried = ctx.successes.untried(built.selected, believed)
+            if untried is not None and free is not None and asked("prior_success_probability"):
+                estimator = estimator.model_copy(update={"prior": untried.info})
+                told = untried.told(poses, ~estimates.enough, free, model)
+                columns["prior_success_probability"] = told
         columns["collision_free"] = free
         known = {name: column for name, column in columns.items() if column is not None and asked(name)}
         if test is not None and pre_opening_m is not None:

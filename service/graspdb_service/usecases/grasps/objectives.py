@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_estimators import StackedModel
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.densities.success_models import LEVEL
+from graspdb_service.usecases.densities.untried import UntriedChance
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.search import ScoreSearch
 from graspdb_service.usecases.runtime.compute import breathing
@@ -45,6 +47,15 @@ def by_success(
     # What was learned may rank otherwise than the kernel estimate, which leads to where it is high.
     rescored = _RESCORED if isinstance(model.whole, StackedModel) else 0
     return ScoreSearch(search, threads, score, rough, pull, _RESOLUTION, rescored), ranking
+
+
+def by_others(search: ModeSearch, untried: UntriedChance, threads: int) -> tuple[ScoreSearch, Ranking]:
+    """The success probability before any attempt, as other objects tell it."""
+    objects = untried.info.objects or 0
+    told = f"success probability as attempts at {objects} other objects tell it"
+    ranking = Ranking(objective="success_probability", score=told)
+    score = partial(untried.score, threads=threads)
+    return ScoreSearch(search, threads, score, score, None, _RESOLUTION), ranking
 
 
 def by_mean(

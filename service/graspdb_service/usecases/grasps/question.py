@@ -20,8 +20,9 @@ from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.evidence.calibrations import calibrated
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.densities.prior import Prior
+from graspdb_service.usecases.densities.untried import UntriedChance
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import objectives
 from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of, likely_enough
@@ -41,7 +42,8 @@ class Question:
     ``test`` says what collides, ``believed`` the same where success probabilities may rest on it. ``search``
     and ``kernel`` are of the density of successes, or before any of the prior of the object's edges;
     ``wide`` is where grasps are looked for: ``search``, or where symmetries take the successes, too.
-    ``chances``: whether grasps are told with their success probability, by ``model`` if there is one.
+    ``chances``: whether grasps are told with their success probability, by ``model`` if there is one, and
+    ``untried`` where it does not tell.
     """
 
     built: Built
@@ -53,6 +55,7 @@ class Question:
     believed: CollisionTest | None
     chances: bool
     model: Model | None
+    untried: UntriedChance | None
     bounds: Bounds
     engine: Engine
     ranking: Ranking
@@ -90,8 +93,10 @@ def question_of(
         return None
     chances = _wants_chances(request, built)
     believed, model, calibration, symmetry = _chances(ctx, request, built) if chances else 4 * (None,)
+    untried = ctx.successes.untried(selected, believed) if chances else None
     by_success = _by_success(request, model)
-    if (by_success or asks_chance(request)) and model is None:
+    expected = model is None and _by_others(request, untried)
+    if not expected and (by_success or asks_chance(request)) and model is None:
         if built.search is None:
             # Nothing was tried: no chance ranks what no trial tells of.
             return None
@@ -107,6 +112,8 @@ def question_of(
 
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
+        if expected and untried is not None:
+            return objectives.by_others(search, untried, threads)
         if request.objective == "robust":
             value = None if chance is None else success_score(chance.quick, believed, threads)
             pull = None if chance is None else near.pull
@@ -122,8 +129,9 @@ def question_of(
         if limits.candidates is not None:
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
-        bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
-        found = built, search, wide, kernel, limits, test, believed, chances, model, bounds
+        about = near if by_success and not expected else None
+        bounds = _bounds(request, built, limits, search, test, about, model, threads)
+        found = built, search, wide, kernel, limits, test, believed, chances, model, untried, bounds
         return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m)
 
     return ctx.compute.run(complete)
@@ -176,6 +184,13 @@ def _by_success(request: GraspConstraints, model: Model | None) -> bool:
     if request.objective == "robust" and request.robust_of is None:
         return model is not None
     return "success_probability" in (request.objective, request.robust_of)
+
+
+def _by_others(request: GraspConstraints, untried: UntriedChance | None) -> bool:
+    """Whether what other objects tell ranks, if no attempt does: where success probabilities were to."""
+    if request.objective != "success_probability" or asks_chance(request):
+        return False
+    return untried is not None and untried.by_others
 
 
 def _bounds(

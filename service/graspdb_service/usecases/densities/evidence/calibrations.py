@@ -22,7 +22,7 @@ from graspdb_service.storage.trials import provenances
 from graspdb_service.trial_columns import Bools, Floats, Provenance, is_gripper
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.trials import attempts
 from graspdb_service.usecases.trials.selection import Selected, of_provenances, outcome_counts

@@ -17,7 +17,7 @@ from graspdb_density.success.motions import Motions
 from graspdb_geometry.symmetry import Symmetry
 from graspdb_service.problems import ProblemError, conflict
 from graspdb_service.usecases.densities.build import Built
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.geometry.symmetries import ShapeSymmetries
 from graspdb_service.usecases.runtime.compute import Compute
 from graspdb_service.usecases.trials.selection import Selected
