@@ -175,7 +175,7 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
         "density": lambda g: f"{g.density:.4g}",
         "relative": lambda g: f"{g.relative:.3f}",
         "success probability": lambda g: "unknown" if g.success_probability is None else g.chance(),
-        "by geometry": lambda g: number(g.prior_success_probability),
+        "expected untried": lambda g: number(g.prior_success_probability),
         "nearest attempt": _nearest,
         "score": lambda g: None if g.score is None else f"{g.score:.4g}",
         "simulated": lambda g: g.simulated,
@@ -190,7 +190,7 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
     if all(_nearest(g) is None for g in found):
         del columns["nearest attempt"]
     if all(g.prior_success_probability is None for g in found):
-        del columns["by geometry"]
+        del columns["expected untried"]
     show_table(found, columns, empty="No grasp.")
     _tell_frame(found.frame, found.convention, "world" if in_world else "object")
     _tell_kept(found)
@@ -200,6 +200,8 @@ def _show_grasps(found: Grasps, *, in_world: bool) -> None:
         ERRORS.print(f"Success probabilities are told {found.reach.rule}.", soft_wrap=True)
     if any(g.success_probability is not None for g in found):
         _tell_estimator(found.estimator)
+    if any(g.prior_success_probability is not None for g in found):
+        _tell_prior(found.estimator)
     if found[0].prior:
         ERRORS.print("Nothing has succeeded yet: chosen by the object's edges.")
     if found.status == "fewer":
@@ -288,10 +290,24 @@ def _tell_estimator(estimator: EstimatorInfo | None) -> None:
     if estimator.state == "fitting":
         ERRORS.print("Better success probabilities are being learned: ask again in a minute.")
     elif estimator.attempts is not None:
+        of, out = "", "blocks"
+        if estimator.objects is not None:
+            of, out = f" at {estimator.objects} other objects", "objects"
         ERRORS.print(
-            f"Success probabilities were learned from {estimator.attempts:,} attempts ({estimator.name}):"
-            f" Brier skill on left-out blocks {number(estimator.skill)}, of kernels"
+            f"Success probabilities were learned from {estimator.attempts:,} attempts{of} ({estimator.name}):"
+            f" Brier skill on left-out {out} {number(estimator.skill)}, of kernels"
             f" {number(estimator.kernel_skill)}.",
+            soft_wrap=True,
+        )
+
+
+def _tell_prior(estimator: EstimatorInfo | None) -> None:
+    """Who told what is expected where nothing was tried, if that is more than geometry."""
+    prior = None if estimator is None else estimator.prior
+    if prior is not None and prior.attempts is not None:
+        ERRORS.print(
+            f"What is expected untried was learned from {prior.attempts:,} attempts at {prior.objects} other"
+            f" objects: Brier skill on left-out ones {number(prior.skill)}.",
             soft_wrap=True,
         )
 

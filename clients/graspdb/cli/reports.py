@@ -258,7 +258,7 @@ def _promises(raw: wire.reports.PromisesReport) -> Iterator[Table]:
         "explained by choosing the highest": f"at most {number(raw.selection.at_most)}",
         "of other grasps": f"{raw.unmatched:,} trials",
         "without a probability": f"{raw.without_promise:,} trials",
-        "by geometry alone": f"{raw.prior.trials:,} trials",
+        "expected untried": f"{raw.prior.trials:,} trials",
     }
     if raw.placement.trials:
         place = raw.placement

@@ -252,7 +252,7 @@ class Grasp:
         if self.success_probability is not None or self.support is not None:
             rows["success probability"] = self.chance()
         if self.prior_success_probability is not None:
-            rows["by geometry alone"] = f"{self.prior_success_probability:.2f}"
+            rows["expected untried"] = f"{self.prior_success_probability:.2f}"
         if self.support is not None:
             rows["effective trials"] = f"{self.support.effective_trials:.1f}"
         if self.support is not None and self.support.nearest_attempt is not None:

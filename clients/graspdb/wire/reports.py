@@ -943,7 +943,7 @@ class PromiseSelection(Response):
 
 
 class PromisedPrior(Response):
-    """Promises of geometry alone, where no attempt was near enough."""
+    """Promises of geometry or other objects, where no attempt was near enough."""
 
     trials: int
     """How many trials tried such grasps."""
