@@ -1,10 +1,10 @@
 """What attempts at other objects tell of one: the paper's four and ten foreign meshes, each left out.
 
-The foreign meshes are pybullet's examples, scaled to fit a hand, of 600 kg/m^3. Grasps at which the jaw closes
-on something are drawn uniformly about every object and simulated (`wrench`). Objects are left out in five
-groups, whole; the numbers are Brier skills of what then is said of them: 0 is as good as knowing the share of
-their successes, which nobody knows before any attempt. With ten, thirty and a hundred of an object's own
-attempts besides, the kernel estimate of these beside the stack of both.
+The foreign meshes are pybullet's examples, scaled to fit a hand, of 600 kg/m^3. Grasps at which the jaw
+closes on something are drawn uniformly about every object and simulated (`wrench`). Objects are left out in
+five groups, whole; the numbers are Brier skills of what then is said of them: 0 is as good as knowing the
+share of their successes, which nobody knows before any attempt. With ten, thirty and a hundred of an object's
+own attempts besides, the kernel estimate of these beside the stack of both.
 """
 
 from __future__ import annotations

@@ -121,10 +121,10 @@ SelectionField = Annotated[
 PriorProbability = Annotated[
     float | None,
     Field(
-        description="What is expected where no attempt is near enough, by ``estimator.prior``: what attempts at"
-        " other objects with the gripper tell, or the share of successes among attempts that held something by"
-        " geometry; 0 where the open gripper collides or holds nothing; null elsewhere, and where mesh or"
-        " gripper are not known."
+        description="What is expected where no attempt is near enough, by ``estimator.prior``: what attempts"
+        " at other objects with the gripper tell, or the share of successes among attempts that held"
+        " something by geometry; 0 where the open gripper collides or holds nothing; null elsewhere, and"
+        " where mesh or gripper are not known."
     ),
 ]
 
