@@ -58,11 +58,13 @@ class UntriedChance:
             values[rows] = others.transfer.prior(others.shape, others.features, poses[rows], threads)
         return values
 
-    def told(self, poses: Poses, far: Bools, free: Bools, model: Model | None) -> Floats:
+    def told(self, poses: Poses, far: Bools, free: Bools | None, model: Model | None) -> Floats:
         """How likely those of poses (n,) that are ``far`` from every attempt of a model succeed; NaN for the
-        others. ``free`` (n,) tells where the open gripper collides with nothing.
+        others. ``free`` (n,) tells where the open gripper collides with nothing; None: it is not known.
         """
         found = np.where(far, 0.0, np.nan)
+        if free is None:
+            return np.full(len(poses), np.nan)
         # What collides holds nothing: only the others are worth closing the jaw on.
         rows = np.flatnonzero(far & free)
         if not rows.size:

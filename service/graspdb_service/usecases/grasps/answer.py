@@ -176,12 +176,11 @@ def _described(ctx: Estimators, question: Question, found: list[Maximum]) -> lis
     free, openings, widths, nearest, relative = ctx.compute.run(known)
     estimates = None
     if question.chances:
-        believed = question.believed
-        estimates = ctx.successes.estimate(question.model, poses, None if believed is None else free)
-        if question.untried is not None and free is not None:
+        clear = None if question.believed is None else free
+        estimates = ctx.successes.estimate(question.model, poses, clear)
+        if question.untried is not None:
             estimates.prior[:] = question.untried.told(poses, ~estimates.enough, free, question.model)
-    reach = reach_info(question.model)
-    grasps = []
+    reach, grasps = reach_info(question.model), []
     for i, item in enumerate(found):
         density = math.exp(logs[i])
         grasps.append(

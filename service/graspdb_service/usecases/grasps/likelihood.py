@@ -69,13 +69,12 @@ def likelihood(
     def asked(*names: str) -> bool:
         return include is None or any(name in include for name in names)
 
+    columns: dict[str, Any] = {}
+    free = test = reach = None
     with ctx.compute.within(request):
-        built = ctx.densities.requested(slug, request)
+        built, threads = ctx.densities.requested(slug, request), ctx.compute.threads
         frame = frame_of(built.selected, request.frame, request.convention)
         poses = frame.to_tool(poses)
-        columns: dict[str, Any] = {}
-        free = test = reach = None
-        threads = ctx.compute.threads
         if asked("density", "log_density", "relative"):
             columns |= _densities(ctx, built, poses, cutoff, relative=asked("relative"))
         chances = asked(*CHANCES)
@@ -98,10 +97,9 @@ def likelihood(
             columns["effective_trials"] = estimates.effective_trials
             columns["support"] = support_columns(estimates)
             untried = ctx.successes.untried(built.selected, believed)
-            if untried is not None and free is not None and asked("prior_success_probability"):
+            if untried is not None and asked("prior_success_probability"):
                 estimator = estimator.model_copy(update={"prior": untried.info})
-                told = untried.told(poses, ~estimates.enough, free, model)
-                columns["prior_success_probability"] = told
+                columns["prior_success_probability"] = untried.told(poses, ~estimates.enough, free, model)
         columns["collision_free"] = free
         known = {name: column for name, column in columns.items() if column is not None and asked(name)}
         if test is not None and pre_opening_m is not None:
