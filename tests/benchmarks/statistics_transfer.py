@@ -4,7 +4,8 @@ The foreign meshes are pybullet's examples, scaled to fit a hand, of 600 kg/m^3.
 closes on something are drawn uniformly about every object and simulated (`wrench`). Objects are left out in
 five groups, whole; the numbers are Brier skills of what then is said of them: 0 is as good as knowing the
 share of their successes, which nobody knows before any attempt. With ten, thirty and a hundred of an object's
-own attempts besides, the kernel estimate of these beside the stack of both.
+own attempts besides, the kernel estimate of these beside the stack of both. Then more of the paper's objects'
+own attempts: kernels, the stack that these teach, and the same with what the others tell.
 """
 
 from __future__ import annotations
@@ -20,9 +21,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from graspdb.examples import EXAMPLES
+from graspdb_density import SuccessModel, choose_widths, validate_reach
+from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
 from graspdb_density.success.calibration import brier_skill, expected_calibration_error
-from graspdb_estimators import LeftOut, Lesson, fit_transfer
+from graspdb_estimators import (
+    BoostedTrees,
+    GraspFeatures,
+    LeftOut,
+    Lesson,
+    StackedModel,
+    fit_stack,
+    fit_transfer,
+)
 from graspdb_geometry import collision, meshes
 from graspdb_geometry.closing import ClosingGeometry
 from graspdb_geometry.grippers import shape_of
@@ -98,6 +109,32 @@ def skills(held: LeftOut, number: int) -> tuple[float, float]:
     return brier_skill(some.kernel, some.share), brier_skill(some.learned, some.share)
 
 
+def taught(lesson: Lesson, features: GraspFeatures, others: BoostedTrees, count: int) -> tuple[float, ...]:
+    """Brier skills on the last third of an object's grasps from the first so many: the kernel estimate's, and
+    those of the stack without what others tell and with it.
+    """
+    judged = np.arange(2 * COUNT // 3, COUNT)
+    poses, held = lesson.poses[np.arange(count)], lesson.share[:count] >= 0.5
+    asked, won = lesson.poses[judged], lesson.share[judged]
+    kernel = choose_widths(Rows.of(poses[held])).kernel
+    model = SuccessModel.build(poses, held, kernel=kernel)
+    found = [brier_skill(model.probability(asked), won)]
+    for told in (None, others):
+        stack = fit_stack(model, features, reach=validate_reach(model), own_widths=True, others=told)
+        if stack is None:
+            found.append(np.nan)
+            continue
+        used = model if stack.kernel is None else SuccessModel.build(poses, held, kernel=stack.kernel)
+        found.append(brier_skill(StackedModel(used, stack, features).probability(asked), won))
+    return tuple(found)
+
+
+def features_of(name: str) -> GraspFeatures:
+    payload, parts = workpiece(name)
+    corners = np.concatenate([vertices[faces] for vertices, faces in parts])
+    return GraspFeatures(ClosingGeometry(corners, mass_properties(corners).centre), shape_of(payload.gripper))
+
+
 def main() -> None:
     """Print a row an object, and their means."""
     lessons = []
@@ -117,6 +154,13 @@ def main() -> None:
         print(f"{'mean':16} | " + " | ".join(f"{mean:6.3f}" for mean in np.mean(rows, axis=0)))
         off = [expected_calibration_error(part.learned, part.share) for part in (untried, few)]
         print(f"expected calibration error {off[0]:.3f} without an attempt, {off[1]:.3f} with few")
+    transfer = fit_transfer(lessons)
+    assert transfer is not None
+    print("\nown attempts | kernels, own stack, with others")
+    for each in lessons[: len(EXAMPLES)]:
+        for count in (60, 100, 300, 1_000, 2_000):
+            found = taught(each, features_of(each.shape), transfer.trees_for(each.shape), count)
+            print(f"{each.shape:16} {count:5} | " + " ".join(f"{skill:6.3f}" for skill in found), flush=True)
 
 
 if __name__ == "__main__":

@@ -171,11 +171,11 @@ class Learning:
         if not _enough(plain.whole):
             return fewer
         known = self._known(row.id, of.digest, row.epoch, attempts)
-        late = untried is not None and known is not None and not known.others and attempts <= _OTHERS_HELP
+        others = None
+        if untried is not None and untried.transfer.better_untried:
+            others = untried.transfer.trees_for(untried.shape)
+        late = others is not None and known is not None and not known.others and attempts <= _OTHERS_HELP
         if known is None or late or not known.is_of(row.epoch, attempts):
-            others = None
-            if untried is not None and untried.transfer.better_untried:
-                others = untried.transfer.trees_for(untried.shape)
             self._background.do(of.digest, lambda: self._learn(of, plain, others, prepare))
         if known is None or known.epoch != row.epoch:
             return replace(fewer, estimator=fewer.estimator.model_copy(update={"state": "fitting"}))
