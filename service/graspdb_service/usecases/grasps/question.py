@@ -122,7 +122,7 @@ def question_of(
         if limits.candidates is not None:
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
-        bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
+        bounds = bounds_of(request, built, limits, search, test, near if by_success else None, model, threads)
         found = built, search, wide, kernel, limits, test, believed, chances, model, bounds
         return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m)
 
@@ -178,7 +178,7 @@ def _by_success(request: GraspConstraints, model: Model | None) -> bool:
     return "success_probability" in (request.objective, request.robust_of)
 
 
-def _bounds(
+def bounds_of(
     request: GraspConstraints,
     built: Built,
     limits: Constraints,
