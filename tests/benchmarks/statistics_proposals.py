@@ -4,12 +4,12 @@
 [--seeds 10] [--most 100] [--cone 30]``
 
 Each run starts from the same 10 draws of ``edges`` and goes on in batches of 10: proposed by the service,
-executed in simulation (`wrench`, PG70), posted as they were commanded. An execution displaces the tool by 2 mm
-and turns it by 2 degrees, normal along and about every axis of its frame. What collides as commanded is a
-``collision``, what does so only as executed a ``failure``. After every batch the best grasp is asked for by
+executed in simulation (`wrench`, PG70), posted as they were commanded. An execution displaces the tool by
+2 mm and turns it by 2 degrees, normal along and about every axis of its frame. What collides as commanded is
+a ``collision``, what does so only as executed a ``failure``. After every batch the best grasp is asked for by
 success probability, with an approach within a cone about straight down (``--cone 0``: with any), and executed
 100 times. It is reached with the first batch after which it holds in 95 of them, if it does so after the next
-batch, too; runs end there, or after ``--most`` trials, and then count as more than that.
+batch, too; runs end there, or after ``--most`` trials and one batch, and then count as more than that.
 """
 
 from __future__ import annotations

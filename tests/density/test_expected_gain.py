@@ -1,4 +1,4 @@
-"""What a trial is worth to the best grasp: against integrals, simulated decisions, and what must hold of any."""
+"""What a trial is worth to the best grasp: against integrals and decisions, and what must hold of any."""
 
 from __future__ import annotations
 

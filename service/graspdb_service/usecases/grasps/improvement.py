@@ -14,14 +14,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graspdb.wire import BestGraspRequest, ProposalsRequest
-from graspdb.wire.queries import GraspBounds, PostedBounds, SamplesRequest
-from graspdb_density import GraspDensity, IsotropicKernel, PoseNoise, SuccessModel, expected, se3
+from graspdb.wire.queries import PostedBounds
+from graspdb_density import (
+    GraspDensity,
+    IsotropicKernel,
+    ModeSearch,
+    PoseNoise,
+    SuccessModel,
+    expected,
+    se3,
+)
 from graspdb_density.se3 import Poses
 from graspdb_density.success.expected_gain import Beliefs
 from graspdb_density.success.kernel_regression import PRIOR_TRIALS
 from graspdb_estimators import StackedModel
 from graspdb_service.problems import conflict, invalid_fields
-from graspdb_service.trial_columns import Floats
+from graspdb_service.trial_columns import Floats, Ints
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -48,6 +56,7 @@ _NARROW, _MOST = 0.2, 256
 #: Draws of the noise by which collisions in execution are judged.
 _NOISE_DRAWS = 16
 _BOUNDS = tuple(name for name in PostedBounds.model_fields if name != "reference")
+_OF_THE_DRAWS = {"count", "frame", "convention", "near", "name"}
 _NOISES = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
 
 
@@ -73,7 +82,7 @@ def improving(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         limits = constraints(asked, selected, PoseFrame())
         built = ctx.densities.get(selected, choice)
         scene = _scene(ctx, asked, built, limits)
-        beliefs, answer = ctx.compute.run(lambda: _believed(ctx, asked, scene))
+        beliefs, answer = _believed(ctx, asked, scene)
         if not len(beliefs.poses):
             raise conflict(
                 "nothing-to-try",
@@ -82,24 +91,33 @@ def improving(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
             )
         count = min(request.count, _MOST, len(beliefs.poses))
         chosen = ctx.compute.run(lambda: beliefs.choose(count, scene.seen, answer))
-        seed = samples.seed_of(request.seed)
-        rng = np.random.default_rng(seed)
-        symmetric = selected.jaw_symmetric
-        narrow = _narrow(scene.seen)
-        centres = beliefs.poses[chosen.rows]
+        seed, narrow = samples.seed_of(request.seed), _narrow(scene.seen)
+        centres, symmetric = beliefs.poses[chosen.rows], selected.jaw_symmetric
         density = GraspDensity.build(centres, kernel=narrow, symmetric=symmetric)
-        # The same from each, and the rest from those that come first in a random order: every draw by
-        # itself is one from the density, and together they leave nothing out.
-        rows = np.resize(rng.permutation(count), request.count)
-        if request.count == count:
-            rows = np.arange(count)
-        turned = rng.random(request.count) < 0.5 if symmetric else np.zeros(request.count, dtype=np.bool_)
-        about = GraspDensity.build(centres[rows].turned(turned), kernel=narrow, symmetric=False)
-        poses = about.sample_rows(np.arange(request.count), rng)
-        drawn = samples.told_of(
-            ctx, density, poses, built, built.kernel, seed, request, prior=scene.model is None
+        rows, poses = ctx.compute.run(
+            lambda: _about_each(centres, narrow, symmetric, request.count, np.random.default_rng(seed))
         )
+        untried = scene.model is None
+        drawn = samples.told_of(ctx, density, poses, built, built.kernel, seed, request, prior=untried)
         return replace(drawn, expected_gain=chosen.gains[rows])
+
+
+def _about_each(
+    centres: Poses, kernel: IsotropicKernel, symmetric: bool, count: int, rng: np.random.Generator
+) -> tuple[Ints, Poses]:
+    """As many draws about each of the centres as about any other, and one more about some drawn at random: a
+    stratified sample of their mixture. Which centre each (count,) is about, and the draws; as many as there
+    are centres come in their order.
+    """
+    rows = np.arange(count)
+    if count != len(centres):
+        rows = np.resize(rng.permutation(len(centres)), count)
+    about = centres[rows]
+    if symmetric:
+        about = about.turned(rng.random(count) < 0.5)
+    moves, turns = kernel.sample_displacements(count, rng)
+    turned = se3.multiply(about.quaternions_xyzw, turns)
+    return rows, Poses(about.positions + moves, se3.normalise(turned))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +134,18 @@ class _Scene:
     prior: Prior | None
     test: CollisionTest | None
 
+    @property
+    def search(self) -> ModeSearch:
+        """In the successes, or before any in the edges."""
+        found = self.built.search or (None if self.prior is None else self.prior.search)
+        assert found is not None
+        return found
+
 
 def _about(request: ProposalsRequest) -> BestGraspRequest:
     """The question for the best grasp that trials are to improve."""
-    apart = {*SamplesRequest.model_fields} - {*GraspBounds.model_fields}
-    selecting = {*BestGraspRequest.model_fields} & {*request.model_fields_set}
-    left_out = {"count", "seed", "frame", "convention", "near", "name"} & apart
-    fields = {name: getattr(request, name) for name in selecting - left_out}
+    given = {*BestGraspRequest.model_fields} & request.model_fields_set - _OF_THE_DRAWS
+    fields = {name: getattr(request, name) for name in given}
     noisy = any(getattr(request, name) for name in _NOISES)
     objective = "robust" if noisy else "success_probability"
     more = {"robust_of": "success_probability"} if noisy else dict.fromkeys(_NOISES)
@@ -156,19 +179,26 @@ def _scene(ctx: Estimators, asked: BestGraspRequest, built: Built, limits: Const
 
 def _believed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene) -> tuple[Beliefs, int | None]:
     """What is believed of grasps that might be the best, and which of them is answered now, if any is."""
-    rng = np.random.default_rng(0)
-    found = None if scene.question is None else scene.question.engine.best(scene.question.bounds)
-    answers = [Poses(best.position[None], best.quaternion_xyzw[None]) for best in found or ()]
-    candidates = _candidates(ctx, scene, rng)
-    candidates = candidates[_allowed(ctx, asked, scene, candidates)]
-    poses = Poses.concatenate([*answers, candidates])
-    mean, trials = _mean(ctx, scene, poses)
-    # Where the jaw closes on nothing, nothing is to be learned; of the answer that is.
-    kept = mean > 0.0
+    question, run = scene.question, ctx.compute.run
+    found = [] if question is None else run(lambda: question.engine.best(question.bounds))
+    answers = [Poses(best.position[None], best.quaternion_xyzw[None]) for best in found]
+
+    def looked_at() -> Poses:
+        candidates = _candidates(ctx, scene, np.random.default_rng(0))
+        return Poses.concatenate([*answers, candidates[_allowed(ctx, asked, scene, candidates)]])
+
+    poses = run(looked_at)
+    prior = _prior_mean(ctx, scene, poses)
+    # Where the jaw closes on nothing there is nothing to learn; of what is answered there is.
+    kept = prior > 0.0
     kept[: len(answers)] = True
-    poses, mean, trials = poses[kept], mean[kept], trials[kept]
-    beliefs = Beliefs(poses, mean, trials, _comes(ctx, asked, scene, poses))
-    return beliefs, 0 if answers else None
+    poses, prior = poses[kept], prior[kept]
+
+    def believed() -> Beliefs:
+        mean, trials = _told(ctx, scene, poses, prior)
+        return Beliefs(poses, mean, trials, _comes(ctx, asked, scene, poses))
+
+    return run(believed), 0 if answers else None
 
 
 def _candidates(ctx: Estimators, scene: _Scene, rng: np.random.Generator) -> Poses:
@@ -206,25 +236,28 @@ def _candidates(ctx: Estimators, scene: _Scene, rng: np.random.Generator) -> Pos
     return Poses.concatenate(found)
 
 
-def _allowed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Poses) -> np.ndarray:
+def _allowed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Poses) -> Ints:
     """Rows that the bounds admit, whatever is known of their chances."""
-    search = scene.built.search or (None if scene.prior is None else scene.prior.search)
-    assert search is not None
-    unasked = asked.model_copy(update={"min_success_probability": None, "min_effective_trials": None})
-    bounds = bounds_of(
-        unasked, scene.built, scene.limits, search, scene.test, None, None, ctx.compute.threads
-    )
+    threads = ctx.compute.threads
+    bounds = bounds_of(asked, scene.built, scene.limits, scene.search, scene.test, None, None, threads)
     return bounds.allowed(poses)
 
 
-def _mean(ctx: Estimators, scene: _Scene, poses: Poses) -> tuple[Floats, Floats]:
+def _prior_mean(ctx: Estimators, scene: _Scene, poses: Poses) -> Floats:
+    """The success probability (n,) that beliefs start from: by geometry, where that is known."""
+    model = scene.model
+    prior = np.full(len(poses), 0.5 if model is None else _share(model.whole))
+    if scene.test is None:
+        return prior
+    far = Estimates.unknown(len(poses))
+    free = np.ones(len(poses), dtype=np.bool_)
+    ctx.successes.add_prior(far, model, poses, scene.test, free)
+    return np.where(np.isfinite(far.prior), far.prior, prior)
+
+
+def _told(ctx: Estimators, scene: _Scene, poses: Poses, prior: Floats) -> tuple[Floats, Floats]:
     """Expected success probability (n,) and as how many trials those around count."""
     model, threads = scene.model, ctx.compute.threads
-    prior = np.full(len(poses), 0.5 if model is None else _share(model.whole))
-    if scene.test is not None:
-        far = Estimates.unknown(len(poses))
-        ctx.successes.add_prior(far, model, poses, scene.test, np.ones(len(poses), dtype=np.bool_))
-        prior = np.where(np.isfinite(far.prior), far.prior, prior)
     if model is None:
         return prior, np.zeros(len(poses))
     won, trials = model.whole.counted(poses, threads=threads)
@@ -250,12 +283,9 @@ def _comes(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Poses
         # With the jaw as far open as each pose needs, a displaced one would be tested by its own opening.
         return np.ones(len(poses))
     narrow, threads = _narrow(scene.seen), ctx.compute.threads
-    at_object, at_tool = PoseNoise(0.0, 0.0), PoseNoise(0.0, 0.0)
-    if scene.built.density is not None or scene.prior is not None:
-        density = scene.built.density or (scene.prior.density if scene.prior else None)
-        assert density is not None
-        noises, _ = noises_of(asked, scene.built.object_row, density)
-        at_object, at_tool = noises["pose_noise"], noises["tool_noise"]
+    search = scene.search
+    noises, _ = noises_of(asked, scene.built.object_row, search.centres)
+    at_object, at_tool = noises["pose_noise"], noises["tool_noise"]
     tool = PoseNoise(
         math.hypot(at_tool.sigma_position_m, narrow.sigma_position_m),
         math.hypot(at_tool.sigma_rotation, narrow.sigma_rotation),
