@@ -99,7 +99,8 @@ def improving(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         )
         untried = scene.model is None
         drawn = samples.told_of(ctx, density, poses, built, built.kernel, seed, request, prior=untried)
-        return replace(drawn, expected_gain=chosen.gains[rows])
+        estimator = drawn.estimator if scene.model is None else scene.model.estimator
+        return replace(drawn, expected_gain=chosen.gains[rows], estimator=estimator)
 
 
 def _about_each(

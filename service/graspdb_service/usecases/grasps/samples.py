@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from graspdb.wire import KernelInfo, Selection, SymmetryInfo
+from graspdb.wire import EstimatorInfo, KernelInfo, Selection, SymmetryInfo
 from graspdb_density import se3
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_service.problems import ProblemError, conflict
@@ -33,7 +33,8 @@ class Draw:
     ``selected`` are the trials that it is about; ``support``: columns of how far the draws are from what was
     tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial. ``opening_m`` (n,)
     is how far open the jaw comes to each, where that was asked; ``symmetry`` what shares attempts;
-    ``expected_gain`` (n,) what the best grasp gains by each, where they were chosen by that.
+    ``expected_gain`` (n,) what the best grasp gains by each, where they were chosen by that; ``estimator``
+    told the success probabilities that chose them.
     """
 
     built: Built
@@ -47,6 +48,7 @@ class Draw:
     opening_m: Floats | None = None
     symmetry: SymmetryInfo | None = None
     expected_gain: Floats | None = None
+    estimator: EstimatorInfo = field(default_factory=EstimatorInfo)
 
     @property
     def selected(self) -> Selected:
