@@ -192,7 +192,7 @@ def main() -> None:
                 trials = sorted(count for count, _ in runs)
                 told = " ".join("more" if math.isinf(count) else f"{count:.0f}" for count in trials)
                 seconds = statistics.median(seconds for _, seconds in runs)
-                middle = statistics.median_low(trials)
+                middle = statistics.median(trials)
                 shown = f"> {asked.most}" if math.isinf(middle) else f"{middle:.0f}"
                 print(f"{name:12} {strategy:20} {shown:>7}   {told}; {seconds:.2f}", flush=True)
             simulation.workpiece.close()

@@ -204,9 +204,11 @@ def test_its_densities_integrate_to_one(
     post(http, "thing", *known_and_unknown)
     p, q, g = arrays(propose(http, count=60_000, seed=5))
     narrow = IsotropicKernel(0.0015, math.radians(1.5))
+    # About draws in the middle of what is drawn: out in its tails single ratios would count for everything.
+    about = np.argsort(-g[:3_000])[:300]
     for symmetric in (True, False):
-        h = GraspDensity.build(se3.Poses.of(p[:300], q[:300]), kernel=narrow, symmetric=symmetric)
-        ratio = h.density(se3.Poses.of(p[300:], q[300:]), cutoff=None, threads=2) / g[300:]
+        h = GraspDensity.build(se3.Poses.of(p[about], q[about]), kernel=narrow, symmetric=symmetric)
+        ratio = h.density(se3.Poses.of(p[3_000:], q[3_000:]), cutoff=None, threads=2) / g[3_000:]
         error = ratio.std() / math.sqrt(len(ratio))
-        assert error < 0.08
+        assert error < 0.05
         assert ratio.mean() == pytest.approx(1.0, abs=4 * error)
