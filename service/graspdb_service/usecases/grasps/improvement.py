@@ -189,7 +189,7 @@ def _believed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene) -> tuple[
         return Poses.concatenate([*answers, candidates[_allowed(ctx, asked, scene, candidates)]])
 
     poses = run(looked_at)
-    prior = _prior_mean(ctx, scene, poses)
+    prior = _prior_mean(ctx, asked, scene, poses)
     # Where the jaw closes on nothing there is nothing to learn; of what is answered there is.
     kept = prior > 0.0
     kept[: len(answers)] = True
@@ -244,11 +244,11 @@ def _allowed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Pos
     return bounds.allowed(poses)
 
 
-def _prior_mean(ctx: Estimators, scene: _Scene, poses: Poses) -> Floats:
-    """The success probability (n,) that beliefs start from: by geometry, where that is known."""
+def _prior_mean(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Poses) -> Floats:
+    """The success probability (n,) that beliefs start from: by geometry, where that is known and counts."""
     model = scene.model
     prior = np.full(len(poses), 0.5 if model is None else _share(model.whole))
-    if scene.test is None:
+    if scene.test is None or asked.collision_free is False:
         return prior
     far = Estimates.unknown(len(poses))
     free = np.ones(len(poses), dtype=np.bool_)
