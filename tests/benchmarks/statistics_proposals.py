@@ -9,7 +9,8 @@ executed in simulation (`wrench`, PG70), posted as they were commanded. An execu
 a ``collision``, what does so only as executed a ``failure``. After every batch the best grasp is asked for by
 success probability, with an approach within a cone about straight down (``--cone 0``: with any), and executed
 100 times. It is reached with the first batch after which it holds in 95 of them, if it does so after the next
-batch, too; runs end there, or after ``--most`` trials and one batch, and then count as more than that.
+batch, too; runs end there, or after ``--most`` trials and one batch: these count as more, in the mean as
+one batch more.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def main() -> None:
     # Draws of edges collide, some of them, and are posted all the same.
     warnings.simplefilter("ignore", DoubtfulTrials)
     bounds = {"approach": (0.0, 0.0, -1.0), "approach_cone_deg": asked.cone} if asked.cone else {}
-    print("object       strategy              median   of each run, sorted; seconds a batch")
+    print("object       strategy                 mean  median   of each run, sorted; seconds a batch")
     with tempfile.TemporaryDirectory() as folder, service(Path(folder)) as db:
         for name in asked.objects:
             simulation = Simulation(name)
@@ -193,8 +194,9 @@ def main() -> None:
                 told = " ".join("more" if math.isinf(count) else f"{count:.0f}" for count in trials)
                 seconds = statistics.median(seconds for _, seconds in runs)
                 middle = statistics.median(trials)
+                mean = statistics.mean(min(count, asked.most + BATCH) for count in trials)
                 shown = f"> {asked.most}" if math.isinf(middle) else f"{middle:.0f}"
-                print(f"{name:12} {strategy:20} {shown:>7}   {told}; {seconds:.2f}", flush=True)
+                print(f"{name:12} {strategy:20} {mean:7.1f} {shown:>7}   {told}; {seconds:.2f}", flush=True)
             simulation.workpiece.close()
 
 
