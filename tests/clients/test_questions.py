@@ -15,7 +15,7 @@ from graspdb import Client, Infeasible, wire
 from graspdb.errors import AmbiguousSelection, Conflict, InvalidInput
 from graspdb.reports import Reports
 from graspdb.resources.objects import GraspObject
-from graspdb.resources.selection import Constraints, Selection, TrialSelection
+from graspdb.resources.selection import Bounds, Constraints, Selection, TrialSelection
 
 Run = Callable[..., tuple[int, str, str]]
 DOWN = [1.0, 0.0, 0.0, 0.0]
@@ -45,6 +45,8 @@ def test_keywords_are_what_the_service_takes() -> None:
     # Each is told of where it is declared.
     told = " ".join(inspect.getdoc(kind) or "" for kind in (TrialSelection, Selection, Constraints))
     assert all(name in told for name in Constraints.__optional_keys__)
+    bounds = set(Bounds.__optional_keys__) - {"box"} | {"box_min", "box_max"}
+    assert bounds == set(wire.queries.PostedBounds.model_fields)
 
 
 def test_a_wrong_keyword_is_a_type_error_that_names_it(db: Client, fresh_id: str) -> None:
@@ -115,6 +117,16 @@ def test_grasps_before_any_success_say_so(untried: GraspObject, run: Run) -> Non
     drawn = untried.proposals(100, strategy="edges", gripper="pg70", seed=1)
     assert "opposed" in (drawn.criterion or "")
     assert best.density > np.median(drawn.proposal_density)
+    within = {"box": ([-0.3, -0.3, 0.0], [0.3, 0.3, 0.3]), "approach": (0, 0, -1), "approach_cone_deg": 30}
+    sought = untried.proposals(5, strategy="expected_improvement", gripper="pg70", seed=1, **within)
+    assert sought.prior
+    assert sought.expected_gain is not None
+    assert (sought.expected_gain > 0).all()
+    assert drawn.expected_gain is None
+    assert (sought.matrices[:, 2, 2] < -0.7).all()
+    assert (sought.position[:, 2] > -0.02).all()
+    with pytest.raises(InvalidInput, match="approach"):
+        untried.proposals(5, strategy="edges", gripper="pg70", **within)
     receipt = untried.trials.add(
         drawn.poses, True, gripper="pg70", source="robot", proposal_density=drawn.proposal_density
     )
@@ -124,5 +136,9 @@ def test_grasps_before_any_success_say_so(untried: GraspObject, run: Run) -> Non
 
     code, out, _ = run("--json", "best-grasp", untried.id, "--gripper", "pg70")
     assert (code, json.loads(out)["grasps"][0]["prior"]) == (0, True)
+    command = ("proposals", untried.id, "--strategy", "expected_improvement", "--gripper", "pg70")
+    code, out, _ = run(*command, "--approach", "0,0,-1", "--approach-cone-deg", "30", "--seed", "1")
+    assert code == 0
+    assert "expected gain" in out
     code, out, _ = run("--json", "best-grasp", untried.id, "--no-prior")
     assert (code, json.loads(out)["grasps"]) == (1, [])

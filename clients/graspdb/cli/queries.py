@@ -38,7 +38,13 @@ from graspdb.resources.results import (
     chance,
     pose_columns,
 )
-from graspdb.resources.selection import Constraints, DrawSelection, LikelihoodSelection, Selection
+from graspdb.resources.selection import (
+    Constraints,
+    DrawSelection,
+    LikelihoodSelection,
+    ProposalSelection,
+    Selection,
+)
 from graspdb.wire import DensityInfo, EstimatorInfo, SelectionInfo
 
 Count = Annotated[int, typer.Option(min=1, max=1_000_000, help="So many poses.")]
@@ -347,13 +353,14 @@ def samples(
 def proposals(
     state: State,
     id: ObjectId,
-    selection: DrawSelection,
+    selection: ProposalSelection,
     count: Count = 10,
     strategy: Annotated[
         str,
         typer.Option(
             help="density: where successes lie; uncertainty: where a trial teaches most;"
-            " edges: where the jaw can close, before any trial (needs a mesh and --gripper)."
+            " edges: where the jaw can close, before any trial (needs a mesh and --gripper);"
+            " expected_improvement: what raises the success probability of the best grasp within bounds most."
         ),
     ] = "density",
     pre_opening_m: Annotated[
@@ -385,5 +392,7 @@ def _show_poses(state: State, found: SampledPoses, csv: bool) -> None:
             columns["within reach"] = partial(_cell, found.support.enough)
         if found.opening_m is not None:
             columns["opening [m]"] = partial(_cell, found.opening_m)
+        if found.expected_gain is not None:
+            columns["expected gain"] = partial(_cell, found.expected_gain)
         show_table(range(len(found)), columns, empty="No samples.")
         _tell_frame(found.frame, found.convention)

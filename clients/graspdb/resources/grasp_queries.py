@@ -22,8 +22,10 @@ from graspdb.resources.selection import (
     Constraints,
     DrawSelection,
     LikelihoodSelection,
+    ProposalSelection,
     Selection,
     best_grasp_request,
+    bounded,
     names,
     near_of,
     query,
@@ -209,17 +211,21 @@ class GraspQueries(Resource):
         pre_opening_m: float | str | None = None,
         name: str | None = None,
         timeout_s: float | None = None,
-        **selection: Unpack[DrawSelection],
+        **selection: Unpack[ProposalSelection],
     ) -> SampledPoses:
         """Grasps to try next; send ``proposal_density`` back with their trials.
 
         ``density`` draws where successes lie, ``uncertainty`` where one more trial teaches most. ``edges``
         needs no trial, but a mesh and a ``gripper``: it draws about grasps that close on opposed surfaces,
-        edges or points; some of what it draws collides. Either starts from poses at which the gripper is
-        free, as far open as ``pre_opening_m`` says (see :class:`Constraints`). ``name`` keeps the answer, as
-        for :meth:`samples`.
+        edges or points; some of what it draws collides. ``expected_improvement`` draws about the grasps that
+        are expected to raise the success probability of the best grasp within :class:`Bounds` most
+        (``expected_gain``), before any trial as well where mesh and gripper are known; give it those that
+        you ask for the best grasp with, the noise of the execution above all. All three start from poses at
+        which the gripper is free, as far open as ``pre_opening_m`` says (see :class:`Constraints`). ``name``
+        keeps the answer, as for :meth:`samples`.
         """
-        fields = _drawn(known_keywords(DrawSelection, selection, "proposals"))
+        given = known_keywords(ProposalSelection, selection, "proposals")
+        fields = bounded(_drawn({name: value for name, value in given.items() if value is not None}))
         fields |= {"count": count, "seed": seed, "strategy": strategy, "pre_opening_m": pre_opening_m}
         fields |= {"name": name, "timeout_s": timeout_s}
         request = validate(wire.ProposalsRequest, fields)

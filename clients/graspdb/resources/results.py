@@ -657,7 +657,8 @@ class SampledPoses(PoseArrays):
     ``newer_revision`` the object's revision now, where a name keeps them of an older one; ``stale``: the
     database did not answer, so they are from what the service had read before. ``opening_m`` (N,) is the
     opening to command at each proposal, metres, where ``pre_opening_m`` asked for it; ``symmetry`` says which
-    symmetries share attempts, where that was asked.
+    symmetries share attempts, where that was asked; ``expected_gain`` (N,) by how much each is expected to
+    raise the success probability of the best grasp, where that chose them.
     """
 
     proposal_density: Floats
@@ -673,11 +674,14 @@ class SampledPoses(PoseArrays):
     selection: wire.SelectionInfo | None = None
     opening_m: Floats | None = None
     symmetry: wire.SymmetryInfo | None = None
+    expected_gain: Floats | None = None
 
     @classmethod
     def from_wire(cls, answer: wire.Samples) -> SampledPoses:
         """From the service's answer."""
-        openings = answer.opening_m if isinstance(answer, wire.Proposals) else None
+        openings, gains = (
+            (answer.opening_m, answer.expected_gain) if isinstance(answer, wire.Proposals) else (None, None)
+        )
         return cls(
             position=np.array(answer.position, dtype=np.float64).reshape(-1, 3),
             quaternion_xyzw=np.array(answer.quaternion_xyzw, dtype=np.float64).reshape(-1, 4),
@@ -696,6 +700,7 @@ class SampledPoses(PoseArrays):
             selection=answer.selection,
             symmetry=answer.symmetry,
             opening_m=None if openings is None else np.array(openings, dtype=np.float64),
+            expected_gain=None if gains is None else np.array(gains, dtype=np.float64),
         )
 
     @property
@@ -712,6 +717,8 @@ class SampledPoses(PoseArrays):
         columns = {**pose_columns(self), "proposal_density": self.proposal_density}
         if self.opening_m is not None:
             columns["opening_m"] = self.opening_m
+        if self.expected_gain is not None:
+            columns["expected_gain"] = self.expected_gain
         return columns if self.support is None else columns | self.support.columns()
 
     def __repr__(self) -> str:

@@ -133,7 +133,36 @@ class LikelihoodSelection(Selection, PoseFrame, total=False):
     pre_opening_m: PreOpening
 
 
-class Constraints(Selection, total=False):
+class Bounds(TypedDict, total=False):
+    """Where a best grasp may be, and the noise that it is to withstand, as in :class:`Constraints`."""
+
+    pose_noise_m: Annotated[float | None, Option("Noise of the object's place, per axis.")]
+    pose_noise_deg: Annotated[float | None, Option("... of its turn, about its centre.")]
+    tool_noise_m: Annotated[float | None, Option("Noise of the tool's place, per axis.")]
+    tool_noise_deg: Annotated[float | None, Option("... of its turn.")]
+    box: Annotated[
+        tuple[ArrayLike, ArrayLike] | None,
+        Corners("Lower corner of the workspace.", upper_help="Upper corner of the workspace."),
+    ]
+    sphere: Annotated[ArrayLike | None, Vector("Centre and radius.", of="x,y,z,r")]
+    above_plane: Annotated[ArrayLike | None, Vector("Keep n.x >= d.", of="nx,ny,nz,d")]
+    half_spaces: ArrayLike | None
+    approach: Annotated[ArrayLike | None, Vector("Approach direction (tool z).")]
+    approach_cone_deg: Annotated[float | None, Option("Half angle about --approach.")]
+    closing: Annotated[ArrayLike | None, Vector("Closing direction (tool y).")]
+    closing_cone_deg: Annotated[float | None, Option("Half angle about --closing.")]
+    collision_free: Annotated[
+        bool | None, Option("Whether the gripper must clear the object.", "--collision-free/--any")
+    ]
+    obstacles: wire.Obstacles | Mapping[str, Any] | None
+    pregrasp_distance_m: Annotated[float | None, Option("The straight approach is free from this far back.")]
+    max_width_m: Annotated[float | None, Option("Fingers at most this far apart.")]
+    object_pose: Annotated[ArrayLike | Any | None, Vector("The object in the world.", of="x,y,z,qx,qy,qz,qw")]
+    object_frame: Annotated[str | None, Option("The object's frame that --object-pose is of.")]
+    reference: Annotated[str | None, Option("What the constraints are in: world or object.")]
+
+
+class Constraints(Selection, Bounds, total=False):
     """What a best grasp is chosen by, besides the :class:`Selection`.
 
     All constraints are in ``reference``: the world if ``object_pose`` is given (which is whatever frame that
@@ -188,37 +217,13 @@ class Constraints(Selection, total=False):
         str | None, Option("density, success_probability (its interval's lower end) or robust.")
     ]
     robust_of: Annotated[str | None, Option("What robust averages: success_probability or density.")]
-    pose_noise_m: Annotated[float | None, Option("Noise of the object's place, per axis.")]
-    pose_noise_deg: Annotated[float | None, Option("... of its turn, about its centre.")]
-    tool_noise_m: Annotated[float | None, Option("Noise of the tool's place, per axis.")]
-    tool_noise_deg: Annotated[float | None, Option("... of its turn.")]
-    box: Annotated[
-        tuple[ArrayLike, ArrayLike] | None,
-        Corners("Lower corner of the workspace.", upper_help="Upper corner of the workspace."),
-    ]
-    sphere: Annotated[ArrayLike | None, Vector("Centre and radius.", of="x,y,z,r")]
-    above_plane: Annotated[ArrayLike | None, Vector("Keep n.x >= d.", of="nx,ny,nz,d")]
-    half_spaces: ArrayLike | None
-    approach: Annotated[ArrayLike | None, Vector("Approach direction (tool z).")]
-    approach_cone_deg: Annotated[float | None, Option("Half angle about --approach.")]
-    closing: Annotated[ArrayLike | None, Vector("Closing direction (tool y).")]
-    closing_cone_deg: Annotated[float | None, Option("Half angle about --closing.")]
-    collision_free: Annotated[
-        bool | None, Option("Whether the gripper must clear the object.", "--collision-free/--any")
-    ]
-    obstacles: wire.Obstacles | Mapping[str, Any] | None
-    pregrasp_distance_m: Annotated[float | None, Option("The straight approach is free from this far back.")]
     pre_opening_m: PreOpening
-    max_width_m: Annotated[float | None, Option("Fingers at most this far apart.")]
     min_success_probability: Annotated[float | None, Option("At least so likely to succeed.")]
     min_effective_trials: Annotated[float | None, Option("... from at least so many effective trials.")]
     candidates: Annotated[
         ArrayLike | Any | None, PoseFile("Rank these poses: a file as `likelihood` reads it.")
     ]
     exclude: Annotated[ArrayLike | Any | None, PoseFile("Stay away from these poses: a file.")]
-    object_pose: Annotated[ArrayLike | Any | None, Vector("The object in the world.", of="x,y,z,qx,qy,qz,qw")]
-    object_frame: Annotated[str | None, Option("The object's frame that --object-pose is of.")]
-    reference: Annotated[str | None, Option("What the constraints are in: world or object.")]
     frame: Annotated[str | None, Option("Frame of the gripper that poses are of: tool, base, flange, ...")]
     convention: Annotated[
         str | None, Option("Whose axes poses have: graspdb, acronym, graspgen, graspnet, vgn, moveit.")
@@ -232,6 +237,12 @@ class Constraints(Selection, total=False):
     name: Annotated[str | None, Option("Keep the answer under this name.")]
     timeout_s: Annotated[float | None, Option("Answer within so many seconds.")]
     prior: Annotated[bool | None, Option("Before any success: whether to choose by the edges.")]
+
+
+class ProposalSelection(DrawSelection, Bounds, total=False):
+    """A :class:`DrawSelection`, and the :class:`Bounds` of the best grasp that ``expected_improvement`` is
+    about.
+    """
 
 
 def query(selection: Mapping[str, Any]) -> dict[str, Any]:
@@ -258,7 +269,23 @@ def query(selection: Mapping[str, Any]) -> dict[str, Any]:
 
 def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRequest:
     """The request for ``count`` grasps within :class:`Constraints`; an error names every wrong field."""
-    fields = {name: value for name, value in given.items() if value is not None} | {"count": count}
+    fields = bounded({name: value for name, value in given.items() if value is not None}) | {"count": count}
+    if "near" in fields:
+        fields["near"] = near_of(fields["near"])
+    for name in ("candidates", "exclude"):
+        if name in fields:
+            asked = None if fields.get("frame") in RESERVED else fields.get("frame")
+            fields |= pose_frame(fields[name], asked, fields.get("convention"))
+            fields |= pose_trials(fields[name], fields) if name == "candidates" else {}
+            fields[name] = as_poses(fields[name]).columns()
+    if "include" in fields:
+        fields["include"] = names(fields["include"])
+    return validate(wire.BestGraspRequest, fields)
+
+
+def bounded(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields with the :class:`Bounds` among them as a request takes these."""
+    fields = dict(fields)
     box = fields.pop("box", None)
     if box is not None:
         if len(box) != 2:
@@ -273,24 +300,14 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
     ):
         if name in fields:
             fields[name] = vector(name, fields[name], of)
-    if "near" in fields:
-        fields["near"] = near_of(fields["near"])
     if "half_spaces" in fields:
         fields["half_spaces"] = _rows("half_spaces", fields["half_spaces"], "nx, ny, nz, d")
     obstacles = fields.get("obstacles")
     if isinstance(obstacles, Mapping) and "points" in obstacles:
         fields["obstacles"] = {**obstacles, "points": _rows("points", obstacles["points"], "x, y, z")}
-    for name in ("candidates", "exclude"):
-        if name in fields:
-            asked = None if fields.get("frame") in RESERVED else fields.get("frame")
-            fields |= pose_frame(fields[name], asked, fields.get("convention"))
-            fields |= pose_trials(fields[name], fields) if name == "candidates" else {}
-            fields[name] = as_poses(fields[name]).columns()
     if "object_pose" in fields:
         fields["object_pose"] = as_vector7(fields["object_pose"], "object_pose")
-    if "include" in fields:
-        fields["include"] = names(fields["include"])
-    return validate(wire.BestGraspRequest, fields)
+    return fields
 
 
 def names(given: Sequence[str] | str) -> list[str]:

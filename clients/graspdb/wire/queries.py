@@ -519,21 +519,13 @@ class Obstacles(Request):
     """Radius of the ball that each point stands for, metres."""
 
 
-class GraspConstraints(Selection):
-    """What a best grasp is chosen by, as far as it fits a query string.
+class GraspBounds(Request):
+    """Where a grasp may be, and the noise that it is to withstand.
 
     All constraints are in ``reference``: world if ``object_pose`` is given, else object; and they are about
     the tool frame, its origin and its axes, whatever ``frame`` poses come and go in.
     """
 
-    count: Annotated[int, Field(ge=1, le=1_000)] = 1
-    """How many distinct grasps to answer at most."""
-    objective: Objective = "density"
-    """What is best: the ``density``; ``success_probability``, by the lower end of its interval; or
-    ``robust``, the mean of ``robust_of`` under noise."""
-    robust_of: Averaged | None = None
-    """What ``robust`` is the mean of; by default the success probability where attempts tell it, else the
-    density."""
     pose_noise_m: NoiseM | None = None
     """Standard deviation of the object's place along each axis, metres; by default none."""
     pose_noise_deg: NoiseDeg | None = None
@@ -543,11 +535,6 @@ class GraspConstraints(Selection):
     """Standard deviation of the tool's place along each axis of its frame, metres; by default none."""
     tool_noise_deg: NoiseDeg | None = None
     """Standard deviation of the tool's rotation about each axis of its frame, degrees; by default none."""
-    include: IncludedScores = None
-    prior: bool | None = None
-    """Whether an object with geometry and no success yet may answer from its edges, each grasp marked
-    ``prior``. By default it does where a gripper is known; true says what is missing where it can't, false
-    leaves it at ``no_successes``."""
     box_min: Position | None = None
     """Lower corner x,y,z of the box that the tool's origin lies in, in the ``reference`` frame, metres; by
     default none."""
@@ -575,15 +562,9 @@ class GraspConstraints(Selection):
     pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far back along the approach the open gripper's straight way must be free, metres; by default not at
     all."""
-    pre_opening_m: PreOpeningField = None
     max_width_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far the fingers may be apart once both touch the object, metres; by default as far as the jaw
     opens."""
-    min_success_probability: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Least success probability; a grasp too far from every attempt to have one fails it; by default none."""
-    min_effective_trials: Annotated[float, Field(ge=0, le=1e12)] | None = None
-    """Fewest effective trials that the success probability rests on, with the nearest attempt within the
-    estimator's reach; by default none."""
     object_pose: ObjectPose | None = None
     """Pose of the object in the world frame: x,y,z in metres and a unit quaternion x,y,z,w; null if not
     known, then there is no world. It is that of the object frame, which is its mesh's, or of
@@ -594,6 +575,34 @@ class GraspConstraints(Selection):
     reference: Reference | None = None
     """What constraints, candidates and ``near`` are in: the world, which is whatever frame ``object_pose`` is
     in (the robot's base, say), or the object frame; by default the world if ``object_pose`` is given."""
+
+
+class GraspConstraints(GraspBounds, Selection):
+    """What a best grasp is chosen by, as far as it fits a query string.
+
+    All constraints are in ``reference``: world if ``object_pose`` is given, else object; and they are about
+    the tool frame, its origin and its axes, whatever ``frame`` poses come and go in.
+    """
+
+    count: Annotated[int, Field(ge=1, le=1_000)] = 1
+    """How many distinct grasps to answer at most."""
+    objective: Objective = "density"
+    """What is best: the ``density``; ``success_probability``, by the lower end of its interval; or
+    ``robust``, the mean of ``robust_of`` under noise."""
+    robust_of: Averaged | None = None
+    """What ``robust`` is the mean of; by default the success probability where attempts tell it, else the
+    density."""
+    include: IncludedScores = None
+    prior: bool | None = None
+    """Whether an object with geometry and no success yet may answer from its edges, each grasp marked
+    ``prior``. By default it does where a gripper is known; true says what is missing where it can't, false
+    leaves it at ``no_successes``."""
+    pre_opening_m: PreOpeningField = None
+    min_success_probability: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Least success probability; a grasp too far from every attempt to have one fails it; by default none."""
+    min_effective_trials: Annotated[float, Field(ge=0, le=1e12)] | None = None
+    """Fewest effective trials that the success probability rests on, with the nearest attempt within the
+    estimator's reach; by default none."""
     frame: Annotated[FrameName | None, Field(description=_FRAME_OR_REFERENCE)] = None
     convention: AskedConvention = None
     near: Quaternion | None = None
@@ -620,14 +629,19 @@ class GraspConstraints(Selection):
         return said == "world" if said is not None else self.object_pose is not None
 
 
-class BestGraspRequest(GraspConstraints):
-    """The constrained maximum (figure 2)."""
+class PostedBounds(GraspBounds):
+    """Bounds that take a body."""
 
     half_spaces: Annotated[list[Plane], Field(max_length=MAX_HALF_SPACES)] | None = None
     """Rows nx, ny, nz, d that keep n.x >= d at the tool's origin x, in the ``reference`` frame, d in metres;
     by default none."""
     obstacles: Obstacles | None = None
     """What else the open gripper must not touch, in the ``reference`` frame; null for nothing."""
+
+
+class BestGraspRequest(PostedBounds, GraspConstraints):
+    """The constrained maximum (figure 2)."""
+
     candidates: Annotated[list[Pose], Field(min_length=1, max_length=MAX_CANDIDATES)] | PoseColumns | None = (
         None
     )
@@ -787,15 +801,18 @@ class Samples(Response):
     selection: SelectionField = None
 
 
-Strategy = Literal["density", "uncertainty", "edges"]
+Strategy = Literal["density", "uncertainty", "edges", "expected_improvement"]
 
 
-class ProposalsRequest(SamplesRequest):
-    """Grasps to try next."""
+class ProposalsRequest(SamplesRequest, PostedBounds):
+    """Grasps to try next; bounds and noise are those of the best grasp that ``expected_improvement`` is
+    about, the other strategies refuse them.
+    """
 
     strategy: Strategy = "density"
     """``density``: where successes lie; ``uncertainty``: where one more trial teaches most; ``edges``: where
-    the jaw can close on opposed surfaces or edges, before anything is known."""
+    the jaw can close on opposed surfaces or edges, before anything is known; ``expected_improvement``: where
+    trials are expected to raise the success probability of the best grasp within bounds most."""
     pre_opening_m: PreOpeningField = None
 
 
@@ -809,6 +826,10 @@ class Proposals(Samples):
     opening_m: list[float] | None = None
     """How far open the jaw comes to each pose, metres: the opening to command; null without
     ``pre_opening_m``."""
+    expected_gain: list[float] | None = None
+    """By how much the success probability of the best grasp is expected to rise, 0 to 1, were that of the
+    grasp which each pose is drawn about known, besides those chosen before it; null for other strategies than
+    ``expected_improvement``."""
 
 
 # -- in query strings, and beside poses that are read as arrays

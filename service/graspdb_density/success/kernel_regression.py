@@ -398,6 +398,27 @@ class SuccessModel:
         plain = self.without_quantiles(poses, everywhere=everywhere, threads=threads)
         return plain.probability, plain.trials, plain.nearest
 
+    def counted(self, poses: Poses, *, threads: int = 1) -> tuple[Floats, Floats]:
+        """As how many successes and as how many attempts those around count at M poses, (M,) each: one at a
+        pose counts as 1 there, and by the kernel elsewhere. Unlike effective trials they fall off with
+        distance.
+        """
+        if not self.size or not len(poses):
+            return np.zeros(len(poses)), np.zeros(len(poses))
+        sums, (one,) = self._sums(poses, threads), self._alone(poses[:1], poses[:1])
+        return sums.won / one, sums.total / one
+
+    def nearness(self, pose: Poses, poses: Poses) -> Floats:
+        """As how much of an attempt one more at a pose (1) would count at M others, by kernel and motions."""
+        return self._alone(pose, poses) / self._alone(pose, pose)
+
+    def _alone(self, pose: Poses, poses: Poses) -> Floats:
+        """The kernel sum (M,) of one attempt, with a jaw as that of those there are."""
+        symmetric = all(part.cells.symmetric.all() for part in self.parts)
+        won = np.ones(1, dtype=np.bool_)
+        alone = SuccessModel.build(pose, won, kernel=self.kernel, symmetric=symmetric)
+        return (alone if self.motions is None else alone.shared(self.motions))._sums(poses, 1).total
+
     def support(self, poses: Poses, *, threads: int = 1) -> tuple[Floats, NearestAttempts]:
         """Effective trials at M poses, and how far the nearest attempts are, however far."""
         _, trials, nearest = self.without_interval(poses, everywhere=True, threads=threads)

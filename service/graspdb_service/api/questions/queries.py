@@ -144,7 +144,10 @@ def post_proposals(ctx: Ctx, id: ObjectId, query: ProposalsRequest) -> Response:
     no trial, but a mesh and a gripper: it draws about grasps that close on opposed surfaces, edges or points
     no farther apart than the jaw opens, at any angle about the closing axis, by default with 10 mm and 15
     degrees. Grasps at which the open gripper collides are left out before; what is drawn about the others is
-    not tested, for then the density would not be the one it was drawn with.
+    not tested, for then the density would not be the one it was drawn with. ``expected_improvement`` draws
+    about the grasps that are expected to raise the success probability of the best grasp within the bounds
+    most, with 3 mm and 3 degrees where success probabilities have the default kernel: before any trial as
+    well, where mesh and gripper are known. Bounds are those of best-grasp; other strategies refuse them.
     """
     return _told(asking.draws(ctx, id, query))
 

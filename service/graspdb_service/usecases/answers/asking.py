@@ -131,7 +131,7 @@ def draws(ctx: Asking, slug: str, request: SamplesRequest) -> Told:
     else:
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
     frame = frame_of(drawn.selected, request.frame, request.convention, request.near)
-    estimator = EstimatorInfo()
+    estimator = drawn.estimator
     head = {
         **_head(ctx, drawn.built, drawn.kernel, estimator, frame),
         "seed": drawn.seed,

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from graspdb.wire import GraspConstraints, Ranking
+from graspdb.wire.queries import GraspBounds
 from graspdb_density import GraspDensity, ModeSearch, PoseNoise, Reach, SuccessModel, expected
 from graspdb_density.se3 import Poses
 from graspdb_density.search.scored_poses import Pull, Score
@@ -67,16 +68,7 @@ def by_mean(
     threads: int,
 ) -> tuple[ScoreSearch, Ranking]:
     """The mean under noise of a success probability ``value``; None: of the density."""
-    pivot, named = _pivot(row, search.centres)
-    about = {"pose_noise": f"the object about {named}, on the left", "tool_noise": "the tool, on the right"}
-    told: dict[str, str] = {}
-    noises: dict[str, PoseNoise] = {}
-    for name, moved in about.items():
-        metres = getattr(request, f"{name}_m") or 0.0
-        degrees = getattr(request, f"{name}_deg") or 0.0
-        noises[name] = PoseNoise(metres, math.radians(degrees), pivot if name == "pose_noise" else (0.0,) * 3)
-        if metres or degrees:
-            told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {moved}"
+    noises, told = noises_of(request, row, search.centres)
     averaged = "density" if value is None else "success_probability"
     if value is None:
         value, noises = _widened(search, noises)
@@ -98,6 +90,25 @@ def by_mean(
     )
     resolution = 0.0 if averaged == "density" else _RESOLUTION
     return ScoreSearch(search, threads, score, rough, pull, resolution), ranking
+
+
+def noises_of(
+    request: GraspBounds, row: ObjectRow, density: GraspDensity
+) -> tuple[dict[str, PoseNoise], dict[str, str]]:
+    """The noise of the object's pose and of the tool's that a request asks to withstand, by their names in
+    it, and in words where there is any.
+    """
+    pivot, named = _pivot(row, density)
+    about = {"pose_noise": f"the object about {named}, on the left", "tool_noise": "the tool, on the right"}
+    told: dict[str, str] = {}
+    noises: dict[str, PoseNoise] = {}
+    for name, moved in about.items():
+        metres = getattr(request, f"{name}_m") or 0.0
+        degrees = getattr(request, f"{name}_deg") or 0.0
+        noises[name] = PoseNoise(metres, math.radians(degrees), pivot if name == "pose_noise" else (0.0,) * 3)
+        if metres or degrees:
+            told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {moved}"
+    return noises, told
 
 
 def success_score(model: SuccessModel, test: CollisionTest | None, threads: int) -> Score:

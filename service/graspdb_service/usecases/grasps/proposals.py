@@ -7,6 +7,7 @@ tells it at each draw: sent back with the trial, it undoes the choice (eq 1).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -24,6 +25,7 @@ from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import samples
 from graspdb_service.usecases.grasps.admissible import NearSuccesses
+from graspdb_service.usecases.grasps.improvement import improving, refuse_bounds
 from graspdb_service.usecases.grasps.samples import Draw
 
 #: Poses whose uncertainty is asked for.
@@ -47,6 +49,11 @@ CRITERIA: dict[Strategy, str] = {
         " without those at which the open gripper collides; the draws themselves are not tested, and some"
         " collide"
     ),
+    "expected_improvement": (
+        "about grasps of which more knowledge is expected to raise the success probability of the best grasp"
+        " within the bounds most, one after the other, those before taken as tried; draws are from kernels a"
+        " fifth as wide as the one that tells of success, and some may collide or leave the bounds by as much"
+    ),
 }
 
 
@@ -55,11 +62,13 @@ def propose(ctx: Estimators, slug: str, request: ProposalsRequest) -> tuple[Draw
 
     409 without what the strategy needs; as :func:`graspdb_service.usecases.grasps.samples.draw`.
     """
+    if request.strategy != "expected_improvement":
+        refuse_bounds(request)
     if request.strategy == "density":
         drawn = samples.draw(ctx, slug, request, request.count, request.seed)
     else:
         samples.check_count(ctx, request.count)
-        drawn = (_uncertain if request.strategy == "uncertainty" else _from_edges)(ctx, slug, request)
+        drawn = _DRAWN[request.strategy](ctx, slug, request)
     return _preshaped(ctx, request, drawn), CRITERIA[request.strategy]
 
 
@@ -114,6 +123,13 @@ def _from_edges(ctx: Estimators, slug: str, request: ProposalsRequest) -> Draw:
         return samples.drawn_from(
             ctx, prior.density, built, prior.kernel, request.count, request.seed, request, prior=True
         )
+
+
+_DRAWN: dict[Strategy, Callable[[Estimators, str, ProposalsRequest], Draw]] = {
+    "uncertainty": _uncertain,
+    "edges": _from_edges,
+    "expected_improvement": improving,
+}
 
 
 def uncertain(

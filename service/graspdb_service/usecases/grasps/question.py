@@ -130,7 +130,7 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         about = near if by_success and not expected else None
-        bounds = _bounds(request, built, limits, search, test, about, model, threads)
+        bounds = bounds_of(request, built, limits, search, test, about, model, threads)
         found = built, search, wide, kernel, limits, test, believed, chances, model, untried, bounds
         return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m)
 
@@ -193,7 +193,7 @@ def _by_others(request: GraspConstraints, untried: UntriedChance | None) -> bool
     return untried is not None and untried.by_others
 
 
-def _bounds(
+def bounds_of(
     request: GraspConstraints,
     built: Built,
     limits: Constraints,

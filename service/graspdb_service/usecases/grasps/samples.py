@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from graspdb.wire import KernelInfo, Selection, SymmetryInfo
+from graspdb.wire import EstimatorInfo, KernelInfo, Selection, SymmetryInfo
 from graspdb_density import se3
 from graspdb_density.kde.density import SearchedDensity
 from graspdb_service.problems import ProblemError, conflict
@@ -32,7 +32,9 @@ class Draw:
 
     ``selected`` are the trials that it is about; ``support``: columns of how far the draws are from what was
     tried, where attempts tell and it was asked; ``prior``: geometry drew them, no trial. ``opening_m`` (n,)
-    is how far open the jaw comes to each, where that was asked; ``symmetry`` what shares attempts.
+    is how far open the jaw comes to each, where that was asked; ``symmetry`` what shares attempts;
+    ``expected_gain`` (n,) what the best grasp gains by each, where they were chosen by that; ``estimator``
+    told the success probabilities that chose them.
     """
 
     built: Built
@@ -45,6 +47,8 @@ class Draw:
     prior: bool = False
     opening_m: Floats | None = None
     symmetry: SymmetryInfo | None = None
+    expected_gain: Floats | None = None
+    estimator: EstimatorInfo = field(default_factory=EstimatorInfo)
 
     @property
     def selected(self) -> Selected:
@@ -53,7 +57,8 @@ class Draw:
     def columns(self, frame: PoseFrame) -> dict[str, Any]:
         """Those of an answer, by name, the poses of a frame."""
         position, quaternion = frame.from_tool(se3.Poses(self.position, self.quaternion_xyzw))
-        names = ["proposal_density", "support", *(["opening_m"] if self.opening_m is not None else [])]
+        known = [name for name in ("opening_m", "expected_gain") if getattr(self, name) is not None]
+        names = ["proposal_density", "support", *known]
         rest = {name: getattr(self, name) for name in names}
         return {"position": position, "quaternion_xyzw": quaternion, **rest}
 
@@ -96,13 +101,33 @@ def drawn_from(
     """Draws from a density of an object as it was at a revision; ``built`` are its trials. Without ``asking``
     (the request) it is not told how far they are from those.
     """
-    chosen = secrets.randbits(63) if seed is None else seed
+    chosen = seed_of(seed)
     poses = ctx.compute.run(lambda: density.sample(count, np.random.default_rng(chosen)))
+    return told_of(ctx, density, poses, built, kernel, chosen, asking, prior=prior)
+
+
+def seed_of(seed: int | None) -> int:
+    """The seed that was asked for, else one that is made up."""
+    return secrets.randbits(63) if seed is None else seed
+
+
+def told_of(
+    ctx: Estimators,
+    density: SearchedDensity,
+    poses: se3.Poses,
+    built: Built,
+    kernel: KernelInfo,
+    seed: int,
+    asking: Selection | None,
+    *,
+    prior: bool = False,
+) -> Draw:
+    """As :func:`drawn_from`, of poses that were drawn from the density already, by a seed."""
     support, symmetry = (None, None) if asking is None else _support(ctx, built, poses, asking)
     return Draw(
         built=built,
         kernel=kernel,
-        seed=chosen,
+        seed=seed,
         position=poses.positions,
         quaternion_xyzw=se3.canonical(poses.quaternions_xyzw),
         proposal_density=np.exp(log_density(ctx, density, poses, _CUTOFF)),
