@@ -33,10 +33,9 @@ from graspdb_service.trial_columns import Floats, Ints
 from graspdb_service.usecases.densities.build import Built, KernelChoice
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
-from graspdb_service.usecases.densities.learning import Model
+from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.densities.prior import Prior
 from graspdb_service.usecases.densities.stored_kernel import isotropic
-from graspdb_service.usecases.densities.success_models import Estimates
 from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps import samples
 from graspdb_service.usecases.grasps.constraints import Constraints, constraints
@@ -245,15 +244,16 @@ def _allowed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Pos
 
 
 def _prior_mean(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Poses) -> Floats:
-    """The success probability (n,) that beliefs start from: by geometry, where that is known and counts."""
+    """The success probability (n,) that beliefs start from: by other objects or by geometry, where these are
+    known and count.
+    """
     model = scene.model
     prior = np.full(len(poses), 0.5 if model is None else _share(model.whole))
-    if scene.test is None or asked.collision_free is False:
+    untried = ctx.successes.untried(scene.built.selected, scene.test)
+    if untried is None or asked.collision_free is False:
         return prior
-    far = Estimates.unknown(len(poses))
-    free = np.ones(len(poses), dtype=np.bool_)
-    ctx.successes.add_prior(far, model, poses, scene.test, free)
-    return np.where(np.isfinite(far.prior), far.prior, prior)
+    every = np.ones(len(poses), dtype=np.bool_)
+    return untried.told(poses, every, every, model)
 
 
 def _told(ctx: Estimators, scene: _Scene, poses: Poses, prior: Floats) -> tuple[Floats, Floats]:
