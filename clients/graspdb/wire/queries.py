@@ -42,6 +42,7 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
+from graspdb.wire.cells.robots import MAX_JOINTS, GraspJoints, JointNumber, RobotReach
 from graspdb.wire.frames.asking import (
     ASKED_FRAME,
     AskedConvention,
@@ -428,7 +429,8 @@ class Likelihoods(Response):
     selection: SelectionField = None
 
 
-def _object_pose(value: Any) -> Any:
+def pose_vector(value: Any) -> Any:
+    """A pose, by seven numbers or its fields, as x, y, z, qx, qy, qz, qw."""
     if isinstance(value, dict):
         pose = Pose.model_validate(value)
         return (*pose.position, *pose.quaternion_xyzw)
@@ -442,7 +444,7 @@ def _object_pose(value: Any) -> Any:
     return value
 
 
-ObjectPose = Annotated[Vector7, BeforeValidator(_object_pose)]
+ObjectPose = Annotated[Vector7, BeforeValidator(pose_vector)]
 """The object frame in the world frame: x, y, z, qx, qy, qz, qw (a pose's object is accepted too)."""
 
 
@@ -635,6 +637,22 @@ class BestGraspRequest(GraspConstraints):
     exclude: Annotated[list[Pose], Field(max_length=MAX_EXCLUDED)] | PoseColumns | None = None
     """No grasp within both separations of one of these poses, of ``frame`` in ``reference``; null for
     none."""
+    scene: Slug | None = None
+    """Id of a stored scene, in the world: what else the gripper, and the robot's links, must not touch; null
+    for none. Needs ``object_pose``."""
+    robot: Slug | None = None
+    """Id of a stored robot: only grasps that its arm can take, on a straight approach where
+    ``pregrasp_distance_m`` is given, and lifted where ``lift_m`` is, without a collision; null for any. Needs
+    ``object_pose`` and a gripper. Of a symmetric jaw's twins the answer has the one that the joints take."""
+    robot_base_pose: ObjectPose | None = None
+    """Pose of the robot's root link in the world: x, y, z in metres and a unit quaternion x, y, z, w; null
+    for the world's own frame."""
+    joints_now: Annotated[list[JointNumber], Field(max_length=MAX_JOINTS)] | None = None
+    """Where the robot's joints are, in its order, radians and metres: of grasps and joint values that are
+    equally good the nearest are chosen; null if not known."""
+    lift_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
+    """How far the arm must lift the grasped object straight up, along the world's z, metres; null for not at
+    all."""
 
 
 class WorldPose(Response):
@@ -687,6 +705,14 @@ class Grasp(Response):
     """The trials nearest to it, by their ``seq``."""
     active_constraints: list[str] = Field(default_factory=list)
     """The constraints that hold it where it is: relax one to do better."""
+    joints: GraspJoints | None = None
+    """Joint values by which the robot takes it; null where no robot was named."""
+    joint_margin: float | None = None
+    """Least distance of a joint to its limit, all the way from pregrasp to lift, radians or metres; null
+    where no robot was named, and without limits."""
+    manipulability: float | None = None
+    """Yoshikawa's measure at the grasp, sqrt(det(J J^T)) in metres cubed of an arm whose joints turn, 0 where
+    it is singular; null where no robot was named."""
 
 
 class Ranking(Response):
@@ -732,7 +758,9 @@ class BestGrasps(Response):
     revision: Revision
     kernel: KernelInfo
     """The kernel of the density that answered."""
-    reach: ReachField = None
+    reach: RobotReach | ReachField = None
+    """How far from an attempt success probabilities are told, null before any attempt and where none was
+    asked for; where infeasible by the robot, why its arm takes none of the grasps."""
     estimator: EstimatorField = None
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None

@@ -6,11 +6,13 @@ Before any success they are chosen by the prior of the object's edges, where geo
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from graspdb.wire import (
+    BestGraspRequest,
     BestGrasps,
     EstimatorInfo,
     Grasp,
@@ -22,6 +24,8 @@ from graspdb.wire import (
 )
 from graspdb.wire.base import Quadruple
 from graspdb_density import Maximum, Separation, se3
+from graspdb_service.usecases.cells import scenes
+from graspdb_service.usecases.cells.reach import RobotQuestion, joints_of
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.evidence import symmetries
@@ -38,12 +42,17 @@ from graspdb_service.usecases.trials.pose_frames import NO_TWINS, frame_of
 from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
+#: Grasps that a robot is asked why it takes none of them.
+_TRIED = 20
 #: From here on an object's pose in the world is doubted, metres.
 _FAR_M = 100.0
 
 
-def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, Selected]:
-    """The best distinct grasps under the request's constraints, and the selection that they are of.
+def best_grasps(
+    ctx: Estimators, slug: str, request: GraspConstraints
+) -> tuple[BestGrasps, Selected, tuple[str, ...]]:
+    """The best distinct grasps under the request's constraints, the selection that they are of, and stamps of
+    the robot and the scene that they depend on.
 
     422 names fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that are not
     there, and as the selection.
@@ -53,7 +62,10 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     with ctx.compute.within(request):
         selected = ctx.densities.selections.resolve(slug, request)
         frame = frame_of(selected, request.pose_frame, request.convention)
-        limits = constraints(request, selected, frame)
+        scene = None
+        if isinstance(request, BestGraspRequest) and request.scene is not None:
+            scene = scenes.standing(ctx.database, request.scene)
+        limits = constraints(request, selected, frame, scene, ctx.scenes)
         built = ctx.densities.get(selected, choice)
         question = question_of(ctx, request, built, limits)
         answer: dict[str, Any] = {"status": "no_successes", "grasps": [], "kernel": built.kernel}
@@ -66,6 +78,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "symmetry": question.symmetry,
                 **_answer(ctx, request, question),
             }
+    robot = None if question is None else question.robot
     near = request.near if selected.jaw_symmetric else None
     answer["grasps"] = [_as_asked(grasp, limits, near) for grasp in answer["grasps"]]
     if answer.get("nearest") is not None:
@@ -84,10 +97,12 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *symmetries.doubts(None if question is None else question.symmetry),
             *frame.warnings,
             *_far_off(limits),
+            *(() if robot is None else robot.warnings),
             *([NO_TWINS] if request.near is not None and near is None else []),
         ],
     }
-    return BestGrasps.model_validate({**told, **answer}), built.selected
+    stamps = [*([] if robot is None else [robot.stamp]), *([] if scene is None else [scene.stamp])]
+    return BestGrasps.model_validate({**told, **answer}), built.selected, tuple(stamps)
 
 
 def _estimator(question: Question | None) -> EstimatorInfo:
@@ -98,6 +113,11 @@ def _estimator(question: Question | None) -> EstimatorInfo:
 def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> dict[str, Any]:
     engine, bounds = question.engine, question.bounds
     found = ctx.compute.run(lambda: engine.best(bounds))
+    if question.robot is not None:
+        grasps = _taken(ctx, question, question.robot, found)
+        if not grasps:
+            return _out_of_reach(ctx, request, question, question.robot)
+        return {"status": "ok" if len(grasps) >= bounds.count else "fewer", "grasps": grasps}
     if found:
         grasps = _described(ctx, question, found)
         return {"status": "ok" if len(grasps) >= bounds.count else "fewer", "grasps": grasps}
@@ -117,6 +137,30 @@ def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> d
     }
 
 
+def _taken(ctx: Estimators, question: Question, robot: RobotQuestion, found: list[Maximum]) -> list[Grasp]:
+    """Grasps as the robot takes them, with its joints."""
+    taken, motions = ctx.compute.run(lambda: robot.taken(found))
+    grasps = _described(ctx, question, taken)
+    return [grasp.model_copy(update=joints_of(motion)) for grasp, motion in zip(grasps, motions, strict=True)]
+
+
+def _out_of_reach(
+    ctx: Estimators, request: GraspConstraints, question: Question, robot: RobotQuestion
+) -> dict[str, Any]:
+    """The answer where the robot takes no grasp: why not, or which constraints leave none to take."""
+    anyone = replace(question, robot=None, bounds=replace(question.bounds, dear=None, count=_TRIED))
+    found = ctx.compute.run(lambda: anyone.engine.best(anyone.bounds))
+    if not found:
+        without = request.model_copy(update={"robot": None})
+        return _answer(ctx, without, replace(anyone, bounds=replace(anyone.bounds, count=request.count)))
+    poses = se3.Poses(
+        np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
+    )
+    place, why = ctx.compute.run(lambda: robot.why_none(poses))
+    nearest = _described(ctx, anyone, found[place : place + 1])[0]
+    return {"status": "infeasible", "grasps": [], "nearest": nearest, "conflict": ["robot"], "reach": why}
+
+
 def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) -> Conflict:
     """Which constraints exclude each other, as grasps are ranked by what noise averages."""
     averaged = question.ranking.robust_of or question.ranking.objective
@@ -127,7 +171,9 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
     built = question.built
 
     def ask(request: GraspConstraints) -> Grasp | None:
-        limits = constraints(request, built.selected, question.limits.frame)
+        limits = constraints(
+            request, built.selected, question.limits.frame, question.limits.scene, ctx.scenes
+        )
         other = question_of(ctx, request, built, limits)
         if other is None:
             return None

@@ -18,6 +18,8 @@ from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.cells.standing import PlacedSolid, StandingScene
+from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.trials.pose_frames import PoseFrame
 from graspdb_service.usecases.trials.selection import Selected
 
@@ -42,9 +44,10 @@ class Constraints:
     object_pose: Poses | None
     in_world: bool
     frame: PoseFrame
-    obstacles: tuple[Scene | PointCloud, ...] = ()
+    obstacles: tuple[Scene | PointCloud | PlacedSolid, ...] = ()
     candidates: Poses | None = None
     exclude: Poses | None = None
+    scene: StandingScene | None = None
 
     def named(self, active: tuple[str, ...]) -> list[str]:
         """The request's names of the region's active limits, each once."""
@@ -58,10 +61,17 @@ class Constraints:
         return list(dict.fromkeys(names))
 
 
-def constraints(request: GraspConstraints, selected: Selected, frame: PoseFrame) -> Constraints:
+def constraints(
+    request: GraspConstraints,
+    selected: Selected,
+    frame: PoseFrame,
+    scene: StandingScene | None = None,
+    solids: Scenes | None = None,
+) -> Constraints:
     """Check a request's constraints and bring them to the object frame; 422 names fields that contradict.
 
-    Boxes become half spaces, for in the object frame they may stand askew. ``frame``: what its poses are of.
+    Boxes become half spaces, for in the object frame they may stand askew. ``frame``: what its poses are of;
+    ``scene`` the one that the request names, and ``solids`` what its objects' geometry is found in.
     """
     _check(request)
     pose = _object_pose(request, selected.row)
@@ -103,9 +113,10 @@ def constraints(request: GraspConstraints, selected: Selected, frame: PoseFrame)
         pose,
         in_world,
         frame,
-        _obstacles(posted.obstacles, into),
+        (*_obstacles(posted.obstacles, into), *_scene(scene, solids, pose)),
         _moved(posted.candidates, into, frame),
         _moved(posted.exclude, into, frame),
+        scene,
     )
 
 
@@ -149,6 +160,22 @@ def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud
         points = into.positions + se3.rotate(into.quaternions_xyzw, np.array(given.points))
         solids.append(PointCloud(points, given.point_radius_m))
     return tuple(solids)
+
+
+def _scene(
+    scene: StandingScene | None, solids: Scenes | None, object_pose: Poses | None
+) -> tuple[Scene | PointCloud | PlacedSolid, ...]:
+    """What stands in a scene, which is in the world, in the object frame."""
+    if scene is None or solids is None or object_pose is None:
+        return ()
+    into = se3.inverse(object_pose)
+    found: list[Scene | PointCloud | PlacedSolid] = list(_obstacles(scene.content, into))
+    for item in scene.content.objects:
+        solid = solids.solid(scene.rows[item.object])
+        if solid is not None:
+            pose = se3.compose(into, Poses(np.array(item.pose[:3]), np.array(item.pose[3:])))
+            found.append(PlacedSolid(solid, Poses(*pose)))
+    return tuple(found)
 
 
 def _moved(given: Sequence[Pose] | PoseColumns | None, into: Poses, frame: PoseFrame) -> Poses | None:
@@ -243,8 +270,26 @@ def _check(request: GraspConstraints) -> None:
         message = "a free approach and collision_free=false contradict each other"
         errors += [("pregrasp_distance_m", message), ("collision_free", message)]
     errors += _objective(request)
+    errors += _cell(request)
     if errors:
         raise _contradiction(errors)
+
+
+def _cell(request: GraspConstraints) -> list[tuple[str, str]]:
+    """What is wrong with what a request says of a robot and a scene."""
+    if not isinstance(request, BestGraspRequest):
+        return []
+    errors = []
+    for name in ("robot", "scene"):
+        if getattr(request, name) is not None and request.object_pose is None:
+            errors.append(("object_pose", f"{name} needs it: the object's pose in the world"))
+    for name in ("robot_base_pose", "joints_now", "lift_m"):
+        if getattr(request, name) is not None and request.robot is None:
+            errors.append(("robot", f"{name} needs it: the id of a stored robot"))
+    if request.robot is not None and request.near is not None:
+        told = "with a robot the joints choose the twin: leave one of the two out"
+        errors += [("near", told), ("robot", told)]
+    return errors
 
 
 def _objective(request: GraspConstraints) -> list[tuple[str, str]]:

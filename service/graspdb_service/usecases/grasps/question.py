@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, GraspConstraints, KernelInfo, Ranking, SymmetryInfo
+from graspdb.wire import (
+    BestGraspRequest,
+    CalibrationInfo,
+    GraspConstraints,
+    KernelInfo,
+    Ranking,
+    SymmetryInfo,
+)
 from graspdb.wire.queries import PreOpening
 from graspdb_density import ModeSearch, Separation
 from graspdb_density.se3 import Poses
@@ -16,6 +23,7 @@ from graspdb_density.search.scored_poses import Admissible, distinct_from
 from graspdb_geometry.grippers import shape_of
 from graspdb_service.problems import conflict
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.cells.reach import RobotQuestion, robot_question
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -59,6 +67,7 @@ class Question:
     calibration: CalibrationInfo | None
     symmetry: SymmetryInfo | None
     pre_opening_m: PreOpening
+    robot: RobotQuestion | None = None
 
     @property
     def prior(self) -> bool:
@@ -105,6 +114,11 @@ def question_of(
         wide = ctx.symmetries.search(request, built, search)
     near = NearSuccesses(wide.centres)
 
+    robot = None
+    if isinstance(request, BestGraspRequest) and request.robot is not None:
+        assert limits.object_pose is not None
+        robot = robot_question(ctx.robots, ctx.scenes, request, selected, limits.object_pose, limits.scene)
+
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if request.objective == "robust":
@@ -123,8 +137,10 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         bounds = _bounds(request, built, limits, search, test, near if by_success else None, model, threads)
+        if robot is not None:
+            bounds = replace(bounds, dear=robot.test)
         found = built, search, wide, kernel, limits, test, believed, chances, model, bounds
-        return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m)
+        return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m, robot)
 
     return ctx.compute.run(complete)
 
