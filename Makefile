@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PACKAGES := graspdb_density graspdb_geometry graspdb_estimators graspdb_service graspdb_simworker graspdb graspdb_viewer
+PACKAGES := graspdb_density graspdb_geometry graspdb_estimators graspdb_robots graspdb_service graspdb_simworker graspdb graspdb_viewer
 # How many processes run tests; the suite is made for two cores.
 JOBS ?= 2
 KEEP ?=

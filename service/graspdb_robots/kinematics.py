@@ -108,8 +108,8 @@ class Kinematics:
         n = len(self.arm.joints)
         mapped = np.empty((_MAPPED, n))
         count = self.map.seeds(target, mapped)
-        starts = [] if seeds is None else [np.reshape(seeds, (-1, n))]
-        starts = np.concatenate([*starts, mapped[:count], self._drawn])
+        given = [] if seeds is None else [np.reshape(seeds, (-1, n))]
+        starts = np.concatenate([*given, mapped[:count], self._drawn])
         out = np.empty((most, n))
         found, left = chain.solutions(starts, target, *self._bounds(within_limits), *self._chain, most, out)
         return out[:found], 0.3 * math.sqrt(left)

@@ -25,6 +25,7 @@ from graspdb.wire.base import Request as Request
 from graspdb.wire.base import Response as Response
 from graspdb.wire.base import Slug as Slug
 from graspdb.wire.base import Source as Source
+from graspdb.wire.cells.beliefs import PoseBelief as PoseBelief
 from graspdb.wire.cells.robots import GraspJoints as GraspJoints
 from graspdb.wire.cells.robots import RobotInfo as RobotInfo
 from graspdb.wire.cells.robots import RobotJoint as RobotJoint

@@ -42,6 +42,7 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
+from graspdb.wire.cells.beliefs import PoseBelief, central
 from graspdb.wire.cells.robots import MAX_JOINTS, GraspJoints, JointNumber, RobotReach
 from graspdb.wire.frames.asking import (
     ASKED_FRAME,
@@ -653,6 +654,30 @@ class BestGraspRequest(GraspConstraints):
     lift_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
     """How far the arm must lift the grasped object straight up, along the world's z, metres; null for not at
     all."""
+    object_belief: PoseBelief | None = None
+    """Where the object may be beside ``object_pose``: the grasp of the highest mean over that, by the
+    objective ``robust``. ``object_pose`` takes it as well, as ``{mean, covariance}`` or ``{poses, weights}``;
+    of poses that in their midst then stands for it. Null where the pose is taken as exact."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _believed(cls, data: Any) -> Any:
+        """``object_pose`` with what is believed of it, as the two that it is."""
+        given = data.get("object_pose") if isinstance(data, dict) else None
+        if not isinstance(given, dict) or not {"mean", "covariance", "poses", "weights"} & set(given):
+            return data
+        if data.get("object_belief") is not None:
+            raise ValueError("object_pose says what is believed of it: leave object_belief out")
+        belief = {name: value for name, value in given.items() if name != "mean"}
+        poses, mean = given.get("poses"), given.get("mean")
+        if poses is not None and isinstance(poses, list):
+            belief["poses"] = [pose_vector(pose) for pose in poses]
+            known = PoseBelief.model_validate(belief)
+            mean = (known.poses or [None])[central(known.poses or [], known.weights)]
+        if mean is None:
+            raise ValueError("object_pose with a covariance needs its mean")
+        settled = {"object_pose": mean, "object_belief": belief}
+        return {"objective": "robust", **data, **settled}
 
 
 class WorldPose(Response):

@@ -67,12 +67,12 @@ def forward(q, sliding, placements, axes, tip, frames, directions):
             for a in range(3):
                 f[a, 3] += directions[i, a] * q[i]
         else:
-            c, s = math.cos(q[i]), math.sin(q[i])
+            c, t = math.cos(q[i]), math.sin(q[i])
             d = 1.0 - c
             # Rodrigues.
-            turned[0, 0], turned[0, 1], turned[0, 2] = c + d * x * x, d * x * y - s * z, d * x * z + s * y
-            turned[1, 0], turned[1, 1], turned[1, 2] = d * x * y + s * z, c + d * y * y, d * y * z - s * x
-            turned[2, 0], turned[2, 1], turned[2, 2] = d * x * z - s * y, d * y * z + s * x, c + d * z * z
+            turned[0, 0], turned[0, 1], turned[0, 2] = c + d * x * x, d * x * y - t * z, d * x * z + t * y
+            turned[1, 0], turned[1, 1], turned[1, 2] = d * x * y + t * z, c + d * y * y, d * y * z - t * x
+            turned[2, 0], turned[2, 1], turned[2, 2] = d * x * z - t * y, d * y * z + t * x, c + d * z * z
             for a in range(3):
                 u, v, w = f[a, 0], f[a, 1], f[a, 2]
                 for b in range(3):

@@ -63,7 +63,7 @@ def best_grasps(
         selected = ctx.densities.selections.resolve(slug, request)
         frame = frame_of(selected, request.pose_frame, request.convention)
         scene = None
-        if isinstance(request, BestGraspRequest) and request.scene is not None:
+        if isinstance(request, BestGraspRequest) and request.scene is not None and request.object_pose:
             scene = scenes.standing(ctx.database, request.scene)
         limits = constraints(request, selected, frame, scene, ctx.scenes)
         built = ctx.densities.get(selected, choice)
@@ -165,6 +165,8 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
     """Which constraints exclude each other, as grasps are ranked by what noise averages."""
     averaged = question.ranking.robust_of or question.ranking.objective
     plain = dict.fromkeys(("robust_of", "pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg"))
+    if isinstance(request, BestGraspRequest):
+        plain["object_belief"] = None
     by_chance = asks_chance(request)
     chances = ("success_probability", "effective_trials") if by_chance else ("density",)
     asked = request.model_copy(update={**plain, "count": 1, "objective": averaged, "include": list(chances)})

@@ -14,6 +14,7 @@ from graspdb.wire.frames.gripper_frames import RESERVED, NoSuchFrame
 from graspdb.wire.frames.object_frames import MESH, mesh_placed
 from graspdb_density import Region, se3
 from graspdb_density.se3 import Poses
+from graspdb_density.search.pose_noise import normal_displacements
 from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.storage.objects import ObjectRow
@@ -27,6 +28,21 @@ _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.
 _TOUCH_M = 1e-8
 _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
+
+
+#: Draws of a pose's covariance that a mean is taken over.
+_BELIEF_DRAWS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """By what a grasp is displaced (K), seen from where the object may be, and how likely that is (K,); in
+    words, what was believed.
+    """
+
+    displacements: Poses
+    weights: Floats
+    told: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +64,7 @@ class Constraints:
     candidates: Poses | None = None
     exclude: Poses | None = None
     scene: StandingScene | None = None
+    belief: Belief | None = None
 
     def named(self, active: tuple[str, ...]) -> list[str]:
         """The request's names of the region's active limits, each once."""
@@ -117,7 +134,33 @@ def constraints(
         _moved(posted.candidates, into, frame),
         _moved(posted.exclude, into, frame),
         scene,
+        _belief(posted, pose),
     )
+
+
+def _belief(request: BestGraspRequest, pose: Poses | None) -> Belief | None:
+    """Where the object may be beside its pose."""
+    belief = request.object_belief
+    if belief is None or pose is None:
+        return None
+    if belief.covariance is not None:
+        try:
+            drawn = normal_displacements(np.array(belief.covariance), _BELIEF_DRAWS)
+        except ValueError as error:
+            raise _contradiction([("object_pose.covariance", str(error))]) from None
+        turned = se3.multiply(se3.from_rotation_vector(drawn[:, 3:]), pose.quaternions_xyzw)
+        there = Poses(pose.positions + drawn[:, :3], se3.normalise(turned))
+        told = "the covariance of the object's pose"
+    else:
+        values = np.array(belief.poses)
+        given = Poses(values[:, :3], se3.normalise(values[:, 3:]))
+        # Of the frame that object_pose is of, as that is.
+        first = Poses(np.array(request.object_pose)[:3], np.array(request.object_pose)[3:])
+        there = Poses(*se3.compose(given, Poses(*se3.compose(se3.inverse(first), pose))))
+        told = f"{len(values)} weighted poses of the object"
+    weights = np.ones(len(there)) if belief.weights is None else np.array(belief.weights)
+    p, q = se3.compose(se3.inverse(there), pose)
+    return Belief(Poses(p, se3.normalise(q)), weights / weights.sum(), told)
 
 
 def _object_pose(request: GraspConstraints, row: ObjectRow) -> Poses | None:
@@ -280,7 +323,7 @@ def _cell(request: GraspConstraints) -> list[tuple[str, str]]:
     if not isinstance(request, BestGraspRequest):
         return []
     errors = []
-    for name in ("robot", "scene"):
+    for name in ("robot", "scene", "object_belief"):
         if getattr(request, name) is not None and request.object_pose is None:
             errors.append(("object_pose", f"{name} needs it: the object's pose in the world"))
     for name in ("robot_base_pose", "joints_now", "lift_m"):
@@ -294,6 +337,12 @@ def _cell(request: GraspConstraints) -> list[tuple[str, str]]:
 
 def _objective(request: GraspConstraints) -> list[tuple[str, str]]:
     given = [name for name in _NOISE if getattr(request, name) is not None]
+    if isinstance(request, BestGraspRequest) and request.object_belief is not None:
+        told = "what is believed of the object's pose is averaged over by objective=robust"
+        if request.objective != "robust":
+            return [("objective", f"{told}: leave objective out")]
+        beside = [name for name in ("pose_noise_m", "pose_noise_deg") if getattr(request, name) is not None]
+        return [(name, f"{told}: leave the noise out") for name in beside]
     if request.objective == "robust":
         if not any(getattr(request, name) for name in given):
             return [(name, "objective=robust needs noise: one of the four above 0") for name in _NOISE]

@@ -10,6 +10,7 @@ import numpy as np
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb_density import GraspDensity, ModeSearch, PoseNoise, Reach, SuccessModel, expected
 from graspdb_density.se3 import Poses
+from graspdb_density.search.pose_noise import expected_over
 from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_estimators import StackedModel
 from graspdb_service.storage.objects import ObjectRow
@@ -17,6 +18,7 @@ from graspdb_service.trial_columns import Floats
 from graspdb_service.usecases.densities.learning import Model
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.grasps.constraints import Belief
 from graspdb_service.usecases.grasps.search import ScoreSearch
 from graspdb_service.usecases.runtime.compute import breathing
 
@@ -54,8 +56,11 @@ def by_mean(
     value: Score | None,
     pull: Pull | None,
     threads: int,
+    belief: Belief | None = None,
 ) -> tuple[ScoreSearch, Ranking]:
-    """The mean under noise of a success probability ``value``; None: of the density."""
+    """The mean under noise of a success probability ``value`` (None: of the density), and over where the
+    object is believed to be.
+    """
     pivot, named = _pivot(row, search.centres)
     about = {"pose_noise": f"the object about {named}, on the left", "tool_noise": "the tool, on the right"}
     told: dict[str, str] = {}
@@ -66,6 +71,8 @@ def by_mean(
         noises[name] = PoseNoise(metres, math.radians(degrees), pivot if name == "pose_noise" else (0.0,) * 3)
         if metres or degrees:
             told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {moved}"
+    if belief is not None:
+        told["pose_noise"] = belief.told
     averaged = "density" if value is None else "success_probability"
     if value is None:
         value, noises = _widened(search, noises)
@@ -76,6 +83,11 @@ def by_mean(
             expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
             for draws in (_NOISE_DRAWS, _FEW_DRAWS)
         )
+    if belief is not None:
+        likeliest = np.argsort(-belief.weights, kind="stable")[:_FEW_DRAWS]
+        share = belief.weights[likeliest] / belief.weights[likeliest].sum()
+        rough = expected_over(rough, belief.displacements[likeliest], share)
+        score = expected_over(score, belief.displacements, belief.weights)
     unit = ", 1/(m^3 rad^3)" if averaged == "density" else ""
     ranking = Ranking.model_validate(
         {

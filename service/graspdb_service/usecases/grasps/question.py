@@ -124,7 +124,7 @@ def question_of(
         if request.objective == "robust":
             value = None if chance is None else success_score(chance.quick, believed, threads)
             pull = None if chance is None else near.pull
-            return objectives.by_mean(request, row, wide, value, pull, threads)
+            return objectives.by_mean(request, row, wide, value, pull, threads, limits.belief)
         if chance is not None:
             return objectives.by_success(wide, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)
