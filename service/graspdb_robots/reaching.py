@@ -22,7 +22,7 @@ _TWIN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ArmMotion:
     """Joints (n,) for a grasp: before it, at it, and lifted; the first and last None without such a way.
 
     ``twin``: the gripper is turned by half a turn about its approach. ``way`` (steps, n) are all joints that
@@ -123,7 +123,7 @@ class Reaching:
         found = [next(self._ways(grasp), None) is not None for grasp in grasps]
         return np.array(found, dtype=np.bool_).reshape(len(grasps))
 
-    def motion(self, grasp: Floats) -> Motion | None:
+    def motion(self, grasp: Floats) -> ArmMotion | None:
         """How the arm takes a grasp (4, 4): of all motions found the one with the least travel, or without
         ``now`` the one farthest from limits; None where it can't.
         """
@@ -188,10 +188,10 @@ class Reaching:
         order = [step for step in dict.fromkeys([0, last, *range(last)]) if step != grasp]
         return not any(self._collisions.hits(way[step], lifted=step > grasp) for step in order)
 
-    def _motion(self, way: Floats, twin: bool) -> Motion:
+    def _motion(self, way: Floats, twin: bool) -> ArmMotion:
         kinematics, now = self.cell.kinematics, self.cell.now
         parts = math.ceil(self.cell.distance_m / STEP_M - 1e-9)
-        return Motion(
+        return ArmMotion(
             way[0] if parts else None,
             way[parts],
             way[-1] if parts < len(way) - 1 else None,

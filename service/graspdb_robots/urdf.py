@@ -215,12 +215,12 @@ def _shape(shape: Any, mesh_points: MeshPoints) -> tuple[Floats, float] | None:
     if kind.tag == "sphere":
         return np.zeros((1, 3)), _number(kind.get("radius"))
     if kind.tag in ("cylinder", "capsule"):
-        radius, half = _number(kind.get("radius")), _number(kind.get("length")) / 2
+        radius, end = _number(kind.get("radius")), _number(kind.get("length")) / 2
         if kind.tag == "capsule":
-            return np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), radius
+            return np.array([[0.0, 0.0, -end], [0.0, 0.0, end]]), radius
         turn = np.arange(_SIDES) * 2 * np.pi / _SIDES
         rim = radius / math.cos(np.pi / _SIDES) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        return np.concatenate([np.column_stack([rim, np.full(_SIDES, z)]) for z in (-half, half)]), 0.0
+        return np.concatenate([np.column_stack([rim, np.full(_SIDES, z)]) for z in (-end, end)]), 0.0
     if kind.tag != "mesh":
         return None
     points = mesh_points(kind.get("filename") or "")

@@ -673,7 +673,8 @@ class BestGraspRequest(GraspConstraints):
         if poses is not None and isinstance(poses, list):
             belief["poses"] = [pose_vector(pose) for pose in poses]
             known = PoseBelief.model_validate(belief)
-            mean = (known.poses or [None])[central(known.poses or [], known.weights)]
+            assert known.poses is not None
+            mean = known.poses[central(known.poses, known.weights)]
         if mean is None:
             raise ValueError("object_pose with a covariance needs its mean")
         settled = {"object_pose": mean, "object_belief": belief}

@@ -76,10 +76,10 @@ class LazySearch:
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
         """The best distinct grasps."""
-        found = self.walked(count, separation)
-        if not len(found):
+        passed = self.walked(count, separation)
+        if not len(passed):
             return []
-        found = self.search.worth(found)
+        found = self.search.worth(passed)
         found = ScoredPoses.joined(found, self.climbed(found.ranked()[:_CLIMBED])).ranked()
         best = self.distinct(self.cheapest_first(found, count), count, separation)
         return self.search.maxima(best, self.search.told(best))

@@ -54,12 +54,8 @@ def forward(q, sliding, placements, axes, tip, frames, directions):
         place = placements[i]
         for a in range(3):
             for b in range(4):
-                s = 0.0
-                for c in range(3):
-                    s += m[a, c] * place[c, b]
-                if b == 3:
-                    s += m[a, 3]
-                f[a, b] = s
+                f[a, b] = m[a, 0] * place[0, b] + m[a, 1] * place[1, b] + m[a, 2] * place[2, b]
+            f[a, 3] += m[a, 3]
         x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
         for a in range(3):
             directions[i, a] = f[a, 0] * x + f[a, 1] * y + f[a, 2] * z
@@ -141,6 +137,7 @@ def _turn(r, target, out):
         out[3], out[4], out[5] = 3.0, 0.5, 0.25
 
 
+# long: one loop; its parts share small arrays and are nothing apart.
 @_fast
 def solve(q, target, lower, upper, sliding, placements, axes, tip, steps, frames, directions, work):
     """Move joints q (n,) in place to where the flange is at target (4, 4); whether it got there, and the

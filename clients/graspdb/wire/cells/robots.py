@@ -23,9 +23,11 @@ class RobotJoint(Response):
     name: str
     """Name of the joint, as the URDF has it."""
     lower: float | None = None
-    """Lower limit, radians, or metres of one that slides; null for one that turns on without end."""
+    """Lower limit along or about the axis of the joint's frame, radians, or metres of one that slides; null
+    for one that turns on without end."""
     upper: float | None = None
-    """Upper limit, radians, or metres of one that slides; null for one that turns on without end."""
+    """Upper limit along or about the axis of the joint's frame, radians, or metres of one that slides; null
+    for one that turns on without end."""
     sliding: bool = False
     """Whether it slides: its values are metres."""
 

@@ -38,7 +38,7 @@ class SceneSummary(Response):
     boxes: int
     """How many boxes stand in it."""
     points: int
-    """How many points of a sensor are in it."""
+    """How many points of a sensor are in it, in the world's frame."""
     objects: list[str]
     """Ids of the objects in it."""
     updated_at: datetime

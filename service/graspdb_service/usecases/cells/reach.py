@@ -25,7 +25,7 @@ from graspdb_service.usecases.trials.pose_frames import pose_frame
 from graspdb_service.usecases.trials.selection import Selected
 
 if TYPE_CHECKING:
-    from graspdb_robots.reaching import Motion, Reaching
+    from graspdb_robots.reaching import ArmMotion, Reaching
 
 #: Places for the robot that are looked at where it reaches nothing: so far off, metres, in so many
 #: directions.
@@ -60,7 +60,7 @@ class RobotQuestion:
             cost,
         )
 
-    def taken(self, found: list[Maximum]) -> tuple[list[Maximum], list[Motion]]:
+    def taken(self, found: list[Maximum]) -> tuple[list[Maximum], list[ArmMotion]]:
         """Grasps as the arm takes them, each the twin that its joints lead to, and how."""
         grasps, motions = [], []
         for item in found:
@@ -118,7 +118,7 @@ class RobotQuestion:
         return None
 
 
-def joints_of(motion: Motion) -> dict[str, Any]:
+def joints_of(motion: ArmMotion) -> dict[str, Any]:
     """What an answer says of how the arm takes a grasp."""
 
     def listed(joints: Floats | None) -> list[float] | None:
@@ -196,7 +196,8 @@ def _flange_in_tool(robot: PreparedRobot, selected: Selected) -> Floats:
     pose = pose_frame(named, None, profile, selected.gripper).fixed or IDENTITY
     if named == BASE and mount is not None:
         pose = compose(pose, inverse(mount))
-    return matrices(Poses(np.array([pose.position]), np.array([pose.quaternion_xyzw])))[0]
+    found: Floats = matrices(Poses(np.array([pose.position]), np.array([pose.quaternion_xyzw])))[0]
+    return found
 
 
 def _gripper(request: BestGraspRequest, selected: Selected, flange_in_tool: Floats) -> tuple[Floats, ...]:

@@ -36,9 +36,9 @@ def put(database: Database, id: str, scene: SceneCreate) -> tuple[SceneSummary, 
     with database.write() as tx:
         errors = []
         for i, item in enumerate(scene.objects):
-            row = objects.find(tx, item.object)
-            if row is None or row.mesh_sha256 is None:
-                told = "there is no such object" if row is None else "it has no mesh: PUT one first"
+            standing_there = objects.find(tx, item.object)
+            if standing_there is None or standing_there.mesh_sha256 is None:
+                told = "it has no mesh: PUT one first" if standing_there else "there is no such object"
                 errors.append((f"objects.{i}.object", told))
         if errors:
             raise invalid_fields(errors)

@@ -6,7 +6,6 @@ Before any success they are chosen by the prior of the object's edges, where geo
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -115,12 +114,13 @@ def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> d
     found = ctx.compute.run(lambda: engine.best(bounds))
     if question.robot is not None:
         grasps = _taken(ctx, question, question.robot, found)
-        if not grasps:
-            return _out_of_reach(ctx, request, question, question.robot)
-        return {"status": "ok" if len(grasps) >= bounds.count else "fewer", "grasps": grasps}
-    if found:
+    else:
         grasps = _described(ctx, question, found)
+    if grasps:
         return {"status": "ok" if len(grasps) >= bounds.count else "fewer", "grasps": grasps}
+    out_of_reach = None if question.robot is None else _out_of_reach(ctx, question, question.robot)
+    if out_of_reach is not None:
+        return out_of_reach
     centres = question.search.centres
     poses = question.limits.candidates
     if poses is None:
@@ -144,20 +144,17 @@ def _taken(ctx: Estimators, question: Question, robot: RobotQuestion, found: lis
     return [grasp.model_copy(update=joints_of(motion)) for grasp, motion in zip(grasps, motions, strict=True)]
 
 
-def _out_of_reach(
-    ctx: Estimators, request: GraspConstraints, question: Question, robot: RobotQuestion
-) -> dict[str, Any]:
-    """The answer where the robot takes no grasp: why not, or which constraints leave none to take."""
-    anyone = replace(question, robot=None, bounds=replace(question.bounds, dear=None, count=_TRIED))
-    found = ctx.compute.run(lambda: anyone.engine.best(anyone.bounds))
+def _out_of_reach(ctx: Estimators, question: Question, robot: RobotQuestion) -> dict[str, Any] | None:
+    """The answer where it is the robot that takes no grasp, and why; None where there is none to take."""
+    anyones = question.bounds.whoever_takes(_TRIED)
+    found = ctx.compute.run(lambda: question.engine.best(anyones))
     if not found:
-        without = request.model_copy(update={"robot": None})
-        return _answer(ctx, without, replace(anyone, bounds=replace(anyone.bounds, count=request.count)))
+        return None
     poses = se3.Poses(
         np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
     )
     place, why = ctx.compute.run(lambda: robot.why_none(poses))
-    nearest = _described(ctx, anyone, found[place : place + 1])[0]
+    nearest = _described(ctx, question, found[place : place + 1])[0]
     return {"status": "infeasible", "grasps": [], "nearest": nearest, "conflict": ["robot"], "reach": why}
 
 
@@ -166,7 +163,8 @@ def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) ->
     averaged = question.ranking.robust_of or question.ranking.objective
     plain = dict.fromkeys(("robust_of", "pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg"))
     if isinstance(request, BestGraspRequest):
-        plain["object_belief"] = None
+        # Whether there is a grasp that no robot takes is known by now.
+        plain |= dict.fromkeys(("object_belief", "robot", "robot_base_pose", "joints_now", "lift_m"))
     by_chance = asks_chance(request)
     chances = ("success_probability", "effective_trials") if by_chance else ("density",)
     asked = request.model_copy(update={**plain, "count": 1, "objective": averaged, "include": list(chances)})

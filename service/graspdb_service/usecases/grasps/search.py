@@ -40,6 +40,10 @@ class Bounds:
     separation: Separation
     dear: DearTest | None = None
 
+    def whoever_takes(self, count: int) -> Bounds:
+        """The same for so many grasps, without the dear test."""
+        return replace(self, dear=None, count=count)
+
     def allowed(self, poses: Poses) -> NDArray[np.intp]:
         """Rows of the poses that everything but the region admits."""
         if self.admissible is None or not len(poses):
