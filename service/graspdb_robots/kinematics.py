@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -30,7 +31,7 @@ class Straight:
     back: Floats
     lift: Floats
 
-    @property
+    @functools.cached_property
     def parts(self) -> tuple[int, int]:
         """How many steps either way is made in."""
         first, last = (

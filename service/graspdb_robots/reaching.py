@@ -159,14 +159,16 @@ class Reaching:
         """Ways (steps, n) without a collision, each with whether it is the twin's."""
         kinematics, ways = self.cell.kinematics, self._straight(grasp)
         parts, _ = ways.parts
+        asked = False
         for twin in self._twins():
             flange = self.flanges(grasp[None], twin=twin)[0]
             for joints in self._solutions(flange):
                 # Of all steps the grasp collides most often.
                 if self._collisions.hits(joints):
-                    if self._collisions.gripper_hits(joints):
-                        # Wherever the links are, and whichever finger is where.
+                    # The gripper does wherever the links are, and whichever finger is where.
+                    if not asked and self._collisions.gripper_hits(joints):
                         return
+                    asked = True
                     continue
                 way = kinematics.way(joints, flange, ways)
                 if way is not None and self._free(way, parts):

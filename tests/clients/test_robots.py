@@ -75,7 +75,8 @@ def test_a_robot_and_a_scene_come_and_go(cell: Client) -> None:
     assert cell.robots.update("kuka", gripper_mount=[0, 0, 0.05, 0, 0, 0, 1]).gripper_mount is not None
     assert cell.robots.description("kuka").startswith(b"PK")
     summary = cell.scenes.put("s", points=np.zeros((3, 3)), objects={})
-    assert (summary.points, [scene.id for scene in cell.scenes]) == (3, ["s"])
+    assert summary.points == 3
+    assert "s" in [scene.id for scene in cell.scenes]
     assert cell.scenes.get("s").scene.points == [(0, 0, 0)] * 3
     cell.scenes.delete("s")
     cell.robots.delete("kuka")
@@ -102,7 +103,7 @@ def test_it_is_typed_and_awaited(cell: Client, tmp_path: Path) -> None:
     )
     assert "joints, grasp" in told.output, told.output
     far = typed("best-grasp", "mug", "--object-pose", "2,0,0,0,0,0,1", "--robot", "arm", "--gripper", "panda")
-    assert "out of the arm's reach" in " ".join(far.output.split()), far.output
+    assert "out of the arm's reach" in str(far.exception)
 
     async def awaited() -> list[str]:
         async with AsyncClient(cell.url) as db:
