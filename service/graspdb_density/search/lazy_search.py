@@ -21,15 +21,18 @@ __all__ = ["ClimbedSearch", "DearTest", "LazySearch"]
 
 #: Centres looked at in all, and at a time.
 MOST_CENTRES, _BLOCK = 20_000, 512
-#: Poses asked of the dear test at a time, while none has passed it; how many that pass are climbed from.
-_ASKED, _CLIMBED = 16, 4
+#: Poses asked of the dear test at a time, while none has passed it; how many that pass are
+#: compared, kernel widths between them, and how many of the best are climbed from.
+_ASKED, _PASSED, _CLIMBED = 16, 12, 4
 #: Poses that the hint speaks against and that rank higher than one that passed are asked all the same; at
 #: most so many after something passed, and so many where nothing did.
 _DOUBTED, _DOUBTED_IN_VAIN = 512, 4_000
 #: Centres that are looked at for more once something passed.
 _FARTHER = 2_048
 #: Steps tried from each pose at a time, and how often; a step's length in kernel widths, at first.
-_TRIES, _ROUNDS, _STEP = 6, 5, 0.5
+_TRIES, _ROUNDS, _STEP = 6, 8, 0.5
+#: Kernel widths between poses that pass and are compared.
+_APART = 0.5
 #: Scores that differ by less are equal: then what is cheaper to take wins.
 _EQUAL = 1e-6
 
@@ -89,7 +92,8 @@ class LazySearch:
     def walked(self, count: int, separation: Separation) -> Poses:
         """Poses that pass, most of them the first in the order of what they are worth."""
         passed, doubted = list[Poses](), list[Poses]()
-        wanted, looked = max(_CLIMBED, 2 * count), 0
+        wanted, looked = max(_PASSED, 2 * count), 0
+        apart = self.search.widths(_APART) if count == 1 else separation
         for block in self.ranked():
             likely = np.asarray(self.dear.likely(block), dtype=bool)
             rows = np.flatnonzero(likely)
@@ -100,7 +104,7 @@ class LazySearch:
             looked += len(block)
             if rows.size:
                 passed.append(block[rows])
-            enough = passed and len(self.distinct(_unscored(passed), wanted, separation)) >= wanted
+            enough = passed and len(self.distinct(_unscored(passed), wanted, apart)) >= wanted
             if enough or looked >= (_FARTHER if passed else MOST_CENTRES):
                 break
         left = _DOUBTED if passed else _DOUBTED_IN_VAIN
