@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from .arm import Arm, Floats, LinkSolid
 from .collision import self_collisions
 
-MAX_LINKS, MAX_JOINTS = 300, 12
+MAX_LINKS, MAX_JOINTS, MAX_SOLIDS = 300, 12, 200
+_LONGEST_NAME = 200
 #: Sides of the prism that stands for a cylinder, which it contains.
 _SIDES = 24
 #: Points of a mesh of which no hull is made; only a broken file has so flat a body.
@@ -75,7 +76,9 @@ def read_arm(xml: bytes, flange: str | None, mesh_points: MeshPoints) -> tuple[s
         **{**vars(arm), "solids": solids, "untested": untested},
     )
     ends = tuple(dict.fromkeys([*(parent for parent, _, _ in path), flange]))
-    return root.get("name", "robot"), Arm(**{**vars(arm), "pairs": _pairs(arm), "links": ends})
+    return root.get("name", "robot")[:_LONGEST_NAME], Arm(
+        **{**vars(arm), "pairs": _pairs(arm), "links": ends}
+    )
 
 
 def _parsed(xml: bytes) -> Any:
@@ -97,6 +100,8 @@ def _name(item: Any, kind: str) -> str:
     name = item.get("name")
     if not name:
         raise UrdfError("robot", f"a {kind} has no name")
+    if len(name) > _LONGEST_NAME:
+        raise UrdfError("robot", f"a {kind}'s name has more than {_LONGEST_NAME} characters")
     return str(name)
 
 
@@ -196,6 +201,8 @@ def _solids(
             points, radius = found
             place = np.array(frame.placement.homogeneous) @ _origin(shape.find("origin"))
             moved = points @ place[:3, :3].T + place[:3, 3]
+            if len(solids) == MAX_SOLIDS:
+                raise UrdfError("robot", f"more than {MAX_SOLIDS} collision shapes: send simpler ones")
             solids.append(LinkSolid(name, int(frame.parentJoint), moved, radius))
             read += 1
         if read < len(shapes) or (not shapes and link.find("visual") is not None):

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
+import io
+import subprocess
+import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -106,6 +111,44 @@ def test_what_is_no_robot_is_refused_by_its_field(
     (error,) = answer.json()["errors"]
     assert error["field"] == field
     assert told in error["message"]
+
+
+def test_a_service_without_the_extra_says_how_to_get_it(
+    cell: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = importlib.util.find_spec
+    missing = lambda name: None if name == "coal" else found(name)  # noqa: E731
+    monkeypatch.setattr("graspdb_service.usecases.cells.robots.importlib.util.find_spec", missing)
+    for answer in (
+        cell.put("/robots/r?flange=tip", content=b"<robot/>", headers=XML),
+        cell.post("/objects/thing/best-grasp", json={"robot": "panda", "object_pose": AT}),
+    ):
+        assert answer.status_code == 501
+        assert answer.json()["type"].endswith("robots-not-installed")
+        assert "graspdb[service,robot]" in answer.json()["title"]
+
+
+def test_the_service_starts_without_loading_it() -> None:
+    code = "import sys, graspdb_service.app; print(sorted({'pinocchio', 'coal'} & set(sys.modules)))"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
+
+
+def test_a_zip_is_bounded_and_holds_one_urdf(cell: httpx.Client) -> None:
+    def sent(**files: bytes) -> httpx.Response:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in files.items():
+                archive.writestr(name, content)
+        return cell.put("/robots/r?flange=tip", content=stream.getvalue(), headers=ZIP)
+
+    for answer, told in (
+        (cell.put("/robots/r?flange=tip", content=b"PK\0\0", headers=ZIP), "not a zip"),
+        (sent(readme=b"no robot"), "one .urdf"),
+        (sent(**{"a.urdf": b"<robot/>", "bomb.stl": bytes(300 * 2**20)}), "unpacks to over"),
+    ):
+        assert answer.status_code == 422, answer.text
+        assert told in answer.json()["errors"][0]["message"]
 
 
 def _flange(joints: list[float]) -> NDArray[np.float64]:
