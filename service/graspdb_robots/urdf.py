@@ -72,13 +72,10 @@ def read_arm(xml: bytes, flange: str | None, mesh_points: MeshPoints) -> tuple[s
     model = _reduced(xml, set(movable))
     arm = _chain(model, flange, movable)
     solids, untested = _solids(root, model, beyond, mesh_points)
-    arm = Arm(
-        **{**vars(arm), "solids": solids, "untested": untested},
-    )
+    solid = Arm(**{**vars(arm), "solids": solids, "untested": untested})
     ends = tuple(dict.fromkeys([*(parent for parent, _, _ in path), flange]))
-    return root.get("name", "robot")[:_LONGEST_NAME], Arm(
-        **{**vars(arm), "pairs": _pairs(arm), "links": ends}
-    )
+    whole = Arm(**{**vars(solid), "pairs": _pairs(solid), "links": ends})
+    return root.get("name", "robot")[:_LONGEST_NAME], whole
 
 
 def _parsed(xml: bytes) -> Any:
