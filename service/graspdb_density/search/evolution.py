@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from cmaes import CMA
@@ -77,6 +78,7 @@ class EvolutionSearch(ClimbedSearch):
         rank otherwise.
     """
 
+    exactly: ClassVar[int] = 64
     score: Score
     rough: Score
     pull: Pull | None

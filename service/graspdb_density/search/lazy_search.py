@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -50,7 +51,11 @@ class DearTest:
 
 
 class ClimbedSearch(MultiStart):
-    """A search by starts that says what poses are worth, and steps from them."""
+    """A search by starts that says what poses are worth, and steps from them; ``exactly`` is of how many at
+    once that can be afforded.
+    """
+
+    exactly: ClassVar[int]
 
     def worth(self, poses: Poses) -> ScoredPoses:
         """Poses with what they are ranked by."""
@@ -120,7 +125,7 @@ class LazySearch:
 
     def ranked(self) -> Iterator[Poses]:
         """Feasible poses nearest to centres, best first, so many at a time."""
-        search = self.search
+        search, done = self.search, False
         reach = search.widths(REACH)
         for rows, turned in search.candidates():
             centres = search.centres(rows, turned)
@@ -128,6 +133,11 @@ class LazySearch:
             inside &= np.linalg.norm(p - centres.positions, axis=1) <= reach.metres
             inside &= se3.angle_between(q, centres.quaternions_xyzw) <= reach.radians
             valued = search.valued(Poses(p, q)[inside]).poses
+            if not done:
+                # A sample of the kernels, or a rough score, ranks centres within some 10 %.
+                first = search.worth(valued[: search.exactly]).ranked().poses
+                valued = Poses.concatenate([first, valued[search.exactly :]])
+                done = True
             for start in range(0, len(valued), _BLOCK):
                 yield valued[start : start + _BLOCK]
 

@@ -175,6 +175,8 @@ class ModeSearch:
 class MeanShiftSearch(ClimbedSearch):
     """A multi-start search by mean shift: `climb` moves poses uphill, `scored` compares them."""
 
+    exactly = 512
+
     def run(self, count: int, separation: Separation) -> list[Maximum]:
         """The best distinct grasps."""
         # A sample ranks centres roughly: more of them are tried.
