@@ -24,14 +24,14 @@ __all__ = ["ClimbedSearch", "DearTest", "LazySearch"]
 MOST_CENTRES, _BLOCK = 20_000, 512
 #: Poses asked of the dear test at a time, while none has passed it; how many that pass are
 #: compared, kernel widths between them, and how many of the best are climbed from.
-_ASKED, _PASSED, _CLIMBED = 16, 12, 4
+_ASKED, _PASSED, _CLIMBED = 16, 12, 3
 #: Poses that the hint speaks against and that rank higher than one that passed are asked all the same; at
 #: most so many after something passed, and so many where nothing did.
 _DOUBTED, _DOUBTED_IN_VAIN = 512, 4_000
 #: Centres that are looked at for more once something passed.
 _FARTHER = 2_048
 #: Steps tried from each pose at a time, and how often; a step's length in kernel widths, at first.
-_TRIES, _ROUNDS, _STEP = 6, 8, 0.5
+_TRIES, _ROUNDS, _STEP = 6, 5, 0.5
 #: Kernel widths between poses that pass and are compared.
 _APART = 0.5
 #: Scores that differ by less are equal: then what is cheaper to take wins.
