@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PACKAGES := graspdb_density graspdb_geometry graspdb_estimators graspdb_service graspdb_simworker graspdb graspdb_viewer
+PACKAGES := graspdb_density graspdb_geometry graspdb_estimators graspdb_robots graspdb_service graspdb_simworker graspdb graspdb_viewer
 # How many processes run tests; the suite is made for two cores.
 JOBS ?= 2
 KEEP ?=
@@ -74,7 +74,7 @@ PIP_COMPILE = $(BIN)/python -m piptools compile --quiet --generate-hashes --allo
 
 requirements:  ## Pin what pyproject.toml allows, for development and for the images (UPGRADE=--upgrade: the newest)
 	$(PIP_COMPILE) $(UPGRADE) --all-extras --output-file requirements.txt pyproject.toml
-	$(PIP_COMPILE) -c requirements.txt --extra service --extra postgres --extra plot --extra pictures --extra arrow --build-deps-for wheel \
+	$(PIP_COMPILE) -c requirements.txt --extra service --extra postgres --extra plot --extra pictures --extra arrow --extra robot --build-deps-for wheel \
 	  --output-file service/requirements.txt pyproject.toml
 	$(PIP_COMPILE) -c requirements.txt --extra sim --extra mujoco --extra dask --build-deps-for wheel \
 	  --output-file simworker/requirements.txt pyproject.toml

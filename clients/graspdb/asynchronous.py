@@ -22,6 +22,8 @@ from graspdb.reports import AllReports, Reports
 from graspdb.resources.access.audit import Audit
 from graspdb.resources.access.keys import Keys
 from graspdb.resources.answers import Answers
+from graspdb.resources.cells.robots import Robots
+from graspdb.resources.cells.scenes import Scenes
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
 from graspdb.resources.objects import GraspObject, Objects
@@ -275,6 +277,26 @@ class AsyncGrippers(Mirror[Grippers]):
     get = _awaited(Grippers.get)
     delete = _awaited(Grippers.delete)
     list = _iterated(Grippers.list, _same)
+
+
+class AsyncRobots(Mirror[Robots]):
+    """:class:`graspdb.resources.cells.robots.Robots`."""
+
+    put = _awaited(Robots.put)
+    get = _awaited(Robots.get)
+    description = _awaited(Robots.description)
+    update = _awaited(Robots.update)
+    delete = _awaited(Robots.delete)
+    list = _iterated(Robots.list, _same)
+
+
+class AsyncScenes(Mirror[Scenes]):
+    """:class:`graspdb.resources.cells.scenes.Scenes`."""
+
+    put = _awaited(Scenes.put)
+    get = _awaited(Scenes.get)
+    delete = _awaited(Scenes.delete)
+    list = _iterated(Scenes.list, _same)
     __aiter__ = list
 
 
@@ -328,6 +350,8 @@ class AsyncClient(Mirror[Client]):
         super().__init__(Client(url, api_key=api_key, timeout_s=timeout_s, retries=retries))
         self.objects = AsyncObjects(self.sync.objects)
         self.grippers = AsyncGrippers(self.sync.grippers)
+        self.robots = AsyncRobots(self.sync.robots)
+        self.scenes = AsyncScenes(self.sync.scenes)
         self.kernels = AsyncKernels(self.sync.kernels)
         self.sweeps = AsyncSweeps(self.sync.sweeps)
         self.answers = AsyncAnswers(self.sync.answers)

@@ -11,6 +11,8 @@ from graspdb.reports import AllReports
 from graspdb.resources.access.audit import Audit
 from graspdb.resources.access.keys import Keys
 from graspdb.resources.answers import Answers
+from graspdb.resources.cells.robots import Robots
+from graspdb.resources.cells.scenes import Scenes
 from graspdb.resources.grippers import Grippers
 from graspdb.resources.kernels import Kernels
 from graspdb.resources.objects import GraspObject, Objects
@@ -41,6 +43,8 @@ class Client:
         )
         self.objects = Objects(self._transport, "/objects")
         self.grippers = Grippers(self._transport, "/grippers")
+        self.robots = Robots(self._transport, "/robots")
+        self.scenes = Scenes(self._transport, "/scenes")
         self.kernels = Kernels(self._transport, "/kernels")
         self.answers = Answers(self._transport, "/answers")
         self.reports = AllReports(self._transport, "/reports")

@@ -72,6 +72,11 @@ class ClosingGeometry:
         self._tree = (nodes, links, points[order])
 
     @property
+    def corners(self) -> FloatArray:
+        """Its triangles (F, 3, 3), metres, object frame, in no order."""
+        return self._tree[2]
+
+    @property
     def nbytes(self) -> int:
         """Bytes that it keeps."""
         return sum(array.nbytes for array in self._tree)

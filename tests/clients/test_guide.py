@@ -19,6 +19,7 @@ import trimesh
 import yaml
 
 import foreign_files as files
+import known_robots
 from graspdb import Client, wire
 from graspdb.errors import NotFound
 from graspdb.examples import example
@@ -60,6 +61,7 @@ class Robot:
 def test_the_python_blocks_run(own_service_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "franka_panda").symlink_to(known_robots.PANDA.parent)
     parts = [trimesh.Trimesh(v, f) for v, f in example("mug").parts]
     cup = [trimesh.creation.box([40, 40, 60]), trimesh.creation.box([20, 20, 100])]
     trimesh.util.concatenate(cup).export(tmp_path / "cup.stl")

@@ -19,6 +19,7 @@ PACKAGES = {
     "graspdb",
     "graspdb_density",
     "graspdb_estimators",
+    "graspdb_robots",
     "graspdb_geometry",
     "graspdb_service",
     "graspdb_simworker",

@@ -351,7 +351,7 @@ def compare(
             query, region = random_request(rng, scene=seed % 3 == 2)
             tested = scene if query["collision_free"] else None
             try:
-                answer, _ = best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+                answer, *_ = best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
             except ProblemError:
                 assert not region.project(np.zeros((1, 3)), se3.IDENTITY[None])[2].any(), seed
                 continue
@@ -486,7 +486,7 @@ def compare_scores(
                 query["objective"] = "success_probability"
                 rough = score = field.chance("low")
             try:
-                answer, _ = best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
+                answer, *_ = best_grasps(ctx, "thing", BestGraspRequest(**query, **WIDTHS))
             except ProblemError:
                 assert not region.project(np.zeros((1, 3)), se3.IDENTITY[None])[2].any(), seed
                 continue

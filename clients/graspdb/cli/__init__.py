@@ -44,6 +44,13 @@ TABLE = {
     "add-example": Entry(
         "Add the paper's objects, with mesh and convex parts.", "graspdb.cli.objects:add_example"
     ),
+    "robots": Entry(
+        "Store, list, show and delete robots: arms by their URDFs.", "graspdb.cli.cells.robots:robots"
+    ),
+    "scenes": Entry(
+        "Store, list, show and delete scenes: what stands around the gripper.",
+        "graspdb.cli.cells.scenes:scenes",
+    ),
     "grippers": Entry(
         "Create, list, show and delete gripper profiles.", "graspdb.cli.grippers.making:grippers"
     ),

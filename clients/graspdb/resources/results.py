@@ -70,6 +70,19 @@ def distance(nearest: wire.NearestAttempt) -> str:
     )
 
 
+def reach_told(reach: wire.RobotReach) -> str:
+    """Why a robot's arm takes none of the grasps, in words."""
+    told = {
+        "too_far": f"out of the arm's reach by {reach.off_m:.2f} m",
+        "joint_limit": f"only beyond a joint's limit, {reach.off_m:.2f} m off within them",
+        "singular": "no straight approach and lift lead there",
+    }.get(reach.reason, f"{reach.link} would collide with {reach.other}")
+    if reach.nearest_base_pose is not None:
+        at = " ".join(f"{number:+.2f}" for number in reach.nearest_base_pose.position)
+        told += f"; with its root at {at} m (world) the arm takes one"
+    return f"the nearest of {reach.tested} grasps tested is {told}" if reach.link is None else told
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Grasp:
     """A grasp: the pose of the tool frame in the object frame, metres and unit xyzw, and what is known of it.
@@ -93,6 +106,9 @@ class Grasp:
     - ``opening_m``: opening to command before the approach, at which collisions were tested, metres.
     - ``nearest_trials``: ``seq`` of the trials nearest to it.
     - ``active_constraints``: those that hold it where it is.
+    - ``joints``: of a robot that was named, ``pregrasp``, ``grasp`` and ``lift``, lists in the order of its
+      joints, radians and metres; ``joint_margin`` is the least distance of any to its limit on the way, and
+      ``manipulability`` Yoshikawa's measure at the grasp.
     - ``gripper``, ``protocol``: those of the trials that it was chosen from, None where they are of none.
     - ``answer``: id of the answer that it is of, for the trial that tries it; None where it is not kept.
     - ``warnings``: what to mind of that answer; printing the grasp says them, too.
@@ -114,6 +130,9 @@ class Grasp:
     opening_m: float | None = None
     nearest_trials: tuple[int, ...] = ()
     active_constraints: tuple[str, ...] = ()
+    joints: wire.GraspJoints | None = None
+    joint_margin: float | None = None
+    manipulability: float | None = None
     score: float | None = None
     candidate: int | None = None
     simulated: str | None = None
@@ -265,6 +284,13 @@ class Grasp:
             rows["width [m]"] = f"{self.width_m:.4f}"
         if self.opening_m is not None:
             rows["opening to command [m]"] = f"{self.opening_m:.4f}"
+        if self.joints is not None:
+            for name, joints in self.joints:
+                if joints is not None:
+                    rows[f"joints, {name}"] = " ".join(f"{value:+.4f}" for value in joints)
+            margin = "none has a limit" if self.joint_margin is None else f"{self.joint_margin:.3f} rad or m"
+            rows["nearest joint limit"] = margin
+            rows["manipulability"] = f"{self.manipulability:.3g}"
         if self.active_constraints:
             rows["held by"] = ", ".join(self.active_constraints)
         if self.answer is not None:
@@ -311,7 +337,8 @@ class Grasps(Sequence[Grasp]):
         self.revision = answer.revision
         self.kernel = answer.kernel
         self.ranking = answer.ranking
-        self.reach = answer.reach
+        self.reach = answer.reach if isinstance(answer.reach, wire.ReachInfo) else None
+        self.robot_reach = answer.reach if isinstance(answer.reach, wire.RobotReach) else None
         self.estimator = answer.estimator
         self.warnings = list(answer.warnings)
         self.selection = answer.selection
@@ -348,6 +375,8 @@ class Grasps(Sequence[Grasp]):
             what = "all that was tried" if len(self.conflict) == 1 else "each other"
             exclude = "excludes" if len(self.conflict) == 1 else "exclude"
             told += f": {' and '.join(self.conflict)} {exclude} {what}"
+        if self.robot_reach is not None:
+            told += f"; {reach_told(self.robot_reach)}"
         if self.relax:
             values = [
                 f"{name}={','.join(f'{number:g}' for number in np.atleast_1d(value))}"

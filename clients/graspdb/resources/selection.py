@@ -195,7 +195,9 @@ class Constraints(Selection, Bounds, total=False):
       Of grasps and samples the gripper and protocol go along where none is named.
     - ``exclude``: poses to stay away from, by the separation; as candidates, of ``frame`` in ``reference``.
     - ``object_pose``: the object in the world: (4, 4) or ``x y z qx qy qz qw``; of its mesh's frame, or of
-      ``object_frame``, one of the object's ``frames``.
+      ``object_frame``, one of the object's ``frames``. Where it is not known exactly ``{"mean": ...,
+      "covariance": (6, 6)}``, translation first, about the object's origin along the world's axes, or
+      ``{"poses": [...], "weights": [...]}`` of at most 64: the best grasp on average over that (``robust``).
     - ``reference``: ``world`` or ``object``; ``frame="world"`` and ``"object"`` mean the same.
     - ``frame``, ``convention``: what poses are of, as in :class:`PoseFrame`: the grasps, too.
     - ``near``: unit quaternion (4,): of the two grasps that are one for a symmetric jaw the one whose
@@ -206,6 +208,11 @@ class Constraints(Selection, Bounds, total=False):
     - ``name``: keeps the answer under this name: the same question is answered exactly so again, until it is
       deleted (``db.answers``).
     - ``timeout_s``: answer within this time, or DeadlineExceeded.
+    - ``robot``: id of a stored robot (``db.robots``): only grasps that its arm can take, on the straight
+      approach of ``pregrasp_distance_m`` and lifted by ``lift_m``, metres, without a collision;
+      ``grasp.joints`` says how. ``robot_base_pose`` is its root in the world, by default the world's frame;
+      ``joints_now`` (n,) are where its joints are: of equally good ones the nearest are chosen.
+    - ``scene``: id of a stored scene (``db.scenes``), in the world: what else must not be touched.
     - ``prior``: whether an object with geometry and no success yet may answer from its edges; such grasps
       have ``grasp.prior``. By default it does where a gripper is known; True says what is missing where it
       can't.
@@ -231,6 +238,13 @@ class Constraints(Selection, Bounds, total=False):
     near: Annotated[
         ArrayLike | None, Vector("Of a symmetric jaw's two twins that nearer to this turn.", of="qx,qy,qz,qw")
     ]
+    scene: Annotated[str | None, Option("A stored scene that must not be touched.")]
+    robot: Annotated[str | None, Option("Only what this stored robot's arm can take.")]
+    robot_base_pose: Annotated[
+        ArrayLike | Any | None, Vector("The robot's root in the world.", of="x,y,z,qx,qy,qz,qw")
+    ]
+    joints_now: ArrayLike | None
+    lift_m: Annotated[float | None, Option("The arm lifts the grasp straight up so far.")]
     include: Sequence[str] | None
     min_separation_m: Annotated[float | None, Option("Distinct from this distance on.")]
     min_separation_deg: Annotated[float | None, Option("Distinct from this angle on.")]
@@ -278,6 +292,10 @@ def best_grasp_request(count: int, given: Mapping[str, Any]) -> wire.BestGraspRe
             fields |= pose_frame(fields[name], asked, fields.get("convention"))
             fields |= pose_trials(fields[name], fields) if name == "candidates" else {}
             fields[name] = as_poses(fields[name]).columns()
+    if "robot_base_pose" in fields and not isinstance(fields["robot_base_pose"], dict):
+        fields["robot_base_pose"] = as_vector7(fields["robot_base_pose"], "robot_base_pose")
+    if "joints_now" in fields:
+        fields["joints_now"] = np.asarray(fields["joints_now"], dtype=np.float64).ravel().tolist()
     if "include" in fields:
         fields["include"] = names(fields["include"])
     return validate(wire.BestGraspRequest, fields)
@@ -305,8 +323,24 @@ def bounded(fields: Mapping[str, Any]) -> dict[str, Any]:
     obstacles = fields.get("obstacles")
     if isinstance(obstacles, Mapping) and "points" in obstacles:
         fields["obstacles"] = {**obstacles, "points": _rows("points", obstacles["points"], "x, y, z")}
-    if "object_pose" in fields:
-        fields["object_pose"] = as_vector7(fields["object_pose"], "object_pose")
+    believed = fields.get("object_pose")
+    if isinstance(believed, Mapping) and {"mean", "poses"} & set(believed):
+        fields["object_pose"] = _belief(believed)
+    elif "object_pose" in fields and not isinstance(believed, dict):
+        fields["object_pose"] = as_vector7(believed, "object_pose")
+    return fields
+
+
+def _belief(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Where an object is believed to be, its poses and numbers as requests take them."""
+    fields = dict(given)
+    if fields.get("mean") is not None:
+        fields["mean"] = as_vector7(fields["mean"], "object_pose")
+    if fields.get("poses") is not None:
+        fields["poses"] = [as_vector7(pose, "object_pose") for pose in fields["poses"]]
+    for name in ("covariance", "weights"):
+        if fields.get(name) is not None:
+            fields[name] = np.asarray(fields[name], dtype=np.float64).tolist()
     return fields
 
 

@@ -25,6 +25,16 @@ from graspdb.wire.base import Request as Request
 from graspdb.wire.base import Response as Response
 from graspdb.wire.base import Slug as Slug
 from graspdb.wire.base import Source as Source
+from graspdb.wire.cells.beliefs import PoseBelief as PoseBelief
+from graspdb.wire.cells.robots import GraspJoints as GraspJoints
+from graspdb.wire.cells.robots import RobotInfo as RobotInfo
+from graspdb.wire.cells.robots import RobotJoint as RobotJoint
+from graspdb.wire.cells.robots import RobotReach as RobotReach
+from graspdb.wire.cells.robots import RobotUpdate as RobotUpdate
+from graspdb.wire.cells.scenes import SceneCreate as SceneCreate
+from graspdb.wire.cells.scenes import SceneInfo as SceneInfo
+from graspdb.wire.cells.scenes import SceneObject as SceneObject
+from graspdb.wire.cells.scenes import SceneSummary as SceneSummary
 from graspdb.wire.frames.conventions import CONVENTIONS as CONVENTIONS
 from graspdb.wire.frames.conventions import Convention as Convention
 from graspdb.wire.grippers import Finger as Finger

@@ -42,6 +42,8 @@ from graspdb.wire.base import (
     _split_commas,
     _unit,
 )
+from graspdb.wire.cells.beliefs import PoseBelief, central
+from graspdb.wire.cells.robots import MAX_JOINTS, GraspJoints, JointNumber, RobotReach
 from graspdb.wire.frames.asking import (
     ASKED_FRAME,
     AskedConvention,
@@ -429,7 +431,8 @@ class Likelihoods(Response):
     selection: SelectionField = None
 
 
-def _object_pose(value: Any) -> Any:
+def pose_vector(value: Any) -> Any:
+    """A pose, by seven numbers or its fields, as x, y, z, qx, qy, qz, qw."""
     if isinstance(value, dict):
         pose = Pose.model_validate(value)
         return (*pose.position, *pose.quaternion_xyzw)
@@ -443,7 +446,7 @@ def _object_pose(value: Any) -> Any:
     return value
 
 
-ObjectPose = Annotated[Vector7, BeforeValidator(_object_pose)]
+ObjectPose = Annotated[Vector7, BeforeValidator(pose_vector)]
 """The object frame in the world frame: x, y, z, qx, qy, qz, qw (a pose's object is accepted too)."""
 
 
@@ -650,6 +653,47 @@ class BestGraspRequest(PostedBounds, GraspConstraints):
     exclude: Annotated[list[Pose], Field(max_length=MAX_EXCLUDED)] | PoseColumns | None = None
     """No grasp within both separations of one of these poses, of ``frame`` in ``reference``; null for
     none."""
+    scene: Slug | None = None
+    """Id of a stored scene, in the world: what else the gripper, and the robot's links, must not touch; null
+    for none. Needs ``object_pose``."""
+    robot: Slug | None = None
+    """Id of a stored robot: only grasps that its arm can take, on a straight approach where
+    ``pregrasp_distance_m`` is given, and lifted where ``lift_m`` is, without a collision; null for any. Needs
+    ``object_pose`` and a gripper. Of a symmetric jaw's twins the answer has the one that the joints take."""
+    robot_base_pose: ObjectPose | None = None
+    """Pose of the robot's root link in the world: x, y, z in metres and a unit quaternion x, y, z, w; null
+    for the world's own frame."""
+    joints_now: Annotated[list[JointNumber], Field(max_length=MAX_JOINTS)] | None = None
+    """Where the robot's joints are, in its order, radians and metres: of grasps and joint values that are
+    equally good the nearest are chosen; null if not known."""
+    lift_m: Annotated[float, Field(gt=0, le=2.0)] | None = None
+    """How far the arm must lift the grasped object straight up, along the world's z, metres; null for not at
+    all."""
+    object_belief: PoseBelief | None = None
+    """Where the object may be beside ``object_pose``: the grasp of the highest mean over that, by the
+    objective ``robust``. ``object_pose`` takes it as well, as ``{mean, covariance}`` or ``{poses, weights}``;
+    of poses that in their midst then stands for it. Null where the pose is taken as exact."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _believed(cls, data: Any) -> Any:
+        """``object_pose`` with what is believed of it, as the two that it is."""
+        given = data.get("object_pose") if isinstance(data, dict) else None
+        if not isinstance(given, dict) or not {"mean", "covariance", "poses", "weights"} & set(given):
+            return data
+        if data.get("object_belief") is not None:
+            raise ValueError("object_pose says what is believed of it: leave object_belief out")
+        belief = {name: value for name, value in given.items() if name != "mean"}
+        poses, mean = given.get("poses"), given.get("mean")
+        if poses is not None and isinstance(poses, list):
+            belief["poses"] = [pose_vector(pose) for pose in poses]
+            known = PoseBelief.model_validate(belief)
+            assert known.poses is not None
+            mean = known.poses[central(known.poses, known.weights)]
+        if mean is None:
+            raise ValueError("object_pose with a covariance needs its mean")
+        settled = {"object_pose": mean, "object_belief": belief}
+        return {"objective": "robust", **data, **settled}
 
 
 class WorldPose(Response):
@@ -702,6 +746,14 @@ class Grasp(Response):
     """The trials nearest to it, by their ``seq``."""
     active_constraints: list[str] = Field(default_factory=list)
     """The constraints that hold it where it is: relax one to do better."""
+    joints: GraspJoints | None = None
+    """Joint values by which the robot takes it; null where no robot was named."""
+    joint_margin: float | None = None
+    """Least distance of a joint to its limit, all the way from pregrasp to lift, radians or metres; null
+    where no robot was named, and without limits."""
+    manipulability: float | None = None
+    """Yoshikawa's measure at the grasp, sqrt(det(J J^T)) in metres cubed of an arm whose joints turn, 0 where
+    it is singular; null where no robot was named."""
 
 
 class Ranking(Response):
@@ -747,7 +799,9 @@ class BestGrasps(Response):
     revision: Revision
     kernel: KernelInfo
     """The kernel of the density that answered."""
-    reach: ReachField = None
+    reach: RobotReach | ReachField = None
+    """How far from an attempt success probabilities are told, null before any attempt and where none was
+    asked for; where infeasible by the robot, why its arm takes none of the grasps."""
     estimator: EstimatorField = None
     warnings: Warnings = Field(default_factory=list)
     answer: AnswerId = None

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from cmaes import CMA
 
 from .. import se3
 from ..se3 import Floats, Poses
-from .multi_start import REACH, Indices, MultiStart
+from .lazy_search import ClimbedSearch
+from .multi_start import REACH, Indices
 from .scored_poses import (
     Admissible,
     Bools,
@@ -51,7 +53,7 @@ _FIRST_STEP, _LAST_STEP = 0.6, 0.4
 
 
 @dataclass(eq=False)
-class EvolutionSearch(MultiStart):
+class EvolutionSearch(ClimbedSearch):
     """The best distinct grasps by ``score``.
 
     Starts are well separated centres of the density, projected into the region, those of the highest score
@@ -76,6 +78,7 @@ class EvolutionSearch(MultiStart):
         rank otherwise.
     """
 
+    exactly: ClassVar[int] = 64
     score: Score
     rough: Score
     pull: Pull | None
@@ -196,6 +199,20 @@ class EvolutionSearch(MultiStart):
         p, q = tried.positions.reshape(shape), tried.quaternions_xyzw.reshape(shape)
         ends, moved = self.best_tries(at, at.scores, p, q, scores.reshape(count, _TRIES))
         return ends, np.where(moved, np.minimum(1.1 * step, 1.0), 0.6 * step), moved
+
+    # -- where one test is dear
+
+    def worth(self, poses: Poses) -> ScoredPoses:
+        return ScoredPoses(poses, self.told_apart(self.values(self.score, poses), poses))
+
+    def told(self, best: ScoredPoses) -> Floats:
+        return best.scores
+
+    def step_from(
+        self, at: ScoredPoses, step: Floats, tries: int, rng: np.random.Generator
+    ) -> tuple[ScoredPoses, Floats]:
+        ends, step, _ = self.stepped(at, step, rng)
+        return ends, step
 
     # -- evolution
 

@@ -23,7 +23,8 @@ from ..kde.isotropic import GraspDensity
 from ..se3 import Floats, Poses
 from . import mean_shift
 from .evolution import EvolutionSearch
-from .multi_start import REACH, MultiStart
+from .lazy_search import ClimbedSearch, DearTest, LazySearch
+from .multi_start import REACH
 from .region import Region
 from .scored_poses import Admissible, Maximum, Pull, Score, ScoredPoses, Separation
 from .start_ranking import CentreSums, StartRanking, centre_sums, rank_starts
@@ -111,6 +112,7 @@ class ModeSearch:
         pull: Pull | None = None,
         resolution: float = 0.0,
         rescored: int = 0,
+        dear: DearTest | None = None,
         threads: int = 1,
     ) -> list[Maximum]:
         """The ``count`` best distinct grasps, best first; fewer where there are no more, none where no centre
@@ -128,6 +130,8 @@ class ModeSearch:
             What is best. None: the density.
         rough, pull, resolution, rescored
             See `EvolutionSearch`; where the density is best they say nothing.
+        dear
+            A test that costs much, which every pose that is returned has passed: see `LazySearch`.
         threads
 
         Raises
@@ -146,12 +150,15 @@ class ModeSearch:
             start.density.isotropic, start.ranking(threads), log_density, region or Region(), admissible,
             threads,
         )  # fmt: skip
+        search: MeanShiftSearch | EvolutionSearch
         if climbing:
-            return MeanShiftSearch(*common).run(count, separation)
-        score = score or log_density
-        return EvolutionSearch(*common, score, rough or score, pull, resolution, rescored).run(
-            count, separation
-        )
+            search = MeanShiftSearch(*common)
+        else:
+            score = score or log_density
+            search = EvolutionSearch(*common, score, rough or score, pull, resolution, rescored)
+        if dear is not None:
+            return LazySearch(search, dear).run(count, separation)
+        return search.run(count, separation)
 
     def global_maximum(self, threads: int = 1) -> Maximum:
         """The highest point of the whole density, computed once."""
@@ -165,8 +172,10 @@ class ModeSearch:
         return np.minimum(np.exp(log_density - self.global_maximum(threads).log_density), 1.0)
 
 
-class MeanShiftSearch(MultiStart):
+class MeanShiftSearch(ClimbedSearch):
     """A multi-start search by mean shift: `climb` moves poses uphill, `scored` compares them."""
+
+    exactly = 512
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
         """The best distinct grasps."""
@@ -243,6 +252,19 @@ class MeanShiftSearch(MultiStart):
         """The best poses that are ``apart`` kernel widths from each other, at most ``most``."""
         ranked = poses.ranked()
         return ranked[self.thin(ranked.poses, 0, most, self.widths(apart))]
+
+    # -- where one test is dear
+
+    def worth(self, poses: Poses) -> ScoredPoses:
+        return self.scored(poses)
+
+    def told(self, best: ScoredPoses) -> Floats:
+        return self.log_density(best.poses)
+
+    def step_from(
+        self, at: ScoredPoses, step: Floats, tries: int, rng: np.random.Generator
+    ) -> tuple[ScoredPoses, Floats]:
+        return self.stepped(at, step, tries, rng, self.ranking.coarse_to_fine[-1])
 
     # -- the edge of the free space
 

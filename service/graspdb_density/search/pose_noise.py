@@ -13,7 +13,7 @@ from .. import se3
 from ..se3 import Floats, Poses
 from .scored_poses import Score
 
-__all__ = ["PoseNoise", "expected"]
+__all__ = ["PoseNoise", "expected", "expected_over", "normal_displacements"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +65,39 @@ def expected(
         return np.asarray(values.reshape(samples, len(p)).mean(axis=0), dtype=np.float64)
 
     return mean
+
+
+def expected_over(value: Score, displacements: Poses, weights: Floats) -> Score:
+    """The mean of ``value`` where the object is displaced, itself a score.
+
+    Parameters
+    ----------
+    displacements : (K)
+        By which a grasp is displaced, seen from where the object is: on the left of a pose.
+    weights : (K,)
+        How likely each is; they sum up to 1.
+    """
+    count = len(displacements)
+    left_p, left_q = displacements.positions[:, None], displacements.quaternions_xyzw[:, None]
+
+    def mean(poses: Poses) -> Floats:
+        p, q = poses
+        at, to = se3.rotate(left_q, p[None]) + left_p, se3.multiply(left_q, q[None])
+        values = value(Poses(at.reshape(-1, 3), se3.normalise(to.reshape(-1, 4))))
+        return np.asarray(weights @ values.reshape(count, len(p)), dtype=np.float64)
+
+    return mean
+
+
+def normal_displacements(covariance: Floats, samples: int) -> Floats:
+    """Draws (samples, 6) of a normal distribution of a covariance (6, 6), the first a power of two of a fixed
+    scrambled Sobol set; ValueError where it is none.
+    """
+    values, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
+    if values.min() < -1e-9 * max(values.max(), 1e-30):
+        raise ValueError("a covariance has no negative eigenvalue")
+    uniform = qmc.Sobol(6, rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(samples)))
+    return np.asarray(ndtri(uniform[:samples]) @ (axes * np.sqrt(np.maximum(values, 0.0))).T)
 
 
 def _draws(noise: PoseNoise | None, normal: Floats) -> tuple[Floats, Floats]:

@@ -10,6 +10,7 @@ from graspdb_service.storage.upkeep.probe import Probe
 from graspdb_service.usecases.access.key_ring import KeyRing
 from graspdb_service.usecases.answers.asking import Asking
 from graspdb_service.usecases.answers.keeping import AnswerKeeper
+from graspdb_service.usecases.cells.robots import Robots
 from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
 from graspdb_service.usecases.densities.evidence.symmetries import Symmetries
@@ -69,6 +70,7 @@ class Context(Asking):
             compute=compute,
             densities=densities,
             scenes=scenes,
+            robots=Robots(database, compute),
             evidence=CollisionEvidence(scenes, compute),
             symmetries=Symmetries(ShapeSymmetries(database, compute), compute),
             priors=Priors(compute, scenes),

@@ -99,6 +99,36 @@ gripper_versions = Table(
     info=WHOLLY_AUDITED,
 )
 
+# Arms: what was sent, and the arm that was read from it.
+robots = Table(
+    "robots",
+    metadata,
+    Column("id", String(64), primary_key=True),
+    Column("info", JSON, nullable=False),
+    Column("gripper_mount", JSON(none_as_null=True)),
+    Column("sha256", String(64), nullable=False),
+    Column("media_type", String(100), nullable=False),
+    Column("content", LargeBinary, nullable=False),
+    Column("arm", LargeBinary, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
+    info=WHOLLY_AUDITED,
+)
+
+# What stands around. Objects in it are named, not referred to: a scene outlives them.
+scenes = Table(
+    "scenes",
+    metadata,
+    Column("id", String(64), primary_key=True),
+    Column("sha256", String(64), nullable=False),
+    # A scene as JSON, in UTF-8.
+    Column("content", LargeBinary, nullable=False),
+    Column("summary", JSON, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
+    info=WHOLLY_AUDITED,
+)
+
 # Content-addressed: meshes and convex parts, stored once whoever uses them.
 assets = Table(
     "assets",

@@ -39,6 +39,8 @@ GripperId = Annotated[
     str, _id("Id of the gripper, as `GET /grippers` lists it; read, too, one version, as in `panda@1`.")
 ]
 BatchId = Annotated[str, _id("Id of the batch, as posting its trials answered it.")]
+RobotId = Annotated[str, _id("Id of the robot, as it was stored.")]
+SceneId = Annotated[str, _id("Id of the scene, as it was stored.")]
 KernelId = Annotated[str, _id("Id of the kernel, as fitting or storing it answered it.")]
 AnswerRef = Annotated[str, _id("Id of the answer, or a name that it was given.")]
 RunId = Annotated[str, _id("Id of the run, as the 202 that started it answered it.")]

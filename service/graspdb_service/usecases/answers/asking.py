@@ -77,8 +77,8 @@ def best_grasps(ctx: Asking, slug: str, request: GraspConstraints) -> Told:
     before = _under_name(ctx, slug, "best-grasp", request.name, question)
     if before is not None:
         return before
-    best, selected = answer.best_grasps(ctx, slug, request)
-    asked = _Asked("best-grasp", request.name, question, selected, best.kernel, best.estimator)
+    best, selected, stamps = answer.best_grasps(ctx, slug, request)
+    asked = _Asked("best-grasp", request.name, question, selected, best.kernel, best.estimator, stamps=stamps)
 
     def as_json(id: str | None) -> bytes:
         return best.model_copy(update={"answer": id}).model_dump_json().encode()
@@ -161,7 +161,9 @@ def ask(ctx: Asking, slug: str, kind: str, question: Mapping[str, Any]) -> Told:
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A question with what answered it; ``drawn`` names what the answer made up of it, its seed."""
+    """A question with what answered it; ``drawn`` names what the answer made up of it, its seed; ``stamps``
+    are of what else it depends on.
+    """
 
     kind: AnswerKind
     name: str | None
@@ -170,6 +172,7 @@ class _Asked:
     kernel: KernelInfo
     estimator: EstimatorInfo | None
     drawn: str | None = None
+    stamps: tuple[str, ...] = ()
 
 
 def _question(request: Selection) -> dict[str, Any]:
@@ -219,7 +222,7 @@ def _kept(ctx: Asking, asked: _Asked, make: Callable[[str | None], bytes]) -> tu
     row = selected.row
     id = answer_id(
         *(row.id, row.epoch, row.revision, asked.kind, question.decode(), asked.kernel.kind, asked.kernel.id),
-        *(selected.filters, selected.stamp, asked.estimator),
+        *(selected.filters, selected.stamp, asked.estimator, *asked.stamps),
         __version__,
     )
     content = make(id)

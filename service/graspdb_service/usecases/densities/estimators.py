@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from graspdb_service.usecases.cells.robots import Robots
 from graspdb_service.usecases.densities.cache import Densities
 from graspdb_service.usecases.densities.evidence.collisions import CollisionEvidence
 from graspdb_service.usecases.densities.evidence.symmetries import Symmetries
@@ -19,6 +20,7 @@ class Estimators(Runtime):
 
     densities: Densities
     scenes: Scenes
+    robots: Robots
     evidence: CollisionEvidence
     symmetries: Symmetries
     priors: Priors

@@ -196,6 +196,10 @@ class Scenes:
             raise _unknown(selected)
         return test
 
+    def solid(self, row: ObjectRow) -> Solid | None:
+        """An object's geometry for collision tests; None without mesh and parts."""
+        return self._solid(row)
+
     def closing(self, row: ObjectRow) -> ClosingGeometry | None:
         """What a jaw closes on, of the mesh or else the convex parts; None without either."""
         parts, info = row.parts_sha256, row.mesh_info

@@ -6,34 +6,17 @@ result on the standard output.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
-import os
-import resource
-import subprocess
 import sys
 from dataclasses import asdict, replace
 
 import numpy as np
 
-from graspdb.processes import ChildProcess, end_with_parent
 from graspdb_geometry import meshes
 from graspdb_geometry.meshes import Inspection, Mesh, MeshError, MeshProperties
+from graspdb_service.usecases.geometry.bounded_child import ChildFailed, ChildLimits, begin, bounded
 from graspdb_service.usecases.geometry.mesh_form import MeshForm
-
-# One thread in the numeric libraries: each would reserve address space of its own.
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-#: Modules are not looked for in the working folder, for which Python 3.10 has no option.
-_COMMAND = (
-    [sys.executable, "-P", "-m", __name__]
-    if sys.version_info >= (3, 11)
-    else [sys.executable, "-c", f"import sys; del sys.path[0]; from {__name__} import main; sys.exit(main())"]
-)
-
-
-PATIENCE = 4.0
-"""A mesh is refused for the processor time it takes, not for what else the machine is doing."""
 
 
 def inspect_in_child(
@@ -54,53 +37,18 @@ def inspect_in_child(
     # Cheap refusals need no child.
     if not meshes.readable(form.media_type, form.unit) or not data:
         form.read(data)
-    order = {
-        "as_parts": as_parts,
-        **form._asdict(),
-        "max_triangles": max_triangles,
-        "memory_bytes": memory_bytes,
-        "seconds": seconds,
-    }
-    pipe = subprocess.PIPE
-    with ChildProcess(
-        _COMMAND,
-        env=os.environ | _ONE_THREAD,
-        stdin=pipe,
-        stdout=pipe,
-        stderr=subprocess.DEVNULL,
-    ) as child:
-        try:
-            answer, _ = child.communicate(
-                json.dumps(order).encode() + b"\n" + data, timeout=PATIENCE * seconds
-            )
-        except subprocess.TimeoutExpired:
-            child.kill()
-            raise MeshError(
-                "mesh",
-                f"reading it took more than {PATIENCE * seconds:g} s: this machine is busy, so try again"
-                " later, or simplify it",
-            ) from None
-    if child.returncode != 0:
-        raise MeshError(
-            "mesh",
-            f"reading it failed or needs more than {memory_bytes / 2**20:.0f} MiB of memory or {seconds:g} s "
-            "of processor time: check the file, or simplify it",
-        )
+    order = {"as_parts": as_parts, **form._asdict(), "max_triangles": max_triangles}
+    limits = ChildLimits(memory_bytes, seconds)
+    try:
+        answer = bounded(__name__, order, data, limits)
+    except ChildFailed as error:
+        raise MeshError("mesh", f"{error}, or simplify it") from None
     return _deserialise(answer)
 
 
 def main() -> int:
     """Limit this process, read one mesh, write the result; 0 also for a mesh that was refused."""
-    end_with_parent()
-    order = json.loads(sys.stdin.buffer.readline())
-    # Both limits count what the libraries have used already.
-    for kind, limit in (
-        (resource.RLIMIT_AS, order["memory_bytes"]),
-        (resource.RLIMIT_CPU, max(1, round(order["seconds"]))),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        with contextlib.suppress(ValueError, OSError):  # an inherited limit may be tighter already
-            resource.setrlimit(kind, (limit, limit))
+    order = begin()
     try:
         data = sys.stdin.buffer.read()
         inspection = meshes.inspect(

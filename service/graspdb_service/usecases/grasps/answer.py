@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from graspdb.wire import (
+    BestGraspRequest,
     BestGrasps,
     EstimatorInfo,
     Grasp,
@@ -22,6 +23,8 @@ from graspdb.wire import (
 )
 from graspdb.wire.base import Quadruple
 from graspdb_density import Maximum, Separation, se3
+from graspdb_service.usecases.cells import scenes
+from graspdb_service.usecases.cells.reach import RobotQuestion, joints_of
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
 from graspdb_service.usecases.densities.evidence import symmetries
@@ -38,12 +41,17 @@ from graspdb_service.usecases.trials.pose_frames import NO_TWINS, frame_of
 from graspdb_service.usecases.trials.selection import Selected
 
 _NEAREST_TRIALS = 5
+#: Grasps that a robot is asked why it takes none of them.
+_TRIED = 20
 #: From here on an object's pose in the world is doubted, metres.
 _FAR_M = 100.0
 
 
-def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[BestGrasps, Selected]:
-    """The best distinct grasps under the request's constraints, and the selection that they are of.
+def best_grasps(
+    ctx: Estimators, slug: str, request: GraspConstraints
+) -> tuple[BestGrasps, Selected, tuple[str, ...]]:
+    """The best distinct grasps under the request's constraints, the selection that they are of, and stamps of
+    the robot and the scene that they depend on.
 
     422 names fields that contradict each other; 409 for what needs a mesh, a gripper or attempts that are not
     there, and as the selection.
@@ -53,7 +61,10 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
     with ctx.compute.within(request):
         selected = ctx.densities.selections.resolve(slug, request)
         frame = frame_of(selected, request.pose_frame, request.convention)
-        limits = constraints(request, selected, frame)
+        scene = None
+        if isinstance(request, BestGraspRequest) and request.scene is not None and request.object_pose:
+            scene = scenes.standing(ctx.database, request.scene)
+        limits = constraints(request, selected, frame, scene, ctx.scenes)
         built = ctx.densities.get(selected, choice)
         question = question_of(ctx, request, built, limits)
         answer: dict[str, Any] = {"status": "no_successes", "grasps": [], "kernel": built.kernel}
@@ -66,6 +77,7 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
                 "symmetry": question.symmetry,
                 **_answer(ctx, request, question),
             }
+    robot = None if question is None else question.robot
     near = request.near if selected.jaw_symmetric else None
     answer["grasps"] = [_as_asked(grasp, limits, near) for grasp in answer["grasps"]]
     if answer.get("nearest") is not None:
@@ -84,10 +96,12 @@ def best_grasps(ctx: Estimators, slug: str, request: GraspConstraints) -> tuple[
             *symmetries.doubts(None if question is None else question.symmetry),
             *frame.warnings,
             *_far_off(limits),
+            *(() if robot is None else robot.warnings),
             *([NO_TWINS] if request.near is not None and near is None else []),
         ],
     }
-    return BestGrasps.model_validate({**told, **answer}), built.selected
+    stamps = [*([] if robot is None else [robot.stamp]), *([] if scene is None else [scene.stamp])]
+    return BestGrasps.model_validate({**told, **answer}), built.selected, tuple(stamps)
 
 
 def _estimator(question: Question | None) -> EstimatorInfo:
@@ -102,9 +116,15 @@ def _estimator(question: Question | None) -> EstimatorInfo:
 def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> dict[str, Any]:
     engine, bounds = question.engine, question.bounds
     found = ctx.compute.run(lambda: engine.best(bounds))
-    if found:
+    if question.robot is not None:
+        grasps = _taken(ctx, question, question.robot, found)
+    else:
         grasps = _described(ctx, question, found)
+    if grasps:
         return {"status": "ok" if len(grasps) >= bounds.count else "fewer", "grasps": grasps}
+    out_of_reach = None if question.robot is None else _out_of_reach(ctx, question, question.robot)
+    if out_of_reach is not None:
+        return out_of_reach
     centres = question.search.centres
     poses = question.limits.candidates
     if poses is None:
@@ -121,17 +141,43 @@ def _answer(ctx: Estimators, request: GraspConstraints, question: Question) -> d
     }
 
 
+def _taken(ctx: Estimators, question: Question, robot: RobotQuestion, found: list[Maximum]) -> list[Grasp]:
+    """Grasps as the robot takes them, with its joints."""
+    taken, motions = ctx.compute.run(lambda: robot.taken(found))
+    grasps = _described(ctx, question, taken)
+    return [grasp.model_copy(update=joints_of(motion)) for grasp, motion in zip(grasps, motions, strict=True)]
+
+
+def _out_of_reach(ctx: Estimators, question: Question, robot: RobotQuestion) -> dict[str, Any] | None:
+    """The answer where it is the robot that takes no grasp, and why; None where there is none to take."""
+    anyones = question.bounds.whoever_takes(_TRIED)
+    found = ctx.compute.run(lambda: question.engine.best(anyones))
+    if not found:
+        return None
+    poses = se3.Poses(
+        np.array([item.position for item in found]), np.array([item.quaternion_xyzw for item in found])
+    )
+    place, why = ctx.compute.run(lambda: robot.why_none(poses))
+    nearest = _described(ctx, question, found[place : place + 1])[0]
+    return {"status": "infeasible", "grasps": [], "nearest": nearest, "conflict": ["robot"], "reach": why}
+
+
 def _conflict(ctx: Estimators, request: GraspConstraints, question: Question) -> Conflict:
     """Which constraints exclude each other, as grasps are ranked by what noise averages."""
     averaged = question.ranking.robust_of or question.ranking.objective
     plain = dict.fromkeys(("robust_of", "pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg"))
+    if isinstance(request, BestGraspRequest):
+        # Whether there is a grasp that no robot takes is known by now.
+        plain |= dict.fromkeys(("object_belief", "robot", "robot_base_pose", "joints_now", "lift_m"))
     by_chance = asks_chance(request)
     chances = ("success_probability", "effective_trials") if by_chance else ("density",)
     asked = request.model_copy(update={**plain, "count": 1, "objective": averaged, "include": list(chances)})
     built = question.built
 
     def ask(request: GraspConstraints) -> Grasp | None:
-        limits = constraints(request, built.selected, question.limits.frame)
+        limits = constraints(
+            request, built.selected, question.limits.frame, question.limits.scene, ctx.scenes
+        )
         other = question_of(ctx, request, built, limits)
         if other is None:
             return None

@@ -14,10 +14,13 @@ from graspdb.wire.frames.gripper_frames import RESERVED, NoSuchFrame
 from graspdb.wire.frames.object_frames import MESH, mesh_placed
 from graspdb_density import Region, se3
 from graspdb_density.se3 import Poses
+from graspdb_density.search.pose_noise import normal_displacements
 from graspdb_geometry.collision import PointCloud, Scene, box_part
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.cells.standing import PlacedSolid, StandingScene
+from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.trials.pose_frames import PoseFrame
 from graspdb_service.usecases.trials.selection import Selected
 
@@ -25,6 +28,21 @@ _AXES = np.eye(3)
 #: Limits that miss each other by less than this meet: they come rounded, and are turned.
 _TOUCH_M = 1e-8
 _NOISE = ("pose_noise_m", "pose_noise_deg", "tool_noise_m", "tool_noise_deg")
+
+
+#: Draws of a pose's covariance that a mean is taken over.
+_BELIEF_DRAWS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """By what a grasp is displaced (K), seen from where the object may be, and how likely that is (K,); in
+    words, what was believed.
+    """
+
+    displacements: Poses
+    weights: Floats
+    told: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +60,11 @@ class Constraints:
     object_pose: Poses | None
     in_world: bool
     frame: PoseFrame
-    obstacles: tuple[Scene | PointCloud, ...] = ()
+    obstacles: tuple[Scene | PointCloud | PlacedSolid, ...] = ()
     candidates: Poses | None = None
     exclude: Poses | None = None
+    scene: StandingScene | None = None
+    belief: Belief | None = None
 
     def named(self, active: tuple[str, ...]) -> list[str]:
         """The request's names of the region's active limits, each once."""
@@ -58,10 +78,17 @@ class Constraints:
         return list(dict.fromkeys(names))
 
 
-def constraints(request: GraspConstraints, selected: Selected, frame: PoseFrame) -> Constraints:
+def constraints(
+    request: GraspConstraints,
+    selected: Selected,
+    frame: PoseFrame,
+    scene: StandingScene | None = None,
+    solids: Scenes | None = None,
+) -> Constraints:
     """Check a request's constraints and bring them to the object frame; 422 names fields that contradict.
 
-    Boxes become half spaces, for in the object frame they may stand askew. ``frame``: what its poses are of.
+    Boxes become half spaces, for in the object frame they may stand askew. ``frame``: what its poses are of;
+    ``scene`` the one that the request names, and ``solids`` what its objects' geometry is found in.
     """
     _check(request)
     pose = _object_pose(request, selected.row)
@@ -103,10 +130,37 @@ def constraints(request: GraspConstraints, selected: Selected, frame: PoseFrame)
         pose,
         in_world,
         frame,
-        _obstacles(posted.obstacles, into),
+        (*_obstacles(posted.obstacles, into), *_scene(scene, solids, pose)),
         _moved(posted.candidates, into, frame),
         _moved(posted.exclude, into, frame),
+        scene,
+        _belief(posted, pose),
     )
+
+
+def _belief(request: BestGraspRequest, pose: Poses | None) -> Belief | None:
+    """Where the object may be beside its pose."""
+    belief = request.object_belief
+    if belief is None or pose is None:
+        return None
+    if belief.covariance is not None:
+        try:
+            drawn = normal_displacements(np.array(belief.covariance), _BELIEF_DRAWS)
+        except ValueError as error:
+            raise _contradiction([("object_pose.covariance", str(error))]) from None
+        turned = se3.multiply(se3.from_rotation_vector(drawn[:, 3:]), pose.quaternions_xyzw)
+        there = Poses(pose.positions + drawn[:, :3], se3.normalise(turned))
+        told = "the covariance of the object's pose"
+    else:
+        values = np.array(belief.poses)
+        given = Poses(values[:, :3], se3.normalise(values[:, 3:]))
+        # Of the frame that object_pose is of, as that is.
+        first = Poses(np.array(request.object_pose)[:3], np.array(request.object_pose)[3:])
+        there = Poses(*se3.compose(given, Poses(*se3.compose(se3.inverse(first), pose))))
+        told = f"{len(values)} weighted poses of the object"
+    weights = np.ones(len(there)) if belief.weights is None else np.array(belief.weights)
+    p, q = se3.compose(se3.inverse(there), pose)
+    return Belief(Poses(p, se3.normalise(q)), weights / weights.sum(), told)
 
 
 def _object_pose(request: GraspConstraints, row: ObjectRow) -> Poses | None:
@@ -149,6 +203,22 @@ def _obstacles(given: Obstacles | None, into: Poses) -> tuple[Scene | PointCloud
         points = into.positions + se3.rotate(into.quaternions_xyzw, np.array(given.points))
         solids.append(PointCloud(points, given.point_radius_m))
     return tuple(solids)
+
+
+def _scene(
+    scene: StandingScene | None, solids: Scenes | None, object_pose: Poses | None
+) -> tuple[Scene | PointCloud | PlacedSolid, ...]:
+    """What stands in a scene, which is in the world, in the object frame."""
+    if scene is None or solids is None or object_pose is None:
+        return ()
+    into = se3.inverse(object_pose)
+    found: list[Scene | PointCloud | PlacedSolid] = list(_obstacles(scene.content, into))
+    for item in scene.content.objects:
+        solid = solids.solid(scene.rows[item.object])
+        if solid is not None:
+            pose = se3.compose(into, Poses(np.array(item.pose[:3]), np.array(item.pose[3:])))
+            found.append(PlacedSolid(solid, Poses(*pose)))
+    return tuple(found)
 
 
 def _moved(given: Sequence[Pose] | PoseColumns | None, into: Poses, frame: PoseFrame) -> Poses | None:
@@ -243,12 +313,36 @@ def _check(request: GraspConstraints) -> None:
         message = "a free approach and collision_free=false contradict each other"
         errors += [("pregrasp_distance_m", message), ("collision_free", message)]
     errors += _objective(request)
+    errors += _cell(request)
     if errors:
         raise _contradiction(errors)
 
 
+def _cell(request: GraspConstraints) -> list[tuple[str, str]]:
+    """What is wrong with what a request says of a robot and a scene."""
+    if not isinstance(request, BestGraspRequest):
+        return []
+    errors = []
+    for name in ("robot", "scene", "object_belief"):
+        if getattr(request, name) is not None and request.object_pose is None:
+            errors.append(("object_pose", f"{name} needs it: the object's pose in the world"))
+    for name in ("robot_base_pose", "joints_now", "lift_m"):
+        if getattr(request, name) is not None and request.robot is None:
+            errors.append(("robot", f"{name} needs it: the id of a stored robot"))
+    if request.robot is not None and request.near is not None:
+        told = "with a robot the joints choose the twin: leave one of the two out"
+        errors += [("near", told), ("robot", told)]
+    return errors
+
+
 def _objective(request: GraspConstraints) -> list[tuple[str, str]]:
     given = [name for name in _NOISE if getattr(request, name) is not None]
+    if isinstance(request, BestGraspRequest) and request.object_belief is not None:
+        told = "what is believed of the object's pose is averaged over by objective=robust"
+        if request.objective != "robust":
+            return [("objective", f"{told}: leave objective out")]
+        beside = [name for name in ("pose_noise_m", "pose_noise_deg") if getattr(request, name) is not None]
+        return [(name, f"{told}: leave the noise out") for name in beside]
     if request.objective == "robust":
         if not any(getattr(request, name) for name in given):
             return [(name, "objective=robust needs noise: one of the four above 0") for name in _NOISE]

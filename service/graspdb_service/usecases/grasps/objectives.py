@@ -12,6 +12,7 @@ from graspdb.wire import GraspConstraints, Ranking
 from graspdb.wire.queries import GraspBounds
 from graspdb_density import GraspDensity, ModeSearch, PoseNoise, Reach, SuccessModel, expected
 from graspdb_density.se3 import Poses
+from graspdb_density.search.pose_noise import expected_over
 from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_estimators import StackedModel
 from graspdb_service.storage.objects import ObjectRow
@@ -20,6 +21,7 @@ from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.densities.untried import UntriedChance
 from graspdb_service.usecases.geometry.collision import CollisionTest
+from graspdb_service.usecases.grasps.constraints import Belief
 from graspdb_service.usecases.grasps.search import ScoreSearch
 from graspdb_service.usecases.runtime.compute import breathing
 
@@ -66,9 +68,14 @@ def by_mean(
     value: Score | None,
     pull: Pull | None,
     threads: int,
+    belief: Belief | None = None,
 ) -> tuple[ScoreSearch, Ranking]:
-    """The mean under noise of a success probability ``value``; None: of the density."""
+    """The mean under noise of a success probability ``value`` (None: of the density), and over where the
+    object is believed to be.
+    """
     noises, told = noises_of(request, row, search.centres)
+    if belief is not None:
+        told["pose_noise"] = belief.told
     averaged = "density" if value is None else "success_probability"
     if value is None:
         value, noises = _widened(search, noises)
@@ -79,6 +86,11 @@ def by_mean(
             expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
             for draws in (_NOISE_DRAWS, _FEW_DRAWS)
         )
+    if belief is not None:
+        likeliest = np.argsort(-belief.weights, kind="stable")[:_FEW_DRAWS]
+        share = belief.weights[likeliest] / belief.weights[likeliest].sum()
+        rough = expected_over(rough, belief.displacements[likeliest], share)
+        score = expected_over(score, belief.displacements, belief.weights)
     unit = ", 1/(m^3 rad^3)" if averaged == "density" else ""
     ranking = Ranking.model_validate(
         {

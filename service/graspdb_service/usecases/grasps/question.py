@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graspdb.wire import CalibrationInfo, GraspConstraints, KernelInfo, Ranking, SymmetryInfo
+from graspdb.wire import (
+    BestGraspRequest,
+    CalibrationInfo,
+    GraspConstraints,
+    KernelInfo,
+    Ranking,
+    SymmetryInfo,
+)
 from graspdb.wire.queries import PreOpening
 from graspdb_density import ModeSearch, Separation
 from graspdb_density.se3 import Poses
@@ -16,6 +23,7 @@ from graspdb_density.search.scored_poses import Admissible, distinct_from
 from graspdb_geometry.grippers import shape_of
 from graspdb_service.problems import conflict
 from graspdb_service.trial_columns import Floats
+from graspdb_service.usecases.cells.reach import RobotQuestion, robot_question
 from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.densities.cache import kernel_of
 from graspdb_service.usecases.densities.estimators import Estimators
@@ -62,6 +70,7 @@ class Question:
     calibration: CalibrationInfo | None
     symmetry: SymmetryInfo | None
     pre_opening_m: PreOpening
+    robot: RobotQuestion | None = None
 
     @property
     def prior(self) -> bool:
@@ -110,6 +119,11 @@ def question_of(
         wide = ctx.symmetries.search(request, built, search)
     near = NearSuccesses(wide.centres)
 
+    robot = None
+    if isinstance(request, BestGraspRequest) and request.robot is not None:
+        assert limits.object_pose is not None
+        robot = robot_question(ctx.robots, ctx.scenes, request, selected, limits.object_pose, limits.scene)
+
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
         if expected and untried is not None:
@@ -117,7 +131,7 @@ def question_of(
         if request.objective == "robust":
             value = None if chance is None else success_score(chance.quick, believed, threads)
             pull = None if chance is None else near.pull
-            return objectives.by_mean(request, row, wide, value, pull, threads)
+            return objectives.by_mean(request, row, wide, value, pull, threads, limits.belief)
         if chance is not None:
             return objectives.by_success(wide, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)
@@ -131,8 +145,10 @@ def question_of(
             engine = CandidateRanking(limits.candidates, by, separated)
         about = near if by_success and not expected else None
         bounds = bounds_of(request, built, limits, search, test, about, model, threads)
+        if robot is not None:
+            bounds = replace(bounds, dear=robot.test)
         found = built, search, wide, kernel, limits, test, believed, chances, model, untried, bounds
-        return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m)
+        return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m, robot)
 
     return ctx.compute.run(complete)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from graspdb_density import Maximum, ModeSearch, Region, Separation, se3
 from graspdb_density.se3 import Poses
+from graspdb_density.search.lazy_search import DearTest
 from graspdb_density.search.scored_poses import (
     Admissible,
     Pull,
@@ -28,12 +30,19 @@ _FEW = 32
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """What grasps must keep, how many there may be, and from which separation on two are distinct."""
+    """What grasps must keep, how many there may be, and from which separation on two are distinct; ``dear``
+    is what they must pass, too, and costs more than all else.
+    """
 
     region: Region
     admissible: Admissible | None
     count: int
     separation: Separation
+    dear: DearTest | None = None
+
+    def whoever_takes(self, count: int) -> Bounds:
+        """The same for so many grasps, without the dear test."""
+        return replace(self, dear=None, count=count)
 
     def allowed(self, poses: Poses) -> NDArray[np.intp]:
         """Rows of the poses that everything but the region admits."""
@@ -91,6 +100,7 @@ class ScoreSearch:
             pull=self.pull,
             resolution=self.resolution,
             rescored=self.rescored,
+            dear=bounds.dear,
             threads=self.threads,
         )
 
@@ -121,15 +131,19 @@ class CandidateRanking:
         poses = poses[bounds.allowed(poses)]
         if not len(poses):
             return []
-        poses = self.by.shortlist(poses, max(bounds.count, _FEW))
+        if bounds.dear is None:
+            # Whatever may be refused, the last candidate may be the first that passes.
+            poses = self.by.shortlist(poses, max(bounds.count, _FEW))
         logs, scores = self.scored(poses)
         twins = bool(self.by.search.centres.symmetric.all())
         chosen: list[int] = []
         highest = float(logs.max()) if np.isfinite(logs).any() else 0.0
         ranks = ranked_by_density_where_flat(scores, logs, highest, self.by.resolution)
-        for i in np.argsort(-ranks, kind="stable"):
+        for i in self._ordered(poses, ranks, bounds):
             if len(chosen) == bounds.count:
                 break
+            if bounds.dear is not None and not bounds.dear.passes(poses[i : i + 1])[0]:
+                continue
             if self.separated and chosen:
                 apart = distinct_from(poses[np.array(chosen)], bounds.separation, twins=twins)
                 if not apart(poses[i : i + 1])[0]:
@@ -140,6 +154,16 @@ class CandidateRanking:
             Maximum(p[i], se3.canonical(q[i]), float(logs[i]), region.active(p[i], q[i]), float(scores[i]))
             for i in chosen
         ]
+
+    def _ordered(self, poses: Poses, ranks: Floats, bounds: Bounds) -> NDArray[np.intp]:
+        """Rows of the poses, best first; of equally good ones the one that costs least."""
+        cost = None if bounds.dear is None else bounds.dear.cost
+        if cost is None or len(np.unique(ranks)) == len(ranks):
+            return np.argsort(-ranks, kind="stable")
+        tied = np.flatnonzero(np.isin(ranks, [rank for rank, n in Counter(ranks.tolist()).items() if n > 1]))
+        costs = np.zeros(len(poses))
+        costs[tied] = cost(poses[tied])
+        return np.lexsort((costs, -ranks))
 
     def scored(self, poses: Poses) -> tuple[Floats, Floats]:
         return self.by.scored(poses)

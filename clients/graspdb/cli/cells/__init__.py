@@ -1,0 +1,1 @@
+"""``graspdb robots`` and ``graspdb scenes``."""

@@ -1,0 +1,1 @@
+"""A robot's cell: its arm, and what stands around it."""

@@ -1,0 +1,1 @@
+"""GraspDB in ROS 2, as an example."""

@@ -1,0 +1,1 @@
+"""Compiled loops over the joints of a chain, and over points."""

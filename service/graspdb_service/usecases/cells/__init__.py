@@ -1,0 +1,1 @@
+"""Robots' cells: arms, scenes, and which grasps an arm can take in one."""
