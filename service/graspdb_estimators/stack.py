@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, nnls
 from scipy.spatial import cKDTree
 from scipy.special import expit
-from scipy.stats import binom
 
 from graspdb_density import Reach, SuccessModel, se3
 from graspdb_density.se3 import Floats, Poses
@@ -117,6 +116,8 @@ class LeftOut:
         uncertain = (mean > 0.05) & (mean < 0.95)
         if not uncertain.any():
             return math.nan
+        from scipy.stats import binom  # late: 0.5 s
+
         n, k = count[uncertain], won[uncertain] * count[uncertain]
         least, most = binom.ppf(0.05, n, low[uncertain]), binom.ppf(0.95, n, high[uncertain])
         return float(np.mean((least <= np.ceil(k)) & (np.floor(k) <= most)))

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from cmaes import CMA
 
 from .. import se3
 from ..se3 import Floats, Poses
@@ -213,6 +212,8 @@ class EvolutionSearch(MultiStart):
         apart
             Refuses poses besides ``admissible``.
         """
+        from cmaes import CMA  # late: 0.5 s, for it imports scipy.stats; a density's best grasp needs none
+
         best = starts[np.arange(len(starts))]
         strategies = [CMA(np.zeros(6), _LAST_STEP, seed=0, population_size=_POPULATION) for _ in best.scores]
         on = begun = np.argsort(-best.scores, kind="stable")[: plan[0][0]]

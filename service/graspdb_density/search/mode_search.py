@@ -71,6 +71,8 @@ class ModeSearch:
         self._sums: CentreSums | None = None
         self._ranking: StartRanking | None = None
         self._global: Maximum | None = None
+        self._widening = threading.Lock()
+        self._wider: tuple[tuple[float, float], ModeSearch] | None = None
 
     def extended(self, density: SearchedDensity, centres: GraspDensity | None = None) -> ModeSearch:
         """The search in what the density was extended to: what centres are worth is completed, not computed
@@ -88,7 +90,27 @@ class ModeSearch:
     def nbytes(self) -> int:
         """Bytes held, those of the density left out."""
         own = sum(part.nbytes for part in (self._sums, self._ranking) if part is not None)
+        if self._wider is not None:
+            own += self._wider[1].nbytes + self._wider[1].density.nbytes
         return own + (0 if self._by_values is self else self._by_values.nbytes)
+
+    def widened(self, sigma_position_m: float, sigma_rotation: float) -> ModeSearch:
+        """The search in the isotropic density's mean under noise of the tool with these deviations per axis,
+        which is a density under a wider kernel. The last one is kept, so that those who ask alike share it.
+        """
+        asked, density = (sigma_position_m, sigma_rotation), self.density.isotropic
+        if not any(asked):
+            return self if density is self.density else self._by_values
+        with self._widening:
+            if self._wider is None or self._wider[0] != asked:
+                wider = GraspDensity.build(
+                    density.poses,
+                    kernel=density.kernel.widened(*asked),
+                    weights=density.weights,
+                    symmetric=density.symmetric,
+                )
+                self._wider = asked, ModeSearch(wider)
+            return self._wider[1]
 
     def ranking(self, threads: int = 1) -> StartRanking:
         """The rows of ``density.isotropic``, ranked at the first search."""

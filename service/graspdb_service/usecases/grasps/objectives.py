@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -67,11 +68,15 @@ def by_mean(
         if metres or degrees:
             told[name] = f"{1000 * metres:g} mm and {degrees:g} degrees per axis, of {moved}"
     averaged = "density" if value is None else "success_probability"
+    mean = None
     if value is None:
-        value, noises = _widened(search, noises)
+        wider, noises = _widened(search, noises)
+        value = partial(_density, wider, threads)
+        # Where the object does not turn, the mean is the wider density itself.
+        mean = None if any(_any(noise) for noise in noises.values()) else wider
     value = breathing(value, "scoring poses")
     score = rough = value
-    if any(noise.sigma_position_m or noise.sigma_rotation for noise in noises.values()):
+    if any(_any(noise) for noise in noises.values()):
         score, rough = (
             expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
             for draws in (_NOISE_DRAWS, _FEW_DRAWS)
@@ -86,7 +91,15 @@ def by_mean(
         }
     )
     resolution = 0.0 if averaged == "density" else _RESOLUTION
-    return ScoreSearch(search, threads, score, rough, pull, resolution), ranking
+    return ScoreSearch(search, threads, score, rough, pull, resolution, mean=mean), ranking
+
+
+def _any(noise: PoseNoise) -> bool:
+    return bool(noise.sigma_position_m or noise.sigma_rotation)
+
+
+def _density(search: ModeSearch, threads: int, poses: Poses) -> Floats:
+    return np.exp(search.density.log_density(poses, threads=threads))
 
 
 def success_score(model: SuccessModel, test: CollisionTest | None, threads: int) -> Score:
@@ -117,27 +130,21 @@ def _where_free(value: Score, test: CollisionTest | None, threads: int) -> Score
     return score
 
 
-def _widened(search: ModeSearch, noises: dict[str, PoseNoise]) -> tuple[Score, dict[str, PoseNoise]]:
-    """A density under a kernel that is wider by the noise, and the noise that is left to draw.
+def _widened(search: ModeSearch, noises: dict[str, PoseNoise]) -> tuple[ModeSearch, dict[str, PoseNoise]]:
+    """The search in a density under a kernel that is wider by the noise, and the noise that is left to draw.
 
     An isotropic kernel takes all noise of the tool and the object's shifts; the object's turns move a grasp
     the farther the longer its lever, which no one kernel does.
     """
-    density, at_object, at_tool = search.density.isotropic, noises["pose_noise"], noises["tool_noise"]
-    if density is not search.density:
-        return lambda poses: np.exp(search.density.log_density(poses)), noises
+    if search.density.isotropic is not search.density:
+        return search, noises
+    at_object, at_tool = noises["pose_noise"], noises["tool_noise"]
     shift = math.hypot(at_object.sigma_position_m, at_tool.sigma_position_m)
-    wider = GraspDensity.build(
-        density.poses,
-        kernel=density.kernel.widened(shift, at_tool.sigma_rotation),
-        weights=density.weights,
-        symmetric=density.symmetric,
-    )
     left = {
         "pose_noise": replace(at_object, sigma_position_m=0.0),
         "tool_noise": replace(at_tool, sigma_position_m=0.0, sigma_rotation=0.0),
     }
-    return wider.density, left
+    return search.widened(shift, at_tool.sigma_rotation), left
 
 
 def _pivot(row: ObjectRow, density: GraspDensity) -> tuple[tuple[float, float, float], str]:
