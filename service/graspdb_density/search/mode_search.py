@@ -133,6 +133,7 @@ class ModeSearch:
         pull: Pull | None = None,
         resolution: float = 0.0,
         rescored: int = 0,
+        leading: Score | None = None,
         threads: int = 1,
     ) -> list[Maximum]:
         """The ``count`` best distinct grasps, best first; fewer where there are no more, none where no centre
@@ -148,7 +149,7 @@ class ModeSearch:
             Called with K poses, answers (K,) bool. Never is a pose returned that it refused.
         score
             What is best. None: the density.
-        rough, pull, resolution, rescored
+        rough, pull, resolution, rescored, leading
             See `EvolutionSearch`; where the density is best they say nothing.
         threads
 
@@ -171,9 +172,8 @@ class ModeSearch:
         if climbing:
             return MeanShiftSearch(*common).run(count, separation)
         score = score or log_density
-        return EvolutionSearch(*common, score, rough or score, pull, resolution, rescored).run(
-            count, separation
-        )
+        more = rough or score, pull, resolution, rescored, leading
+        return EvolutionSearch(*common, score, *more).run(count, separation)
 
     def global_maximum(self, threads: int = 1) -> Maximum:
         """The highest point of the whole density, computed once."""

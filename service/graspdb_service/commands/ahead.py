@@ -1,4 +1,5 @@
-"""Compiling ahead: a service of its own, in an empty folder, is asked each kind of question once.
+"""Compiling ahead: a service of its own, in an empty folder, is asked each kind of question once,
+but for one report.
 
 Numba compiles a function when it is first called and keeps it on disk. What no question here leads to is
 compiled when somebody asks it, so whatever is compiled belongs into one of these.
@@ -173,6 +174,7 @@ def _reports() -> Iterator[tuple[str, dict[str, Any]]]:
         yield "anisotropy", gripper | {"method": method}
     yield "anisotropy", gripper | {"alignment": "surface-pair"}
     yield "anisotropy", gripper | {"alignment": "edge"}
+    # Not kernel-similarity, which sums for half a minute and has two functions of its own.
     for name in ("calibration", "bandwidth", "sources"):
         yield name, gripper
 

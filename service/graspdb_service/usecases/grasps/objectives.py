@@ -21,8 +21,10 @@ from graspdb_service.usecases.geometry.collision import CollisionTest
 from graspdb_service.usecases.grasps.search import ScoreSearch
 from graspdb_service.usecases.runtime.compute import breathing
 
-#: Draws of the noise that a mean is taken over, and while searching.
-_NOISE_DRAWS, _FEW_DRAWS = 256, 16
+#: Draws of the noise that a mean is taken over, that lead strategies where a density is averaged, and while
+#: searching. A success probability with collisions in it is not smooth: led by 64 draws, two in twenty
+#: searches ended at 0.990 and 0.992 of the best.
+_NOISE_DRAWS, _LEADING_DRAWS, _FEW_DRAWS = 256, 32, 16
 #: Differences of a success probability that mean nothing.
 _RESOLUTION = 1e-5
 #: The best by the kernel estimate that are ranked anew by what was learned.
@@ -76,11 +78,13 @@ def by_mean(
         mean = None if any(_any(noise) for noise in noises.values()) else wider
     value = breathing(value, "scoring poses")
     score = rough = value
+    leading = None
     if any(_any(noise) for noise in noises.values()):
-        score, rough = (
+        score, led, rough = (
             expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
-            for draws in (_NOISE_DRAWS, _FEW_DRAWS)
+            for draws in (_NOISE_DRAWS, _LEADING_DRAWS, _FEW_DRAWS)
         )
+        leading = led if averaged == "density" else None
     unit = ", 1/(m^3 rad^3)" if averaged == "density" else ""
     ranking = Ranking.model_validate(
         {
@@ -91,7 +95,7 @@ def by_mean(
         }
     )
     resolution = 0.0 if averaged == "density" else _RESOLUTION
-    return ScoreSearch(search, threads, score, rough, pull, resolution, mean=mean), ranking
+    return ScoreSearch(search, threads, score, rough, pull, resolution, mean=mean, leading=leading), ranking
 
 
 def _any(noise: PoseNoise) -> bool:

@@ -59,7 +59,8 @@ class ScoreSearch:
     successes or a prior. ``rough`` is nearly the score and much faster. Differences of scores below
     ``resolution`` mean nothing: there the density decides. So many of the best by ``rough`` as are
     ``rescored`` are ranked by the score. ``mean``: the search in the density that the score is, where it is
-    one, for a density is climbed many times faster than values are searched.
+    one, for a density is climbed many times faster than values are searched. ``leading``: see
+    `EvolutionSearch`.
     """
 
     search: ModeSearch
@@ -70,6 +71,7 @@ class ScoreSearch:
     resolution: float = 0.0
     rescored: int = 0
     mean: ModeSearch | None = None
+    leading: Score | None = None
 
     def with_breath(self) -> ScoreSearch:
         """The same, which lets other questions between its steps."""
@@ -81,7 +83,8 @@ class ScoreSearch:
             if self.rough is self.score or self.rough is None
             else breathing(self.rough, "scoring poses")
         )
-        return replace(self, score=score, rough=rough)
+        leading = None if self.leading is None else breathing(self.leading, "scoring poses")
+        return replace(self, score=score, rough=rough, leading=leading)
 
     def best(self, bounds: Bounds) -> list[Maximum]:
         if self.mean is not None:
@@ -96,6 +99,7 @@ class ScoreSearch:
             pull=self.pull,
             resolution=self.resolution,
             rescored=self.rescored,
+            leading=self.leading,
             threads=self.threads,
         )
 
