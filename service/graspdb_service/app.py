@@ -51,7 +51,7 @@ from graspdb_service.api.routing.document import document
 from graspdb_service.api.routing.encodings import Decoding
 from graspdb_service.api.routing.methods import METHODS, Methods, allowed
 from graspdb_service.api.routing.prefix import Prefix
-from graspdb_service.api.routing.scopes import declared_parameters, refuse_unknown_parameters
+from graspdb_service.api.routing.scopes import DeclaredParameters, refuse_unknown_parameters
 from graspdb_service.formats.negotiation import require_json
 from graspdb_service.problems import ProblemError, invalid_fields
 from graspdb_service.settings import Settings
@@ -130,7 +130,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         refuse_unguarded(router.routes)
         app.include_router(router)
     app.openapi = openapi_document  # type: ignore[method-assign]
-    app.state.parameters = declared_parameters(openapi_document())
+    app.state.parameters = DeclaredParameters(route for router in ROUTERS for route in router.routes)
     _add_docs(app)
     _add_problems(app)
     rates = Rates(settings.max_requests_per_s, settings.max_request_burst)

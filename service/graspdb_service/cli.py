@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
+import logging
 import os
+import subprocess
 import sys
 import tempfile
 import threading
@@ -17,7 +21,7 @@ NEEDS = "graspdb-server needs {}: pip install 'graspdb[service]'"
 try:
     import typer
 
-    from graspdb.processes import LIFELINE_HELP, end_with_parent
+    from graspdb.processes import LIFELINE_HELP, ChildProcess, end_with_parent
     from graspdb_service import connections
     from graspdb_service.commands import access, upkeep
     from graspdb_service.commands.keys import keys
@@ -31,6 +35,15 @@ except ModuleNotFoundError as error:
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
+
+log = logging.getLogger("graspdb")
+
+#: Below whatever serves: compiling can wait.
+_NICE = 10
+_COLD = (
+    "Compiled code is missing, so that first answers are slow: it is made now, once, which takes minutes."
+    " `graspdb-server warm-up` does it ahead."
+)
 
 cli = typer.Typer(add_completion=False, no_args_is_help=True, help="The GraspDB service.")
 cli.add_typer(keys, name="keys")
@@ -63,6 +76,8 @@ def serve(
     files = {"ssl_certfile": ssl_certfile, "ssl_keyfile": ssl_keyfile}
     settings = settings_from(host=host, port=port, database_url=database_url, auth=auth, **given, **files)
     access.check_certificate(settings)
+    # Looking through a million new objects that all stay is a fifth of a start; `settle` has it begin.
+    gc.disable()
     # Before NumPy is imported: its BLAS would start a thread a core inside each compute thread.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logs.configure(settings.log_format, settings.log_level)
@@ -76,15 +91,47 @@ def serve(
 
 def _warm_up(app: Any) -> None:
     """Load what queries need while the server already answers."""
-    from graspdb_service.usecases.runtime.warmup import keep_tidy, settle, warm_up  # extra: service
+    from graspdb_service.usecases.runtime.warmup import (  # extra: service
+        NotCompiled,
+        keep_tidy,
+        load,
+        settle,
+        warm_up,
+    )
 
     settle()
 
     def behind() -> None:
-        warm_up(app.state.context.compute)
+        compute = app.state.context.compute
+        try:
+            load(compute)
+        except NotCompiled:
+            log.warning(_COLD)
+            # Not in this process, whose answers would wait for the interpreter meanwhile.
+            command = [sys.executable, "-c", "from graspdb_service.cli import main; main()", "warm-up"]
+            child = ChildProcess(command, stdout=subprocess.DEVNULL)
+            with contextlib.suppress(OSError, AttributeError):  # AttributeError: Windows
+                os.setpriority(os.PRIO_PROCESS, child.pid, _NICE)
+            child.wait()
+            warm_up(compute)
         keep_tidy(lambda: app.state.admission.is_quiet)
 
     threading.Thread(target=behind, name="graspdb-behind", daemon=True).start()
+
+
+@cli.command("warm-up")
+def warm_up() -> None:
+    """Compile ahead what answers need, once after an install, so that no start has to: it takes minutes.
+
+    The compiled code is kept beside the package, or where that can't be written in the user's cache, or in
+    the folder that NUMBA_CACHE_DIR names, for this version on this kind of processor.
+    """
+    from graspdb_service.commands.ahead import compile_ahead  # extra: service
+
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for name in [name for name in os.environ if name.startswith("GRASPDB_")]:
+        del os.environ[name]  # a limit of the real service may refuse what is asked here
+    typer.echo(f"What answers need is compiled: it took {compile_ahead():.0f} s.")
 
 
 @cli.command()

@@ -32,7 +32,8 @@ PACKAGE_FILES = 12
 #: Files that may lie flat beside a package's rooms, `__init__` apart.
 FLAT_FILES = {"service/graspdb_density": 2, "service/graspdb_service/usecases": 5}
 #: What an extra installs may be imported where it is needed; everything else is imported at the top, but for
-#: modules of ours that need an extra, whose import says so in a comment ``# extra: NAME``.
+#: modules of ours that need an extra, whose import says so in a comment ``# extra: NAME``, and for what takes
+#: long to import and few need, ``# late: SECONDS``: a server's first answer waits for what stands at the top.
 OPTIONAL = {
     "coacd",
     "coal",
@@ -129,7 +130,7 @@ def test_imports_stand_at_the_top_but_for_optional_extras(modules: list[Module])
                     names = ["." * node.level + (node.module or "")]
                 else:
                     continue
-                if "# extra: " in lines[node.lineno - 1]:
+                if re.search("# (extra|late): ", lines[node.lineno - 1]):
                     continue
                 inside += [
                     f"{module.place}:{node.lineno} {name}"

@@ -39,6 +39,11 @@ def _head() -> str | None:
     return ScriptDirectory(str(schema.migrations_directory())).get_current_head()
 
 
+def test_history_is_what_alembic_walks() -> None:
+    script = ScriptDirectory(str(schema.migrations_directory()))
+    assert schema.history() == [item.revision for item in script.walk_revisions()][::-1]
+
+
 def _tables(database: Database) -> set[str]:
     with database.read() as tx:
         return set(inspect(tx).get_table_names())

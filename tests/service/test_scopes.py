@@ -10,7 +10,7 @@ from fastapi import APIRouter, FastAPI
 
 from graspdb_service.api.access.guard import GuardedRoute, refuse_unguarded
 from graspdb_service.api.routing.document import scope_matrix
-from graspdb_service.api.routing.scopes import ACCEPTED_FIELD, SCOPE_FIELD, declared_parameters, scope
+from graspdb_service.api.routing.scopes import ACCEPTED_FIELD, SCOPE_FIELD, DeclaredParameters, scope
 from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 
@@ -62,7 +62,7 @@ def test_route_without_a_scope_is_refused() -> None:
     def open_to_all() -> None: ...
 
     with pytest.raises(RuntimeError, match="GET /open declares no scope"):
-        declared_parameters(app.openapi())
+        DeclaredParameters(app.routes)
 
 
 def test_route_with_an_unknown_scope_is_refused() -> None:
@@ -72,7 +72,7 @@ def test_route_with_an_unknown_scope_is_refused() -> None:
     def odd() -> None: ...
 
     with pytest.raises(RuntimeError, match="GET /odd declares no scope"):
-        declared_parameters(app.openapi())
+        DeclaredParameters(app.routes)
 
 
 def test_route_that_nothing_guards_is_refused() -> None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from cmaes import CMA
 
 from .. import se3
 from ..se3 import Floats, Poses
@@ -41,6 +40,8 @@ _FIRST, _TRIES, _ROUNDS = 64, 8, 12
 #: Of what it passed, so many are valued by the score itself. From the best start strategies: so many for so
 #: many generations, then the best of them, each of so many poses a generation.
 _FINALISTS, _PLAN, _POPULATION = 32, ((12, 12), (6, 12), (3, 24)), 14
+#: Of what strategies led to by a score that is not the one asked for, so many are valued by that.
+_RESCORED = 24
 #: Generations of a runner-up's strategy, which stays away from the other answers, and how many have one.
 _RUNNER_UP, _RUNNERS_UP = ((1, 20),), 8
 #: Draws around centres in reach, and how many of them may join the starts: where the nearest poses of centres
@@ -76,6 +77,9 @@ class EvolutionSearch(ClimbedSearch):
     rescored
         So many of the best by ``rough`` are ranked by the score before some are chosen: for a score that may
         rank otherwise.
+    leading
+        Nearer to the score than ``rough`` and faster than it: leads the strategies; the best of their ends
+        are then valued by the score. None: the score itself leads.
     """
 
     exactly: ClassVar[int] = 64
@@ -84,6 +88,7 @@ class EvolutionSearch(ClimbedSearch):
     pull: Pull | None
     resolution: float = 0.0
     rescored: int = 0
+    leading: Score | None = None
     flat: bool = field(default=False, init=False)
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
@@ -100,16 +105,30 @@ class EvolutionSearch(ClimbedSearch):
             passed = ScoredPoses(passed.poses, self.told_apart(passed.scores, passed.poses)).ranked()
         # More than are wanted: those that go on drive out others on their way.
         best = self.choose(passed, max(2 * count, _FINALISTS), separation)
-        scores = self.told_apart(self.values(self.score, best.poses), best.poses)
-        best = ScoredPoses(best.poses, scores).ranked()
+        best = self.led(best.poses).ranked()
         best = ScoredPoses.joined(best, self.evolve(best, _PLAN)).ranked()
-        best = self.choose(best, count, separation)
+        best = self.choose(self.rescoring(best[: max(2 * count, _RESCORED)]), count, separation)
         for place in range(1, min(len(best), _RUNNERS_UP)):
             others = best.poses[np.arange(len(best)) != place]
             apart = distinct_from(others, separation, twins=self.twins)
-            best.put(place, self.evolve(best[place : place + 1], _RUNNER_UP, apart), 0)
+            ended = self.evolve(self.led(best.poses[place : place + 1]), _RUNNER_UP, apart)
+            ended = self.rescoring(ended)
+            if ended.scores[0] > best.scores[place]:
+                best.put(place, ended, 0)
         best = best.ranked()
         return self.maxima(best, self.values(self.score, best.poses) if self.flat else best.scores)
+
+    def led(self, poses: Poses) -> ScoredPoses:
+        """Poses as strategies see them."""
+        values = self.values(self.leading or self.score, poses)
+        return ScoredPoses(poses, self.told_apart(values, poses))
+
+    def rescoring(self, led: ScoredPoses) -> ScoredPoses:
+        """What strategies saw, ranked by the score."""
+        if self.leading is None:
+            return led
+        values = self.values(self.score, led.poses)
+        return ScoredPoses(led.poses, self.told_apart(values, led.poses)).ranked()
 
     def values(self, score: Score, poses: Poses) -> Floats:
         """A score at poses (K,)."""
@@ -230,6 +249,8 @@ class EvolutionSearch(ClimbedSearch):
         apart
             Refuses poses besides ``admissible``.
         """
+        from cmaes import CMA  # late: 0.5 s, for it imports scipy.stats; a density's best grasp needs none
+
         best = starts[np.arange(len(starts))]
         strategies = [CMA(np.zeros(6), _LAST_STEP, seed=0, population_size=_POPULATION) for _ in best.scores]
         on = begun = np.argsort(-best.scores, kind="stable")[: plan[0][0]]
@@ -258,5 +279,5 @@ class EvolutionSearch(ClimbedSearch):
                 allowed[allowed] = refuses(poses[allowed])
         values = np.full(len(poses), -np.inf)
         if allowed.any():
-            values[allowed] = self.told_apart(self.values(self.score, poses[allowed]), poses[allowed])
+            values[allowed] = self.led(poses[allowed]).scores
         return ScoredPoses(poses, values)

@@ -72,6 +72,8 @@ class ModeSearch:
         self._sums: CentreSums | None = None
         self._ranking: StartRanking | None = None
         self._global: Maximum | None = None
+        self._widening = threading.Lock()
+        self._wider: tuple[tuple[float, float], ModeSearch] | None = None
 
     def extended(self, density: SearchedDensity, centres: GraspDensity | None = None) -> ModeSearch:
         """The search in what the density was extended to: what centres are worth is completed, not computed
@@ -89,7 +91,27 @@ class ModeSearch:
     def nbytes(self) -> int:
         """Bytes held, those of the density left out."""
         own = sum(part.nbytes for part in (self._sums, self._ranking) if part is not None)
+        if self._wider is not None:
+            own += self._wider[1].nbytes + self._wider[1].density.nbytes
         return own + (0 if self._by_values is self else self._by_values.nbytes)
+
+    def widened(self, sigma_position_m: float, sigma_rotation: float) -> ModeSearch:
+        """The search in the isotropic density's mean under noise of the tool with these deviations per axis,
+        which is a density under a wider kernel. The last one is kept, so that those who ask alike share it.
+        """
+        asked, density = (sigma_position_m, sigma_rotation), self.density.isotropic
+        if not any(asked):
+            return self if density is self.density else self._by_values
+        with self._widening:
+            if self._wider is None or self._wider[0] != asked:
+                wider = GraspDensity.build(
+                    density.poses,
+                    kernel=density.kernel.widened(*asked),
+                    weights=density.weights,
+                    symmetric=density.symmetric,
+                )
+                self._wider = asked, ModeSearch(wider)
+            return self._wider[1]
 
     def ranking(self, threads: int = 1) -> StartRanking:
         """The rows of ``density.isotropic``, ranked at the first search."""
@@ -113,6 +135,7 @@ class ModeSearch:
         resolution: float = 0.0,
         rescored: int = 0,
         dear: DearTest | None = None,
+        leading: Score | None = None,
         threads: int = 1,
     ) -> list[Maximum]:
         """The ``count`` best distinct grasps, best first; fewer where there are no more, none where no centre
@@ -128,7 +151,7 @@ class ModeSearch:
             Called with K poses, answers (K,) bool. Never is a pose returned that it refused.
         score
             What is best. None: the density.
-        rough, pull, resolution, rescored
+        rough, pull, resolution, rescored, leading
             See `EvolutionSearch`; where the density is best they say nothing.
         dear
             A test that costs much, which every pose that is returned has passed: see `LazySearch`.
@@ -155,10 +178,9 @@ class ModeSearch:
             search = MeanShiftSearch(*common)
         else:
             score = score or log_density
-            search = EvolutionSearch(*common, score, rough or score, pull, resolution, rescored)
-        if dear is not None:
-            return LazySearch(search, dear).run(count, separation)
-        return search.run(count, separation)
+            more = rough or score, pull, resolution, rescored, leading
+            search = EvolutionSearch(*common, score, *more)
+        return (search if dear is None else LazySearch(search, dear)).run(count, separation)
 
     def global_maximum(self, threads: int = 1) -> Maximum:
         """The highest point of the whole density, computed once."""

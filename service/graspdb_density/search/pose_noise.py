@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import qmc
 
 from .. import se3
 from ..se3 import Floats, Poses
@@ -49,6 +48,8 @@ def expected(
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, not {samples}")
+    from scipy.stats import qmc  # late: 0.5 s, and only means need it
+
     normal = ndtri(
         qmc.Sobol(12, rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(samples)))[:samples]
     )
@@ -96,6 +97,8 @@ def normal_displacements(covariance: Floats, samples: int) -> Floats:
     values, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     if values.min() < -1e-9 * max(values.max(), 1e-30):
         raise ValueError("a covariance has no negative eigenvalue")
+    from scipy.stats import qmc  # late: 0.5 s, and only means need it
+
     uniform = qmc.Sobol(6, rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(samples)))
     return np.asarray(ndtri(uniform[:samples]) @ (axes * np.sqrt(np.maximum(values, 0.0))).T)
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from .. import se3
 from ..kde.density import SearchedDensity
@@ -184,7 +183,9 @@ def marginal(
     raw = _spread(at, shown, edges)
     # A weight shared between neighbouring cells is smoothed by a triangle of variance h^2 / 6 already.
     smooth = math.sqrt(max(sigma**2 - cell**2 / 6.0, 0.0)) / cell
-    value = gaussian_filter(raw, smooth, mode="constant", truncate=5.0) / cell**2
+    from scipy import ndimage  # late: 0.1 s
+
+    value = ndimage.gaussian_filter(raw, smooth, mode="constant", truncate=5.0) / cell**2
     total, profiles = _profiles(at, w, share, inside, edges, smooth, rng, level)
     return Marginal(
         across_edges=edges[0],
@@ -289,7 +290,9 @@ def _profiles(
             table += np.bincount(group * cells + place, weights=shown, minlength=len(table))
         lines = (counts @ table.reshape(groups, cells)) / totals[:, None]
         if smooth > 0.0:
-            lines = gaussian_filter1d(lines, smooth, axis=1, mode="constant", truncate=5.0)
+            from scipy import ndimage  # late: as above
+
+            lines = ndimage.gaussian_filter1d(lines, smooth, axis=1, mode="constant", truncate=5.0)
         lines /= edges[axis][1] - edges[axis][0]
         low, high = np.quantile(lines[1:], [tail, 1.0 - tail], axis=0)
         middle = 0.5 * (edges[axis][1:] + edges[axis][:-1])

@@ -19,8 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc, betaincinv
-from scipy.stats import chi2
+from scipy.special import betainc, betaincinv, chdtrc
 
 from .. import se3
 from ..kde.cell_list import Cells
@@ -133,7 +132,7 @@ def _compared(model: SuccessModel, motions: Motions, threads: int, chance: float
         places.append(Place(asked.positions[row], own, n, other, m, float(chances[row])))
     places.sort(key=lambda place: place.chance)
     logs = np.log(np.maximum(chances[single], 1e-300))
-    together = float(chi2.sf(-2.0 * logs.sum(), 2 * len(logs)))
+    together = float(chdtrc(2 * len(logs), -2.0 * logs.sum()))
     sided = _sided(asked[single], motions.centre, shares[:, single], np.minimum(trials[:, single], _TRIALS))
     # Of few trials a place the score is no normal deviate: it gets a smaller share of the chance.
     least = min(together, _STRICTER * sided, len(chosen) * float(chances[chosen].min()))
@@ -158,7 +157,7 @@ def _sided(asked: Poses, centre: Floats, shares: Floats, trials: Floats) -> floa
     if not told.any() or len(weight) < _FEWEST:
         return 1.0
     along = vectors.T @ score
-    return float(chi2.sf(np.sum(along[told] ** 2 / values[told]), int(told.sum())))
+    return float(chdtrc(int(told.sum()), np.sum(along[told] ** 2 / values[told])))
 
 
 def _widened(model: SuccessModel, scale: float) -> SuccessModel:

@@ -58,12 +58,14 @@ def build(corners: FloatArray, leaf: int) -> tuple[FloatArray, IntArray, IntArra
     nodes = np.empty((count, 2, 3))  # a leaf has two triangles or more, where there are several
     links = np.empty((count, 2), dtype=np.int64)
     pending = np.empty((_STACK, 4), dtype=np.int64)  # begin, end, parent, which child
-    pending[0] = np.array([0, count, -1, 0])
+    # Spelled out: an array assigned to a row takes Numba 2.5 s more to compile.
+    pending[0, 0], pending[0, 1], pending[0, 2], pending[0, 3] = 0, count, -1, 0
     waiting = 1
     made = 0
     while waiting > 0:
         waiting -= 1
-        begin, end, parent, side = pending[waiting]
+        begin, end = pending[waiting, 0], pending[waiting, 1]
+        parent, side = pending[waiting, 2], pending[waiting, 3]
         number = made
         made += 1
         if parent >= 0:
@@ -91,7 +93,9 @@ def build(corners: FloatArray, leaf: int) -> tuple[FloatArray, IntArray, IntArra
             continue
         half = begin + (end - begin) // 2
         _select(order, middles[axis], begin, end, half)
-        pending[waiting] = np.array([half, end, number, 1])
-        pending[waiting + 1] = np.array([begin, half, number, 0])
-        waiting += 2
+        for child in range(2):  # the first is taken first
+            pending[waiting, 0] = begin if child == 1 else half
+            pending[waiting, 1] = half if child == 1 else end
+            pending[waiting, 2], pending[waiting, 3] = number, 1 - child
+            waiting += 1
     return nodes[:made].copy(), links[:made].copy(), order

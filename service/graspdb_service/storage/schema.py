@@ -7,14 +7,14 @@ PostgreSQL, BEGIN IMMEDIATE on SQLite), so one of them migrates and the others t
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from sqlalchemy import text
+from sqlalchemy import inspect, text
 
 from graspdb_service.storage.database import Database, Tx
+
+if TYPE_CHECKING:
+    from alembic.config import Config
 
 ADVISORY_LOCK = 4_707_204_120_121_130
 
@@ -45,6 +45,8 @@ def apply(tx: Tx, revision: str = "head") -> str:
     stored = current(tx)
     if revision == "head" and stored == history()[-1]:
         return stored
+    from alembic import command  # late: 0.4 s, and a database that is current needs none of it
+
     command.upgrade(alembic_config(tx), revision)
     return current(tx) or "base"
 
@@ -70,6 +72,8 @@ def check(database: Database) -> None:
 
 def alembic_config(tx: Tx) -> Config:
     """Alembic's configuration, bound to an open transaction."""
+    from alembic.config import Config  # late: as above
+
     config = Config()
     config.set_main_option("script_location", str(migrations_directory()).replace("%", "%%"))
     config.attributes["connection"] = tx
@@ -78,13 +82,16 @@ def alembic_config(tx: Tx) -> Config:
 
 def current(tx: Tx) -> str | None:
     """The version that the database's schema has; None without one."""
-    return MigrationContext.configure(tx).get_current_revision()
+    if not inspect(tx).has_table("alembic_version"):
+        return None
+    stored: str | None = tx.scalar(text("SELECT version_num FROM alembic_version"))
+    return stored
 
 
 def history() -> list[str]:
-    """Every version that this installation knows, the oldest first."""
-    script = ScriptDirectory(str(migrations_directory()))
-    return [item.revision for item in script.walk_revisions()][::-1]
+    """Every version that this installation knows, the oldest first: numbers, which files are named by."""
+    versions = migrations_directory() / "versions"
+    return sorted(path.name.split("_")[0] for path in versions.glob("[0-9]*_*.py"))
 
 
 def refuse_newer(tx: Tx) -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeAlias
 
 from fastapi import Request
+from fastapi.openapi.utils import get_openapi
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
+from starlette.routing import BaseRoute
 
 from graspdb.wire.access import keys
 from graspdb_service.problems import ProblemError, invalid
@@ -73,22 +76,44 @@ def accepted_scopes(route: APIRoute) -> tuple[str, ...]:
     return declared
 
 
-def declared_parameters(document: Mapping[str, Any]) -> dict[tuple[str, str], dict[str, bool]]:
-    """The query parameters of every operation of an OpenAPI document, and whether each may be repeated.
+class DeclaredParameters:
+    """The query parameters of routes, looked up when one is first asked: the document of all takes a second.
 
-    RuntimeError if an operation declares no scope: none may be open by oversight.
+    RuntimeError if a route declares no scope: none may be open by oversight.
     """
-    found = {}
-    for path, operations in document["paths"].items():
-        for method, operation in operations.items():
-            if operation.get(SCOPE_FIELD) not in SCOPES:
-                raise RuntimeError(f"{method.upper()} {path} declares no scope")
-            found[method.upper(), path] = {
-                item["name"]: '"array"' in json.dumps(item["schema"])
-                for item in operation.get("parameters", ())
-                if item["in"] == "query"
-            }
-    return found
+
+    def __init__(self, routes: Iterable[BaseRoute]) -> None:
+        self._routes: dict[tuple[str, str], APIRoute] = {}
+        self._found: dict[tuple[str, str], dict[str, bool]] = {}
+        for route in routes:
+            if isinstance(route, APIRoute):
+                accepted_scopes(route)
+                self._routes.update(
+                    dict.fromkeys(((method, route.path) for method in route.methods or ()), route)
+                )
+
+    def of(self, method: str, path: str | None) -> dict[str, bool] | None:
+        """An operation's query parameters, and whether each may be repeated; None without the operation."""
+        place = method, path or ""
+        if place not in self._routes:
+            return None
+        if place not in self._found:
+            self._found[place] = _query_parameters(self._routes[place], method)
+        return self._found[place]
+
+
+def _query_parameters(route: APIRoute, method: str) -> dict[str, bool]:
+    bare = copy.copy(route)
+    # What it takes and gives besides is most of a document.
+    bare.body_field = bare.response_field = None
+    bare.response_fields = {}
+    found = get_openapi(title="", version="", routes=[bare], separate_input_output_schemas=False)
+    operation = found["paths"][route.path_format][method.lower()]
+    return {
+        item["name"]: '"array"' in json.dumps(item["schema"])
+        for item in operation.get("parameters", ())
+        if item["in"] == "query"
+    }
 
 
 async def refuse_unknown_parameters(request: Request) -> None:
@@ -99,7 +124,7 @@ async def refuse_unknown_parameters(request: Request) -> None:
     if "\0" in request.url.path or any("\0" in str(value) for value in request.path_params.values()):
         raise ProblemError(404, "not-found", "There is nothing whose name has the NUL character in it")
     path = getattr(request.scope.get("route"), "path", None)
-    known = request.app.state.parameters.get((request.method, path))
+    known = request.app.state.parameters.of(request.method, path)
     if known is None or not request.query_params:
         return
     given = Counter(name for name, _ in request.query_params.multi_items())

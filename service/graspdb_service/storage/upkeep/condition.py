@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from alembic.autogenerate import compare_metadata
-from alembic.migration import MigrationContext
 from sqlalchemy import and_, exists, func, or_, select, text
 from sqlalchemy.exc import DBAPIError
 
@@ -22,6 +20,8 @@ _STAMPS = ("created_at", "updated_at", "changed_at", "started_at", "finished_at"
 
 def schema_differences(tx: Tx) -> list[str]:
     """Tables, columns, indexes and constraints that are not those of this version's tables."""
+    from alembic.autogenerate import compare_metadata  # late: 0.4 s, which a start has no use for
+    from alembic.migration import MigrationContext  # late: as above
 
     def ours(_: object, name: str | None, kind: str, reflected: bool, compared: object) -> bool:
         # Somebody's own tables beside ours are nothing that is wrong.

@@ -9,12 +9,11 @@ from contextlib import closing, contextmanager, suppress
 from typing import Any
 from urllib.parse import quote
 
-from alembic.script import ScriptDirectory
 from sqlalchemy import text
 from sqlalchemy.pool import NullPool
 
 from graspdb_service.storage.database import Database, is_locked
-from graspdb_service.storage.schema import migrations_directory
+from graspdb_service.storage.schema import history
 
 _BUSY_S = 0.5
 _SECONDS = 3
@@ -33,7 +32,7 @@ class Probe:
 
     def __init__(self, database: Database, *, min_free_bytes: int) -> None:
         self._min_free_bytes = min_free_bytes
-        self._head = ScriptDirectory(str(migrations_directory())).get_current_head()
+        self._head = history()[-1]
         self._path = database.path
         self._file = None if self._path is None else _identity(self._path)
         self._engine = None

@@ -38,6 +38,7 @@ from graspdb_service.usecases.grasps.constraints import Constraints
 from graspdb_service.usecases.grasps.likelihood import CHANCES
 from graspdb_service.usecases.grasps.objectives import success_score
 from graspdb_service.usecases.grasps.search import Bounds, CandidateRanking, Engine, ScoreSearch
+from graspdb_service.usecases.trials.selection import Selected
 
 #: Up to so many attempts a model of success probability is built at once; above, it must be asked for.
 FEW_ATTEMPTS = 500_000
@@ -106,23 +107,14 @@ def question_of(
     by_success = _by_success(request, model)
     expected = model is None and _by_others(request, untried)
     if not expected and (by_success or asks_chance(request)) and model is None:
-        if built.search is None:
-            # Nothing was tried: no chance ranks what no trial tells of.
-            return None
-        raise conflict(
-            "no-attempts",
-            "Only successes are known, so no success probability: post failures, too, or rank by the density",
-        )
+        _without_attempts(built)
+        return None
     search, kernel, threads = source.search, source.kernel, ctx.compute.threads
     wide = search
     if by_success and symmetry is not None and symmetry.applied:
         wide = ctx.symmetries.search(request, built, search)
     near = NearSuccesses(wide.centres)
-
-    robot = None
-    if isinstance(request, BestGraspRequest) and request.robot is not None:
-        assert limits.object_pose is not None
-        robot = robot_question(ctx.robots, ctx.scenes, request, selected, limits.object_pose, limits.scene)
+    robot = _robot(ctx, request, selected, limits)
 
     def ranked() -> tuple[ScoreSearch, Ranking]:
         chance = model if by_success else None
@@ -151,6 +143,26 @@ def question_of(
         return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m, robot)
 
     return ctx.compute.run(complete)
+
+
+def _without_attempts(built: Built) -> None:
+    """None before any trial; 409 where only successes were posted."""
+    if built.search is None:
+        # Nothing was tried: no chance ranks what no trial tells of.
+        return
+    raise conflict(
+        "no-attempts",
+        "Only successes are known, so no success probability: post failures, too, or rank by the density",
+    )
+
+
+def _robot(
+    ctx: Estimators, request: GraspConstraints, selected: Selected, limits: Constraints
+) -> RobotQuestion | None:
+    if not isinstance(request, BestGraspRequest) or request.robot is None:
+        return None
+    assert limits.object_pose is not None
+    return robot_question(ctx.robots, ctx.scenes, request, selected, limits.object_pose, limits.scene)
 
 
 def _chances(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -66,7 +67,9 @@ class ScoreSearch:
     """Where a score is highest, from the density's centres; without one the density's own modes, that of
     successes or a prior. ``rough`` is nearly the score and much faster. Differences of scores below
     ``resolution`` mean nothing: there the density decides. So many of the best by ``rough`` as are
-    ``rescored`` are ranked by the score.
+    ``rescored`` are ranked by the score. ``mean``: the search in the density that the score is, where it is
+    one, for a density is climbed many times faster than values are searched. ``leading``: see
+    `EvolutionSearch`.
     """
 
     search: ModeSearch
@@ -76,6 +79,8 @@ class ScoreSearch:
     pull: Pull | None = None
     resolution: float = 0.0
     rescored: int = 0
+    mean: ModeSearch | None = None
+    leading: Score | None = None
 
     def with_breath(self) -> ScoreSearch:
         """The same, which lets other questions between its steps."""
@@ -87,9 +92,12 @@ class ScoreSearch:
             if self.rough is self.score or self.rough is None
             else breathing(self.rough, "scoring poses")
         )
-        return replace(self, score=score, rough=rough)
+        leading = None if self.leading is None else breathing(self.leading, "scoring poses")
+        return replace(self, score=score, rough=rough, leading=leading)
 
     def best(self, bounds: Bounds) -> list[Maximum]:
+        if self.mean is not None:
+            return self._best_mean(bounds, self.mean)
         return self.search.maxima(
             bounds.region,
             count=bounds.count,
@@ -101,8 +109,27 @@ class ScoreSearch:
             resolution=self.resolution,
             rescored=self.rescored,
             dear=bounds.dear,
+            leading=self.leading,
             threads=self.threads,
         )
+
+    def _best_mean(self, bounds: Bounds, mean: ModeSearch) -> list[Maximum]:
+        found = mean.maxima(
+            bounds.region,
+            count=bounds.count,
+            separation=bounds.separation,
+            admissible=bounds.admissible,
+            dear=bounds.dear,
+            threads=self.threads,
+        )
+        if not found:
+            return []
+        at = Poses(np.array([m.position for m in found]), np.array([m.quaternion_xyzw for m in found]))
+        logs = self.search.density.log_density(at, threads=self.threads)
+        return [
+            replace(grasp, log_density=float(log), score=math.exp(grasp.log_density))
+            for grasp, log in zip(found, logs, strict=True)
+        ]
 
     def scored(self, poses: Poses) -> tuple[Floats, Floats]:
         logs = self.search.density.log_density(poses, threads=self.threads)

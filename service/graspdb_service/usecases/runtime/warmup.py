@@ -7,10 +7,12 @@ import ctypes
 import gc
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable
 
 import numpy as np
+from numba.core import event
 
 from graspdb.wire.presets.grippers import PRESETS
 from graspdb_density import (
@@ -45,6 +47,7 @@ def settle() -> None:
     """Make this process one in which many threads share the interpreter, and that gives memory back."""
     sys.setswitchinterval(_SWITCH_S)
     gc.set_threshold(*_COLLECT)
+    gc.enable()
     with contextlib.suppress(OSError, AttributeError):  # glibc only
         # Else every thread has an arena of its own, whose free pages no other thread can use.
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _ARENAS)
@@ -58,6 +61,30 @@ def keep_tidy(is_quiet: Callable[[], bool]) -> None:
             gc.collect()
             with contextlib.suppress(OSError, AttributeError):  # glibc only
                 ctypes.CDLL(None).malloc_trim(0)
+
+
+class NotCompiled(Exception):
+    """What queries call is not among what Numba keeps on disk."""
+
+
+class _Refusing(event.Listener):
+    """Ends a call of this thread that would compile."""
+
+    def __init__(self) -> None:
+        self._thread = threading.get_ident()
+
+    def on_start(self, event: event.Event) -> None:
+        if threading.get_ident() == self._thread:
+            raise NotCompiled
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing: what does not start does not end."""
+
+
+def load(compute: Compute) -> None:
+    """As :func:`warm_up`, but raise :class:`NotCompiled` before anything is compiled."""
+    with event.install_listener("numba:compile", _Refusing()):
+        warm_up(compute)
 
 
 def warm_up(compute: Compute) -> None:
