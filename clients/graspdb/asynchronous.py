@@ -277,6 +277,7 @@ class AsyncGrippers(Mirror[Grippers]):
     get = _awaited(Grippers.get)
     delete = _awaited(Grippers.delete)
     list = _iterated(Grippers.list, _same)
+    __aiter__ = list
 
 
 class AsyncRobots(Mirror[Robots]):
@@ -288,6 +289,7 @@ class AsyncRobots(Mirror[Robots]):
     update = _awaited(Robots.update)
     delete = _awaited(Robots.delete)
     list = _iterated(Robots.list, _same)
+    __aiter__ = list
 
 
 class AsyncScenes(Mirror[Scenes]):

@@ -183,7 +183,7 @@ def _chain(model: Any, flange: str, movable: list[str]) -> Arm:
 def _solids(
     root: Any, model: Any, beyond: set[str], mesh_points: MeshPoints
 ) -> tuple[tuple[LinkSolid, ...], tuple[str, ...]]:
-    solids, untested = [], []
+    solids, untested = list[LinkSolid](), list[str]()
     for link in root.findall("link"):
         name = _name(link, "link")
         if name in beyond or not model.existFrame(name, pin.FrameType.BODY):

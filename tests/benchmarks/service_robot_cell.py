@@ -144,14 +144,15 @@ def thousand(cells: Cells, poses: se3.Poses, rng: np.random.Generator) -> None:
     )
 
 
-def against_all(cells: Cells, poses: se3.Poses, count: int, rng: np.random.Generator) -> None:
+def against_all(cells: Cells, poses: se3.Poses, count: int) -> None:
     """The search's score over that of the best of the 20,000 best centres, each tested."""
     kernel = IsotropicKernel(0.005, np.radians(5.0))
     density = GraspDensity.build(poses, kernel=kernel, symmetric=np.ones(len(poses), dtype=bool))
     search, ratios, shares, asked_of = ModeSearch(density), [], [], []
     first = poses[search.ranking().order[:BEST]]
     logs = density.log_density(first)
-    for _ in range(count):
+    for number in range(count):
+        rng = np.random.default_rng(1_000 + number)
         # Some of these are hard: far out, low, or tilted.
         at = placed(rng)
         at[0] += rng.uniform(0.0, 0.3)
@@ -251,7 +252,7 @@ def main(questions: int = 100, cells: int = 0, again: int = 0) -> None:
     found = se3.Poses(*poses)
     thousand(some, found, rng)
     if cells:
-        against_all(some, found, cells, rng)
+        against_all(some, found, cells)
 
 
 if __name__ == "__main__":

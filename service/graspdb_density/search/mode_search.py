@@ -197,7 +197,7 @@ class ModeSearch:
 class MeanShiftSearch(ClimbedSearch):
     """A multi-start search by mean shift: `climb` moves poses uphill, `scored` compares them."""
 
-    exactly = 512
+    exactly = 2048
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
         """The best distinct grasps."""
