@@ -41,7 +41,8 @@ def test_keywords_are_what_the_service_takes() -> None:
     assert set(Selection.__optional_keys__) == set(wire.Selection.model_fields)
     assert set(TrialSelection.__optional_keys__) < set(Selection.__optional_keys__)
     corners = set(Constraints.__optional_keys__) - {"box"} | {"box_min", "box_max"}
-    assert corners == set(wire.BestGraspRequest.model_fields) - {"count"}
+    # A belief goes in as the object's pose.
+    assert corners == set(wire.BestGraspRequest.model_fields) - {"count", "object_belief"}
     # Each is told of where it is declared.
     told = " ".join(inspect.getdoc(kind) or "" for kind in (TrialSelection, Selection, Constraints))
     assert all(name in told for name in Constraints.__optional_keys__)

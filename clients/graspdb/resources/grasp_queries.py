@@ -147,6 +147,9 @@ class GraspQueries(Resource):
             return self._simulated(grasps, given, verify_timeout_s) if verify else grasps
         if grasps.status == "no_successes":
             way_out = "; with a mesh, name a gripper (gripper=) to choose by its edges"
+            if given.get("objective") == "success_probability":
+                # Nor do other objects tell how likely one is.
+                way_out += ", and leave objective out"
             raise Infeasible(
                 f"{self.id} has no successful trial yet, so there is no grasp to choose from"
                 f"{'' if given.get('prior') is False else way_out}"
