@@ -28,12 +28,20 @@ from .grasp_features import GraspFeatures, monotonic_of
 from .stack import LeftOut, Stack, logit_of, packed, trees_among, unpacked
 from .stacking import Learned, Predicted, neighbours, stacked
 
-__all__ = ["LEAST_OBJECTS", "LEAST_OF_AN_OBJECT", "MOST_OF_AN_OBJECT", "Lesson", "Transfer", "fit_transfer"]
+__all__ = [
+    "LEAST_OBJECTS",
+    "LEAST_OF_AN_OBJECT",
+    "LEAST_OF_EACH",
+    "MOST_OF_AN_OBJECT",
+    "Lesson",
+    "Transfer",
+    "fit_transfer",
+]
 
 Ints = NDArray[np.int64]
 
 #: Fewer objects teach nothing of another one; attempts at each, and of either outcome among them.
-LEAST_OBJECTS, LEAST_OF_AN_OBJECT, _LEAST_OF_EACH = 3, 60, 12
+LEAST_OBJECTS, LEAST_OF_AN_OBJECT, LEAST_OF_EACH = 3, 60, 12
 #: Attempts at each object that are learned from at most, and that judge.
 MOST_OF_AN_OBJECT, _JUDGED = 3_000, 600
 #: An object's first attempts: none, and a few.
@@ -59,7 +67,7 @@ class Lesson(NamedTuple):
     def teaches(self) -> bool:
         """Whether it has enough attempts of both outcomes."""
         won = int((self.share >= 0.5).sum())
-        few = min(won, len(self.share) - won) < _LEAST_OF_EACH
+        few = min(won, len(self.share) - won) < LEAST_OF_EACH
         return len(self.share) >= LEAST_OF_AN_OBJECT and not few
 
 

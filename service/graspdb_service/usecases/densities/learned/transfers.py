@@ -22,7 +22,7 @@ import numpy as np
 
 from graspdb.wire import OUTCOME_CODES
 from graspdb_estimators import GraspFeatures, Lesson, Transfer, fit_transfer
-from graspdb_estimators.transfer import LEAST_OBJECTS, LEAST_OF_AN_OBJECT, MOST_OF_AN_OBJECT
+from graspdb_estimators.transfer import LEAST_OBJECTS, LEAST_OF_AN_OBJECT, LEAST_OF_EACH, MOST_OF_AN_OBJECT
 from graspdb_geometry.closing import FEATURES
 from graspdb_geometry.grippers import shape_of
 from graspdb_service import principal
@@ -44,7 +44,6 @@ log = logging.getLogger("graspdb")
 _FORMAT = "1"
 #: Objects that it is learned of at most, and of each the newest trials posted one by one, and outcomes.
 _MOST_OBJECTS, _NEWEST_ROWS, _OUTCOMES = 48, 20_000, 200_000
-_LEAST_OF_EACH = 12
 #: How often it is looked whether there is more to learn from, and whether a replica has learned anything.
 _LOOK_AGAIN_S, _ASK_AGAIN_S = 30.0, 1.0
 #: Learned again once so large a share of the objects, or of their attempts, are others.
@@ -154,7 +153,7 @@ class Transfers:
                     selected.gripper.partition("@")[0],
                     prefix=prefix,
                     least=LEAST_OF_AN_OBJECT,
-                    least_of_each=_LEAST_OF_EACH,
+                    least_of_each=LEAST_OF_EACH,
                     most=_MOST_OBJECTS,
                 )
             if _nearly_the_same(known, found) or (known is None and len(found) < LEAST_OBJECTS):
