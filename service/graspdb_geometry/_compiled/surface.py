@@ -1,10 +1,8 @@
 """Numba kernels: gripper boxes against a triangle surface, through a tree of bounding boxes.
 
-A box and a triangle meet exactly when an edge of the triangle meets the solid box or an edge of the box meets
-the triangle (a corner of their intersection lies on two edges' worth of planes of one of them).  A box that
-meets no triangle lies wholly inside or outside of a closed surface: a ray from its centre tells, or where the
-ray grazes an edge the winding number (van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE
-TBME 30, 1983).
+A box and a triangle are apart exactly when an axis separates them.  A box that meets no triangle lies wholly
+inside or outside of a closed surface: a ray from its centre tells, or where the ray grazes an edge the winding
+number (van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE TBME 30, 1983).
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from graspdb_geometry._compiled.convex import _rotation, _segment_in_box, _to_tool
+from graspdb_geometry._compiled.convex import _rotation, _to_tool
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -56,48 +54,83 @@ def _boxes_apart(
     return False
 
 
+@nb.njit(cache=True, inline="always")
+def _apart(a: float, b: float, reach: float) -> bool:
+    """Whether an interval from a to b, or b to a, lies outside of -reach to reach."""
+    return min(a, b) > reach or max(a, b) < -reach
+
+
 @nb.njit(cache=True)
-def _box_edge_meets_triangle(c: FloatArray, h: FloatArray, t: FloatArray) -> bool:
-    """Does one of the box's edges, which run along the axes, pass through the triangle's interior?"""
-    for axis in range(3):
-        j = (axis + 1) % 3
-        k = (axis + 2) % 3
-        for corner in range(4):
-            pj = c[j] + (h[j] if corner & 1 else -h[j])
-            pk = c[k] + (h[k] if corner & 2 else -h[k])
-            # Areas of the triangles that the line's point makes with the projected edges.
-            w0 = (t[1, j] - pj) * (t[2, k] - pk) - (t[1, k] - pk) * (t[2, j] - pj)
-            w1 = (t[2, j] - pj) * (t[0, k] - pk) - (t[2, k] - pk) * (t[0, j] - pj)
-            w2 = (t[0, j] - pj) * (t[1, k] - pk) - (t[0, k] - pk) * (t[1, j] - pj)
-            total = w0 + w1 + w2
-            if total == 0.0:
-                continue  # the line lies in the triangle's plane: then one of the triangle's edges decides
-            if (w0 >= 0.0 and w1 >= 0.0 and w2 >= 0.0) or (w0 <= 0.0 and w1 <= 0.0 and w2 <= 0.0):
-                at = (w0 * t[0, axis] + w1 * t[1, axis] + w2 * t[2, axis]) / total
-                if abs(at - c[axis]) <= h[axis]:
-                    return True
-    return False
+def _box_meets_triangle(h: FloatArray, t: FloatArray) -> bool:
+    """Whether no axis separates a box about the origin (half extents h, along the axes) from a triangle.
+
+    Axes: the box's, the triangle's normal, the products of their edges (Akenine-Moller, "Fast 3D
+    triangle-box overlap testing", J. Graphics Tools 6, 2001).
+    """
+    for k in range(3):
+        if min(t[0, k], t[1, k], t[2, k]) > h[k] or max(t[0, k], t[1, k], t[2, k]) < -h[k]:
+            return False
+    for v in range(3):
+        if abs(t[v, 0]) <= h[0] and abs(t[v, 1]) <= h[1] and abs(t[v, 2]) <= h[2]:
+            return True
+    a0, a1, a2 = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
+    b0, b1, b2 = t[2, 0] - t[1, 0], t[2, 1] - t[1, 1], t[2, 2] - t[1, 2]
+    n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    if abs(n0 * t[0, 0] + n1 * t[0, 1] + n2 * t[0, 2]) > h[0] * abs(n0) + h[1] * abs(n1) + h[2] * abs(n2):
+        return False
+    for v in range(3):
+        # Both ends of an edge are at the same place of an axis that is perpendicular to it.
+        w, u = (v + 1) % 3, (v + 2) % 3
+        e0, e1, e2 = t[w, 0] - t[v, 0], t[w, 1] - t[v, 1], t[w, 2] - t[v, 2]
+        a, b = e1 * t[v, 2] - e2 * t[v, 1], e1 * t[u, 2] - e2 * t[u, 1]
+        if _apart(a, b, h[1] * abs(e2) + h[2] * abs(e1)):
+            return False
+        a, b = e2 * t[v, 0] - e0 * t[v, 2], e2 * t[u, 0] - e0 * t[u, 2]
+        if _apart(a, b, h[0] * abs(e2) + h[2] * abs(e0)):
+            return False
+        a, b = e0 * t[v, 1] - e1 * t[v, 0], e0 * t[u, 1] - e1 * t[u, 0]
+        if _apart(a, b, h[0] * abs(e1) + h[1] * abs(e0)):
+            return False
+    return True
 
 
 @nb.njit(cache=True)
 def _meets(
-    c: FloatArray,
-    h: FloatArray,
-    p: FloatArray,
-    r: FloatArray,
-    tree: Tree,
-    stack: IntArray,
-    t: FloatArray,
-    centre: FloatArray,
+    c: FloatArray, h: FloatArray, p: FloatArray, r: FloatArray, tree: Tree, stack: IntArray, room: FloatArray
 ) -> bool:
-    """Whether the tool's box with centre c and half extents h meets a triangle of the tree."""
+    """Whether the tool's box with centre c and half extents h meets a triangle of the tree.
+
+    ``room`` (8, 3) is written to. Nodes are compared with the box about the tool's box first, which takes
+    three differences.
+    """
     nodes, links, triangles = tree
+    about, reach, size, t = room[0], room[1], room[2:5], room[5:8]
+    for k in range(3):
+        about[k] = p[k] + r[k, 0] * c[0] + r[k, 1] * c[1] + r[k, 2] * c[2]
+        for i in range(3):
+            size[k, i] = abs(r[k, i])
+        reach[k] = size[k, 0] * h[0] + size[k, 1] * h[1] + size[k, 2] * h[2]
     stack[0] = 0
     depth = 1
     while depth > 0:
         depth -= 1
         node = stack[depth]
-        if _boxes_apart(c, h, nodes[node], p, r, centre):
+        d0, n0 = nodes[node, 0, 0] - about[0], nodes[node, 1, 0]
+        if abs(d0) > n0 + reach[0]:
+            continue
+        d1, n1 = nodes[node, 0, 1] - about[1], nodes[node, 1, 1]
+        if abs(d1) > n1 + reach[1]:
+            continue
+        d2, n2 = nodes[node, 0, 2] - about[2], nodes[node, 1, 2]
+        if abs(d2) > n2 + reach[2]:
+            continue
+        apart = False
+        for k in range(3):
+            d = abs(d0 * r[0, k] + d1 * r[1, k] + d2 * r[2, k])
+            if d > h[k] + n0 * size[0, k] + n1 * size[1, k] + n2 * size[2, k]:
+                apart = True
+                break
+        if apart:
             continue
         if links[node, 0] >= 0:
             stack[depth] = links[node, 0]
@@ -106,21 +139,12 @@ def _meets(
             continue
         for f in range(-1 - links[node, 0], links[node, 1]):
             for v in range(3):
-                _to_tool(triangles[f, v], p, r, t[v])
-            apart = False
-            for a in range(3):
-                low = min(t[0, a], t[1, a], t[2, a])
-                high = max(t[0, a], t[1, a], t[2, a])
-                if low > c[a] + h[a] or high < c[a] - h[a]:
-                    apart = True
-                    break
-            if apart:
-                continue
-            for v in range(3):
-                t0, t1 = _segment_in_box(t[v], t[(v + 1) % 3], c, h)
-                if t0 <= t1:
-                    return True
-            if _box_edge_meets_triangle(c, h, t):
+                d0 = triangles[f, v, 0] - about[0]
+                d1 = triangles[f, v, 1] - about[1]
+                d2 = triangles[f, v, 2] - about[2]
+                for k in range(3):
+                    t[v, k] = d0 * r[0, k] + d1 * r[1, k] + d2 * r[2, k]
+            if _box_meets_triangle(h, t):
                 return True
     return False
 
@@ -227,7 +251,7 @@ def collides(
     """Fill hits: whether a box (B, 2, 3: centre, half extents; tool frame) overlaps the surface or solid."""
     nodes = tree[0]
     r = np.empty((3, 3))
-    t = np.empty((3, 3))
+    room = np.empty((8, 3))
     centre = np.empty(3)
     stack = np.empty(_STACK, dtype=np.int64)
     for i in range(positions.shape[0]):
@@ -235,7 +259,7 @@ def collides(
         _rotation(quaternions[i], r)
         hit = False
         for b in range(boxes.shape[0]):
-            if _meets(boxes[b, 0], boxes[b, 1], p, r, tree, stack, t, centre):
+            if _meets(boxes[b, 0], boxes[b, 1], p, r, tree, stack, room):
                 hit = True
                 break
         if not hit and solid:
