@@ -10,7 +10,7 @@ from .kernels.diagonal import DiagonalKernel
 from .kernels.gaussian_mixture import AnisotropicKernel
 from .kernels.isotropic import HAAR_VOLUME, IsotropicKernel
 from .search.mode_search import ModeSearch
-from .search.pose_noise import PoseNoise, expected
+from .search.pose_noise import PoseNoise, expected, nearly_expected
 from .search.region import Region
 from .search.scored_poses import Maximum, Separation
 from .success.kernel_regression import NearestAttempts, SuccessEstimate, SuccessModel
@@ -39,6 +39,7 @@ __all__ = [
     "effective_sample_size",
     "expected",
     "importance_weights",
+    "nearly_expected",
     "se3",
     "validate_reach",
     "widths_prefix",

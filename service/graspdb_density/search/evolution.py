@@ -16,7 +16,7 @@ import numpy as np
 from .. import se3
 from ..se3 import Floats, Poses
 from .lazy_search import ClimbedSearch
-from .multi_start import REACH, Indices
+from .multi_start import MOST_CHECKS, REACH, Indices
 from .scored_poses import (
     Admissible,
     Bools,
@@ -28,27 +28,35 @@ from .scored_poses import (
     distinct_from,
     ranked_by_density_where_flat,
 )
+from .start_ranking import CentreScores
+from .strategies import Strategies
 
 __all__ = ["EvolutionSearch"]
 
-_CANDIDATES = 192
+_CANDIDATES = 64
 #: Centres whose score is asked for before any is climbed from: a density tells little of where another score
-#: is high.
-_ASKED = 4096
+#: is high. The best of them are brought into the region so many at a time.
+_ASKED, _LOOKED = 2048, 256
 #: Random search: from how many poses, steps one tries at a time, how often.
-_FIRST, _TRIES, _ROUNDS = 64, 8, 12
+_FIRST, _TRIES, _ROUNDS = 24, 6, 6
 #: Of what it passed, so many are valued by the score itself. From the best start strategies: so many for so
 #: many generations, then the best of them, each of so many poses a generation.
-_FINALISTS, _PLAN, _POPULATION = 32, ((12, 12), (6, 12), (3, 24)), 14
+_FINALISTS, _PLAN, _POPULATION = 24, ((10, 10), (5, 10)), 10
 #: Of what strategies led to by a score that is not the one asked for, so many are valued by that.
-_RESCORED = 24
+_RESCORED = 12
+#: What a leading score led to ends by short strategies of the score itself; their first step, kernel widths.
+_ENDING, _ENDING_STEP = ((2, 8), (1, 8)), 0.15
 #: Generations of a runner-up's strategy, which stays away from the other answers, and how many have one.
-_RUNNER_UP, _RUNNERS_UP = ((1, 20),), 8
-#: Draws around centres in reach, and how many of them may join the starts: where the nearest poses of centres
-#: are refused, others may not be.
-_DRAWN, _JOINING = 2048, 64
+_RUNNER_UP, _RUNNERS_UP = ((1, 16),), 8
+#: Draws around centres in reach, and how many of them may join the starts where those are few: where the
+#: nearest poses of centres are refused, others may not be.
+_DRAWN, _JOINING = 1024, 64
 #: As many equal scores, the highest of those that random search passed, make a plateau.
 _FLAT = 16
+#: A number whose multiples scatter (Knuth, The Art of Computer Programming, volume 3, 6.4).
+_SCATTER = 2_654_435_761
+#: A pose that was moved by less, metres or radians, is where it was.
+_STILL = 1e-6
 #: Steps in kernel widths.
 _FIRST_STEP, _LAST_STEP = 0.6, 0.4
 
@@ -58,7 +66,7 @@ class EvolutionSearch(ClimbedSearch):
     """The best distinct grasps by ``score``.
 
     Starts are well separated centres of the density, projected into the region, those of the highest score
-    among at most 4,096 centres: half of them where the density is highest, half drawn at random. From the
+    among at most 2,048 centres: half of them where the density is highest, half scattered. From the
     best, random steps that shrink as they fail. Of where these led, the best go on by CMA-ES (Hansen and
     Ostermeier, 2001), which learns along which directions a score falls off slowly. All is drawn from fixed
     seeds.
@@ -80,6 +88,8 @@ class EvolutionSearch(ClimbedSearch):
     leading
         Nearer to the score than ``rough`` and faster than it: leads the strategies; the best of their ends
         are then valued by the score. None: the score itself leads.
+    known
+        What ``rough`` gives at centres, as far as it was asked before.
     """
 
     exactly: ClassVar[int] = 64
@@ -89,6 +99,7 @@ class EvolutionSearch(ClimbedSearch):
     resolution: float = 0.0
     rescored: int = 0
     leading: Score | None = None
+    known: CentreScores = field(default_factory=CentreScores)
     flat: bool = field(default=False, init=False)
 
     def run(self, count: int, separation: Separation) -> list[Maximum]:
@@ -107,7 +118,10 @@ class EvolutionSearch(ClimbedSearch):
         best = self.choose(passed, max(2 * count, _FINALISTS), separation)
         best = self.led(best.poses).ranked()
         best = ScoredPoses.joined(best, self.evolve(best, _PLAN)).ranked()
-        best = self.choose(self.rescoring(best[: max(2 * count, _RESCORED)]), count, separation)
+        best = self.rescoring(best[: max(2 * count, _RESCORED)])
+        if self.leading is not None:
+            best = ScoredPoses.joined(best, self.ended(best)).ranked()
+        best = self.choose(best, count, separation)
         for place in range(1, min(len(best), _RUNNERS_UP)):
             others = best.poses[np.arange(len(best)) != place]
             apart = distinct_from(others, separation, twins=self.twins)
@@ -122,6 +136,14 @@ class EvolutionSearch(ClimbedSearch):
         """Poses as strategies see them."""
         values = self.values(self.leading or self.score, poses)
         return ScoredPoses(poses, self.told_apart(values, poses))
+
+    def ended(self, best: ScoredPoses) -> ScoredPoses:
+        """Where short strategies lead by the score itself from the best that others led to."""
+        leading, self.leading = self.leading, None
+        try:
+            return self.evolve(best, _ENDING, step=_ENDING_STEP)
+        finally:
+            self.leading = leading
 
     def rescoring(self, led: ScoredPoses) -> ScoredPoses:
         """What strategies saw, ranked by the score."""
@@ -153,26 +175,64 @@ class EvolutionSearch(ClimbedSearch):
 
     def candidates(self) -> Iterator[tuple[Indices, Bools]]:
         bounds, turned = self.bounds(0, self.density.size)
-        places = np.flatnonzero(bounds > -np.inf)
+        places, half = np.flatnonzero(bounds > -np.inf), _ASKED // 2
         rest = places[:0]
         if len(places) > _ASKED:
-            places = places[np.argsort(-bounds[places], kind="stable")]
-            others = np.random.default_rng(0).permutation(places[_ASKED // 2 :])
-            places = np.concatenate([places[: _ASKED // 2], others[: _ASKED // 2]])
-            rest = others[_ASKED // 2 :]
+            dense = np.argpartition(-bounds[places], half)
+            others = places[dense[half:]]
+            # Always the same ones first, whatever the region: what is known of them serves the next search.
+            scattered = (self.ranking.order[others] * _SCATTER) % 2**32
+            first = np.argpartition(scattered, half)
+            places = np.concatenate([places[dense[:half]], others[first[:half]]])
+            rest = others[first[half:]]
+        places = places[np.argsort(-bounds[places], kind="stable")]
+        if len(places):
+            yield self.ranking.order[places], turned[places]
         # Where none of the first is admissible another may be.
-        for part in (places, *np.array_split(rest, -(-len(rest) // _ASKED) or 1)):
+        for part in np.array_split(rest, -(-len(rest) // _ASKED) or 1):
             if len(part):
                 yield self.ranking.order[part], turned[part]
 
     def starts(self, wanted: int, separation: Separation) -> ScoredPoses:
-        starts = super().starts(wanted, separation)
-        near = next(self.candidates(), None)
-        if near is None:
+        starts = ScoredPoses.unscored(Poses(np.empty((0, 3)), np.empty((0, 4))))
+        looked: list[Poses] = []
+        for rows, turned in self.candidates():
+            looked.append(self.centres(rows, turned))
+            worth = self.known.at(rows, self.density.poses, lambda poses: self.values(self.rough, poses))
+            best = np.argsort(-worth, kind="stable")
+            for first in range(0, len(best), _LOOKED):
+                some = best[first : first + _LOOKED]
+                near = self.brought_in(looked[-1][some], worth[some])
+                starts = self.add_distinct(starts, near, wanted, separation)
+                if len(starts) >= wanted or self.checks >= MOST_CHECKS:
+                    break
+            if len(starts) >= wanted or self.checks >= MOST_CHECKS:
+                break
+        if len(starts) >= wanted or not looked:
             return starts
+        return self.joined_by_draws(starts, looked[0], separation)
+
+    def brought_in(self, centres: Poses, worth: Floats) -> ScoredPoses:
+        """The poses of the region nearest to some centres (K), those in reach, by the rough score, best
+        first; ``worth`` (K,) is that of the centres themselves.
+        """
+        p, q, inside = self.region.project(*centres)
+        reach = self.widths(REACH)
+        away, turned = (
+            np.linalg.norm(p - centres.positions, axis=1),
+            se3.angle_between(q, centres.quaternions_xyzw),
+        )
+        inside &= (away <= reach.metres) & (turned <= reach.radians)
+        moved = (away > _STILL) | (turned > _STILL)
+        scores = worth.copy()
+        if (inside & moved).any():
+            scores[inside & moved] = self.values(self.rough, Poses(p, q)[inside & moved])
+        return ScoredPoses(Poses(p, q), scores)[inside].ranked()
+
+    def joined_by_draws(self, starts: ScoredPoses, near: Poses, separation: Separation) -> ScoredPoses:
+        """The starts, and some draws from the kernels ``near``, which are in reach."""
         rng = np.random.default_rng(0)
-        some = rng.integers(0, len(near[0]), _DRAWN)
-        centres = self.centres(near[0][some], near[1][some])
+        centres = near[rng.integers(0, len(near), _DRAWN)]
         moves, turns = self.density.kernel.sample_displacements(_DRAWN, rng)
         moved = Poses(centres.positions + moves, se3.multiply(centres.quaternions_xyzw, turns))
         drawn, inside = self.landed(moved)
@@ -236,7 +296,11 @@ class EvolutionSearch(ClimbedSearch):
     # -- evolution
 
     def evolve(
-        self, starts: ScoredPoses, plan: tuple[tuple[int, int], ...], apart: Admissible | None = None
+        self,
+        starts: ScoredPoses,
+        plan: tuple[tuple[int, int], ...],
+        apart: Admissible | None = None,
+        step: float = _LAST_STEP,
     ) -> ScoredPoses:
         """The best admissible pose that a strategy from each of the best starts found.
 
@@ -248,25 +312,25 @@ class EvolutionSearch(ClimbedSearch):
             How many go on, for how many generations; how many of them go on, and so forth.
         apart
             Refuses poses besides ``admissible``.
+        step
+            The first one, in kernel widths.
         """
-        from cmaes import CMA  # late: 0.5 s, for it imports scipy.stats; a density's best grasp needs none
-
         best = starts[np.arange(len(starts))]
-        strategies = [CMA(np.zeros(6), _LAST_STEP, seed=0, population_size=_POPULATION) for _ in best.scores]
+        strategies = Strategies(len(best), step, _POPULATION)
         on = begun = np.argsort(-best.scores, kind="stable")[: plan[0][0]]
         for several, generations in plan:
             on = on[np.argsort(-best.scores[on], kind="stable")[:several]]
             for _ in range(generations):
-                steps = np.array([[strategies[i].ask() for _ in range(_POPULATION)] for i in on])
+                steps = strategies.ask(on)
                 tried = self.tried(starts.poses[np.repeat(on, _POPULATION)], steps.reshape(-1, 6), apart)
-                for i, moves, part in zip(on, steps, np.split(np.arange(len(tried)), len(on)), strict=True):
-                    # What is refused ranks last, the farther the later.
-                    ranked = np.lexsort((np.sum(moves**2, axis=1), -tried.scores[part]))
-                    places = np.argsort(ranked).astype(np.float64)
-                    strategies[i].tell(list(zip(moves, places.tolist(), strict=True)))
-                    top = part[ranked[0]]
-                    if tried.scores[top] > best.scores[i]:
-                        best.put(i, tried, top)
+                scores = tried.scores.reshape(len(on), _POPULATION)
+                # What is refused ranks last, the farther the later.
+                ranked = np.lexsort((np.sum(steps**2, axis=2), -scores), axis=1)
+                strategies.tell(on, np.take_along_axis(steps, ranked[..., None], axis=1))
+                top = ranked[:, 0] + _POPULATION * np.arange(len(on))
+                for i, place in zip(on, top, strict=True):
+                    if tried.scores[place] > best.scores[i]:
+                        best.put(i, tried, place)
         return best[begun]
 
     def tried(self, at: Poses, steps: Floats, apart: Admissible | None) -> ScoredPoses:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import OrderedDict
+from collections.abc import Hashable
 from functools import partial
 
 import numpy as np
@@ -27,7 +29,7 @@ from .lazy_search import ClimbedSearch, DearTest, LazySearch
 from .multi_start import REACH
 from .region import Region
 from .scored_poses import Admissible, Maximum, Pull, Score, ScoredPoses, Separation
-from .start_ranking import CentreSums, StartRanking, centre_sums, rank_starts
+from .start_ranking import CentreScores, CentreSums, StartRanking, centre_sums, rank_starts
 
 __all__ = ["DISTINCT", "MeanShiftSearch", "ModeSearch"]
 
@@ -48,6 +50,8 @@ _GAIN = 1e-5
 _ROUGH, _ROUGH_STEPS, _DOUBTFUL = 2, 8, 6
 #: Kernel widths between the ends of climbs that go on, and between the poses passed that are kept.
 _MERGED, _APART = 0.5, 0.3
+#: Rough scores of which what they give at centres is kept.
+_KEPT = 6
 #: Around blocked climbs: poses searched from, random steps at a time, how often; the cut there.
 _EXPLORED, _AROUND = ((32, 10, 4), (8, 16, 7), (3, 24, 14)), 6.0
 
@@ -74,6 +78,7 @@ class ModeSearch:
         self._global: Maximum | None = None
         self._widening = threading.Lock()
         self._wider: tuple[tuple[float, float], ModeSearch] | None = None
+        self._scores: OrderedDict[Hashable, CentreScores] = OrderedDict()
 
     def extended(self, density: SearchedDensity, centres: GraspDensity | None = None) -> ModeSearch:
         """The search in what the density was extended to: what centres are worth is completed, not computed
@@ -93,6 +98,7 @@ class ModeSearch:
         own = sum(part.nbytes for part in (self._sums, self._ranking) if part is not None)
         if self._wider is not None:
             own += self._wider[1].nbytes + self._wider[1].density.nbytes
+        own += sum(scores.nbytes for scores in list(self._scores.values()))
         return own + (0 if self._by_values is self else self._by_values.nbytes)
 
     def widened(self, sigma_position_m: float, sigma_rotation: float) -> ModeSearch:
@@ -112,6 +118,17 @@ class ModeSearch:
                 )
                 self._wider = asked, ModeSearch(wider)
             return self._wider[1]
+
+    def centre_scores(self, alike: Hashable) -> CentreScores:
+        """What searches by one rough score know of centres, kept of the last few scores; None: not kept."""
+        if alike is None:
+            return CentreScores()
+        with self._lock:
+            found = self._scores.setdefault(alike, CentreScores())
+            self._scores.move_to_end(alike)
+            while len(self._scores) > _KEPT:
+                self._scores.popitem(last=False)
+            return found
 
     def ranking(self, threads: int = 1) -> StartRanking:
         """The rows of ``density.isotropic``, ranked at the first search."""
@@ -136,6 +153,7 @@ class ModeSearch:
         rescored: int = 0,
         dear: DearTest | None = None,
         leading: Score | None = None,
+        alike: Hashable = None,
         threads: int = 1,
     ) -> list[Maximum]:
         """The ``count`` best distinct grasps, best first; fewer where there are no more, none where no centre
@@ -153,6 +171,8 @@ class ModeSearch:
             What is best. None: the density.
         rough, pull, resolution, rescored, leading
             See `EvolutionSearch`; where the density is best they say nothing.
+        alike
+            Names the rough score: searches under the same name share what it gives at centres. None: none do.
         dear
             A test that costs much, which every pose that is returned has passed: see `LazySearch`.
         threads
@@ -173,12 +193,10 @@ class ModeSearch:
             start.density.isotropic, start.ranking(threads), log_density, region or Region(), admissible,
             threads,
         )  # fmt: skip
-        search: MeanShiftSearch | EvolutionSearch
-        if climbing:
-            search = MeanShiftSearch(*common)
-        else:
-            score = score or log_density
-            more = rough or score, pull, resolution, rescored, leading
+        search: MeanShiftSearch | EvolutionSearch = MeanShiftSearch(*common)
+        if not climbing:
+            score, known = score or log_density, start.centre_scores(alike)
+            more = rough or score, pull, resolution, rescored, leading, known
             search = EvolutionSearch(*common, score, *more)
         return (search if dear is None else LazySearch(search, dear)).run(count, separation)
 

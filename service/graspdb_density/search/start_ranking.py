@@ -11,6 +11,7 @@ sums for all they compare; they climb among such samples first and among all ker
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +21,9 @@ from .._compiled import isotropic
 from ..kde.cell_list import Cells
 from ..kde.isotropic import GraspDensity
 from ..kde.rows import Rows
-from ..se3 import Floats
+from ..se3 import Floats, Poses
 
-__all__ = ["CentreSums", "StartRanking", "centre_sums", "rank_starts"]
+__all__ = ["CentreScores", "CentreSums", "StartRanking", "centre_sums", "rank_starts"]
 
 Indices = NDArray[np.int64]
 
@@ -33,6 +34,8 @@ MOST_PAIRS = 5e8
 _LEAST_SAMPLE = 4_096
 _PROBES = 256
 _QUERY_BLOCK = 1_024
+#: Centres scored at a time.
+_AT_ONCE = 256
 #: How many times the kernels of the sample the finer one has, and how many times its kernels there must be
 #: for it to pay.
 _FINER, _WORTH = 4.0, 2.0
@@ -59,6 +62,38 @@ class CentreSums:
     @property
     def nbytes(self) -> int:
         return self.values.nbytes + (0 if self.sample is None else self.sample.nbytes)
+
+
+class CentreScores:
+    """What a score gives at the centres of rows, each asked of it once. Safe to use from several threads:
+    searches at once that ask for the same centres share the work, and none waits for another.
+    """
+
+    def __init__(self) -> None:
+        self._values: Floats = np.empty(0)
+        self._begun: NDArray[np.bool_] = np.empty(0, dtype=np.bool_)
+
+    @property
+    def nbytes(self) -> int:
+        return self._values.nbytes + self._begun.nbytes
+
+    def at(self, rows: Indices, centres: Poses, score: Callable[[Poses], Floats]) -> Floats:
+        """The score (K,) at some of the N centres."""
+        if len(self._values) != len(centres):
+            self._begun = np.zeros(len(centres), dtype=np.bool_)
+            self._values = np.full(len(centres), np.nan)
+        values, begun = self._values, self._begun
+        # What another has begun it may end meanwhile; what is still missing then is done here, too.
+        for left in (rows[~begun[rows]], rows):
+            for first in range(0, len(left), _AT_ONCE):
+                some = left[first : first + _AT_ONCE]
+                some = some[np.isnan(values[some])]
+                if left is not rows:
+                    some = some[~begun[some]]
+                if some.size:
+                    begun[some] = True
+                    values[some] = score(centres[some])
+        return np.asarray(values[rows])
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from dataclasses import replace
 from functools import partial
 
@@ -10,13 +11,21 @@ import numpy as np
 
 from graspdb.wire import GraspConstraints, Ranking
 from graspdb.wire.queries import GraspBounds
-from graspdb_density import GraspDensity, ModeSearch, PoseNoise, Reach, SuccessModel, expected
+from graspdb_density import (
+    GraspDensity,
+    ModeSearch,
+    PoseNoise,
+    Reach,
+    SuccessModel,
+    expected,
+    nearly_expected,
+)
 from graspdb_density.se3 import Poses
 from graspdb_density.search.pose_noise import expected_over
 from graspdb_density.search.scored_poses import Pull, Score
 from graspdb_estimators import StackedModel
 from graspdb_service.storage.objects import ObjectRow
-from graspdb_service.trial_columns import Floats
+from graspdb_service.trial_columns import Bools, Floats
 from graspdb_service.usecases.densities.learned.learning import Model
 from graspdb_service.usecases.densities.success_models import LEVEL
 from graspdb_service.usecases.densities.untried import UntriedChance
@@ -25,14 +34,17 @@ from graspdb_service.usecases.grasps.constraints import Belief
 from graspdb_service.usecases.grasps.search import ScoreSearch
 from graspdb_service.usecases.runtime.compute import breathing
 
-#: Draws of the noise that a mean is taken over, that lead strategies where a density is averaged, and while
-#: searching. A success probability with collisions in it is not smooth: led by 64 draws, two in twenty
-#: searches ended at 0.990 and 0.992 of the best.
-_NOISE_DRAWS, _LEADING_DRAWS, _FEW_DRAWS = 256, 32, 16
+#: Draws of the noise that a mean is taken over, that lead strategies, and while searching. Where a success
+#: probability is averaged, its own change within the noise is taken from so many.
+_NOISE_DRAWS, _LEADING_DRAWS, _FEW_DRAWS, _VALUED_DRAWS = 256, 32, 16, 8
+#: Draws tested for collisions, which decide more than the probability's change does and cost less.
+_TESTED_DRAWS = 96
+#: Within how many standard deviations attempts tell while searching.
+_NARROWED = 3.5
 #: Differences of a success probability that mean nothing.
 _RESOLUTION = 1e-5
 #: The best by the kernel estimate that are ranked anew by what was learned.
-_RESCORED = 1_000
+_RESCORED = 200
 
 
 def by_density(search: ModeSearch, threads: int) -> tuple[ScoreSearch, Ranking]:
@@ -45,13 +57,14 @@ def by_success(
 ) -> tuple[ScoreSearch, Ranking]:
     """The lower end of the success probability's interval."""
     score = lower_end_score(model.whole, model.reach, test, threads)
-    # What is within reach of a sample is within reach of all.
-    rough = score if model.quick is model.whole else lower_end_score(model.quick, model.reach, test, threads)
+    rough = lower_end_score(model.whole.narrowed(_NARROWED), model.reach, test, threads)
     told = f"lower end of the success probability's {LEVEL:.0%} interval"
     ranking = Ranking(objective="success_probability", score=told)
     # What was learned may rank otherwise than the kernel estimate, which leads to where it is high.
     rescored = _RESCORED if isinstance(model.whole, StackedModel) else 0
-    return ScoreSearch(search, threads, score, rough, pull, _RESOLUTION, rescored), ranking
+    alike = model.quick, model.reach, _named(test)
+    found = ScoreSearch(search, threads, score, rough, pull, _RESOLUTION, rescored, alike=alike)
+    return replace(found, leading=None if rescored else rough), ranking
 
 
 def by_others(search: ModeSearch, untried: UntriedChance, threads: int) -> tuple[ScoreSearch, Ranking]:
@@ -67,50 +80,101 @@ def by_mean(
     request: GraspConstraints,
     row: ObjectRow,
     search: ModeSearch,
-    value: Score | None,
+    chance: tuple[SuccessModel, CollisionTest | None] | None,
     pull: Pull | None,
     threads: int,
     belief: Belief | None = None,
 ) -> tuple[ScoreSearch, Ranking]:
-    """The mean under noise of a success probability ``value`` (None: of the density), and over where the
-    object is believed to be.
+    """The mean under noise of the success probability by a model, 0 where a test finds collisions (None: of
+    the density), and over where the object is believed to be.
     """
     noises, told = noises_of(request, row, search.centres)
     if belief is not None:
         told["pose_noise"] = belief.told
-    averaged = "density" if value is None else "success_probability"
-    mean = None
-    if value is None:
-        wider, noises = _widened(search, noises)
-        value = partial(_density, wider, threads)
-        # Where the object does not turn, the mean is the wider density itself.
-        mean = None if any(_any(noise) for noise in noises.values()) else wider
-    value = breathing(value, "scoring poses")
-    score = rough = value
-    leading = None
-    if any(_any(noise) for noise in noises.values()):
-        score, led, rough = (
-            expected(value, object_noise=noises["pose_noise"], tool_noise=noises["tool_noise"], samples=draws)
-            for draws in (_NOISE_DRAWS, _LEADING_DRAWS, _FEW_DRAWS)
-        )
-        leading = led if averaged == "density" else None
-    if belief is not None:
-        mean = leading = None
-        likeliest = np.argsort(-belief.weights, kind="stable")[:_FEW_DRAWS]
-        share = belief.weights[likeliest] / belief.weights[likeliest].sum()
-        rough = expected_over(rough, belief.displacements[likeliest], share)
-        score = expected_over(score, belief.displacements, belief.weights)
-    unit = ", 1/(m^3 rad^3)" if averaged == "density" else ""
+    averaged = "density" if chance is None else "success_probability"
     ranking = Ranking.model_validate(
         {
             "objective": "robust",
-            "score": f"mean {averaged.replace('_', ' ')} under the noise{unit}",
+            "score": f"mean {averaged.replace('_', ' ')} under the noise"
+            + (", 1/(m^3 rad^3)" if chance is None else ""),
             "robust_of": averaged,
             **told,
         }
     )
-    resolution = 0.0 if averaged == "density" else _RESOLUTION
-    return ScoreSearch(search, threads, score, rough, pull, resolution, mean=mean, leading=leading), ranking
+    if chance is None:
+        found = _mean_density(search, noises, threads)
+        resolution = 0.0
+    else:
+        found = _mean_chance(search, noises, *chance, threads)
+        resolution = _RESOLUTION
+    if belief is not None:
+        assert found.score is not None
+        assert found.rough is not None
+        likeliest = np.argsort(-belief.weights, kind="stable")[:_FEW_DRAWS]
+        share = belief.weights[likeliest] / belief.weights[likeliest].sum()
+        found = replace(
+            found,
+            score=expected_over(found.score, belief.displacements, belief.weights),
+            rough=expected_over(found.rough, belief.displacements[likeliest], share),
+            mean=None,
+            leading=None
+            if found.leading is None
+            else expected_over(found.rough, belief.displacements, belief.weights),
+            alike=None,
+        )
+    return replace(found, pull=pull, resolution=resolution), ranking
+
+
+def _mean_density(search: ModeSearch, noises: dict[str, PoseNoise], threads: int) -> ScoreSearch:
+    """By the density's mean under noise."""
+    wider, left = _widened(search, noises)
+    value = breathing(partial(_density, wider, threads), "scoring poses")
+    if not any(_any(noise) for noise in left.values()):
+        # Where the object does not turn, the mean is the wider density itself.
+        return ScoreSearch(search, threads, value, value, mean=wider)
+    score, leading, rough = (
+        expected(value, object_noise=left["pose_noise"], tool_noise=left["tool_noise"], samples=draws)
+        for draws in (_NOISE_DRAWS, _LEADING_DRAWS, _FEW_DRAWS)
+    )
+    return ScoreSearch(search, threads, score, rough, leading=leading, alike=(wider, *left.values()))
+
+
+def _mean_chance(
+    search: ModeSearch,
+    noises: dict[str, PoseNoise],
+    model: SuccessModel,
+    test: CollisionTest | None,
+    threads: int,
+) -> ScoreSearch:
+    """By the success probability's mean under noise."""
+    value = breathing(success_score(model, test, threads), "scoring poses")
+    if not any(_any(noise) for noise in noises.values()):
+        return ScoreSearch(search, threads, value, value, alike=(model, _named(test)))
+    at_object, at_tool = noises["pose_noise"], noises["tool_noise"]
+    score = expected(value, object_noise=at_object, tool_noise=at_tool, samples=_NOISE_DRAWS)
+    chance = breathing(partial(model.probability, threads=threads), "scoring poses")
+    leading, rough = (
+        nearly_expected(
+            chance,
+            partial(_free, test, threads),
+            object_noise=at_object,
+            tool_noise=at_tool,
+            tested=tested,
+            valued=valued,
+        )
+        for tested, valued in ((_TESTED_DRAWS, _VALUED_DRAWS), (_FEW_DRAWS, 2))
+    )
+    alike = model, _named(test), at_object, at_tool
+    return ScoreSearch(search, threads, score, rough, leading=leading, alike=alike)
+
+
+def _free(test: CollisionTest | None, threads: int, poses: Poses) -> Bools:
+    return np.ones(len(poses), dtype=np.bool_) if test is None else test.free(poses, threads=threads)
+
+
+def _named(test: CollisionTest | None) -> Hashable:
+    """What tests that say the same have in common."""
+    return None if test is None else (test.solid, test.shape, test.pre_opening_m)
 
 
 def _any(noise: PoseNoise) -> bool:

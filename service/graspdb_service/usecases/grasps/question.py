@@ -36,7 +36,6 @@ from graspdb_service.usecases.grasps import objectives
 from graspdb_service.usecases.grasps.admissible import NearSuccesses, all_of, clear_of, likely_enough
 from graspdb_service.usecases.grasps.constraints import Constraints
 from graspdb_service.usecases.grasps.likelihood import CHANCES
-from graspdb_service.usecases.grasps.objectives import success_score
 from graspdb_service.usecases.grasps.search import Bounds, CandidateRanking, Engine, ScoreSearch
 from graspdb_service.usecases.trials.selection import Selected
 
@@ -121,9 +120,9 @@ def question_of(
         if expected and untried is not None:
             return objectives.by_others(search, untried, threads)
         if request.objective == "robust":
-            value = None if chance is None else success_score(chance.quick, believed, threads)
+            averaged = None if chance is None else (chance.quick, believed)
             pull = None if chance is None else near.pull
-            return objectives.by_mean(request, row, wide, value, pull, threads, limits.belief)
+            return objectives.by_mean(request, row, wide, averaged, pull, threads, limits.belief)
         if chance is not None:
             return objectives.by_success(wide, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)

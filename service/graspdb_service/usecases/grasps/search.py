@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -69,7 +70,7 @@ class ScoreSearch:
     ``resolution`` mean nothing: there the density decides. So many of the best by ``rough`` as are
     ``rescored`` are ranked by the score. ``mean``: the search in the density that the score is, where it is
     one, for a density is climbed many times faster than values are searched. ``leading``: see
-    `EvolutionSearch`.
+    `EvolutionSearch`. ``alike`` names ``rough``, as in `ModeSearch.maxima`.
     """
 
     search: ModeSearch
@@ -81,6 +82,7 @@ class ScoreSearch:
     rescored: int = 0
     mean: ModeSearch | None = None
     leading: Score | None = None
+    alike: Hashable = None
 
     def with_breath(self) -> ScoreSearch:
         """The same, which lets other questions between its steps."""
@@ -110,6 +112,7 @@ class ScoreSearch:
             rescored=self.rescored,
             dear=bounds.dear,
             leading=self.leading,
+            alike=self.alike,
             threads=self.threads,
         )
 
