@@ -285,6 +285,7 @@ class AsyncRobots(Mirror[Robots]):
 
     put = _awaited(Robots.put)
     get = _awaited(Robots.get)
+    shape = _awaited(Robots.shape)
     description = _awaited(Robots.description)
     update = _awaited(Robots.update)
     delete = _awaited(Robots.delete)
