@@ -160,6 +160,7 @@ class GraspQueries(Resource):
             nearest=grasps.nearest,
             conflict=grasps.conflict,
             relax=grasps.relax,
+            reach=grasps.robot_reach,
         )
 
     def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:

@@ -11,6 +11,8 @@ from graspdb.figures.style import OUTCOME_COLOURS, SOURCE_COLOURS
 
 Bytes = NDArray[np.uint8]
 UNKNOWN = (150, 150, 150)
+OBJECT, OBSTACLE, STANDING = (165, 170, 178), (90, 90, 95), (196, 182, 160)
+LINK, LINK_PALE, WRONG = (232, 234, 238), (205, 208, 214), (214, 48, 49)
 BEST, SECOND = (213, 94, 0), (240, 170, 110)
 #: Some of the colours of viridis (Smith and van der Walt, 2015), between which others are mixed.
 _VIRIDIS = np.array(

@@ -147,8 +147,8 @@ class RobotReach(Response):
     """All that collide at ``joints``, the first being ``link`` with ``other``; empty where nothing does."""
     joints: list[float] | None = None
     """Joint values at which it fails, in the robot's order, radians and metres: where the link collides, on
-    the approach, at the grasp or on the lift, or at the grasp beyond a limit or singular; null where it is too
-    far."""
+    the approach, at the grasp or on the lift, or at the grasp beyond a limit or singular; null where it is
+    too far."""
     off_m: float = 0.0
     """How far off the arm stays, metres, with a radian counted as 0.3 m; 0 where it gets there."""
     nearest_base_pose: Pose | None = None
