@@ -252,6 +252,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
     best_grasps = _awaited(GraspObject.best_grasps)
     picture = _awaited(GraspObject.picture)
     samples = _awaited(GraspObject.samples)
+    reach = _awaited(GraspObject.reach)
     proposals = _awaited(GraspObject.proposals)
     answers = _at_once(GraspObject.answers, AsyncListing[wire.AnswerInfo])
     sweep = _mirrored(GraspObject.sweep, AsyncSweep)

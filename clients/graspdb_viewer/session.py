@@ -20,6 +20,7 @@ from graspdb_viewer.latest import Latest
 from graspdb_viewer.motion import simulated
 from graspdb_viewer.page import OBJECT, Page, Subject, put, triple
 from graspdb_viewer.panels import words
+from graspdb_viewer.panels.cell.reach import ReachPanel
 from graspdb_viewer.panels.cell.robot import RobotPanel
 from graspdb_viewer.panels.closing import Closing
 from graspdb_viewer.panels.grasps import GraspsPanel
@@ -74,7 +75,7 @@ class Session:
         """The tab is gone."""
         self._closed.set()
         workers = (self._drawing, self._asking, self._linking, self._listing, self._replaying)
-        for worker in (*workers, self._reports, self.robot):
+        for worker in (*workers, self._reports, self.robot, self.reach):
             worker.close()
 
     # The page
@@ -103,6 +104,7 @@ class Session:
         self._closing = closing
         with tabs.add_tab("Robot"):
             self.robot = RobotPanel(self.page, closing, self._changed, self._choose_cell)
+            self.reach = ReachPanel(self.page, lambda: self._linking.soon(self._tell_link))
         with tabs.add_tab("Grasps"):
             self._grasps = GraspsPanel(self.page, self._redraw)
         with tabs.add_tab("Trials"):
@@ -133,6 +135,8 @@ class Session:
     def _changed(self) -> None:
         """What is asked for has changed; while a drag goes on, many times a second."""
         self._asking.soon(self.question.ask)
+        self.reach.soon()
+        self.reach.soon()
         self._linking.soon(self._tell_link)
 
     def _redraw(self) -> None:
@@ -175,6 +179,7 @@ class Session:
             self.robot.draw(subject)
             self._look(subject)
             self._asking.soon(self.question.ask)
+            self.reach.soon()
 
     def _select(self) -> None:
         view = self.page.view
@@ -260,6 +265,7 @@ class Session:
         self.question.gizmos.draw()
         self._draw()
         self._asking.soon(self.question.ask)
+        self.reach.soon()
 
     def _subject(self, item: GraspObject) -> Subject:
         view, info = self.page.view, item.info

@@ -75,6 +75,7 @@ class View(_Part):
     scene: Name | None = None
     robot_base: Placed | None = None
     """The robot's root in the world."""
+    reach: Literal["none", "grasps", "bases"] = "none"
     pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] = 0.08
     lift_m: Annotated[float, Field(gt=0, le=2.0)] = 0.1
     """How far the arm backs off and lifts; asked with a robot alone."""

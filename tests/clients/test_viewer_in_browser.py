@@ -289,6 +289,10 @@ def test_an_arm_is_shown_where_its_joints_put_it_and_answers_while_its_base_is_d
     opened.until(lambda: robot.way)
     opened.tab("Robot")
     opened.says("The arm takes the best grasp")
+    opened.says("the arm takes it")
+    kind, found = opened.session.reach.shown  # type: ignore[misc]
+    assert kind == "grasps"
+    assert found.reached.count(True) > 100
     opened.page.wait_for_timeout(1_000)
     assert _links_off_m(opened, np.array(question.answered[0].joints.grasp)) < 1e-4  # type: ignore[index]
     opened.shot("robot")
@@ -324,12 +328,16 @@ def test_links_in_the_way_are_red_and_where_the_base_could_stand_is_a_button(
         scene=cell_id,
         robot_base=Placed(position=(0.0, 0.0, -0.05)),
         object_pose=Placed(position=(0.5, 0.0, 0.0)),
+        reach="bases",
     )
     opened = tab(link_to(viewer.url, view))
     robot, nodes = opened.session.robot, opened.session.page.nodes
     opened.tab("Robot")
     opened.says("It would collide.")
     opened.says("meets box 1 of the scene")
+    opened.until(lambda: opened.session.reach.shown)
+    shares = opened.session.reach.shown[1].base_share  # type: ignore[index]
+    assert (min(shares), max(shares) > 0.5) == (0.0, True)
     opened.page.wait_for_timeout(500)
     shown = robot._robot
     assert shown is not None

@@ -26,6 +26,8 @@ from graspdb.wire.base import Response as Response
 from graspdb.wire.base import Slug as Slug
 from graspdb.wire.base import Source as Source
 from graspdb.wire.cells.beliefs import PoseBelief as PoseBelief
+from graspdb.wire.cells.reach import ReachMap as ReachMap
+from graspdb.wire.cells.reach import ReachRequest as ReachRequest
 from graspdb.wire.cells.robots import GraspJoints as GraspJoints
 from graspdb.wire.cells.robots import LinkCollision as LinkCollision
 from graspdb.wire.cells.robots import RobotInfo as RobotInfo

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graspdb.wire import BestGraspRequest, GraspJoints, LinkCollision, Obstacles, RobotReach
+from graspdb.wire import BestGraspRequest, GraspJoints, LinkCollision, Obstacles, ReachRequest, RobotReach
 from graspdb.wire.frames.gripper_frames import BASE, IDENTITY, compose, inverse
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
@@ -139,7 +139,7 @@ def joints_of(motion: ArmMotion) -> dict[str, Any]:
 def robot_question(
     robots: Robots,
     scenes: Scenes,
-    request: BestGraspRequest,
+    request: BestGraspRequest | ReachRequest,
     selected: Selected,
     object_pose: Poses,
     scene: StandingScene | None,
@@ -202,7 +202,9 @@ def _flange_in_tool(robot: PreparedRobot, selected: Selected) -> Floats:
     return found
 
 
-def _gripper(request: BestGraspRequest, selected: Selected, flange_in_tool: Floats) -> tuple[Floats, ...]:
+def _gripper(
+    request: BestGraspRequest | ReachRequest, selected: Selected, flange_in_tool: Floats
+) -> tuple[Floats, ...]:
     """Corners of the gripper's boxes in the flange's frame; of a jaw that opens as each grasp needs the palm
     alone.
     """
@@ -221,7 +223,7 @@ def _gripper(request: BestGraspRequest, selected: Selected, flange_in_tool: Floa
 def _standing(
     robots: Robots,
     scenes: Scenes,
-    request: BestGraspRequest,
+    request: BestGraspRequest | ReachRequest,
     selected: Selected,
     at: Floats,
     scene: StandingScene | None,
