@@ -283,7 +283,9 @@ def test_an_arm_is_shown_where_its_joints_put_it_and_answers_while_its_base_is_d
 ) -> None:
     base = Placed(position=(0.0, 0.0, -0.05))
     stand = Placed(position=(0.5, 0.0, 0.0))
-    view = View(object=cell_id, grasps="none", robot=cell_id, robot_base=base, object_pose=stand)
+    view = View(
+        object=cell_id, grasps="none", robot=cell_id, robot_base=base, object_pose=stand, reach="grasps"
+    )
     opened = tab(link_to(viewer.url, view))
     robot, question = opened.session.robot, opened.session.question
     opened.until(lambda: robot.way)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,11 +37,11 @@ class SceneDrawing:
         if scene is None:
             return
         for i, box in enumerate(scene.scene.boxes):
-            self._solid(f"scene.boxes.{i}", shapes.box(box.size_m), box.position, box.quaternion_xyzw)
+            self._solid(f"scene.boxes.{i}", shapes.box(box.size_m), (*box.position, *box.quaternion_xyzw))
         for i, item in enumerate(scene.scene.objects):
             shape = self._mesh(item.object)
             if shape is not None:
-                self._solid(f"scene.objects.{i}", shape, item.pose[:3], item.pose[3:])
+                self._solid(f"scene.objects.{i}", shape, item.pose)
         points = np.array(scene.scene.points).reshape(-1, 3)
         if len(points):
             node = self._page.client.scene.add_point_cloud(
@@ -67,14 +67,14 @@ class SceneDrawing:
         found = self._page.db.objects.get(id)
         return None if found.info.mesh is None else shapes.of_triangles(found.mesh_triangles())
 
-    def _solid(self, what: str, shape: Shape, position: Any, quaternion_xyzw: Any) -> None:
+    def _solid(self, what: str, shape: Shape, pose: Sequence[float]) -> None:
         node = self._page.solid(
             f"{SCENE}/{what.replace('.', '_')}",
             shape,
             colours.STANDING,
             side="double",
-            position=np.array(position),
-            wxyz=wxyz(quaternion_xyzw),
+            position=np.array(pose[:3]),
+            wxyz=wxyz(pose[3:]),
         )
         self._keep(what, node)
 
