@@ -261,9 +261,10 @@ class Session:
         self.robot.settle(subject)
         if before is None or before.item.id != item.id or OBJECT[1:] not in self.page.nodes:
             self._place(subject)
-        self.robot.draw(subject)
         self.question.gizmos.draw()
         self._draw()
+        # Last, for its robot may be gone.
+        self.robot.draw(subject)
         self._asking.soon(self.question.ask)
         self.reach.soon()
 

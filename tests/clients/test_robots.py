@@ -114,7 +114,16 @@ def test_it_is_typed_and_awaited(cell: Client, tmp_path: Path) -> None:
     def typed(*words: str) -> Any:
         return CliRunner().invoke(app, [*url, *words])
 
-    stored = typed("robots", "put", "arm", str(known_robots.PANDA), "--flange", "panda_link8")
+    stored = typed(
+        "robots",
+        "put",
+        "arm",
+        str(known_robots.PANDA),
+        "--flange",
+        "panda_link8",
+        "--gripper-mount",
+        "0,0,0,0,0,0,1",
+    )
     assert "7 joints to panda_link8" in stored.output, stored.output
     assert "1 boxes" in typed("scenes", "put", "bench", str(bench)).output
     assert "panda_joint1" in typed("robots", "show", "arm").output

@@ -12,13 +12,12 @@ from typing import Annotated
 import typer
 
 from graspdb.cli.common import ERRORS, State
-from graspdb.cli.options import vector_option
+from graspdb.cli.options import Numbers, vector_option
 from graspdb.poses import as_vector7
 from graspdb.processes import end_with_parent
 
 PORT = 8080
 _POSE = "x,y,z,qx,qy,qz,qw"
-Pose = tuple[float, ...]
 
 
 def view(
@@ -36,12 +35,12 @@ def view(
         typer.Option(help="A name that the page is opened under, beside addresses and localhost; repeated."),
     ] = None,
     object_pose: Annotated[
-        Pose | None, vector_option("Where the object stands in the world.", "--object-pose", _POSE)
+        Numbers | None, vector_option("Where the object stands in the world.", "--object-pose", _POSE)
     ] = None,
     robot: Annotated[str | None, typer.Option(help="A stored robot that takes the grasps.")] = None,
     scene: Annotated[str | None, typer.Option(help="A stored scene that stands around.")] = None,
     robot_base_pose: Annotated[
-        Pose | None,
+        Numbers | None,
         vector_option(
             "The robot's root in the world; by default its origin, or beside the object without its pose.",
             "--robot-base-pose",
@@ -73,7 +72,7 @@ def view(
     ERRORS.print("The viewer has ended.")
 
 
-def _placed(pose: Pose | None, name: str) -> dict[str, tuple[float, ...]] | None:
+def _placed(pose: Numbers | None, name: str) -> dict[str, tuple[float, ...]] | None:
     if pose is None:
         return None
     values = as_vector7(pose, name)

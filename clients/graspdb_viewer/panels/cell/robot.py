@@ -123,6 +123,7 @@ class RobotPanel:
             other = robot is None or self._robot is None or robot.shape is not self._robot.shape
             if other:
                 self._arm.remove()
+                self._put_back()
                 self.way = None
             self._robot, self._scene = robot, scene
             self._standing.draw(scene)
@@ -131,6 +132,8 @@ class RobotPanel:
                 if other or "arm 0" not in self._page.nodes:
                     self._arm.put(robot, robot.rest, pale=True)
             elif robot is None:
+                self._standing.mark(())
+                self._stand.visible = False
                 self._told.content = "Store one: `graspdb robots put arm panda.urdf --flange panda_link8`."
                 self._enable(None)
 
