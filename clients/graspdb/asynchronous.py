@@ -252,6 +252,7 @@ class AsyncGraspObject(Mirror[GraspObject]):
     best_grasps = _awaited(GraspObject.best_grasps)
     picture = _awaited(GraspObject.picture)
     samples = _awaited(GraspObject.samples)
+    reach = _awaited(GraspObject.reach)
     proposals = _awaited(GraspObject.proposals)
     answers = _at_once(GraspObject.answers, AsyncListing[wire.AnswerInfo])
     sweep = _mirrored(GraspObject.sweep, AsyncSweep)
@@ -285,6 +286,7 @@ class AsyncRobots(Mirror[Robots]):
 
     put = _awaited(Robots.put)
     get = _awaited(Robots.get)
+    shape = _awaited(Robots.shape)
     description = _awaited(Robots.description)
     update = _awaited(Robots.update)
     delete = _awaited(Robots.delete)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from graspdb.wire import FieldError, Problem
+from graspdb.wire import FieldError, Problem, RobotReach
 from graspdb.wire.reports import CheckCall
 from graspdb.wire.sweeps import FailedChunk
 
@@ -109,7 +109,8 @@ class Infeasible(GraspDBError):
     """No admissible grasp lies within any kernel's reach, or the object has no success yet.
 
     ``nearest`` is the closest grasp outside the constraints, where there is one; ``conflict`` names the
-    fewest constraints found that exclude each other, and ``relax`` a value of each that would do.
+    fewest constraints found that exclude each other, and ``relax`` a value of each that would do; ``reach``
+    is why a robot's arm takes none, where it is the arm that does not.
     """
 
     def __init__(
@@ -119,11 +120,13 @@ class Infeasible(GraspDBError):
         nearest: object | None = None,
         conflict: Sequence[str] = (),
         relax: Mapping[str, bool | float | list[float]] | None = None,
+        reach: RobotReach | None = None,
     ) -> None:
         super().__init__(message)
         self.nearest = nearest
         self.conflict = tuple(conflict)
         self.relax = dict(relax or {})
+        self.reach = reach
 
 
 class SweepFailed(GraspDBError):

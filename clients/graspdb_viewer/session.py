@@ -20,6 +20,8 @@ from graspdb_viewer.latest import Latest
 from graspdb_viewer.motion import simulated
 from graspdb_viewer.page import OBJECT, Page, Subject, put, triple
 from graspdb_viewer.panels import words
+from graspdb_viewer.panels.cell.reach import ReachPanel
+from graspdb_viewer.panels.cell.robot import RobotPanel
 from graspdb_viewer.panels.closing import Closing
 from graspdb_viewer.panels.grasps import GraspsPanel
 from graspdb_viewer.panels.objects import ObjectsPanel
@@ -35,9 +37,12 @@ _REPLAY_S = 3.0
 """A replay lasts so long from the first touch on, or as long as it did."""
 _ANY = "any"
 _NONE = "(no object yet)"
-_MESH = (165, 170, 178)
 _SIZE_M = 0.1
 """Of what is shown without a mesh."""
+_ROOM_M = 4.0
+"""Edges of the floor that a robot stands on."""
+_UNDER_M = 2e-3
+"""So that a table's top that is as high as the base hides it."""
 
 
 class Session:
@@ -70,7 +75,7 @@ class Session:
         """The tab is gone."""
         self._closed.set()
         workers = (self._drawing, self._asking, self._linking, self._listing, self._replaying)
-        for worker in (*workers, self._reports):
+        for worker in (*workers, self._reports, self.robot, self.reach):
             worker.close()
 
     # The page
@@ -89,8 +94,17 @@ class Session:
         tabs = gui.add_tab_group()
         with tabs.add_tab("Best grasp"):
             closing = Closing(self.page)
-            self.question = QuestionPanel(self.page, closing, self._changed, keyed=self._api_key is not None)
+            self.question = QuestionPanel(
+                self.page,
+                closing,
+                self._changed,
+                lambda *told: self.robot.answered(*told),
+                keyed=self._api_key is not None,
+            )
         self._closing = closing
+        with tabs.add_tab("Robot"):
+            self.robot = RobotPanel(self.page, closing, self._changed, self._choose_cell)
+            self.reach = ReachPanel(self.page, lambda: self._linking.soon(self._tell_link))
         with tabs.add_tab("Grasps"):
             self._grasps = GraspsPanel(self.page, self._redraw)
         with tabs.add_tab("Trials"):
@@ -121,6 +135,8 @@ class Session:
     def _changed(self) -> None:
         """What is asked for has changed; while a drag goes on, many times a second."""
         self._asking.soon(self.question.ask)
+        self.reach.soon()
+        self.reach.soon()
         self._linking.soon(self._tell_link)
 
     def _redraw(self) -> None:
@@ -149,6 +165,21 @@ class Session:
         self.question.gizmos.untick()
         self._reports.clear()
         self._drawing.soon(self._load)
+
+    def _choose_cell(self) -> None:
+        """Another robot or scene: it is seen whole."""
+        self.page.view.camera = None
+        self._drawing.soon(self._draw_cell)
+        self._linking.soon(self._tell_link)
+
+    def _draw_cell(self) -> None:
+        subject = self.page.subject
+        if subject is not None:
+            self.robot.settle(subject)
+            self.robot.draw(subject)
+            self._look(subject)
+            self._asking.soon(self.question.ask)
+            self.reach.soon()
 
     def _select(self) -> None:
         view = self.page.view
@@ -227,11 +258,15 @@ class Session:
         self._offer(item)
         self.page.subject = subject
         self._about.content = words.table(item.summary())
+        self.robot.settle(subject)
         if before is None or before.item.id != item.id or OBJECT[1:] not in self.page.nodes:
             self._place(subject)
         self.question.gizmos.draw()
         self._draw()
+        # Last, for its robot may be gone.
+        self.robot.draw(subject)
         self._asking.soon(self.question.ask)
+        self.reach.soon()
 
     def _subject(self, item: GraspObject) -> Subject:
         view, info = self.page.view, item.info
@@ -286,28 +321,40 @@ class Session:
         scene.add_light_directional("/lights/key", intensity=1.5, position=(1.0, -1.2, 2.0))
         scene.add_light_directional("/lights/fill", intensity=0.6, position=(-1.5, 1.0, 0.5))
         frame = scene.add_frame(OBJECT, axes_length=0.25 * subject.size_m, axes_radius=0.004 * subject.size_m)
+        if subject.mesh is not None:
+            node = page.solid(f"{OBJECT}/mesh", subject.mesh, colours.OBJECT, side="double")
+            page.replace("mesh", node)
+        self._look(subject)
+        page.replace(OBJECT[1:], frame)
+
+    def _look(self, subject: Subject) -> None:
+        """The floor, and the eye where the view has it, or else so that the object, or the robot beside it,
+        is seen whole.
+        """
+        view, size = self.page.view, 6 * subject.size_m
+        cell = 0.01 if subject.size_m < 0.5 else 0.1
         low = float(subject.centre[2] - subject.size_m / 2)
         if subject.mesh is not None:
             low = float(subject.mesh.vertices[:, 2].min())
-            node = page.solid(f"{OBJECT}/mesh", subject.mesh, _MESH, side="double")
-            page.replace("mesh", node)
-        cell = 0.01 if subject.size_m < 0.5 else 0.1
-        scene.add_grid(
+        target, away = subject.centre, subject.size_m * np.array([1.5, -1.7, 1.1])
+        if view.robot is not None and view.robot_base is not None:
+            there = np.zeros(3) if view.object_pose is None else np.array(view.object_pose.position)
+            base = np.array(view.robot_base.position)
+            size, cell, low = _ROOM_M, 0.1, float(base[2]) - _UNDER_M
+            target = (there + subject.centre + base) / 2 + np.array([0.0, 0.0, 0.25])
+            away = np.array([0.75, -1.05, 0.5]) * max(1.0, float(np.linalg.norm(there - base)) / 0.6)
+        self._client.scene.add_grid(
             "/floor",
-            width=6 * subject.size_m,
-            height=6 * subject.size_m,
+            width=size,
+            height=size,
             cell_size=cell,
             section_size=10 * cell,
             position=(0.0, 0.0, low),
             cell_color=(228, 230, 233),
             section_color=(200, 204, 209),
         )
-        eye, target = page.view.camera or (
-            triple(subject.centre + subject.size_m * np.array([1.5, -1.7, 1.1])),
-            triple(subject.centre),
-        )
-        self._client.camera.position, self._client.camera.look_at = np.array(eye), np.array(target)
-        page.replace(OBJECT[1:], frame)
+        eye, middle = view.camera or (triple(target + away), triple(target))
+        self._client.camera.position, self._client.camera.look_at = np.array(eye), np.array(middle)
 
     def _draw(self) -> None:
         """Grasps and trials as the view has them."""

@@ -71,6 +71,14 @@ class View(_Part):
     cone: Cone | None = None
     obstacle: Obstacle | None = None
     object_pose: Placed | None = None
+    robot: Name | None = None
+    scene: Name | None = None
+    robot_base: Placed | None = None
+    """The robot's root in the world."""
+    reach: Literal["none", "grasps", "bases"] = "none"
+    pregrasp_distance_m: Annotated[float, Field(gt=0, le=2.0)] = 0.08
+    lift_m: Annotated[float, Field(gt=0, le=2.0)] = 0.1
+    """How far the arm backs off and lifts; asked with a robot alone."""
     camera: tuple[Point, Point] | None = None
     """Where the eye is, and what it looks at."""
 

@@ -5,7 +5,7 @@ Pinocchio and coal test convex solids against solids and meshes; points of a sen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -132,15 +132,23 @@ class ArmCollisions:
 
     def which(self, joints: Floats, *, lifted: bool = False) -> tuple[str, str] | None:
         """A link that collides at joints (n,), and with what; None where none does."""
+        return next(self._colliding(joints, lifted), None)
+
+    def all_hits(self, joints: Floats, *, lifted: bool = False) -> list[tuple[str, str]]:
+        """All that collide at joints (n,): links, each with what it meets."""
+        return list(dict.fromkeys(self._colliding(joints, lifted)))
+
+    def _colliding(self, joints: Floats, lifted: bool) -> Iterator[tuple[str, str]]:
         data = self._after if lifted else self._before
         pin.computeCollisions(
             self._model, self._data, self._geometry, data, np.ascontiguousarray(joints), False
         )
         for k, pair in enumerate(self._pairs):
             if data.activeCollisionPairs[k] and data.collisionResults[k].isCollision():
-                return self._names[pair[0]], self._names[pair[1]]
+                yield self._names[pair[0]], self._names[pair[1]]
         met = self._meeting_points()
-        return None if met is None else (met, "points")
+        if met is not None:
+            yield met, "points"
 
     def self_hits(self, joints: Floats) -> NDArray[np.bool_]:
         """Of each tested pair, whether it collides at joints (n,)."""

@@ -41,14 +41,20 @@ class ArmMotion:
     travel: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Obstruction:
-    """Why an arm can't take a grasp, and by how far it fails, metres (radians counted as 0.3 m)."""
+    """Why an arm can't take a grasp, and by how far it fails, metres (radians counted as 0.3 m).
+
+    ``joints`` (n,) are where it fails: where ``link`` collides, or at the grasp beyond a limit or singular;
+    None where nothing leads there. ``lifted``: that is on the lift.
+    """
 
     reason: Reason
     off_m: float
     link: str | None = None
     other: str | None = None
+    joints: Floats | None = None
+    lifted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,20 +225,36 @@ class Reaching:
                 return None
             met = met or hit
         if met is not None:
-            own = {solid.link for solid in self._collisions.solids}
-            return Obstruction("self_collision" if met[1] in own else "collision", 0.0, *met)
+            return met
         free, farther = kinematics.solutions(flange, self.cell.now, within_limits=False)
         if not len(free):
             return Obstruction("too_far", farther)
+        nearest = self._least_beyond(free)
         ends = (kinematics.way(joints, flange, ways, within_limits=False) for joints in free)
         if broken and all(way is None for way in ends):
-            return Obstruction("singular", 0.0)
-        return Obstruction("joint_limit", 0.0 if broken else off)
+            return Obstruction("singular", 0.0, joints=nearest)
+        return Obstruction("joint_limit", 0.0 if broken else off, joints=nearest)
 
-    def _hit(self, way: Floats, grasp: int) -> tuple[str, str] | None:
+    def _hit(self, way: Floats, grasp: int) -> Obstruction | None:
         """The first collision along a way."""
+        own = {solid.link for solid in self._collisions.solids}
         for step, joints in enumerate(way):
             met = self._collisions.which(joints, lifted=step > grasp)
             if met is not None:
-                return met
+                reason: Reason = "self_collision" if met[1] in own else "collision"
+                return Obstruction(reason, 0.0, *met, joints, step > grasp)
         return None
+
+    def colliding(self, met: Obstruction) -> list[tuple[str, str]]:
+        """All links that collide where a grasp fails, each with what it meets."""
+        if met.link is None or met.joints is None:
+            return []
+        return self._collisions.all_hits(met.joints, lifted=met.lifted)
+
+    def _least_beyond(self, free: Floats) -> Floats:
+        """Of joints (m, n), turned back by whole turns, those that are least beyond limits."""
+        arm = self.cell.kinematics.arm
+        turns = np.round((free - arm.middle) / (2 * math.pi))
+        near = np.where(arm.sliding, free, free - 2 * math.pi * turns)
+        beyond = np.maximum(np.maximum(arm.lower - near, near - arm.upper), 0.0)
+        return np.asarray(near[int(np.argmin(beyond.sum(axis=1)))])

@@ -43,7 +43,7 @@ from graspdb_service.api import (
 from graspdb_service.api.access import keys
 from graspdb_service.api.access.browsers import BrowserGuard
 from graspdb_service.api.access.guard import Door, refuse_unguarded
-from graspdb_service.api.cells import robots, scenes
+from graspdb_service.api.cells import reach, robots, scenes
 from graspdb_service.api.context import Context
 from graspdb_service.api.questions import answers, queries
 from graspdb_service.api.routing.admission import Admission
@@ -85,6 +85,7 @@ ROUTERS = [
     grippers.router,
     robots.router,
     scenes.router,
+    reach.router,
     trials.router,
     queries.router,
     answers.router,

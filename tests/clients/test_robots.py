@@ -84,6 +84,28 @@ def test_a_robot_and_a_scene_come_and_go(cell: Client) -> None:
         cell.robots.get("kuka")
 
 
+def test_a_shape_s_frames_are_where_pinocchio_has_them(cell: Client) -> None:
+    import pinocchio as pin
+
+    cell.robots.put("drawn", known_robots.PANDA, flange="panda_link8")
+    shape = cell.robots.shape("drawn")
+    model = pin.buildModelFromUrdf(str(known_robots.PANDA))
+    data = model.createData()
+    drawn = np.random.default_rng(0).uniform(-1, 1, (10, 7))
+    for row, frames in zip(drawn, shape.frames(drawn), strict=True):
+        q = pin.neutral(model)
+        q[:7] = row
+        pin.framesForwardKinematics(model, data, q)
+        for i in range(9):
+            there = data.oMf[model.getFrameId(f"panda_link{i}")].homogeneous
+            assert np.allclose(frames[i], there, atol=1e-6)
+    with pytest.raises(ValueError, match="7"):
+        shape.frames([0.0] * 6)
+    mug = cell.objects.get("mug")
+    found = mug.reach([0, 0, 0.1, 1, 0, 0, 0], robot="drawn", object_pose=AT, gripper="panda")
+    assert found.reached == [True]
+
+
 def test_it_is_typed_and_awaited(cell: Client, tmp_path: Path) -> None:
     bench = tmp_path / "bench.json"
     bench.write_text(json.dumps({"boxes": [{"position": [0.5, 0, -0.1], "size_m": [1, 1, 0.1]}]}))
@@ -92,7 +114,16 @@ def test_it_is_typed_and_awaited(cell: Client, tmp_path: Path) -> None:
     def typed(*words: str) -> Any:
         return CliRunner().invoke(app, [*url, *words])
 
-    stored = typed("robots", "put", "arm", str(known_robots.PANDA), "--flange", "panda_link8")
+    stored = typed(
+        "robots",
+        "put",
+        "arm",
+        str(known_robots.PANDA),
+        "--flange",
+        "panda_link8",
+        "--gripper-mount",
+        "0,0,0,0,0,0,1",
+    )
     assert "7 joints to panda_link8" in stored.output, stored.output
     assert "1 boxes" in typed("scenes", "put", "bench", str(bench)).output
     assert "panda_joint1" in typed("robots", "show", "arm").output

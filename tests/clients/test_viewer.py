@@ -191,6 +191,31 @@ def test_a_key_is_never_told_and_an_obstacle_is_said_to_be_left_out() -> None:
     assert io.StringIO(told.command).read().count("--") >= 3
 
 
+def test_what_is_shown_first_is_said_on_the_command_line(
+    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[View] = []
+
+    def refused(*_: Any, view: View, **__: Any) -> Any:
+        shown.append(view)
+        raise OSError("no port")
+
+    monkeypatch.setattr("graspdb_viewer.serving.serving", refused)
+    place = ("--object-pose", "0.5,0,0.1,0,0,0,1", "--robot-base-pose", "0,0.2,0,0,0,1,0")
+    run("view", "mug", "--robot", "arm", "--scene", "bench", *place)
+    (view,) = shown
+    assert (view.object, view.robot, view.scene) == ("mug", "arm", "bench")
+    assert view.object_pose == Placed(position=(0.5, 0.0, 0.1))
+    assert view.robot_base == Placed(position=(0.0, 0.2, 0.0), quaternion_xyzw=(0.0, 0.0, 1.0, 0.0))
+    asked = constraints(view, {})
+    assert asked["robot_base_pose"] == [0.0, 0.2, 0.0, 0.0, 0.0, 1.0, 0.0]
+    assert {"lift_m", "pregrasp_distance_m", "scene"} <= asked.keys()
+    assert "pregrasp_distance_m" not in constraints(view, {}, solid=False)
+    told = spoken("http://lab", "mug", 1, asked, keyed=False)
+    for option in ("--robot=arm", "--scene=bench", "--robot-base-pose=0,0.2,0", "--lift-m=0.1"):
+        assert option in told.command
+
+
 def test_only_its_own_pages_are_answered(db: Client) -> None:
     with serving(db, port=0, names=["viewer.lab"]) as server:
         port = server.url.rpartition(":")[2]

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
+import known_robots
 from graspdb import Client
 from graspdb_viewer.motion import simulated
+from graspdb_viewer.scene import colours
 from graspdb_viewer.serving import ViewerServer, link_to, serving
-from graspdb_viewer.view import View
+from graspdb_viewer.view import Placed, View
 from viewer_tab import WIDTH, Tab, chromium
 
 pytestmark = pytest.mark.browser
@@ -241,6 +243,119 @@ def test_a_simulated_trial_is_replayed_as_it_went(
     moved = simulated(trial, sweep, service_url, None)
     assert moved.is_of(trial)
     assert not moved.is_of(trial.model_copy(update={"width_m": 0.02}))
+
+
+@pytest.fixture(scope="module")
+def cell_id(service_url: str) -> str:
+    """The Panda, a box that was grasped from above, and a wall between them: one id for all three."""
+    pytest.importorskip("pinocchio")
+    name = f"cell-{os.getpid()}"
+    rows = np.tile([0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0], (40, 1))
+    rows[:, :3] += np.random.default_rng(1).normal(scale=0.004, size=(40, 3))
+    with Client(service_url, retries=1) as db:
+        item = db.objects.create(name, mesh=_box((0.06, 0.04, 0.1)), media_type="model/stl", mass_kg=0.2)
+        item.trials.add(rows, "success", gripper="panda", source="robot")
+        db.robots.put(name, known_robots.PANDA, flange="panda_link8")
+        wall = {"position": [0.35, 0.0, 0.35], "size_m": [0.02, 0.8, 0.7]}
+        db.scenes.put(name, boxes=[wall], objects={name: [0.9, 0.6, 0.0, 0, 0, 0, 1]})
+    return name
+
+
+def _links_off_m(opened: Tab, joints: np.ndarray) -> float:
+    """How far the farthest drawn link is from where pinocchio has it at these joints."""
+    import pinocchio as pin
+
+    model = pin.buildModelFromUrdf(str(known_robots.PANDA))
+    data, q = model.createData(), pin.neutral(model)
+    q[:7] = joints
+    pin.framesForwardKinematics(model, data, q)
+    robot = opened.session.robot._robot
+    assert robot is not None
+    return max(
+        float(np.linalg.norm(opened.session.page.nodes[f"arm {i}"].position - there.translation))
+        for i, solid in enumerate(robot.shape.solids)
+        for there in [data.oMf[model.getFrameId(solid.link)]]
+    )
+
+
+def test_an_arm_is_shown_where_its_joints_put_it_and_answers_while_its_base_is_dragged(
+    tab: Callable[[str], Tab], viewer: ViewerServer, cell_id: str
+) -> None:
+    base = Placed(position=(0.0, 0.0, -0.05))
+    stand = Placed(position=(0.5, 0.0, 0.0))
+    view = View(
+        object=cell_id, grasps="none", robot=cell_id, robot_base=base, object_pose=stand, reach="grasps"
+    )
+    opened = tab(link_to(viewer.url, view))
+    robot, question = opened.session.robot, opened.session.question
+    opened.until(lambda: robot.way)
+    opened.tab("Robot")
+    opened.says("The arm takes the best grasp")
+    opened.says("the arm takes it")
+    kind, found = opened.session.reach.shown  # type: ignore[misc]
+    assert kind == "grasps"
+    assert found.reached.count(True) > 100
+    opened.page.wait_for_timeout(1_000)
+    assert _links_off_m(opened, np.array(question.answered[0].joints.grasp)) < 1e-4  # type: ignore[index]
+    opened.shot("robot")
+
+    asked = question.questions
+    opened.drag(opened.on_screen((0.14, 0.0, -0.05)), (-60.0, 5.0))
+    opened.until(lambda: opened.session.page.view.robot_base.position[0] < -0.02)  # type: ignore[union-attr]
+    opened.page.wait_for_timeout(300)
+    opened.until(lambda: question.questions > asked)
+    there = opened.session.page.view.robot_base
+    assert there is not None
+    assert there.position[2] == pytest.approx(-0.05)
+    opened.until(lambda: robot.way and np.allclose(robot.way.base[:3, 3], there.position, atol=1e-4))
+    assert _links_off_m(opened, np.array(question.answered[0].joints.grasp)) < 1e-4  # type: ignore[index]
+
+    opened.push("Play the motion")
+    opened.until(lambda: robot._slider.value == 2.0)
+    lift = np.array(question.answered[0].joints.lift)  # type: ignore[index]
+    opened.until(lambda: _links_off_m(opened, lift) < 1e-4)
+    # What it holds is lifted straight up, by its frame and so far as was asked.
+    lifted = opened.session.page.nodes["mesh"].position
+    assert lifted == pytest.approx([0.0, 0.0, view.lift_m], abs=2e-3)
+    opened.until(lambda: robot._slider.value == 1.0)
+
+
+def test_links_in_the_way_are_red_and_where_the_base_could_stand_is_a_button(
+    tab: Callable[[str], Tab], viewer: ViewerServer, cell_id: str
+) -> None:
+    view = View(
+        object=cell_id,
+        grasps="none",
+        robot=cell_id,
+        scene=cell_id,
+        robot_base=Placed(position=(0.0, 0.0, -0.05)),
+        object_pose=Placed(position=(0.5, 0.0, 0.0)),
+        reach="bases",
+    )
+    opened = tab(link_to(viewer.url, view))
+    robot, nodes = opened.session.robot, opened.session.page.nodes
+    opened.tab("Robot")
+    opened.says("It would collide.")
+    opened.says("meets box 1 of the scene")
+    opened.until(lambda: opened.session.reach.shown)
+    shares = opened.session.reach.shown[1].base_share  # type: ignore[index]
+    assert (min(shares), max(shares) > 0.5) == (0.0, True)
+    opened.page.wait_for_timeout(500)
+    shown = robot._robot
+    assert shown is not None
+    red = {
+        solid.link
+        for i, solid in enumerate(shown.shape.solids)
+        if tuple(nodes[f"arm {i}"].color) == colours.WRONG
+    }
+    assert red
+    assert all(f"{link} meets" in robot._told.content.replace("&#95;", "_") for link in red)
+    assert tuple(nodes["standing scene.boxes.0"].color) == colours.WRONG
+    assert tuple(nodes["standing scene.objects.0"].color) == colours.STANDING
+    opened.shot("links-in-the-way")
+    opened.push("Stand where it takes one")
+    opened.says("The arm takes the best grasp")
+    assert tuple(nodes["standing scene.boxes.0"].color) == colours.STANDING
 
 
 def test_a_service_that_is_down_is_told(browser: Browser) -> None:

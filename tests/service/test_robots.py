@@ -286,3 +286,59 @@ def test_an_object_in_a_scene_is_an_obstacle_of_gripper_and_links(
     cell.put("/scenes/s", json=over)
     answer = cell.post("/objects/thing/best-grasp", json={"object_pose": AT, "scene": "s"}).json()
     assert answer["status"] == "infeasible"
+
+
+def test_a_map_of_reach_tells_of_each_grasp_and_of_places_for_the_base(cell: httpx.Client) -> None:
+    down, half = [1.0, 0.0, 0.0, 0.0], 0.5**0.5
+    poses = [
+        {"position": [0, 0, 0.05], "quaternion_xyzw": down},
+        {"position": [0, 0, 3.0], "quaternion_xyzw": down},
+    ]
+    asked = {"robot": "panda", "gripper": "panda", "object_pose": AT, "poses": poses, "lift_m": 0.1}
+    bases = [[0, 0, 0, 0, 0, 0, 1], [9, 0, 0, 0, 0, 0, 1], [0.5, -0.4, 0, 0, 0, half, half]]
+    found = cell.post("/objects/thing/reach", json={**asked, "bases": bases}).json()
+    assert (found["reached"], found["reason"]) == ([True, False], [None, "too_far"])
+    assert found["base_share"] == [0.5, 0.0, 0.5]
+    columns = {name: [pose[name] for pose in poses] for name in ("position", "quaternion_xyzw")}
+    assert cell.post("/objects/thing/reach", json={**asked, "poses": columns}).json()["reached"] == [
+        True,
+        False,
+    ]
+    wall = {"boxes": [{"position": [0.5, 0.1, 0.3], "size_m": [0.5, 0.5, 0.02]}]}
+    met = cell.post("/objects/thing/reach", json={**asked, "obstacles": wall}).json()
+    assert met["reason"] == ["collision", "too_far"]
+    many = cell.post("/objects/thing/reach", json={**asked, "poses": poses[:1] * 100, "bases": bases * 100})
+    assert many.status_code == 422
+    assert "20,000" in many.text
+    assert cell.post("/objects/thing/reach", json={**asked, "robot": "none"}).status_code == 404
+
+
+def test_what_draws_an_arm_is_closed_and_known_to_whoever_has_it(cell: httpx.Client) -> None:
+    first = cell.get("/robots/panda/shape")
+    shape = first.json()
+    assert [joint["name"] for joint in shape["joints"]] == [f"panda_joint{i}" for i in range(1, 8)]
+    assert [solid["joint"] for solid in shape["solids"]] == list(range(8))
+    for solid in shape["solids"]:
+        corners = np.array(solid["vertices"])[np.array(solid["faces"])]
+        # By the divergence theorem: what faces outward has a volume, and a link's is litres at most.
+        assert 0 < np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() / 6 < 0.02
+        edges = {(a, b) for face in solid["faces"] for a, b in zip(face, [*face[1:], face[0]], strict=True)}
+        assert edges == {(b, a) for a, b in edges}
+    again = cell.get("/robots/panda/shape", headers={"If-None-Match": first.headers["ETag"]})
+    assert again.status_code == 304
+    assert cell.get("/robots/none/shape").status_code == 404
+
+
+def test_an_arm_in_the_way_is_told_where_it_collides(cell: httpx.Client) -> None:
+    wall = {"position": [0.3, 0, 0.5], "size_m": [0.02, 2.0, 1.0]}
+    found = best(cell, obstacles={"boxes": [wall]}, pregrasp_distance_m=0.05)
+    assert found["status"] == "infeasible"
+    reach = found["reach"]
+    assert reach["reason"] == "collision"
+    assert reach["colliding"][0] == {"link": reach["link"], "other": reach["other"]}
+    assert len(reach["joints"]) == 7
+    robot = cell.get("/robots/panda").json()
+    for value, joint in zip(reach["joints"], robot["joints"], strict=True):
+        assert joint["lower"] - 1e-6 <= value <= joint["upper"] + 1e-6
+    far = best(cell, robot_base_pose=[-2, 0, 0, 0, 0, 0, 1])["reach"]
+    assert (far["reason"], far["joints"], far["colliding"]) == ("too_far", None, [])

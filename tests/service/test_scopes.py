@@ -17,7 +17,7 @@ from graspdb_service.settings import Settings
 PUBLIC = {"/livez", "/readyz", "/metrics", "/info"}
 FOR_WORKERS = {("get", "/objects/{id}/mesh"), ("get", "/objects/{id}/convex-parts")}
 """Routes that a worker needs, too, though it has only the scope for jobs."""
-COMPUTING = ("/likelihood", "/best-grasp", "/samples", "/proposals")
+COMPUTING = ("/likelihood", "/reach", "/best-grasp", "/samples", "/proposals")
 
 
 def _expected(method: str, path: str) -> str:

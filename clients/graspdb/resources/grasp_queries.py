@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, get_args
 
@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 from graspdb import wire
 from graspdb.errors import Infeasible
 from graspdb.options import known_keywords
-from graspdb.poses import as_poses, pose_frame, pose_trials
+from graspdb.poses import as_poses, as_vector7, pose_frame, pose_trials
 from graspdb.resources.answers import report_grasp
 from graspdb.resources.pages import Resource, segment, validate
 from graspdb.resources.pictures.asking import PictureOptions, picture
@@ -160,6 +160,7 @@ class GraspQueries(Resource):
             nearest=grasps.nearest,
             conflict=grasps.conflict,
             relax=grasps.relax,
+            reach=grasps.robot_reach,
         )
 
     def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:
@@ -204,6 +205,44 @@ class GraspQueries(Resource):
         request = validate(wire.SamplesRequest, fields)
         answer = self._transport.model(wire.Samples, "POST", f"{self._path}/samples", body=request)
         return SampledPoses.from_wire(answer)
+
+    def reach(
+        self,
+        poses: ArrayLike | Any,
+        *,
+        robot: str,
+        object_pose: ArrayLike | Any,
+        robot_base_pose: ArrayLike | Any | None = None,
+        bases: ArrayLike | Any | None = None,
+        gripper: str | None = None,
+        scene: str | None = None,
+        obstacles: Mapping[str, Any] | None = None,
+        pregrasp_distance_m: float | None = None,
+        lift_m: float | None = None,
+        timeout_s: float | None = None,
+    ) -> wire.ReachMap:
+        """Which of at most 1,000 poses of the tool a robot's arm takes where it stands, and why not others.
+
+        ``bases`` are other poses of the robot's root in the world: ``base_share`` is the share of poses that
+        the arm takes from each. All else is as for the best grasp (:class:`Constraints`), ``obstacles`` in
+        the world.
+        """
+        fields = {
+            "gripper": gripper,
+            "scene": scene,
+            "obstacles": obstacles,
+            "pregrasp_distance_m": pregrasp_distance_m,
+            "lift_m": lift_m,
+            "timeout_s": timeout_s,
+            "poses": as_poses(poses).columns(),
+            "robot": robot,
+            "object_pose": as_vector7(object_pose, "object_pose"),
+            "bases": None if bases is None else as_poses(bases).rows.tolist(),
+        }
+        if robot_base_pose is not None:
+            fields["robot_base_pose"] = as_vector7(robot_base_pose, "robot_base_pose")
+        request = validate(wire.ReachRequest, fields)
+        return self._transport.model(wire.ReachMap, "POST", f"{self._path}/reach", body=request)
 
     def proposals(
         self,

@@ -26,10 +26,16 @@ from graspdb.wire.base import Response as Response
 from graspdb.wire.base import Slug as Slug
 from graspdb.wire.base import Source as Source
 from graspdb.wire.cells.beliefs import PoseBelief as PoseBelief
+from graspdb.wire.cells.reach import ReachMap as ReachMap
+from graspdb.wire.cells.reach import ReachRequest as ReachRequest
+from graspdb.wire.cells.robots import ChainJoint as ChainJoint
 from graspdb.wire.cells.robots import GraspJoints as GraspJoints
+from graspdb.wire.cells.robots import LinkCollision as LinkCollision
 from graspdb.wire.cells.robots import RobotInfo as RobotInfo
 from graspdb.wire.cells.robots import RobotJoint as RobotJoint
 from graspdb.wire.cells.robots import RobotReach as RobotReach
+from graspdb.wire.cells.robots import RobotShape as RobotShape
+from graspdb.wire.cells.robots import RobotSolid as RobotSolid
 from graspdb.wire.cells.robots import RobotUpdate as RobotUpdate
 from graspdb.wire.cells.scenes import SceneCreate as SceneCreate
 from graspdb.wire.cells.scenes import SceneInfo as SceneInfo

@@ -72,6 +72,20 @@ class Closing:
         self._put("palm", shapes.palm(profile), _STEEL, opacity=_SEEN_THROUGH)
         self._draw()
 
+    def move(self, pose: Poses) -> None:
+        """The gripper that is shown, elsewhere in the object frame: on the arm's way to its grasp."""
+        frame = self._page.nodes.get("gripper")
+        if frame is not None and self._pose is not None:
+            frame.position, frame.wxyz = pose.position[0], wxyz(pose.quaternion_xyzw[0])
+
+    def close_by(self, share: float) -> None:
+        """The jaw between wide open (0) and on the object (1)."""
+        subject = self._page.subject
+        if subject is not None and subject.profile is not None and self._pose is not None:
+            widest, closed = 1e3 * subject.profile.max_opening_m, 1e3 * (self._end_m or 0.0)
+            put(self._slider, widest + (closed - widest) * share)
+            self._draw()
+
     def replay(self, motion: Motion, shown: Callable[[], bool]) -> None:
         """Move the fingers and the object as they moved, while the jaw stands still, and put them back.
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from graspdb_viewer.page import Page, put, triple, wxyz, xyzw
-from graspdb_viewer.scene import shapes
+from graspdb_viewer.scene import colours, shapes
 from graspdb_viewer.view import Box, Cone, Obstacle, Placed
 
-_WORKSPACE, _CONE, _OBSTACLE = (0, 114, 178), (230, 159, 0), (90, 90, 95)
+_WORKSPACE, _CONE = (0, 114, 178), (230, 159, 0)
 _DOWN = (1.0, 0.0, 0.0, 0.0)
 """Half a turn about x: the approach is downwards."""
 _MARK = 1e-3
@@ -175,7 +175,7 @@ class Gizmos:
             return
         self._gizmo("obstacle", obstacle)
         _set(self._obstacle_size, obstacle.size)
-        body = page.client.scene.add_box("/obstacle/body", dimensions=obstacle.size, color=_OBSTACLE)
+        body = page.client.scene.add_box("/obstacle/body", dimensions=obstacle.size, color=colours.OBSTACLE)
         page.replace("obstacle body", body)
 
 

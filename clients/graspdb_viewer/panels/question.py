@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from graspdb_viewer.panels.gizmos import Gizmos
 from graspdb_viewer.panels.spoken import Spoken, constraints, spoken
 from graspdb_viewer.scene import colours, shapes
 
+Told = Callable[[Mapping[str, Any], Grasps | Infeasible | None, float], None]
 _OBJECTIVES: dict[str, Literal["density", "success_probability"]] = {
     "density": "density",
     "success probability": "success_probability",
@@ -44,10 +45,14 @@ _BUTTON_STYLE = (
 
 
 class QuestionPanel:
-    """What is asked for, and what is answered; ``changed`` is called at every change, and while dragging."""
+    """What is asked for, and what is answered; ``changed`` is called at every change, and while dragging,
+    ``told`` with every question and its answer, in the order in which they were asked.
+    """
 
-    def __init__(self, page: Page, closing: Closing, changed: Callable[[], None], *, keyed: bool) -> None:
-        self._page, self._closing, self._keyed = page, closing, keyed
+    def __init__(
+        self, page: Page, closing: Closing, changed: Callable[[], None], told: Told, *, keyed: bool
+    ) -> None:
+        self._page, self._closing, self._keyed, self._told = page, closing, keyed, told
         gui, view = page.client.gui, page.view
         self._count = gui.add_slider("Best grasps", 0, 20, 1, initial_value=view.best)
         self._objective = gui.add_dropdown(
@@ -79,7 +84,7 @@ class QuestionPanel:
         if subject is None or view.best == 0:
             self._nothing("")
             return
-        given = constraints(view, subject.selection)
+        given = constraints(view, subject.selection, solid=subject.mesh is not None)
         if subject.density is None or not subject.successes:
             if subject.gripper is None or subject.mesh is None:
                 self._nothing("**No best grasp yet**: nothing has succeeded.")
@@ -92,9 +97,11 @@ class QuestionPanel:
             found = subject.item.best_grasps(count=view.best, **given)
         except Infeasible as error:
             self._infeasible(error)
+            self._told(given, error, time.perf_counter() - began)
             return
         self.answered = found
         self._show(subject, found)
+        self._told(given, found, time.perf_counter() - began)
         self.questions += 1
         self._latency.content = (
             f"Answered in {1e3 * (time.perf_counter() - began):.0f} ms, at revision {found.revision:,}."
@@ -138,7 +145,9 @@ class QuestionPanel:
         nearest = error.nearest if isinstance(error.nearest, Grasp) else None
         self._nothing(_why_none(error))
         subject = self._page.subject
-        if nearest is not None and subject is not None and subject.profile is not None:
+        # Where the arm fails its own gripper is drawn.
+        alone = error.reach is None or error.reach.joints is None
+        if nearest is not None and alone and subject is not None and subject.profile is not None:
             shape = shapes.gripper(subject.profile)
             node = self._page.instances(
                 f"{OBJECT}/nearest", shape, _pose(nearest), _NEAREST, lod="off", opacity=0.5

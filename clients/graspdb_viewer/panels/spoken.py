@@ -11,7 +11,7 @@ import numpy as np
 
 from graspdb.poses import matrices
 from graspdb.resources.selection import TrialSelection, best_grasp_request
-from graspdb_viewer.view import View
+from graspdb_viewer.view import Placed, View
 
 _DIGITS = 5
 
@@ -24,12 +24,23 @@ class Spoken(NamedTuple):
     command: str
 
 
-def constraints(view: View, selection: TrialSelection) -> dict[str, Any]:
-    """What the view asks, as ``best_grasps`` takes it."""
+def constraints(view: View, selection: TrialSelection, *, solid: bool = True) -> dict[str, Any]:
+    """What the view asks, as ``best_grasps`` takes it; ``solid``: the object has a mesh, without which
+    nothing is said of an approach.
+    """
     given: dict[str, Any] = {**selection, "objective": view.objective}
-    if view.object_pose is not None:
-        pose = view.object_pose
-        given["object_pose"] = _rounded([*pose.position, *pose.quaternion_xyzw], 7)
+    pose = view.object_pose
+    if pose is None and (view.robot is not None or view.scene is not None):
+        pose = Placed(position=(0.0, 0.0, 0.0))
+    if pose is not None:
+        given["object_pose"] = _placed(pose)
+    if view.scene is not None:
+        given["scene"] = view.scene
+    if view.robot is not None:
+        base = view.robot_base or Placed(position=(0.0, 0.0, 0.0))
+        given |= {"robot": view.robot, "robot_base_pose": _placed(base), "lift_m": view.lift_m}
+        if solid:
+            given["pregrasp_distance_m"] = view.pregrasp_distance_m
     if view.box is not None:
         centre, half = np.array(view.box.centre), 0.5 * np.array(view.box.size)
         given["box"] = (_rounded(centre - half), _rounded(centre + half))
@@ -79,6 +90,10 @@ def _command(url: str, object_id: str, count: int, given: Mapping[str, Any]) -> 
             options.append(f"--{name.replace('_', '-')}={said}")
     words = ["graspdb", "--url", url, "best-grasp", object_id]
     return " ".join(map(shlex.quote, words)) + "".join(f" \\\n  {shlex.quote(o)}" for o in options) + left_out
+
+
+def _placed(pose: Placed) -> list[float]:
+    return _rounded([*pose.position, *pose.quaternion_xyzw], 7)
 
 
 def _rounded(values: Any, digits: int = _DIGITS) -> list[float]:

@@ -11,6 +11,8 @@ from graspdb.figures.style import OUTCOME_COLOURS, SOURCE_COLOURS
 
 Bytes = NDArray[np.uint8]
 UNKNOWN = (150, 150, 150)
+OBJECT, OBSTACLE, STANDING = (165, 170, 178), (90, 90, 95), (196, 182, 160)
+LINK, LINK_PALE, WRONG = (232, 234, 238), (205, 208, 214), (214, 48, 49)
 BEST, SECOND = (213, 94, 0), (240, 170, 110)
 #: Some of the colours of viridis (Smith and van der Walt, 2015), between which others are mixed.
 _VIRIDIS = np.array(
@@ -48,9 +50,18 @@ def bar(height: int = 14, width: int = 280) -> Bytes:
 
 def legend(names: Sequence[str], counts: Sequence[int]) -> str:
     """Names with their colours, as HTML; the names are the service's own."""
+    return legend_of(
+        [
+            (_NAMED.get(name, UNKNOWN), f"{name.replace('_', ' ')} {count:,}")
+            for name, count in zip(names, counts, strict=True)
+        ]
+    )
+
+
+def legend_of(entries: Sequence[tuple[tuple[int, ...], str]]) -> str:
+    """Colours and what they mean, as HTML; the words are the page's own."""
     rows = []
-    for name, count in zip(names, counts, strict=True):
-        red, green, blue = _NAMED.get(name, UNKNOWN)
+    for (red, green, blue), words in entries:
         dot = f"<span style='color:rgb({red},{green},{blue});font-size:1.2em'>&#9679;</span>"
-        rows.append(f"{dot} {name.replace('_', ' ')} {count:,}")
+        rows.append(f"{dot} {words}")
     return "<div style='padding:0 0.75em;font-size:0.85em;line-height:1.6'>" + "<br>".join(rows) + "</div>"

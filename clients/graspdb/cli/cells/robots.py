@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from graspdb.cli.common import State
-from graspdb.cli.options import Commands, vector_option
+from graspdb.cli.options import Commands, Numbers, vector_option
 from graspdb.wire import RobotInfo
 
 robots = Commands(no_args_is_help=True, help="Store, list, show and delete robots: arms by their URDFs.")
@@ -26,7 +26,7 @@ def put_robot(
         Path | None, typer.Option(help="Folder with its meshes; by default the URDF's and the one above.")
     ] = None,
     gripper_mount: Annotated[
-        tuple[float, ...] | None,
+        Numbers | None,
         vector_option("The gripper's base in the flange link.", "--gripper-mount", "x,y,z,qx,qy,qz,qw"),
     ] = None,
 ) -> None:

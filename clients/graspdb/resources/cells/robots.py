@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from graspdb import wire
 from graspdb.files.robots import zipped_robot
 from graspdb.poses import pose_documents
+from graspdb.resources.cells.shapes import RobotShape
 from graspdb.resources.pages import Listing, Resource, segment, validate
 from graspdb.wire.cells.robots import URDF, ZIP
 
@@ -55,6 +56,11 @@ class Robots(Resource):
     def get(self, id: str) -> wire.RobotInfo:
         """The robot with this id: joints with their limits, links, and which of them are tested."""
         return self._transport.model(wire.RobotInfo, "GET", f"{self._path}/{segment(id)}")
+
+    def shape(self, id: str) -> RobotShape:
+        """What draws the arm, and where its links are: ``shape.frames(joints)``."""
+        path = f"{self._path}/{segment(id)}/shape"
+        return RobotShape(self._transport.model(wire.RobotShape, "GET", path))
 
     def description(self, id: str) -> bytes:
         """The URDF, or the zip of it and its meshes, as it was sent."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from graspdb.wire.base import Pose, Request, Response, Text
+from graspdb.wire.base import Pose, Request, Response, Text, Triple
 
 URDF, ZIP = "application/xml", "application/zip"
 """Media types of a robot: its URDF alone, or zipped with the meshes that it names."""
@@ -62,6 +62,45 @@ class RobotInfo(Response):
     """When it was last changed, UTC."""
 
 
+class ChainJoint(Response):
+    """A joint of a robot's chain: where it is, and how it moves what comes after it."""
+
+    name: str
+    """Name of the joint, as the URDF has it."""
+    placement: Pose
+    """Its frame at zero in the frame of the joint before it, of the first in the root link; metres and a unit
+    quaternion."""
+    axis: Triple
+    """Unit axis that it turns about, or slides along, in its own frame."""
+    sliding: bool = False
+    """Whether it slides: its values are metres."""
+
+
+class RobotSolid(Response):
+    """A convex solid of a link, as it is tested for collisions."""
+
+    link: str
+    """Name of the link that it belongs to."""
+    joint: int
+    """How many joints of the chain move it: its frame is that of the last of these, or for 0 the root link's.
+    """
+    vertices: list[Triple]
+    """Corners, metres, in the frame of that joint, rounded to micrometres."""
+    faces: list[tuple[int, int, int]]
+    """Triangles by the numbers of their vertices, counter-clockwise from outside."""
+
+
+class RobotShape(Response):
+    """What is needed to draw a robot's arm at any joint values, root to flange."""
+
+    joints: list[ChainJoint]
+    """The chain from the root to the flange, in the order of joint values."""
+    flange: Pose
+    """The flange link in the frame of the last joint, metres and a unit quaternion."""
+    solids: list[RobotSolid]
+    """What is tested for collisions: a link whose shape could not be read is not there."""
+
+
 class RobotUpdate(Request):
     """What of a robot may be changed beside its URDF."""
 
@@ -83,6 +122,16 @@ class GraspJoints(Response):
     """Lifted straight up; null without ``lift_m``."""
 
 
+class LinkCollision(Response):
+    """A link that collides, and what it meets."""
+
+    link: str
+    """The link that collides, or ``gripper``."""
+    other: str
+    """Another link, ``object``, ``points``, or an obstacle as it stands in the request or the scene, such as
+    ``scene.boxes.0``."""
+
+
 class RobotReach(Response):
     """Why a robot's arm takes none of the grasps, told of the one that it came nearest to."""
 
@@ -94,6 +143,12 @@ class RobotReach(Response):
     other: str | None = None
     """What it collides with: another link, ``object``, or an obstacle as it stands in the request, such as
     ``obstacles.boxes.0``; null where nothing collides."""
+    colliding: list[LinkCollision] = Field(default_factory=list)
+    """All that collide at ``joints``, the first being ``link`` with ``other``; empty where nothing does."""
+    joints: list[float] | None = None
+    """Joint values at which it fails, in the robot's order, radians and metres: where the link collides, on
+    the approach, at the grasp or on the lift, or at the grasp beyond a limit or singular; null where it is
+    too far."""
     off_m: float = 0.0
     """How far off the arm stays, metres, with a radian counted as 0.3 m; 0 where it gets there."""
     nearest_base_pose: Pose | None = None

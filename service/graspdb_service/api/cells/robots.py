@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from graspdb.wire import Page, RobotInfo, RobotUpdate
+from graspdb.wire import Page, RobotInfo, RobotShape, RobotUpdate
 from graspdb.wire.cells.robots import URDF, ZIP
 from graspdb_service.api.routing.admission import AdmittedRoute
 from graspdb_service.api.routing.caching import tagged_json
@@ -70,6 +70,12 @@ def get_robot_description(ctx: Ctx, id: RobotId) -> Response:
     """The URDF, or the zip, as it came."""
     content, media_type = robots.content(ctx.database, id)
     return Response(content, media_type=media_type)
+
+
+@router.get("/robots/{id}/shape", response_model=RobotShape, **scope("read"))
+def get_robot_shape(ctx: Ctx, id: RobotId, request: Request) -> Response:
+    """What draws its arm at any joint values: the chain of joints, and the solids that are tested."""
+    return tagged_json(request, robots.shape(ctx.database, id))
 
 
 @router.patch("/robots/{id}", **scope("objects:write"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graspdb.wire import BestGraspRequest, GraspJoints, Obstacles, Pose, RobotReach
+from graspdb.wire import BestGraspRequest, GraspJoints, LinkCollision, Obstacles, ReachRequest, RobotReach
 from graspdb.wire.frames.gripper_frames import BASE, IDENTITY, compose, inverse
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
@@ -18,7 +18,7 @@ from graspdb_geometry.grippers import shape_of
 from graspdb_robots.arm import Floats
 from graspdb_service.problems import conflict, invalid
 from graspdb_service.usecases.cells.robots import PreparedRobot, Robots
-from graspdb_service.usecases.cells.standing import StandingScene, boxes_of, matrices
+from graspdb_service.usecases.cells.standing import StandingScene, boxes_of, matrices, pose_of
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.runtime.compute import breathe, breathing
 from graspdb_service.usecases.trials.pose_frames import pose_frame
@@ -96,8 +96,10 @@ class RobotQuestion:
             reason=met.reason,
             link=met.link,
             other=met.other,
+            colliding=[LinkCollision(link=a, other=b) for a, b in self.reaching.colliding(met)],
+            joints=None if met.joints is None else met.joints.tolist(),
             off_m=met.off_m,
-            nearest_base_pose=None if base is None else _pose(base),
+            nearest_base_pose=None if base is None else pose_of(base),
             tested=len(grasps),
         )
         return place, told
@@ -137,7 +139,7 @@ def joints_of(motion: ArmMotion) -> dict[str, Any]:
 def robot_question(
     robots: Robots,
     scenes: Scenes,
-    request: BestGraspRequest,
+    request: BestGraspRequest | ReachRequest,
     selected: Selected,
     object_pose: Poses,
     scene: StandingScene | None,
@@ -200,7 +202,9 @@ def _flange_in_tool(robot: PreparedRobot, selected: Selected) -> Floats:
     return found
 
 
-def _gripper(request: BestGraspRequest, selected: Selected, flange_in_tool: Floats) -> tuple[Floats, ...]:
+def _gripper(
+    request: BestGraspRequest | ReachRequest, selected: Selected, flange_in_tool: Floats
+) -> tuple[Floats, ...]:
     """Corners of the gripper's boxes in the flange's frame; of a jaw that opens as each grasp needs the palm
     alone.
     """
@@ -219,7 +223,7 @@ def _gripper(request: BestGraspRequest, selected: Selected, flange_in_tool: Floa
 def _standing(
     robots: Robots,
     scenes: Scenes,
-    request: BestGraspRequest,
+    request: BestGraspRequest | ReachRequest,
     selected: Selected,
     at: Floats,
     scene: StandingScene | None,
@@ -253,8 +257,3 @@ def _standing(
     else:
         found.append(Obstacle("object", at, shape=own, held=True))
     return tuple(found), np.concatenate(points), max(radii), untold
-
-
-def _pose(matrix: Floats) -> Pose:
-    quaternion = se3.canonical(se3.from_matrix(matrix[:3, :3]))
-    return Pose(position=tuple(matrix[:3, 3].tolist()), quaternion_xyzw=tuple(quaternion.tolist()))

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from graspdb.wire import RobotInfo, RobotUpdate
+from graspdb.wire import RobotInfo, RobotShape, RobotUpdate
+from graspdb.wire.cells.robots import ChainJoint, RobotSolid
 from graspdb_robots.arm import Arm
+from graspdb_robots.drawing import triangles_of
 from graspdb_service import principal
 from graspdb_service.problems import ProblemError, conflict, found, invalid
 from graspdb_service.storage.access import audit
@@ -19,6 +21,7 @@ from graspdb_service.storage.cells.robots import RobotRow
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.objects import ObjectRow
 from graspdb_service.usecases.cells.robot_child import RobotRefused, read_robot
+from graspdb_service.usecases.cells.standing import pose_of
 from graspdb_service.usecases.geometry.collision import Scenes
 from graspdb_service.usecases.identifiers import is_slug
 from graspdb_service.usecases.runtime.cache import SingleFlightCache
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     from graspdb_robots.collision import LinkShapes
     from graspdb_robots.kinematics import Kinematics
 
+_MICROMETRES = 6
 _CACHED_BYTES = 192 * 2**20
 _LIST = "GET /robots lists them, PUT /robots/{id} stores one"
 
@@ -98,6 +102,28 @@ def content(database: Database, id: str) -> tuple[bytes, str]:
     """What was sent, and its media type."""
     with database.read() as tx:
         return found(robots.content(tx, id) if is_slug(id) else None, "robot", id, _LIST)
+
+
+def shape(database: Database, id: str) -> RobotShape:
+    """The arm's chain, and its solids as triangles."""
+    with database.read() as tx:
+        row = found(robots.find(tx, id) if is_slug(id) else None, "robot", id, _LIST)
+        stored = robots.arm(tx, id, row.sha256)
+    if stored is None:
+        raise conflict("robot-changed", f"Robot {id!r} was replaced just now: ask again")
+    arm = Arm.from_bytes(stored)
+    joints = [
+        ChainJoint(name=name, placement=pose_of(place), axis=tuple(axis), sliding=slides)
+        for name, place, axis, slides in zip(
+            arm.joints, arm.placements, arm.axes.tolist(), arm.sliding.tolist(), strict=True
+        )
+    ]
+    solids = []
+    for solid in arm.solids:
+        vertices, faces = triangles_of(solid)
+        listed = vertices.round(_MICROMETRES).tolist()
+        solids.append(RobotSolid(link=solid.link, joint=solid.joint, vertices=listed, faces=faces.tolist()))
+    return RobotShape(joints=joints, flange=pose_of(arm.flange), solids=solids)
 
 
 def page(database: Database, *, after: str, limit: int) -> tuple[list[RobotInfo], str | None]:

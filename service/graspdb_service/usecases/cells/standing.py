@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graspdb.wire import Obstacles, SceneCreate
+from graspdb.wire import Obstacles, Pose, SceneCreate
 from graspdb_density import se3
 from graspdb_density.se3 import Poses
 from graspdb_geometry.collision import Scene, Surface
@@ -57,6 +57,12 @@ def matrices(poses: Poses) -> NDArray[np.float64]:
     found[:, :3, 3] = poses.positions
     found[:, 3, 3] = 1.0
     return found
+
+
+def pose_of(matrix: NDArray[np.float64]) -> Pose:
+    """A pose (4, 4) as answers have it."""
+    quaternion = se3.canonical(se3.from_matrix(matrix[:3, :3]))
+    return Pose(position=tuple(matrix[:3, 3].tolist()), quaternion_xyzw=tuple(quaternion.tolist()))
 
 
 def boxes_of(given: Obstacles) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,0 +1,1 @@
+"""The robot's cell: its arm, what stands around it, and what the arm reaches."""
