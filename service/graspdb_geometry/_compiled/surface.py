@@ -1,7 +1,7 @@
 """Numba kernels: gripper boxes against a triangle surface, through a tree of bounding boxes.
 
 A box and a triangle are apart exactly when an axis separates them.  A box that meets no triangle lies wholly
-inside or outside of a closed surface: a ray from its centre tells, or where the ray grazes an edge the winding
+inside or outside of a closed surface: a ray from its centre tells, or where it grazes an edge the winding
 number (van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE TBME 30, 1983).
 """
 
