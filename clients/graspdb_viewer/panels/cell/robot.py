@@ -134,7 +134,8 @@ class RobotPanel:
             elif robot is None:
                 self._standing.mark(())
                 self._stand.visible = False
-                self._told.content = "Store one: `graspdb robots put arm panda.urdf --flange panda_link8`."
+                first = "Choose a robot, or store" if len(self._robots.options) > 1 else "Store"
+                self._told.content = f"{first} one: `graspdb robots put arm panda.urdf --flange panda_link8`."
                 self._enable(None)
 
     def answered(self, given: Mapping[str, Any], found: Grasps | Infeasible | None, seconds: float) -> None:
