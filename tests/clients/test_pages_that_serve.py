@@ -93,7 +93,8 @@ def test_a_proxy_that_serves_it_under_a_prefix(tmp_path: Path) -> None:
 
 def test_a_viewer_of_a_lab_service(service_url: str, tmp_path: Path) -> None:
     ((_, block),) = blocks(VIEWER, "bash")
-    _, here, there, _ = block.splitlines()
+    lines = [line for line in block.splitlines() if " view mug" in line]
+    here, there, *_ = (line for line in lines if "--robot" not in line)
     for command in (here, there.replace("http://lab:8000", service_url)):
         port = free_port()
         command = command.partition("#")[0].replace("8090", str(port))
