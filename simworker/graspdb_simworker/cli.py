@@ -90,7 +90,7 @@ RunEngine = Annotated[
         " that name one are taken for every engine that is installed; both asks for all of these.",
     ),
 ]
-Protocol = Annotated[str, typer.Option(help="wrench, lift or shake.")]
+Protocol = Annotated[str, typer.Option(help="wrench, lift, shake, or as in shake-5-100.")]
 DecomposeSeconds = Annotated[
     float,
     typer.Option(

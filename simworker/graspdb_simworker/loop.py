@@ -27,8 +27,9 @@ from graspdb_simworker.process.runner import ChunkCancelled, ChunkFailed, ChunkR
 
 log = logging.getLogger("graspdb.simworker")
 
-CAPABILITIES = ("simulate", "lift", "shake", "drawn-wrench", "drawn-lift", "drawn-shake")
-"""Job kinds, protocols beyond ``wrench``, and protocols with draws, that this worker's processes claim."""
+CAPABILITIES = ("simulate", "lift", "shake", "drawn-wrench", "drawn-lift", "drawn-shake", "stated-shake")
+"""Job kinds, protocols beyond ``wrench``, those with draws and with accelerations of their own, that this
+worker's processes claim."""
 DECOMPOSING = ("decompose",)
 """What it claims besides, one at a time."""
 GLB = "model/gltf-binary"

@@ -485,6 +485,27 @@ def test_a_lift_sweep_waits_for_a_worker_that_can(sqlite_http: httpx.Client, sql
     database.dispose()
 
 
+def test_how_hard_a_sweep_shakes_is_part_of_its_protocol(sqlite_http: httpx.Client, sqlite_url: str) -> None:
+    """Older workers, which know the usual shake alone, do not get it, and who waits is told."""
+    database = Database(sqlite_url)
+    add_box(database, "box")
+    sweep = start_sweep(sqlite_http, 2_000, protocol="shake-5-100")
+    assert sweep["protocol"] == "shake-5-100"
+    older, newer = ["simulate", "shake", "drawn-shake"], ["simulate", "shake", "stated-shake"]
+    assert sqlite_http.post("/jobs/claim", json={"worker": "old", "capabilities": older}).json()["jobs"] == []
+    (warning,) = sqlite_http.get(f"/sweeps/{sweep['id']}").json()["warnings"]
+    assert "older version" in warning
+    able = sqlite_http.post("/jobs/claim", json={"worker": "new", "capabilities": newer}).json()
+    assert able["jobs"][0]["payload"]["protocol"] == "shake-5-100"
+    for unknown in ("shake-5", "shake-0-100", "shake-5-100-1", "drop"):
+        refused = sqlite_http.post("/objects/box/sweeps", json={"protocol": unknown})
+        assert refused.status_code == 422
+        (error,) = refused.json()["errors"]
+        assert error["field"] == "protocol"
+        assert "shake-5-100" in error["message"]
+    database.dispose()
+
+
 def test_a_sweep_of_an_engine_waits_for_a_worker_that_has_it(http: httpx.Client, box: Database) -> None:
     def ask(worker: str, *can: str) -> list[dict[str, Any]]:
         body = {"worker": worker, "capabilities": ["simulate", *can], "limit": 1}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb.wire import Finger, GripperProfile, SimulatePayload
-from graspdb.wire.sweeps import Protocol
+from graspdb.wire.sweeps import PROTOCOLS
 from graspdb_simworker.loop import CAPABILITIES
 from graspdb_simworker.simulation import chunks, lifting
 from graspdb_simworker.simulation.bodies import Part, mass_properties
@@ -81,12 +81,20 @@ def test_the_jaw_ends_ten_centimetres_higher_and_at_rest() -> None:
         assert way.min() == pytest.approx(-lifting.SHAKE_M, rel=1e-2)
 
 
-def test_a_shake_has_the_stated_accelerations_and_comes_home() -> None:
-    times = np.linspace(0.0, lifting.SHAKE.duration_s, 60_001)
-    rows = [lifting.shake_at(float(t)) for t in times]
+@pytest.mark.parametrize(
+    ("protocol", "along", "about"),
+    [("shake", lifting.ALONG_M_S2, lifting.ABOUT_RAD_S2), ("shake-5-100", 5.0, 100.0)],
+)
+def test_a_shake_has_the_stated_accelerations_and_comes_home(
+    protocol: str, along: float, about: float
+) -> None:
+    motion = lifting.motion_of(protocol)
+    assert motion is not None
+    times = np.linspace(0.0, motion.duration_s, 60_001)
+    rows = [motion.at(float(t)) for t in times]
     pushes, rates = np.array([f.push for f in rows]), np.array([f.spin_rate for f in rows])
-    assert np.abs(pushes).max(axis=0) == pytest.approx([lifting.ALONG_M_S2] * 3, rel=1e-3)
-    assert np.abs(rates).max(axis=0) == pytest.approx([lifting.ABOUT_RAD_S2] * 3, rel=1e-3)
+    assert np.abs(pushes).max(axis=0) == pytest.approx([along] * 3, rel=1e-3)
+    assert np.abs(rates).max(axis=0) == pytest.approx([about] * 3, rel=1e-3)
     for second, stroke in ((-pushes, lifting.ALONG_M), (rates, lifting.ABOUT_RAD)):
         first = np.cumsum(second, axis=0) * times[1]
         way = np.cumsum(first, axis=0) * times[1]
@@ -263,9 +271,9 @@ def test_lifts_do_not_depend_on_order_or_world(payload_of: MakePayload, physical
 
 
 def test_the_worker_says_what_it_can_do() -> None:
-    drawn = {f"drawn-{protocol}" for protocol in get_args(Protocol)}
-    assert set(CAPABILITIES) == {"simulate", *drawn, *get_args(Protocol)} - {"wrench"}
-    assert set(chunks.PROTOCOLS) == set(get_args(Protocol))
+    drawn = {f"drawn-{protocol}" for protocol in PROTOCOLS}
+    assert set(CAPABILITIES) == {"simulate", "stated-shake", *drawn, *PROTOCOLS} - {"wrench"}
+    assert set(chunks.PROTOCOLS) == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize("friction", [0.1, 0.4, 0.9])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -166,7 +166,7 @@ class GraspQueries(Resource):
     def _simulated(self, grasps: Grasps, given: dict[str, Any], timeout_s: float) -> Grasps:
         """The grasps with their outcomes in simulation, by the gripper and protocol of their trials."""
         chosen = self.density(**{name: given.get(name) for name in ("gripper", "protocol", "source")})
-        protocol = chosen.protocol if chosen.protocol in get_args(wire.sweeps.Protocol) else None
+        protocol = chosen.protocol if wire.sweeps.is_simulated(chosen.protocol) else None
         plan: SweepOptions = {"poses": list(grasps), "gripper": chosen.gripper, "protocol": protocol}
         plan |= {"fidelity": "fine", "purpose": "check"}
         sweep = create_sweep(self._transport, self._path, plan)

@@ -66,11 +66,12 @@ class SweepOptions(PoseFrame, total=False):
     default that of the samples or proposals that ``poses`` are. What poses are of: :class:`PoseFrame`.
     ``gripper`` is a profile's id, by default ``pg70``; ``protocol`` ``wrench`` (the contact forces can
     counter gravity in every direction), ``lift`` (still where it was after a lift) or ``shake`` (not lost
-    when shaken without gravity); ``fidelity`` ``standard`` or ``fine`` (smaller time step); ``engine``
-    ``pybullet``, ``mujoco`` or ``both`` (two sweeps: see :meth:`Sweep.linked`), by default that of whichever
-    workers come; ``randomise`` what is drawn anew in each of several simulations of a pose
-    (:class:`graspdb.wire.Randomise`, a mapping or the number of draws): a pose then succeeds k times of n;
-    ``purpose`` ``collect``, or ``check``: outcomes are stored but enter no density.
+    when shaken without gravity; ``shake-5-100``: with up to 5 m/s^2 and 100 rad/s^2); ``fidelity``
+    ``standard`` or ``fine`` (smaller time step); ``engine`` ``pybullet``, ``mujoco`` or ``both`` (two
+    sweeps: see :meth:`Sweep.linked`), by default that of whichever workers come; ``randomise`` what is
+    drawn anew in each of several simulations of a pose (:class:`graspdb.wire.Randomise`, a mapping or the
+    number of draws): a pose then succeeds k times of n; ``purpose`` ``collect``, or ``check``: outcomes
+    are stored but enter no density.
     """
 
     max_poses: Annotated[int | None, Option("A random part of the grid.", min=1)]
@@ -88,7 +89,7 @@ class SweepOptions(PoseFrame, total=False):
     sample: Annotated[int | None, Option("Simulate so many draws from the density.", min=1)]
     seed: Annotated[int | None, Option("Of --max-poses or --sample.", min=0)]
     gripper: Annotated[str | None, Option("Gripper profile [pg70].")]
-    protocol: Annotated[str | None, Option("wrench, lift or shake [wrench].")]
+    protocol: Annotated[str | None, Option("wrench, lift, shake, or as hard as said: shake-5-100 [wrench].")]
     fidelity: Annotated[str | None, Option("standard or fine [standard].")]
     engine: Annotated[str | None, Option("pybullet, mujoco or both [the workers' own].")]
     randomise: Annotated[

@@ -26,8 +26,9 @@ class ClaimRequest(Request):
         default_factory=lambda: ["simulate"]
     )
     """Job kinds the worker can do, ``lift`` and ``shake`` where it has these protocols, ``drawn-wrench``,
-    ``drawn-lift`` and ``drawn-shake`` where it can simulate a pose under what is drawn, and its physics
-    engines: a chunk that names none goes to any worker."""
+    ``drawn-lift`` and ``drawn-shake`` where it can simulate a pose under what is drawn, ``stated-shake``
+    where it shakes, drawn or not, as hard as the protocol's name says, and its physics engines: a chunk
+    that names none goes to any worker."""
     limit: Annotated[int, Field(ge=1, le=64)] = 1
     """How many jobs it takes at most."""
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from graspdb.wire.base import (
     MANY,
@@ -34,7 +35,44 @@ from graspdb.wire.queries import KernelSpec, PoseColumns
 from graspdb.wire.states import AnySweepState
 from graspdb.wire.trials import ProposalDensity
 
-Protocol = Literal["wrench", "lift", "shake"]
+PROTOCOLS = ("wrench", "lift", "shake")
+"""How workers judge an outcome; of ``shake`` accelerations may be stated: ``shake-5-100``."""
+_STATED = re.compile(r"shake-([1-9][0-9]{0,3})-([1-9][0-9]{0,3})")
+
+
+def stated_accelerations(protocol: str) -> tuple[int, int] | None:
+    """What a protocol's name says of how hard it shakes: along the jaw's axes at most, m/s^2, and about them,
+    rad/s^2; None where it says nothing.
+    """
+    found = _STATED.fullmatch(protocol)
+    return None if found is None else (int(found[1]), int(found[2]))
+
+
+def is_simulated(protocol: str | None) -> bool:
+    """Whether workers have a protocol of this name."""
+    return protocol in PROTOCOLS or (protocol is not None and stated_accelerations(protocol) is not None)
+
+
+def simulated_protocol(protocol: str) -> str:
+    """The protocol, if workers have it; ValueError says what there is."""
+    if not is_simulated(protocol):
+        raise ValueError(
+            f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}, and shake-ALONG-ABOUT, which shakes"
+            " with up to so many whole m/s^2 and rad/s^2 (1 to 9999), as in shake-5-100"
+        )
+    return protocol
+
+
+Protocol = Annotated[
+    str,
+    Field(
+        json_schema_extra={
+            "pattern": "^(wrench|lift|shake(-[1-9][0-9]{0,3}-[1-9][0-9]{0,3})?)$",
+            "examples": ["wrench", "lift", "shake", "shake-5-100"],
+        }
+    ),
+    AfterValidator(simulated_protocol),
+]
 Fidelity = Literal["standard", "fine"]
 Engine = Literal["pybullet", "mujoco"]
 AskedEngine = Literal["pybullet", "mujoco", "both"]
@@ -145,7 +183,7 @@ class SweepCreate(Request):
     protocol: Protocol = "wrench"
     """``wrench``: the contact forces can counter gravity in every direction; ``lift``: still held, and
     where it was, after the jaw lifted it and moved it about; ``shake``: not lost when the jaw shakes it,
-    without gravity."""
+    without gravity, with up to 20 m/s^2 and 100 rad/s^2, or what its name says: ``shake-5-100``."""
     fidelity: Fidelity = "standard"
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
     engine: AskedEngine | None = None
@@ -217,7 +255,7 @@ class SweepInfo(Response):
     """Id of the gripper that grasps."""
     gripper_version: OneGripperVersion = None
     protocol: str
-    """How an outcome is judged: ``wrench``, ``lift`` or ``shake``."""
+    """How an outcome is judged: ``wrench``, ``lift`` or ``shake``, with its accelerations if stated."""
     fidelity: str
     """Time step and iterations of the physics: ``standard``, or ``fine``."""
     engine: str | None = None

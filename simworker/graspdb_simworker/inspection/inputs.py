@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast, get_args
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from graspdb.examples import example
 from graspdb.transport import Transport
 from graspdb.wire import GridPlan, GridSpec, GripperInfo, GripperProfile, ObjectInfo, SimulatePayload
 from graspdb.wire.presets.grippers import PRESETS
-from graspdb.wire.sweeps import Engine, Protocol
+from graspdb.wire.sweeps import Engine, simulated_protocol
 from graspdb_geometry import meshes
 from graspdb_simworker.simulation.bodies import Part
 
@@ -33,8 +32,7 @@ def load(
 
     ValueError for an unknown example, gripper or protocol, or an object that can't be simulated yet.
     """
-    if protocol not in get_args(Protocol):
-        raise ValueError(f"no protocol {protocol!r}; there are {', '.join(get_args(Protocol))}")
+    simulated_protocol(protocol)
     parts: Sequence[Part]
     if not url:
         thing = example(name)
@@ -66,7 +64,7 @@ def load(
         mass_kg=mass,
         friction=friction,
         gripper=profile,
-        protocol=cast(Protocol, protocol),
+        protocol=protocol,
         fidelity="fine" if fine else "standard",
         engine=engine,
         grid=grid,

@@ -38,7 +38,7 @@ from graspdb_simworker.simulation.draws import DrawnWorld, draws_of, noisy
 from graspdb_simworker.simulation.force_test import compile_force_test
 from graspdb_simworker.simulation.grasp_world import GraspWorld
 from graspdb_simworker.simulation.labels import Label, Outcome, label_of, majority
-from graspdb_simworker.simulation.lifting import MOTIONS
+from graspdb_simworker.simulation.lifting import MOTIONS, motion_of
 
 PROTOCOLS = ("wrench", *MOTIONS)
 """Protocols this worker can simulate."""
@@ -123,7 +123,8 @@ def prepare(
 
     UnsupportedProtocol, EngineMissing, or ValueError for parts or a gripper that no physics can be done with.
     """
-    if payload.protocol not in PROTOCOLS:
+    motion = motion_of(payload.protocol)
+    if motion is None and payload.protocol not in PROTOCOLS:
         raise UnsupportedProtocol(
             f"this worker simulates {', '.join(PROTOCOLS)}; the sweep asks for {payload.protocol!r}"
         )
@@ -137,7 +138,7 @@ def prepare(
             gripper_of(payload.gripper, draw.mass_kg),
             payload.fidelity,
             engine=payload.engine,
-            motion=MOTIONS.get(payload.protocol),
+            motion=motion,
             compliance=draw.compliance,
             visible=visible,
             film_every_s=film_every_s,

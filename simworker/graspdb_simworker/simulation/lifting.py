@@ -15,10 +15,11 @@ then goes there and back once along each of its axes and turns there and back on
 tool's origin), with accelerations of about 1 g and 33 rad/s^2 at most. Then it rests. The object has to stay
 where it was in the jaw.
 
-**shake**: nothing weighs. The jaw goes 10 cm there, back and home along each of its axes, with accelerations
-of 20 m/s^2 at most, turns by 45 degrees likewise about each (through the tool's origin) with 100 rad/s^2 at
-most, and rests. The object has to be between the fingers still, wherever it slid: so data sets label whose
-grasps are shaken without gravity. Whether it stayed firmly or slid by little is told by the quality.
+**shake**: nothing weighs. The jaw goes 10 cm there, back and home along each of its axes, with
+accelerations of 20 m/s^2 at most, turns by 45 degrees likewise about each (through the tool's origin) with
+100 rad/s^2 at most, and rests; with others as long as they take to go as far. The object has to be between
+the fingers still, wherever it slid: so data sets label whose grasps are shaken without gravity. Whether it
+stayed firmly or slid by little is told by the quality.
 
 The object is at rest in the jaw when either begins. The fingers are coupled, as a parallel jaw's are: they
 can be forced open, but not pushed aside together.
@@ -35,6 +36,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from graspdb.wire.sweeps import stated_accelerations
 from graspdb_simworker.simulation.bodies import Quaternion, Vector, inverse, multiply, rotate
 from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
 
@@ -54,9 +56,6 @@ ALONG_M, ALONG_M_S2 = 0.10, 20.0
 ABOUT_RAD, ABOUT_RAD_S2 = math.radians(45.0), 100.0
 _HARDEST = 2.735815 / _AMPLITUDE
 """Largest acceleration of :func:`_there_and_back` in a period of 2 pi."""
-ALONG_S = 2.0 * math.pi * math.sqrt(ALONG_M * _HARDEST / ALONG_M_S2)
-ABOUT_S = 2.0 * math.pi * math.sqrt(ABOUT_RAD * _HARDEST / ABOUT_RAD_S2)
-"""What going there and back along an axis takes, and about one."""
 
 
 class Frame(NamedTuple):
@@ -120,20 +119,6 @@ def lift_at(time_s: float) -> Frame:
     return Frame((0.0, 0.0, GRAVITY_M_S2), _NOTHING, _NOTHING)
 
 
-def shake_at(time_s: float) -> Frame:
-    """The jaw's motion in ``shake``."""
-    if time_s < 3.0 * ALONG_S:
-        _, _, acceleration = _there_and_back(math.fmod(time_s, ALONG_S) / ALONG_S, ALONG_S)
-        push = _scaled(_AXES[int(time_s / ALONG_S)], -ALONG_M * acceleration)
-        return Frame(push, _NOTHING, _NOTHING)
-    time_s -= 3.0 * ALONG_S
-    if time_s < 3.0 * ABOUT_S:
-        axis = _AXES[int(time_s / ABOUT_S)]
-        _, rate, acceleration = _there_and_back(math.fmod(time_s, ABOUT_S) / ABOUT_S, ABOUT_S)
-        return Frame(_NOTHING, _scaled(axis, ABOUT_RAD * rate), _scaled(axis, ABOUT_RAD * acceleration))
-    return Frame(_NOTHING, _NOTHING, _NOTHING)
-
-
 LIFT = Motion(
     lift_at,
     DURATION_S,
@@ -143,15 +128,42 @@ LIFT = Motion(
 """What friction holds moves by hundredths of what is allowed, on the pads' give. The motion's hardest
 instants are short, and what they ask for beyond what friction gives lets an object slide by little: a quarter
 too much is some 9 mm of a fall, or 2 degrees of a turn. A wider tolerance would call that held."""
-SHAKE = Motion(
-    shake_at,
-    3.0 * (ALONG_S + ABOUT_S) + REST_S,
-    allowed=Displacement(0.050, math.pi),
-    lost=Displacement(0.050, math.pi),
-)
-"""However it is turned, and up to 5 cm off: it is not lost."""
+
+
+@lru_cache(maxsize=8)
+def shaking(along_m_s2: float, about_rad_s2: float) -> Motion:
+    """The jaw's motion in ``shake``, with accelerations of so much at most along its axes and about them.
+
+    However it is turned, and up to 5 cm off, what is held is not lost.
+    """
+    along_s = 2.0 * math.pi * math.sqrt(ALONG_M * _HARDEST / along_m_s2)
+    about_s = 2.0 * math.pi * math.sqrt(ABOUT_RAD * _HARDEST / about_rad_s2)
+
+    def at(time_s: float) -> Frame:
+        if time_s < 3.0 * along_s:
+            _, _, acceleration = _there_and_back(math.fmod(time_s, along_s) / along_s, along_s)
+            push = _scaled(_AXES[int(time_s / along_s)], -ALONG_M * acceleration)
+            return Frame(push, _NOTHING, _NOTHING)
+        time_s -= 3.0 * along_s
+        if time_s < 3.0 * about_s:
+            axis = _AXES[int(time_s / about_s)]
+            _, rate, acceleration = _there_and_back(math.fmod(time_s, about_s) / about_s, about_s)
+            return Frame(_NOTHING, _scaled(axis, ABOUT_RAD * rate), _scaled(axis, ABOUT_RAD * acceleration))
+        return Frame(_NOTHING, _NOTHING, _NOTHING)
+
+    displaced = Displacement(0.050, math.pi)
+    return Motion(at, 3.0 * (along_s + about_s) + REST_S, allowed=displaced, lost=displaced)
+
+
+SHAKE = shaking(ALONG_M_S2, ABOUT_RAD_S2)
 MOTIONS: Mapping[str, Motion] = {"lift": LIFT, "shake": SHAKE}
 """By the protocols that they belong to."""
+
+
+def motion_of(protocol: str) -> Motion | None:
+    """A protocol's motion; None where it has none, or there is no such protocol."""
+    stated = stated_accelerations(protocol)
+    return MOTIONS.get(protocol) if stated is None else shaking(*stated)
 
 
 @lru_cache(maxsize=8)

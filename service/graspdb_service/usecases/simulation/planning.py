@@ -177,9 +177,7 @@ def _create(
     """Store a sweep of an object (locked) with its batch, whose key is answered, and queue its jobs."""
     snapshot = dict(planned.snapshot)
     sweep = {**shared, **{name: getattr(planned, name) for name in ("id", "linked", "purpose", "request")}}
-    capability: str = "simulate" if sweep["protocol"] == "wrench" else sweep["protocol"]
-    if "randomise" in planned.request:
-        capability = f"drawn-{sweep['protocol']}"
+    capability = sweep_plan.capability_of(sweep["protocol"], "randomise" in planned.request)
     sweeps.create(
         tx,
         {**sweep, "snapshot": snapshot},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from graspdb.wire import OUTCOMES, SweepInfo
 from graspdb.wire.states import JobState, SweepState
+from graspdb.wire.sweeps import stated_accelerations
 from graspdb_service import principal
 from graspdb_service.problems import conflict, found
 from graspdb_service.storage.access import audit
@@ -14,6 +15,7 @@ from graspdb_service.usecases.geometry import decompositions
 from graspdb_service.usecases.identifiers import is_uuid
 from graspdb_service.usecases.objects import require
 from graspdb_service.usecases.simulation import feasibility
+from graspdb_service.usecases.trials import sweep_plan
 
 _LATELY_S = 120.0
 
@@ -125,7 +127,7 @@ def sweep_info(tx: Tx, row: SweepRow) -> SweepInfo:
                 *feasibility.warnings(row.gripper, row.snapshot["world"]["gripper"]),
                 *row.snapshot.get("warnings", []),
                 *_without_engine(tx, row),
-                *_without_draws(tx, row),
+                *_outdated(tx, row),
                 *_linked_without_engine(tx, row),
             ],
         }
@@ -144,19 +146,22 @@ def _without_engine(tx: Tx, row: SweepRow) -> list[str]:
     ]
 
 
-def _without_draws(tx: Tx, row: SweepRow) -> list[str]:
-    """What a sweep that draws waits for where workers are here, all of a version that can't."""
-    if not row.request.get("randomise") or row.finished_at is not None:
+def _outdated(tx: Tx, row: SweepRow) -> list[str]:
+    """What a sweep that draws, or states how hard to shake, waits for where workers are here, all of a
+    version that can't.
+    """
+    drawn, stated = bool(row.request.get("randomise")), stated_accelerations(row.protocol) is not None
+    if row.finished_at is not None or not (drawn or stated):
         return []
-    plain = "simulate" if row.protocol == "wrench" else row.protocol
-    there, draws = (
-        jobs.someone_has(tx, name, within_s=_LATELY_S) for name in (plain, f"drawn-{row.protocol}")
-    )
-    if draws or not there:
+    plain = sweep_plan.capability_of("shake" if stated else row.protocol, False)
+    needed = sweep_plan.capability_of(row.protocol, drawn)
+    there, able = (jobs.someone_has(tx, name, within_s=_LATELY_S) for name in (plain, needed))
+    if able or not there:
         return []
+    what = "shake as hard as a protocol's name says" if stated else "simulate a pose under what is drawn"
     return [
-        f"no worker that was here in the last {_LATELY_S / 60:.0f} minutes can simulate a pose under what is"
-        " drawn: they are of an older version, update and start them again"
+        f"no worker that was here in the last {_LATELY_S / 60:.0f} minutes can {what}: they are of an older"
+        " version, update and start them again"
     ]
 
 

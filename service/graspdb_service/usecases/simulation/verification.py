@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graspdb.wire import OUTCOME_CODES, OUTCOMES, KernelInfo
 from graspdb.wire.reports import CheckCall
-from graspdb.wire.sweeps import Protocol
+from graspdb.wire.sweeps import is_simulated
 from graspdb_density import IsotropicKernel
 from graspdb_density.se3 import Poses
 from graspdb_service.storage.database import Database
@@ -92,7 +92,7 @@ def calls(built: Built, kernels: Iterable[IsotropicKernel | str]) -> list[CheckC
         body: dict[str, Any] = {"sample": sample, "purpose": "check"}
         if selected.gripper is not None:
             body["gripper"] = selected.gripper
-        if selected.protocol in get_args(Protocol):
+        if is_simulated(selected.protocol):
             body["protocol"] = selected.protocol
         made.append(CheckCall(method="POST", path=f"/objects/{built.object_row.slug}/sweeps", body=body))
     return made

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from graspdb.wire import GridPlan
+from graspdb.wire.sweeps import stated_accelerations
 from graspdb_density import HAAR_VOLUME
 from graspdb_geometry.grids import PoseGrid
 from graspdb_service.storage.database import Tx
@@ -64,6 +65,15 @@ def repeat_key(
     if protocol in _MADE_ANEW:
         document["simulation"] = _MADE_ANEW[protocol]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def capability_of(protocol: str, drawn: bool) -> str:
+    """What a worker must be able to do for a sweep by this protocol, ``drawn``: under what is drawn."""
+    if stated_accelerations(protocol) is not None:
+        return "stated-shake"
+    if drawn:
+        return f"drawn-{protocol}"
+    return "simulate" if protocol == "wrench" else protocol
 
 
 def draws(sweep: SweepRow) -> int:
