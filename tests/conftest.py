@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -22,13 +21,12 @@ from typing import Any
 import httpx
 import psycopg
 import pytest
-import uvicorn
 from hypothesis import settings
 
-from graspdb_service.app import create_app
 from graspdb_service.settings import Settings
 from graspdb_service.storage import schema
 from graspdb_service.storage.database import Database
+from less_waiting import one_tls_context, read_once, serving
 from postgres_server import PostgresPrograms, PostgresServer
 from small_disk import Guard
 
@@ -56,8 +54,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         del os.environ[name]
     # The same question has the same answer while nothing is posted; what is learned has tests of its own.
     os.environ["GRASPDB_LEARNED_ESTIMATES"] = "false"
+    one_tls_context()
     if getattr(session.config.option, "numprocesses", None):
         subprocess.run([sys.executable, "-c", _COMPILE], check=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _files_read_once() -> Iterator[None]:
+    """The process that reads an untrusted file starts once for the same file, not in every test."""
+    with pytest.MonkeyPatch.context() as patch:
+        read_once(patch)
+        yield
 
 
 @pytest.fixture
@@ -204,29 +211,6 @@ def database_url(request: pytest.FixtureRequest) -> str:
     """Each test twice: on SQLite and on PostgreSQL."""
     url: str = request.getfixturevalue(f"{request.param}_url")
     return url
-
-
-@contextmanager
-def serving(settings: Settings) -> Iterator[str]:
-    """The application on a real uvicorn in a thread; yields its address once it answers."""
-    server = uvicorn.Server(
-        uvicorn.Config(
-            create_app(settings), host="127.0.0.1", port=0, http="h11", log_level="warning", lifespan="on"
-        )
-    )
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    deadline = time.monotonic() + 30
-    while not server.started:
-        if not thread.is_alive() or time.monotonic() > deadline:
-            raise RuntimeError("the service did not start")
-        time.sleep(0.01)
-    port = server.servers[0].sockets[0].getsockname()[1]
-    try:
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        server.should_exit = True
-        thread.join(15)
 
 
 Serve = Callable[..., str]

@@ -15,7 +15,6 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from graspdb.wire.cells.robots import ZIP
 from graspdb_geometry.mesh_reading.content import FormatError
 from graspdb_geometry.mesh_reading.formats import READERS
 from graspdb_geometry.meshes import MAX_TRIANGLES
@@ -42,7 +41,10 @@ def read_robot(
 
     ``max_bytes`` is what a zip may unpack to in all; the rest as for `ChildLimits`.
     """
-    order = {"media_type": media_type, "flange": flange, "max_bytes": max_bytes}
+    # Here and not above: the child, which imports this module too, needs no schemas.
+    from graspdb.wire.cells.robots import ZIP
+
+    order = {"zipped": media_type == ZIP, "flange": flange, "max_bytes": max_bytes}
     try:
         answer = bounded(__name__, order, data, ChildLimits(memory_bytes, seconds))
     except ChildFailed as error:
@@ -61,7 +63,7 @@ def main() -> int:
     from graspdb_robots.urdf import UrdfError, read_arm  # extra: robot
 
     try:
-        xml, meshes = _unpacked(sys.stdin.buffer.read(), order["media_type"], order["max_bytes"])
+        xml, meshes = _unpacked(sys.stdin.buffer.read(), order["zipped"], order["max_bytes"])
         name, arm = read_arm(xml, order["flange"], lambda name: _points(meshes, name))
         answer = json.dumps({"name": name}).encode() + b"\n" + arm.to_bytes()
     except (UrdfError, RobotRefused) as error:
@@ -71,9 +73,9 @@ def main() -> int:
     return 0
 
 
-def _unpacked(data: bytes, media_type: str, max_bytes: int) -> tuple[bytes, Mapping[str, bytes]]:
+def _unpacked(data: bytes, zipped: bool, max_bytes: int) -> tuple[bytes, Mapping[str, bytes]]:
     """The URDF, and the other files by their paths."""
-    if media_type != ZIP:
+    if not zipped:
         return data, {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from graspdb_geometry import meshes
 from graspdb_geometry.meshes import Mesh
-from graspdb_service.storage.objects import ObjectRow
+
+if TYPE_CHECKING:  # every mesh is read in a process of its own, which would import the storage for a name
+    from graspdb_service.storage.objects import ObjectRow
 
 
 class MeshForm(NamedTuple):
