@@ -76,7 +76,7 @@ def _written(folder: Path, grasps: FileGrasps, format: str, gripper: GripperProf
     return interop.read(path, gripper=gripper, **SAID.get(format, {}))
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     outcomes=st.lists(st.sampled_from(["success", "failure"]), min_size=1, max_size=6),

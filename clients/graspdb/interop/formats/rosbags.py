@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,8 +48,9 @@ def extra() -> Any:
         raise ImportError("A bag needs rosbags: pip install 'graspdb[rosbag]'") from error
 
 
+@functools.cache
 def typestore() -> Any:
-    """The messages of ROS 2 Humble, and MoveIt's grasps."""
+    """The messages of ROS 2 Humble, and MoveIt's grasps; one, as it keeps what it compiled to write them."""
     types = extra().typesys
     store = types.get_typestore(types.Stores.ROS2_HUMBLE)
     for name, text in _DEFINITIONS.items():
