@@ -35,16 +35,14 @@ class RobotRefused(ValueError):
 
 
 def read_robot(
-    data: bytes, media_type: str, flange: str | None, *, max_bytes: int, memory_bytes: int, seconds: float
+    data: bytes, zipped: bool, flange: str | None, *, max_bytes: int, memory_bytes: int, seconds: float
 ) -> tuple[str, Arm]:
     """The robot's name and its arm to the link ``flange``; RobotRefused for what can't be used.
 
-    ``max_bytes`` is what a zip may unpack to in all; the rest as for `ChildLimits`.
+    ``zipped`` says that the URDF is in a zip with its meshes; ``max_bytes`` is what that may unpack to
+    in all; the rest as for `ChildLimits`.
     """
-    # Here and not above: the child, which imports this module too, needs no schemas.
-    from graspdb.wire.cells.robots import ZIP
-
-    order = {"zipped": media_type == ZIP, "flange": flange, "max_bytes": max_bytes}
+    order = {"zipped": zipped, "flange": flange, "max_bytes": max_bytes}
     try:
         answer = bounded(__name__, order, data, ChildLimits(memory_bytes, seconds))
     except ChildFailed as error:

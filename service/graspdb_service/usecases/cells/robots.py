@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from graspdb.wire import RobotInfo, RobotShape, RobotUpdate
-from graspdb.wire.cells.robots import ChainJoint, RobotSolid
+from graspdb.wire.cells.robots import ZIP, ChainJoint, RobotSolid
 from graspdb_robots.arm import Arm
 from graspdb_robots.drawing import triangles_of
 from graspdb_service import principal
@@ -67,7 +67,7 @@ def put(ctx: Runtime, id: str, content: bytes, media_type: str, flange: str | No
         with ctx.mesh_children:
             name, arm = read_robot(
                 content,
-                media_type,
+                media_type == ZIP,
                 flange,
                 max_bytes=4 * limits.max_mesh_bytes,
                 memory_bytes=limits.max_mesh_memory_bytes,
