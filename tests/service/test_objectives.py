@@ -501,7 +501,7 @@ def compare_scores(
             assert field.near(pose).all(), seed
             assert not query["collision_free"] or not field.scene.collides(pose, PG70).any(), seed
             assert grasp.score == pytest.approx(float(score(pose)[0]), rel=1e-3, abs=1e-6), seed
-            assert grasp.score >= 0.999 * best, (seed, grasp.score / best, query)
+            assert grasp.score >= 0.995 * best, (seed, grasp.score / best, query)
 
 
 def test_chances_and_means_against_exhaustive_search(
