@@ -44,7 +44,7 @@ _NARROWED = 3.5
 #: Differences of a success probability that mean nothing.
 _RESOLUTION = 1e-5
 #: The best by the kernel estimate that are ranked anew by what was learned.
-_RESCORED = 200
+_RESCORED = 1_000
 
 
 def by_density(search: ModeSearch, threads: int) -> tuple[ScoreSearch, Ranking]:
