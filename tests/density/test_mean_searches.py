@@ -172,7 +172,8 @@ def test_searches_at_once_ask_for_each_centre_once_or_little_more() -> None:
     for thread in threads:
         thread.join()
     assert all(np.array_equal(values, centres.positions[rows].sum(axis=1)) for values in found)
-    assert asked[0] < 3 * len(rows)
+    # What another was at meanwhile may be done twice: a block of 256 centres of each of the five others.
+    assert asked[0] <= len(rows) + 6 * 5 * 256
     before = asked[0]
     np.testing.assert_array_equal(known.at(rows[:9], centres, score), found[0][:9])
     assert asked[0] == before

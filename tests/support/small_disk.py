@@ -78,13 +78,10 @@ class SmallDisk:
     def fill(self, writers: Iterable[int]) -> None:
         """Leave no room; ``writers`` are the processes that write here."""
         if self.is_mounted:
-            with self._ballast.open("wb") as ballast, suppress(OSError):
-                while True:
-                    ballast.write(b"\0" * 2**20)
-            # What was left of the last MiB.
-            with self._ballast.open("ab", buffering=0) as ballast, suppress(OSError):
-                while True:
-                    ballast.write(b"\0" * 4096)
+            # Without a buffer: what one holds when no room is left would be written, and fail, at closing.
+            with suppress(OSError), self._ballast.open("wb", buffering=0) as ballast:
+                while ballast.write(b"\0" * 2**20):
+                    pass
             return
         for pid in writers:
             self._limit(pid, "4096")

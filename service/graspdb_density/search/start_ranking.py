@@ -11,6 +11,7 @@ sums for all they compare; they climb among such samples first and among all ker
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -70,6 +71,7 @@ class CentreScores:
     """
 
     def __init__(self) -> None:
+        self._claims = threading.Lock()
         self._values: Floats = np.empty(0)
         self._begun: NDArray[np.bool_] = np.empty(0, dtype=np.bool_)
 
@@ -79,19 +81,19 @@ class CentreScores:
 
     def at(self, rows: Indices, centres: Poses, score: Callable[[Poses], Floats]) -> Floats:
         """The score (K,) at some of the N centres."""
-        if len(self._values) != len(centres):
-            self._begun = np.zeros(len(centres), dtype=np.bool_)
-            self._values = np.full(len(centres), np.nan)
-        values, begun = self._values, self._begun
+        with self._claims:
+            if len(self._values) != len(centres):
+                self._begun = np.zeros(len(centres), dtype=np.bool_)
+                self._values = np.full(len(centres), np.nan)
+            values, begun = self._values, self._begun
         # What another has begun it may end meanwhile; what is still missing then is done here, too.
         for left in (rows[~begun[rows]], rows):
             for first in range(0, len(left), _AT_ONCE):
                 some = left[first : first + _AT_ONCE]
-                some = some[np.isnan(values[some])]
-                if left is not rows:
-                    some = some[~begun[some]]
-                if some.size:
+                with self._claims:
+                    some = some[np.isnan(values[some]) if left is rows else ~begun[some]]
                     begun[some] = True
+                if some.size:
                     values[some] = score(centres[some])
         return np.asarray(values[rows])
 
