@@ -129,7 +129,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.admission = admission
     for router in ROUTERS:
         refuse_unguarded(router.routes)
-        app.include_router(router)
+        # Not included, which would make every route anew for every application at its first request.
+        app.router.routes.extend(router.routes)
     app.openapi = openapi_document  # type: ignore[method-assign]
     app.state.parameters = DeclaredParameters(route for router in ROUTERS for route in router.routes)
     _add_docs(app)

@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from fastapi import Depends
 from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 from starlette.types import Receive, Scope, Send
 
 from graspdb_service import principal
-from graspdb_service.api.routing.scopes import accepted_scopes
+from graspdb_service.api.routing.scopes import accepted_scopes, refuse_unknown_parameters
 from graspdb_service.principal import Principal
 from graspdb_service.problems import ProblemError
 from graspdb_service.usecases.access.key_ring import KeyRing
@@ -37,13 +38,14 @@ class Door:
 
 
 class GuardedRoute(APIRoute):
-    """A route behind the application's :class:`Door`.
+    """A route behind the application's :class:`Door`, which takes the parameters that it declares alone.
 
     What is below it may ask :mod:`graspdb_service.principal` who asks. RuntimeError without a declared scope.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
+        known = [Depends(refuse_unknown_parameters), *(options.pop("dependencies", None) or ())]
+        super().__init__(*args, dependencies=known, **options)
         self._accepted = accepted_scopes(self)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
