@@ -5,13 +5,15 @@
 
 FOLDER holds ACRONYM's .h5 files and, anywhere below it, their meshes by the names that the files give. The
 gripper is the Panda, mass and friction are the files'; with what force ACRONYM's closes they do not say, and
-``--force-n`` may be another than the Panda's. Agreement has to be read beside the share of the majority
-class, which who always says the same reaches; balanced accuracy is the mean of the shares of both classes
-that are labelled right. With ``--randomise`` every grasp is simulated under what that draws (an object as
-in a sweep's request; what it leaves out is drawn as usual there), and holds if at least half of its draws do.
-What k of n tells beside that is the share of pairs in order: of a grasp that held in ACRONYM and one that did
-not, how often the first succeeds more often here; equally often counts half. Data sets are no part of this
-project: without a folder nothing is done.
+``--force-n`` may name others than the Panda's. With several forces or protocols, what is not told is chosen
+for each file by one half of its grasps and judged by the other, and the other way round: the row
+``chosen by the other half``. Rows of all files together come last. Agreement has to be read beside the share
+of the majority class, which who always says the same reaches; balanced accuracy is the mean of the shares of
+both classes that are labelled right. With ``--randomise`` every grasp is simulated under what that draws (an
+object as in a sweep's request; what it leaves out is drawn as usual there), and holds if at least half of its
+draws do. What k of n tells beside that is the share of pairs in order: of a grasp that held in ACRONYM and
+one that did not, how often the first succeeds more often here; equally often counts half. Data sets are no
+part of this project: without a folder nothing is done.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,25 +114,56 @@ def ranked(successes: NDArray[np.uint8], held: NDArray[np.bool_]) -> float:
     return float(np.mean(more > 0) + 0.5 * np.mean(more == 0))
 
 
-def measure(file: Labelled, protocol: str, gripper: GripperProfile, randomise: Randomise | None) -> None:
-    """Print a file's row, and what the labels were that do not agree."""
-    started = time.process_time()
-    found = simulated(file, protocol, gripper, randomise)
-    outcomes = found.outcome
-    ours, theirs = outcomes == Outcome.SUCCESS, file.held
-    balanced = 0.5 * (np.mean(ours[theirs]) + np.mean(~ours[~theirs]))
-    majority = max(np.mean(theirs), np.mean(~theirs))
-    wrong = Counter(Outcome(int(code)).name.lower() for code in outcomes[ours != theirs])
-    told = ", ".join(
-        f"{number} held, ACRONYM's failed" if name == "success" else f"{number} {name}, ACRONYM's held"
-        for name, number in wrong.most_common()
+class Compared(NamedTuple):
+    """Labels (n,) of a protocol and a force beside ACRONYM's; ``usual`` is the majority class of its file."""
+
+    outcomes: NDArray[np.uint8]
+    successes: NDArray[np.uint8]
+    held: NDArray[np.bool_]
+    usual: NDArray[np.bool_]
+
+    @property
+    def agree(self) -> NDArray[np.bool_]:
+        """Which labels (n,) are ACRONYM's, too."""
+        return np.asarray((self.outcomes == Outcome.SUCCESS) == self.held)
+
+    @classmethod
+    def joined(cls, parts: list[Compared]) -> Compared:
+        """Those of several files or halves as one."""
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def of(self, rows: NDArray[np.intp]) -> Compared:
+        """Some of the n."""
+        return Compared(*(column[rows] for column in self))
+
+
+def told(name: str, how: str, compared: Compared, seconds: float | None = None) -> None:
+    """Print a row, and what the labels were that do not agree."""
+    held, agree = compared.held, compared.agree
+    balanced = 0.5 * (np.mean(agree[held]) + np.mean(agree[~held]))
+    majority = np.mean(compared.usual == held)
+    wrong = Counter(Outcome(int(code)).name.lower() for code in compared.outcomes[~agree])
+    words = ", ".join(
+        f"{number} held, ACRONYM's failed" if label == "success" else f"{number} {label}, ACRONYM's held"
+        for label, number in wrong.most_common()
     )
-    pairs = ranked(found.successes, theirs)
     print(
-        f"| {file.name} | {len(file.parts)} | {protocol} | {len(ours)} | {np.mean(ours == theirs):.3f}"
-        f" | {majority:.3f} | {balanced:.3f} | {pairs:.3f} | {told} | {time.process_time() - started:.0f} |",
+        f"| {name} | {how} | {len(held)} | {np.mean(agree):.3f} | {majority:.3f}"
+        f" | {np.mean(agree) - majority:+.3f} | {balanced:.3f} | {ranked(compared.successes, held):.3f}"
+        f" | {words} | {'' if seconds is None else f'{seconds:.0f}'} |",
         flush=True,
     )
+
+
+def chosen_by_the_other_half(ways: dict[str, Compared]) -> Compared:
+    """What agrees best with one half of the grasps, on the other half; and the other way round."""
+    count = len(next(iter(ways.values())).held)
+    halves = np.arange(0, count, 2), np.arange(1, count, 2)
+    judged = []
+    for learn, judge in (halves, halves[::-1]):
+        best = max(ways.values(), key=lambda way: float(way.agree[learn].mean()))
+        judged.append(best.of(judge))
+    return Compared.joined(judged)
 
 
 def main() -> None:
@@ -138,29 +172,45 @@ def main() -> None:
     asked.add_argument("--grasps", type=int, default=400)
     asked.add_argument("--protocols", nargs="*", default=chunks.PROTOCOLS)
     asked.add_argument("--seed", type=int, default=0)
-    asked.add_argument("--force-n", type=float, default=PANDA.force_n)
+    asked.add_argument("--force-n", type=float, nargs="*", default=[PANDA.force_n])
     asked.add_argument("--randomise", type=Randomise.model_validate_json)
     given = asked.parse_args()
-    gripper = PANDA.model_copy(update={"force_n": given.force_n})
     if given.folder is None:
         print("nothing done: give a folder with ACRONYM's files and their meshes")
         return
     heads = (
-        "parts",
-        "protocol",
+        "object",
+        "protocol, closing force",
         "grasps",
         "agreement",
         "majority class",
+        "over it",
         "balanced accuracy",
         "pairs in order",
         "disagreements",
+        "s",
     )
-    print("| object |", " | ".join(heads), "| s |")
-    print("|---" * 10 + "|")
+    print("|", " | ".join(heads), "|")
+    print("|---" * len(heads) + "|")
+    of_files: dict[str, list[Compared]] = {}
     for path in sorted(given.folder.rglob("*.h5")):
         file = read(path, given.folder, given.grasps, given.seed)
-        for protocol in given.protocols:
-            measure(file, protocol, gripper, given.randomise)
+        ways: dict[str, Compared] = {}
+        usual = np.full_like(file.held, file.held.mean() >= 0.5)
+        for protocol, force in product(given.protocols, given.force_n):
+            started = time.process_time()
+            gripper = PANDA.model_copy(update={"force_n": force})
+            found = simulated(file, protocol, gripper, given.randomise)
+            way = f"`{protocol}`, {force:g} N"
+            ways[way] = Compared(found.outcome, found.successes, file.held, usual)
+            told(f"{file.name}, {len(file.parts)} parts", way, ways[way], time.process_time() - started)
+        if len(ways) > 1:
+            ways["chosen by the other half"] = chosen_by_the_other_half(ways)
+            told(file.name, "chosen by the other half", ways["chosen by the other half"])
+        for way, compared in ways.items():
+            of_files.setdefault(way, []).append(compared)
+    for way, files in of_files.items():
+        told("all", way, Compared.joined(files))
 
 
 if __name__ == "__main__":

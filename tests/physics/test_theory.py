@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from closed_forms import Case
 
-from graspdb.wire.sweeps import Engine
+from graspdb.wire.sweeps import SHAKEN, Engine
 from graspdb_simworker.simulation import chunks, lifting
 from graspdb_simworker.simulation.bodies import mass_properties
 from graspdb_simworker.simulation.grasp_world import GraspWorld
@@ -114,7 +114,7 @@ def test_what_slides_while_it_is_shaken_slides_as_far_as_friction_says() -> None
     """At 1.25 times what two fingers hold, at either step, and then so much that it leaves them. A box that
     lies flat is closed on once more at the fine step: the motion is the same."""
     case, friction = closed_forms.box((0.06, 0.02, 0.02)), 0.4
-    limit = 2.0 * friction * closed_forms.PG70.force_n / lifting.ALONG_M_S2
+    limit = 2.0 * friction * closed_forms.PG70.force_n / SHAKEN[0]
     x, z = (closed_forms.slid(1.25 * limit, friction, lifting.SHAKE, axis) for axis in (0, 2))
     farthest = np.hypot(x, z).max()
     assert 0.005 < farthest < 0.030

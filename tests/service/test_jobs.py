@@ -497,6 +497,7 @@ def test_how_hard_a_sweep_shakes_is_part_of_its_protocol(sqlite_http: httpx.Clie
     assert "older version" in warning
     able = sqlite_http.post("/jobs/claim", json={"worker": "new", "capabilities": newer}).json()
     assert able["jobs"][0]["payload"]["protocol"] == "shake-5-100"
+    assert start_sweep(sqlite_http, 2_000, protocol="shake-20-100")["protocol"] == "shake"
     for unknown in ("shake-5", "shake-0-100", "shake-5-100-1", "drop"):
         refused = sqlite_http.post("/objects/box/sweeps", json={"protocol": unknown})
         assert refused.status_code == 422

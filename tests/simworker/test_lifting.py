@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from graspdb.examples import example
 from graspdb.wire import Finger, GripperProfile, SimulatePayload
-from graspdb.wire.sweeps import PROTOCOLS
+from graspdb.wire.sweeps import PROTOCOLS, SHAKEN
 from graspdb_simworker.loop import CAPABILITIES
 from graspdb_simworker.simulation import chunks, lifting
 from graspdb_simworker.simulation.bodies import Part, mass_properties
@@ -83,7 +83,7 @@ def test_the_jaw_ends_ten_centimetres_higher_and_at_rest() -> None:
 
 @pytest.mark.parametrize(
     ("protocol", "along", "about"),
-    [("shake", lifting.ALONG_M_S2, lifting.ABOUT_RAD_S2), ("shake-5-100", 5.0, 100.0)],
+    [("shake", *SHAKEN), ("shake-5-100", 5.0, 100.0)],
 )
 def test_a_shake_has_the_stated_accelerations_and_comes_home(
     protocol: str, along: float, about: float

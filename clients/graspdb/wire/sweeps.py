@@ -37,6 +37,8 @@ from graspdb.wire.trials import ProposalDensity
 
 PROTOCOLS = ("wrench", "lift", "shake")
 """How workers judge an outcome; of ``shake`` accelerations may be stated: ``shake-5-100``."""
+SHAKEN = 20, 100
+"""The accelerations of ``shake`` itself: m/s^2 along the jaw's axes and rad/s^2 about them."""
 _STATED = re.compile(r"shake-([1-9][0-9]{0,3})-([1-9][0-9]{0,3})")
 
 
@@ -54,13 +56,13 @@ def is_simulated(protocol: str | None) -> bool:
 
 
 def simulated_protocol(protocol: str) -> str:
-    """The protocol, if workers have it; ValueError says what there is."""
+    """The protocol by its one name, if workers have it; ValueError says what there is."""
     if not is_simulated(protocol):
         raise ValueError(
             f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}, and shake-ALONG-ABOUT, which shakes"
             " with up to so many whole m/s^2 and rad/s^2 (1 to 9999), as in shake-5-100"
         )
-    return protocol
+    return "shake" if stated_accelerations(protocol) == SHAKEN else protocol
 
 
 Protocol = Annotated[

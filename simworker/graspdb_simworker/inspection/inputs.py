@@ -32,7 +32,7 @@ def load(
 
     ValueError for an unknown example, gripper or protocol, or an object that can't be simulated yet.
     """
-    simulated_protocol(protocol)
+    protocol = simulated_protocol(protocol)
     parts: Sequence[Part]
     if not url:
         thing = example(name)

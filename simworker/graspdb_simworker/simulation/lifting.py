@@ -36,7 +36,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from graspdb.wire.sweeps import stated_accelerations
+from graspdb.wire.sweeps import SHAKEN, stated_accelerations
 from graspdb_simworker.simulation.bodies import Quaternion, Vector, inverse, multiply, rotate
 from graspdb_simworker.simulation.force_test import GRAVITY_M_S2
 
@@ -52,8 +52,7 @@ ONSET_S, LIFT_S, SHAKE_S, TURN_S, REST_S = 0.1, 0.4, 0.4, 0.8, 0.1
 _TURNS_FROM_S = ONSET_S + LIFT_S + 3.0 * SHAKE_S
 DURATION_S = _TURNS_FROM_S + 3.0 * TURN_S + REST_S
 
-ALONG_M, ALONG_M_S2 = 0.10, 20.0
-ABOUT_RAD, ABOUT_RAD_S2 = math.radians(45.0), 100.0
+ALONG_M, ABOUT_RAD = 0.10, math.radians(45.0)
 _HARDEST = 2.735815 / _AMPLITUDE
 """Largest acceleration of :func:`_there_and_back` in a period of 2 pi."""
 
@@ -155,7 +154,7 @@ def shaking(along_m_s2: float, about_rad_s2: float) -> Motion:
     return Motion(at, 3.0 * (along_s + about_s) + REST_S, allowed=displaced, lost=displaced)
 
 
-SHAKE = shaking(ALONG_M_S2, ABOUT_RAD_S2)
+SHAKE = shaking(*SHAKEN)
 MOTIONS: Mapping[str, Motion] = {"lift": LIFT, "shake": SHAKE}
 """By the protocols that they belong to."""
 
