@@ -75,3 +75,34 @@ def test_simulated_trials_and_strays_say_nothing_against_geometry(
     assert found["collision_free"] == [False]
     assert found["success_probability"] == [0.0]
     assert not any("grasps that held" in text for text in found["warnings"])
+
+
+def test_the_best_by_success_probability_closes_on_something(sqlite_http: httpx.Client, block: str) -> None:
+    """Along y the grasps that held come to where nothing is; a centimetre farther off nothing is held."""
+    rng = np.random.default_rng(0)
+    trials = _trials(rng.normal(0.03, 0.002, 80), ["success"] * 80, "robot")
+    trials["columns"]["position"] = np.column_stack(
+        [rng.uniform(0.0, 0.03, 80), np.zeros(80), rng.normal(0.03, 0.002, 80)]
+    ).tolist()
+    trials["columns"]["outcome"] = ["success"] * 79 + ["slipped"]
+    sqlite_http.post(f"{block}/trials", json=trials).raise_for_status()
+    beyond = {"objective": "success_probability", "half_spaces": [[1.0, 0.0, 0.0, 0.045]]}
+    answer = sqlite_http.post(f"{block}/best-grasp", json=beyond).json()
+    assert answer["status"] == "infeasible"
+    as_asked = sqlite_http.post(f"{block}/best-grasp", json={**beyond, "collision_free": False}).json()
+    assert as_asked["status"] == "ok"
+
+
+def test_real_grasps_that_closed_on_nothing_say_that_geometry_is_off(
+    sqlite_http: httpx.Client, block: str
+) -> None:
+    rng = np.random.default_rng(0)
+    outcomes = ["success"] * 54 + ["slipped"] * 6
+    above = _trials(rng.normal(0.08, 0.002, 60), outcomes, "robot")
+    sqlite_http.post(f"{block}/trials", json=above).raise_for_status()
+    found = _ask(sqlite_http, block, 0.08)
+    assert found["collision_free"] == [True]
+    assert found["success_probability"][0] > 0.7
+    assert any("nothing between its fingers" in text for text in found["warnings"])
+    asked = {"objective": "success_probability"}
+    assert sqlite_http.post(f"{block}/best-grasp", json=asked).json()["status"] == "ok"

@@ -7,9 +7,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from .exp import exp
 from .isotropic import BLOCK, COUNT, OFFSET, TWIN, empty_runs, place, runs_within
-from .options import exact, inlined
-from .quaternions import relative, turned_back
+from .isotropic_runs import single
+from .options import exact, fast, inlined
+from .quaternions import angle_factor, relative, turned_back
 
 __all__ = [
     "displacements",
@@ -21,6 +25,8 @@ __all__ = [
     "square_sums",
 ]
 
+F32 = np.float32
+_ZERO, _ONE = F32(0.0), F32(1.0)
 #: Rows with a smaller exponent are at one pose, tried again.
 _SAME = 0.5 * 0.05**2
 
@@ -38,7 +44,103 @@ def rotation_vector(ax, ay, az, aw, bx, by, bz, bw):
     return factor * x, factor * y, factor * z
 
 
-@exact
+@inlined
+def _displaced(data, i, twin, at, half, turning):
+    """From row ``i``, or its nearer twin, to a pose: the translation (3) along the axes of the widths, the
+    rotation vector (3), and the exponents of either.
+    """
+    dx, dy, dz = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
+    ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
+    x, y, z = dx, dy, dz
+    if turning:
+        x, y, z = turned_back(ax, ay, az, aw, dx, dy, dz)
+    u, v, t = rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
+    turned = half[3] * u * u + half[4] * v * v + half[5] * t * t
+    if twin:
+        b, c, d = rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
+        other = half[3] * b * b + half[4] * c * c + half[5] * d * d
+        if other < turned:
+            u, v, t, turned = b, c, d, other
+    moved = half[0] * x * x + half[1] * y * y + half[2] * z * z
+    return x, y, z, u, v, t, moved, turned
+
+
+@inlined
+def _turned_least(w):
+    """The least squared angle, radians, of a rotation whose quaternion has ``w``: little below it up to a
+    right angle, and cheap.
+    """
+    return 8.0 * (1.0 - abs(w))
+
+
+@inlined
+def _lowest(half):
+    """The least of 1 / (2 sigma^2), of translations and of rotations."""
+    return min(half[0], min(half[1], half[2])), min(half[3], min(half[4], half[5]))
+
+
+@inlined
+def _farther(data, i, twin, at, least, cut):
+    """Whether what is cheap to know shows that the exponent of a row, and of its twin, is at least ``cut``;
+    ``least`` is `_lowest`.
+    """
+    x, y, z = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
+    ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
+    near = abs(ax * at.qx + ay * at.qy + az * at.qz + aw * at.qw)
+    if twin:
+        near = max(near, abs(ay * at.qx - ax * at.qy + aw * at.qz - az * at.qw))
+    return least[0] * (x * x + y * y + z * z) + least[1] * _turned_least(near) >= cut
+
+
+@fast
+def _squares_run(data, begin, end, at, half, turning, twin, cut):
+    """Sums of k and k^2 over the rows of a run whose exponent is at most ``cut``, their twins beside them."""
+    h0, h1, h2, h3, h4, h5 = half
+    total, squares = _ZERO, _ZERO
+    for i in range(np.uint64(begin), np.uint64(end)):
+        x, y, z = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
+        ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
+        if turning:
+            x, y, z = turned_back(ax, ay, az, aw, x, y, z)
+        base = h0 * x * x + h1 * y * y + h2 * z * z
+        u, v, t, w = relative(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
+        f = angle_factor(min(abs(w), _ONE))
+        e = base + f * f * (h3 * u * u + h4 * v * v + h5 * t * t)
+        k = exp(-e) if e <= cut else _ZERO
+        if twin:
+            # The row turned about its z: from there the rotation is (v, -u, -w, t).
+            f = angle_factor(min(abs(t), _ONE))
+            e = base + f * f * (h3 * v * v + h4 * u * u + h5 * w * w)
+            k += exp(-e) if e <= cut else _ZERO
+        total += k
+        squares += k * k
+    return total, squares
+
+
+@fast
+def _nearest_by_sums(data, at, runs, of_run, half, turning):
+    """The least exponent of some runs' rows, and its place, by the sums of their kernels, which are used up.
+
+    No kernel is larger than its run's sum, so few runs are looked through.
+    """
+    least, nearest = 1e30, -1
+    lowest = _lowest(half)
+    for _ in range(of_run.shape[0]):
+        r = int(np.argmax(of_run))
+        if of_run[r] <= 0.0 or of_run[r] < 0.999 * math.exp(-least):
+            break
+        for i in range(runs[r, 0], runs[r, 1]):
+            if _farther(data, i, runs[r, 2] > 0, at, lowest, least):
+                continue
+            displaced = _displaced(data, i, runs[r, 2] > 0, at, half, turning)
+            e = displaced[6] + displaced[7]
+            if e < least:
+                least, nearest = e, i
+        of_run[r] = 0.0
+    return least, nearest
+
+
+@fast
 def square_sums(cells, positions, quaternions, half, turning, radius, out):
     """Sums of k and k^2 at every pose into ``out`` (M, 2), over rows with an exponent of at most radius^2.
 
@@ -47,39 +149,30 @@ def square_sums(cells, positions, quaternions, half, turning, radius, out):
     Of a row's jaw and its turn the translation's x and y differ in sign only, which widths do not see. Where
     ``out`` has four columns, the nearest row's exponent and its place follow, -1e30 and -1 without any.
     """
-    runs, cut, data = empty_runs(cells, BLOCK), radius * radius, cells.data
+    runs, cut, data = empty_runs(cells, BLOCK), F32(radius * radius), cells.data
+    of_run = np.empty(runs.shape[0])
+    narrow = F32(half[0]), F32(half[1]), F32(half[2]), F32(half[3]), F32(half[4]), F32(half[5])
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], 1.0)
-        bx, by, bz, bw = at.qx, at.qy, at.qz, at.qw
-        total, squares, least, nearest = 0.0, 0.0, 1e30, -1
-        for r in range(runs_within(cells, at, radius, BLOCK, runs)):
-            for i in range(runs[r, 0], runs[r, 1]):
-                x, y, z = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
-                ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
-                if turning:
-                    x, y, z = turned_back(ax, ay, az, aw, x, y, z)
-                base = half[0] * x * x + half[1] * y * y + half[2] * z * z
-                if base > cut:
-                    continue
-                k = 0.0
-                u, v, t = rotation_vector(ax, ay, az, aw, bx, by, bz, bw)
-                e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
-                if e <= cut:
-                    k = math.exp(-e)
-                    if e < least:
-                        least, nearest = e, i
-                if runs[r, 2] > 0:
-                    # The row turned about its z: q times (0, 0, 1, 0).
-                    u, v, t = rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
-                    e = base + half[3] * u * u + half[4] * v * v + half[5] * t * t
-                    if e <= cut:
-                        k += math.exp(-e)
-                        if e < least:
-                            least, nearest = e, i
-                total += k
-                squares += k * k
+        near, total, squares = single(at), 0.0, 0.0
+        count = runs_within(cells, at, radius, BLOCK, runs)
+        for r in range(count):
+            begin, end, twin = runs[r, 0], runs[r, 1], runs[r, 2] > 0
+            # The constants let LLVM make a loop of its own of each.
+            if turning and twin:
+                part = _squares_run(data, begin, end, near, narrow, True, True, cut)
+            elif turning:
+                part = _squares_run(data, begin, end, near, narrow, True, False, cut)
+            elif twin:
+                part = _squares_run(data, begin, end, near, narrow, False, True, cut)
+            else:
+                part = _squares_run(data, begin, end, near, narrow, False, False, cut)
+            total += part[0]
+            squares += part[1]
+            of_run[r] = part[0]
         out[j, 0], out[j, 1] = total, squares
         if out.shape[1] > 2:
+            least, nearest = _nearest_by_sums(data, at, runs, of_run[:count], half, turning)
             out[j, 2], out[j, 3] = -least, nearest
 
 
@@ -111,6 +204,9 @@ def near_pairs(positions, quaternions, symmetric, fold, judged, turning, widest,
             ax, ay, az, aw = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
             own = abs(ax * bx + ay * by + az * bz + aw * bw)
             other = abs(ay * bx - ax * by + aw * bz - az * bw)
+            near = max(own, other) if symmetric[i] else own
+            if e + b * _turned_least(near) > cut:
+                continue
             if symmetric[i] and other > own:
                 u, v, t = rotation_vector(ay, -ax, aw, -az, bx, by, bz, bw)
             else:
@@ -147,27 +243,6 @@ def held_out_sums(first, won, squared, half, cut, out):
         out[j, 0], out[j, 1], out[j, 2] = success, total, squares
 
 
-@inlined
-def _displaced(data, i, twin, at, half, turning):
-    """From row ``i``, or its nearer twin, to a pose: the translation (3) along the axes of the widths, the
-    rotation vector (3), and the exponents of either.
-    """
-    dx, dy, dz = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
-    ax, ay, az, aw = data[3, i], data[4, i], data[5, i], data[6, i]
-    x, y, z = dx, dy, dz
-    if turning:
-        x, y, z = turned_back(ax, ay, az, aw, dx, dy, dz)
-    u, v, t = rotation_vector(ax, ay, az, aw, at.qx, at.qy, at.qz, at.qw)
-    turned = half[3] * u * u + half[4] * v * v + half[5] * t * t
-    if twin:
-        b, c, d = rotation_vector(ay, -ax, aw, -az, at.qx, at.qy, at.qz, at.qw)
-        other = half[3] * b * b + half[4] * c * c + half[5] * d * d
-        if other < turned:
-            u, v, t, turned = b, c, d, other
-    moved = half[0] * x * x + half[1] * y * y + half[2] * z * z
-    return x, y, z, u, v, t, moved, turned
-
-
 @exact
 def displacements(cells, places, positions, quaternions, half, turning, gripper, out):
     """How far every pose is from the row at its place, into ``out`` (M, 10): metres, radians, either in
@@ -198,7 +273,7 @@ def displacements(cells, places, positions, quaternions, half, turning, gripper,
 def nearest_anywhere(cells, positions, quaternions, half, turning, out):
     """As `nearest.nearest_anywhere`, under widths for every axis: minus the least exponent, and its place."""
     data, boxes, blocks = cells.data, cells.boxes, cells.blocks
-    least = min(half[0], min(half[1], half[2]))
+    least = _lowest(half)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], 1.0)
         best, chosen = -1e30, -1
@@ -206,11 +281,10 @@ def nearest_anywhere(cells, positions, quaternions, half, turning, out):
             gx = max(max(boxes[b, 0] - at.x, at.x - boxes[b, 3]), 0.0)
             gy = max(max(boxes[b, 1] - at.y, at.y - boxes[b, 4]), 0.0)
             gz = max(max(boxes[b, 2] - at.z, at.z - boxes[b, 5]), 0.0)
-            if -least * (gx * gx + gy * gy + gz * gz) <= best:
+            if -least[0] * (gx * gx + gy * gy + gz * gz) <= best:
                 continue
             for i in range(blocks[b, 0], blocks[b, 1]):
-                dx, dy, dz = at.x - data[0, i], at.y - data[1, i], at.z - data[2, i]
-                if -least * (dx * dx + dy * dy + dz * dz) <= best:
+                if _farther(data, i, blocks[b, 2] > 0, at, least, -best):
                     continue
                 displaced = _displaced(data, i, blocks[b, 2] > 0, at, half, turning)
                 exponent = -displaced[6] - displaced[7]
@@ -240,11 +314,14 @@ def left_out_sums(
         is left out.
     """
     runs, cut, data, shells = empty_runs(cells, BLOCK), radius * radius, cells.data, sums.shape[2]
+    least = _lowest(half)
     for j in range(positions.shape[0]):
         at, side = place(cells, positions[j], quaternions[j], 1.0), sides[j]
         for r in range(runs_within(cells, at, radius, BLOCK, runs)):
             for i in range(runs[r, 0] + (-runs[r, 0]) % step, runs[r, 1], step):
                 if i == own[j]:
+                    continue
+                if _farther(data, i, runs[r, 2] > 0, at, least, cut):
                     continue
                 x, y, z, u, v, t, moved, turned = _displaced(data, i, runs[r, 2] > 0, at, half, turning)
                 if moved + turned > cut:

@@ -358,13 +358,15 @@ def _nearest_by_sums(data, near, runs, of_run):
 @fast
 def other_blocks_sums(cells, block, positions, quaternions, own, kappa, radius, out):
     """Kernel sums at poses (M,) over the sorted kernels whose ``block`` (N,) int32 differs from ``own``
-    (M,).
+    (M,), into ``out`` (M, 5): under ``kappa``, and under twice, four, eight and sixteen times that.
     """
     runs = empty_runs(cells, BLOCK)
     for j in range(positions.shape[0]):
         at = place(cells, positions[j], quaternions[j], kappa)
         near = single(at)
-        out[j] = 0.0
+        t0, t1, t2, t3, t4 = 0.0, 0.0, 0.0, 0.0, 0.0
         for r in range(runs_within(cells, at, radius, BLOCK, runs)):
             begin, end, twin = runs[r, 0], runs[r, 1], F32(runs[r, 2])
-            out[j] += isotropic_runs.other_blocks_run(cells.data, block, own[j], begin, end, near, twin)
+            part = isotropic_runs.other_blocks_run(cells.data, block, own[j], begin, end, near, twin)
+            t0, t1, t2, t3, t4 = t0 + part[0], t1 + part[1], t2 + part[2], t3 + part[3], t4 + part[4]
+        out[j, 0], out[j, 1], out[j, 2], out[j, 3], out[j, 4] = t0, t1, t2, t3, t4

@@ -26,6 +26,8 @@ LANES = 32
 #: Less than any exponent.
 LEAST = F32(-1e30)
 _ZERO = F32(0.0)
+#: Far below what any kernel counts for; its square, and that times a kernel of position, are normal numbers.
+_NORMAL = F32(2.0**-60)
 
 
 class At(NamedTuple):
@@ -281,11 +283,22 @@ def nearest_of_run(data, begin, end, at, twin):
 
 @fast
 def other_blocks_run(data, block, own, begin, end, at, twin):
-    """Sum of both twins' kernels over a run, those of block ``own`` left out."""
-    total = _ZERO
+    """Sums of both twins' kernels over a run, those of block ``own`` left out: under the rotation's
+    concentration, and under twice, four, eight and sixteen times that, whose exponentials are squares.
+    """
+    t0, t1, t2, t3, t4 = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
     for i in range(np.uint64(begin), np.uint64(end)):
-        base = -at.kappa - squared(data, i, at)
+        k = data[7, i] * exp(-squared(data, i, at))
+        k = k if block[i] != own else _ZERO
         a, b = cosines(data, i, at)
-        k = exp(base + abs(a)) + twin * exp(base + abs(b))
-        total += data[7, i] * k if block[i] != own else _ZERO
-    return total
+        a, b = exp(abs(a) - at.kappa), exp(abs(b) - at.kappa)
+        t0 += k * (a + twin * b)
+        a, b = max(a * a, _NORMAL), max(b * b, _NORMAL)
+        t1 += k * (a + twin * b)
+        a, b = max(a * a, _NORMAL), max(b * b, _NORMAL)
+        t2 += k * (a + twin * b)
+        a, b = max(a * a, _NORMAL), max(b * b, _NORMAL)
+        t3 += k * (a + twin * b)
+        a, b = max(a * a, _NORMAL), max(b * b, _NORMAL)
+        t4 += k * (a + twin * b)
+    return t0, t1, t2, t3, t4

@@ -18,7 +18,8 @@ from . import exp
 from . import isotropic as c
 from .isotropic_runs import LANES, single
 from .options import fast
-from .weighted import angle_factor, mixture_log_sum
+from .quaternions import angle_factor
+from .weighted import mixture_log_sum
 
 __all__ = ["mixture_log_sums", "mixture_sums_at"]
 

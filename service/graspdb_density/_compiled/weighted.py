@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from . import exp
 from . import isotropic as c
 from .isotropic_runs import cosines, single, squared
-from .options import exact, fast, inlined
+from .options import exact, fast
+from .quaternions import angle_factor
 
 F32 = np.float32
 #: Rows evaluated at a time: the buffers stay in the first-level cache.
@@ -72,38 +73,9 @@ class MixtureRows(NamedTuple):
     turning: bool
 
 
-def _angle_coefficients() -> tuple[np.float32, ...]:
-    """Power series in ``2 w - 1`` of the factor ``2 acos(w) / sqrt(1 - w^2)`` on [0, 1].
-
-    It turns a unit quaternion's vector part into the rotation vector. Analytic up to w = -1, so degree 10
-    leaves a relative error below float32's rounding.
-    """
-    w = 0.5 * (1.0 + np.cos(np.pi * (np.arange(64) + 0.5) / 64))
-    factor = 2.0 * np.arccos(w) / np.sqrt(1.0 - w * w)
-    series = np.polynomial.Chebyshev.fit(2.0 * w - 1.0, factor, 10, domain=[-1.0, 1.0])
-    return tuple(F32(v) for v in series.convert(kind=np.polynomial.Polynomial).coef)
-
-
-(_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10) = _angle_coefficients()
 _TURN = F32(2.0 * math.pi)
 #: Keeps the wrap of a rotation by nothing finite; far below float32 where the wrap matters.
 _TINY = F32(1e-6)
-
-
-@inlined
-def angle_factor(w):
-    """Rotation angle over the sine of its half, for w = cos(angle / 2) in [0, 1]."""
-    t = w + w - _ONE
-    y = _A10 * t + _A9
-    y = y * t + _A8
-    y = y * t + _A7
-    y = y * t + _A6
-    y = y * t + _A5
-    y = y * t + _A4
-    y = y * t + _A3
-    y = y * t + _A2
-    y = y * t + _A1
-    return y * t + _A0
 
 
 @fast

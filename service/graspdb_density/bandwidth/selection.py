@@ -176,18 +176,21 @@ def _scored(rows: Rows, threads: int) -> Iterator[tuple[IsotropicKernel, NDArray
     rows = rows.over(float(rows.weights.mean()))
     for step in _STEPS_POSITION:
         sigma = DEFAULT_KERNEL.sigma_position_m * 2.0 ** (0.5 * step)
-        cells = Cells.build(rows, sigma)
-        for turn in _STEPS_ROTATION:
-            kernel = IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
-            yield kernel, *_held_out(kernel, cells, rows, threads)
+        kernels = [
+            IsotropicKernel(sigma, DEFAULT_KERNEL.sigma_rotation * 2.0 ** (0.5 * turn))
+            for turn in _STEPS_ROTATION
+        ]
+        held, values = _held_out(kernels, rows, threads)
+        for kernel, column in zip(kernels, values, strict=True):
+            yield kernel, held, column
 
 
-def _held_out(
-    kernel: IsotropicKernel, cells: Cells, rows: Rows, threads: int
-) -> tuple[NDArray[np.int64], Floats]:
-    """Rows, and their log density given those outside their block."""
+def _held_out(kernels: list[IsotropicKernel], rows: Rows, threads: int) -> tuple[NDArray[np.int64], Floats]:
+    """Rows (H,), and their log densities (T, H) given those outside their block, under kernels of one
+    position width and of the rotation widths of `_STEPS_ROTATION`.
+    """
     (p, q), w = rows.poses, rows.weights
-    edge = BLOCK_WIDTHS * kernel.sigma_position_m
+    edge = BLOCK_WIDTHS * kernels[0].sigma_position_m
     low = p.min(axis=0)
     block = numbered(np.floor((p - low) / edge)).astype(np.int32)
     outside = w.sum() - np.bincount(block, weights=w)[block]
@@ -195,19 +198,22 @@ def _held_out(
     held = np.unique(np.linspace(0, len(p) - 1, min(len(p), MOST_HELD_OUT)).astype(np.int64))
     held = held[outside[held] > 0.0]
     if not held.size:
-        return held, np.empty(0)
-    out = np.empty(len(held))
+        return held, np.empty((len(kernels), 0))
+    cells = Cells.build(rows, kernels[0].sigma_position_m)
+    out = np.empty((len(held), len(kernels)))
     sorted_block = block[cells.rows]
 
     def work(begin: int, end: int) -> None:
         part = held[begin:end]
+        # From width to width the concentration halves: the widest has the least.
         isotropic.other_blocks_sums(
-            cells.arrays, sorted_block,
-            p[part], q[part], block[part], kernel.kappa, scaled_radius(5.0), out[begin:end],
+            cells.arrays, sorted_block, p[part], q[part], block[part],
+            kernels[-1].kappa, scaled_radius(5.0), out[begin:end, ::-1],
         )  # fmt: skip
 
     for_blocks(work, len(held), block=256, threads=threads)
-    density = out / outside[held] * math.exp(kernel.log_peak)
+    peaks = np.exp([kernel.log_peak for kernel in kernels])
+    density = out.T / outside[held] * peaks[:, None]
     spread = np.maximum(p.max(axis=0) - low, 1e-3)
     uniform = 1.0 / (float(np.prod(spread)) * HAAR_VOLUME)
     return held, np.log((1.0 - _UNIFORM_SHARE) * density + _UNIFORM_SHARE * uniform)

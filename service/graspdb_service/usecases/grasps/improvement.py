@@ -239,7 +239,9 @@ def _candidates(ctx: Estimators, scene: _Scene, rng: np.random.Generator) -> Pos
 def _allowed(ctx: Estimators, asked: BestGraspRequest, scene: _Scene, poses: Poses) -> Ints:
     """Rows that the bounds admit, whatever is known of their chances."""
     threads = ctx.compute.threads
-    bounds = bounds_of(asked, scene.built, scene.limits, scene.search, scene.test, None, None, threads)
+    built, test = scene.built, scene.test
+    closes = test if built.search is None else None
+    bounds = bounds_of(asked, built, scene.limits, scene.search, test, closes, None, None, threads)
     return bounds.allowed(poses)
 
 

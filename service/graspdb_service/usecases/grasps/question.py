@@ -135,7 +135,11 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         about = near if by_success and not expected else None
-        bounds = bounds_of(request, built, limits, search, test, about, model, threads)
+        # Between grasps that held, and between those on a prior's pairs, lie others that hold nothing.
+        closes = test if built.search is None else believed if about is not None else None
+        if request.collision_free is False and built.search is not None:
+            closes = None
+        bounds = bounds_of(request, built, limits, search, test, closes, about, model, threads)
         if robot is not None:
             bounds = replace(bounds, dear=robot.test)
         found = built, search, wide, kernel, limits, test, believed, chances, model, untried, bounds
@@ -226,27 +230,30 @@ def bounds_of(
     limits: Constraints,
     search: ModeSearch,
     test: CollisionTest | None,
+    closes: CollisionTest | None,
     near: NearSuccesses | None,
     model: Model | None,
     threads: int,
 ) -> Bounds:
-    """Region, separation, and every constraint that a region can't express, the cheap ones first."""
+    """Region, separation, and every constraint that a region can't express, the cheap ones first.
+
+    ``closes`` says where the jaw must be free, with something between its fingers; ``test`` where free.
+    """
     metres, degrees = request.min_separation_m, request.min_separation_deg
     separation = Separation(
         DISTINCT.metres if metres is None else metres,
         DISTINCT.radians if degrees is None else math.radians(degrees),
     )
     checks: list[Admissible] = []
-    if built.search is None and test is not None:
-        # Between the grasps on a prior's pairs lie others that hold nothing.
-        checks.append(lambda poses: test.holds(poses, threads))
     if near is not None:
         checks.append(near)
     if limits.exclude is not None and len(limits.exclude):
         twins = bool(search.centres.symmetric.all())
         checks.append(distinct_from(limits.exclude, separation, twins=twins))
     distance = request.pregrasp_distance_m or 0.0
-    if test is not None and request.collision_free is not False:
+    if closes is not None:
+        checks.append(lambda poses: closes.holds(poses, threads))
+    if test is not None and request.collision_free is not False and (closes is None or distance):
         checks.append(lambda poses: test.free_on_the_way(poses, distance, threads))
     profile = built.selected.profile
     if limits.obstacles and profile is not None:

@@ -1,9 +1,10 @@
-"""Whether trials contradict the collision test: grasps that held where the gripper should overlap the object.
+"""Whether trials contradict the collision test: grasps that held where the gripper should overlap the object,
+or close on nothing.
 
 A scanned mesh, a profile from a data sheet or a pose as a camera saw it may be some millimetres off, and
 geometry then calls impossible what a robot has done. Where that is so of more than a few grasps, collisions
-are still told and best grasps still keep clear of them, but they decide no success probability: the attempts
-there do.
+are still told and best grasps still keep clear of them, but they decide no success probability, nor whether
+the jaw closes on something: the attempts there do.
 """
 
 from __future__ import annotations
@@ -18,23 +19,25 @@ from graspdb_service.usecases.densities.build import Built
 from graspdb_service.usecases.geometry.collision import CollisionTest, Scenes
 from graspdb_service.usecases.runtime.compute import Compute
 
-#: Successes looked at, drawn at random, and how many of them, and which share, may collide for other reasons.
+#: Successes looked at, drawn at random, and how many of them, and which share, may contradict for other
+#: reasons.
 _LOOKED_AT, _STRAY, _STRAY_SHARE = 256, 1, 0.05
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """So many of the real successes that were looked at collide by geometry."""
+    """So many of the real successes that were looked at collide by geometry, or close on nothing."""
 
-    collided: int
+    impossible: int
     looked_at: int
 
     @property
     def warning(self) -> str:
         return (
-            f"in {self.collided:,} of {self.looked_at:,} grasps that held (simulation left aside) the open"
-            " gripper overlaps the object by geometry: collisions therefore decide no success probability"
-            " here. Check the gripper's profile, the mesh's frame and how the object's pose was measured"
+            f"in {self.impossible:,} of {self.looked_at:,} grasps that held (simulation left aside) the open"
+            " gripper overlaps the object by geometry, or has nothing between its fingers: geometry therefore"
+            " decides no success probability here. Check the gripper's profile, the mesh's frame and how the"
+            " object's pose was measured"
         )
 
 
@@ -46,10 +49,10 @@ def contradiction(built: Built, test: CollisionTest, threads: int) -> Contradict
     rows = np.random.default_rng(0).permutation(rows)[:_LOOKED_AT]
     if len(rows) <= _STRAY:
         return None
-    collided = int((~test.free(built.density.poses[rows], threads)).sum())
-    if collided <= max(_STRAY, _STRAY_SHARE * len(rows)):
+    impossible = int((~test.holds(built.density.poses[rows], threads)).sum())
+    if impossible <= max(_STRAY, _STRAY_SHARE * len(rows)):
         return None
-    return Contradiction(collided, len(rows))
+    return Contradiction(impossible, len(rows))
 
 
 class CollisionEvidence:
