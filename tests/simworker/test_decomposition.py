@@ -125,7 +125,7 @@ def test_a_child_that_dies_is_told_apart() -> None:
 def test_the_best_so_far_is_taken_when_time_is_over() -> None:
     script = (
         "import time; from graspdb_simworker.process import channel as m;"
-        "m.receive(0); m.send(1, m.RESULT, b'coarse'); m.send(1, m.RESULT, b'finer'); time.sleep(60)"
+        "m.Inbox(0).receive(); m.send(1, m.RESULT, b'coarse'); m.send(1, m.RESULT, b'finer'); time.sleep(60)"
     )
     found = supervisor.decompose(
         PAYLOAD, angle_stl(), limits=ResourceLimits(seconds=0.3), command=(sys.executable, "-c", script)

@@ -216,11 +216,16 @@ def test_messages_survive_the_pipe_and_broken_pipes_are_noticed() -> None:
     big = os.urandom(3 << 20)
     thread = threading.Thread(target=channel.send, args=(writer, channel.RESULT, big))
     thread.start()
-    assert channel.receive(reader, silence_s=10.0) == (channel.RESULT, big)
+    inbox = channel.Inbox(reader)
+    assert inbox.receive(silence_s=10.0) == (channel.RESULT, big)
     thread.join()
+    for body in (b"", b"one", b"two"):
+        channel.send(writer, channel.NOTE, body)
+    inbox = channel.Inbox(reader, pause_s=0.01)
+    assert [inbox.receive()[1] for _ in range(3)] == [b"", b"one", b"two"]
     with pytest.raises(channel.Silent):
-        channel.receive(reader, silence_s=0.1, poll_s=0.02)
+        inbox.receive(silence_s=0.1, poll_s=0.02)
     os.close(writer)
     with pytest.raises(channel.Closed):
-        channel.receive(reader)
+        inbox.receive()
     os.close(reader)

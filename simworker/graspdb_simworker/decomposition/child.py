@@ -29,7 +29,7 @@ def main() -> int:
     os.dup2(0, 2)  # CoACD's log
     os.nice(NICENESS)
     try:
-        _, body = channel.receive(source, poll_s=60.0)
+        _, body = channel.Inbox(source).receive(poll_s=60.0)
         head, _, content = body.partition(b"\n")
         order = json.loads(head)
         memory, seconds = int(order["memory_bytes"]), max(1, math.ceil(order["seconds"]))

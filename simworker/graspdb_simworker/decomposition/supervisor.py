@@ -86,11 +86,12 @@ def decompose(
     assert process.stdin is not None
     assert process.stdout is not None
     best: bytes | None = None
+    inbox = channel.Inbox(process.stdout.fileno())
     try:
         with contextlib.suppress(channel.Closed):
             channel.send(process.stdin.fileno(), channel.CHUNK, json.dumps(order).encode() + b"\n" + mesh)
         while True:
-            kind, body = channel.receive(process.stdout.fileno(), check=check)
+            kind, body = inbox.receive(check=check)
             if kind == channel.NOTE:
                 progress(body.decode(errors="replace"))
             elif kind == channel.RESULT:

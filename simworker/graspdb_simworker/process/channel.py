@@ -78,35 +78,51 @@ def send(fd: int, kind: bytes, body: bytes = b"") -> None:
         raise Closed("the pipe's reader is gone") from error
 
 
-def receive(
-    fd: int, *, silence_s: float | None = None, poll_s: float = 0.2, check: Callable[[], None] | None = None
-) -> tuple[bytes, bytes]:
-    """Read one message whole: kind and body.
+class Inbox:
+    """Messages that come over a pipe, in turn; read as many at a time as there are.
 
-    ``check`` is called about every ``poll_s`` while waiting; what it raises ends the wait. Closed if nobody
-    writes any more, Silent if nothing came for ``silence_s``.
+    Where many small ones come, whoever reads is woken for each, and takes the time of who writes:
+    ``pause_s`` is how long to let them gather.
     """
-    kind, length = _HEADER.unpack(_exactly(fd, _HEADER.size, silence_s, poll_s, check))
-    if length > MAX_BYTES:
-        raise Closed(f"a message of {length} bytes: the stream is broken")
-    return kind, _exactly(fd, length, silence_s, poll_s, check)
 
+    def __init__(self, fd: int, *, pause_s: float = 0.0) -> None:
+        self._fd = fd
+        self._pause_s = pause_s
+        self._read = bytearray()
 
-def _exactly(
-    fd: int, count: int, silence_s: float | None, poll_s: float, check: Callable[[], None] | None
-) -> bytes:
-    pieces: list[bytes] = []
-    heard = time.monotonic()
-    while count:
-        while not select.select([fd], [], [], poll_s)[0]:
-            if check is not None:
-                check()
-            if silence_s is not None and time.monotonic() - heard > silence_s:
-                raise Silent(f"nothing heard for {silence_s:g} s")
-        piece = os.read(fd, min(count, 1 << 20))
-        if not piece:
-            raise Closed("the pipe's writer is gone")
-        pieces.append(piece)
-        count -= len(piece)
+    def receive(
+        self, *, silence_s: float | None = None, poll_s: float = 0.2, check: Callable[[], None] | None = None
+    ) -> tuple[bytes, bytes]:
+        """The next message whole: kind and body.
+
+        ``check`` is called about every ``poll_s`` while waiting; what it raises ends the wait. Closed if
+        nobody writes any more, Silent if nothing came for ``silence_s``.
+        """
+        self._gather(_HEADER.size, silence_s, poll_s, check)
+        kind, length = _HEADER.unpack_from(self._read)
+        if length > MAX_BYTES:
+            raise Closed(f"a message of {length} bytes: the stream is broken")
+        end = _HEADER.size + length
+        self._gather(end, silence_s, poll_s, check)
+        body = bytes(memoryview(self._read)[_HEADER.size : end])
+        del self._read[:end]
+        return kind, body
+
+    def _gather(
+        self, count: int, silence_s: float | None, poll_s: float, check: Callable[[], None] | None
+    ) -> None:
+        """Read until so many bytes are there."""
         heard = time.monotonic()
-    return b"".join(pieces)
+        while len(self._read) < count:
+            while not select.select([self._fd], [], [], poll_s)[0]:
+                if check is not None:
+                    check()
+                if silence_s is not None and time.monotonic() - heard > silence_s:
+                    raise Silent(f"nothing heard for {silence_s:g} s")
+            if self._pause_s and not self._read:
+                time.sleep(self._pause_s)
+            piece = os.read(self._fd, 1 << 20)
+            if not piece:
+                raise Closed("the pipe's writer is gone")
+            self._read += piece
+            heard = time.monotonic()

@@ -26,6 +26,8 @@ START_SECONDS = 600.0
 """Loading an engine and, the first time on a machine, compiling the collision test; if starved, too."""
 RECYCLE_CHUNKS = 64
 """pybullet leaks: a child is replaced after this many chunks."""
+GATHER_S = 0.02
+"""A child tells of every closing, some hundred times a second: so long they may wait to be read together."""
 MAX_DEATHS = 50
 """More dead children than this in one chunk are no bad luck with poses any more."""
 
@@ -48,6 +50,7 @@ class LocalRunner(ChunkRunner):
         self._pose_s = pose_s
         self._recycle = recycle_chunks
         self._process: ChildProcess | None = None
+        self._inbox: channel.Inbox | None = None
         self._chunks = 0
 
     def __exit__(self, *_: object) -> None:
@@ -83,8 +86,8 @@ class LocalRunner(ChunkRunner):
 
         try:
             while True:
-                process = self._started(check)
-                attempt = _Attempt(process, known, self._pose_s, check, progress)
+                process, inbox = self._started(check)
+                attempt = _Attempt(process, inbox, known, self._pose_s, check, progress)
                 outcome = attempt.run(payload, parts_glb)
                 if outcome is not None:
                     self._chunks += 1
@@ -103,18 +106,19 @@ class LocalRunner(ChunkRunner):
             self.kill()
             raise
 
-    def _started(self, check: Callable[[], None]) -> ChildProcess:
-        if self._process is not None:
-            return self._process
+    def _started(self, check: Callable[[], None]) -> tuple[ChildProcess, channel.Inbox]:
+        if self._process is not None and self._inbox is not None:
+            return self._process, self._inbox
         self._chunks = 0
         process = self._process = channel.start(self._command)
+        inbox = self._inbox = channel.Inbox(_fd(process.stdout), pause_s=GATHER_S)
         try:
-            kind, body = channel.receive(_fd(process.stdout), silence_s=START_SECONDS, check=check)
+            kind, body = inbox.receive(silence_s=START_SECONDS, check=check)
         except (channel.Closed, channel.Silent) as error:
             raise ChunkFailed(f"the simulating process did not start: {self._cause_of_death()}") from error
         if kind == channel.MISSING:
             raise PhysicsMissing(body.decode(errors="replace"))
-        return process
+        return process, inbox
 
     def _cause_of_death(self) -> str:
         process = self._process
@@ -138,6 +142,7 @@ class _Attempt:
     """One try of one process at a chunk; remembers how far it came."""
 
     process: ChildProcess
+    inbox: channel.Inbox
     known: dict[int, Label]
     pose_s: float
     check: Callable[[], None]
@@ -153,7 +158,7 @@ class _Attempt:
             while True:
                 # Before the first closing the prefilter runs: minutes at worst, for the largest chunks.
                 silence = START_SECONDS if self.simulating is None else SILENT * self.pose_s + 5.0
-                kind, body = channel.receive(_fd(self.process.stdout), silence_s=silence, check=self.check)
+                kind, body = self.inbox.receive(silence_s=silence, check=self.check)
                 self.heard += 1
                 # Here too: a busy child leaves no silence in which to ask.
                 self.check()

@@ -28,10 +28,11 @@ WORKPIECE_FIELDS = {
 def serve(source: int, sink: int) -> None:
     """Answer chunks until the worker closes the pipe (which raises :class:`channel.Closed`)."""
     channel.send(sink, channel.READY)
+    inbox = channel.Inbox(source)
     key: str | None = None
     workpiece: chunks.Workpiece | None = None
     while True:
-        kind, body = channel.receive(source, poll_s=3600.0)
+        kind, body = inbox.receive(poll_s=3600.0)
         if kind != channel.CHUNK:
             raise channel.Closed(f"unexpected message {kind!r}")
         try:

@@ -328,7 +328,8 @@ class GraspWorld:
                     contacts.clear()
                     ratings.clear()
             looks += 1
-            if looks % _EMPTY_CHECK_LOOKS == 0 and not self._between():
+            # What both fingers press is between them.
+            if looks % _EMPTY_CHECK_LOOKS == 0 and not squeezing and not self._between():
                 end = End.EMPTY
                 break
             if touched and depth > SUNK_M:
